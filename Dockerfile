@@ -1,0 +1,20 @@
+# syntax=docker/dockerfile:1
+# The operator's image, for those who have a container engine: `docker build -t leaderboard-operator:dev .`
+# `make image` makes the same one without an engine; local/operator-image.toml is its list of files.
+
+FROM rust:1.95-bookworm AS build
+WORKDIR /src
+COPY . .
+# Two builds, as the runner is static and small: it is copied into every Pod and runs inside any image.
+RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/src/target \
+    triple="$(rustc -vV | sed -n 's/^host: //p')" \
+    && cargo build --locked --release -p leaderboard-operator --bin leaderboard-operator \
+    && RUSTFLAGS="-C target-feature=+crt-static" \
+       cargo build --locked --release --target "$triple" -p leaderboard-runner \
+    && install -D -t /out target/release/leaderboard-operator "target/$triple/release/leaderboard-runner"
+
+# Has the C library, the authorities for TLS, the user 65532, and no shell.
+FROM gcr.io/distroless/cc-debian12:nonroot
+COPY --from=build /out/leaderboard-operator /out/leaderboard-runner /usr/local/bin/
+USER 65532:65532
+ENTRYPOINT ["leaderboard-operator"]

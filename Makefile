@@ -1,0 +1,66 @@
+# What a developer or a host runs on one machine. `make help` explains every target.
+SHELL := /bin/bash
+PROFILE ?= local
+TARGET := target/x86_64-unknown-linux-gnu
+STATIC := RUSTFLAGS="-C target-feature=+crt-static"
+LAB := ./local/lab
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-core cluster down status build static image images crds fmt lint deny bench chart-test lab-test
+
+help: ## Explain every target
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time)
+	$(LAB) demo
+
+test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; 45 min the first time)
+	$(LAB) test
+
+test-core: ## Run the tests that need neither root nor a node
+	$(LAB) test --core
+
+cluster: ## Start the one-node cluster and the AWS stand-in; prints the KUBECONFIG line to copy
+	$(LAB) up
+
+down: ## End everything that cluster, demo and test have started
+	$(LAB) down
+
+status: ## Say what of the cluster is up
+	$(LAB) status
+
+build: ## Build the operator
+	cargo build --profile $(PROFILE) --workspace --bins --test programs
+
+static: ## Build the programs that go into other images, statically
+	$(STATIC) cargo build --release --target x86_64-unknown-linux-gnu -p leaderboard-runner
+	$(STATIC) cargo build --profile $(PROFILE) --target x86_64-unknown-linux-gnu -p challenge-stand-in
+
+image: build static ## Make the operator's image without a container engine and push it to the local registry
+	$(LAB) image local/operator-image.toml --profile $(PROFILE)
+
+images: image ## Make and push all images of the demo
+	$(LAB) image local/challenge/images.toml --profile $(PROFILE)
+
+crds: ## Generate crds/ from the types
+	UPDATE_CRDS=1 cargo test --profile $(PROFILE) --workspace --lib -- crds
+
+fmt: ## Format the code
+	cargo fmt --all
+
+lint: ## Check format and lints
+	cargo fmt --all --check
+	cargo clippy --profile $(PROFILE) --workspace --all-targets -- -D warnings
+
+deny: ## Check licenses, advisories, sources and unused dependencies
+	cargo deny --offline check bans licenses sources
+	cargo machete
+
+chart-test: ## Lint the chart and check what it renders against the schemas
+	$(LAB) chart-test
+
+bench: ## Measure the merge of results
+	cargo bench -p leaderboard-results
+
+lab-test: ## Test local/ itself
+	python3 -m unittest discover -s local/tests -t local

@@ -1,0 +1,200 @@
+//! A worker's checkpoint file: bytes to a typed checkpoint, or a reason why not. Called once per worker and round; the
+//! merge takes what comes out. Knows one file at a time: what concerns several workers is the merge's.
+
+mod plausible;
+mod record;
+
+pub(crate) use record::Record;
+
+use crate::json::{self, Limit, Object, ReadError, Text, Value};
+use crate::plan::Verify;
+use crate::{Plan, Refusal, verify};
+
+const MAX_RECORDS: usize = 10_000;
+const MAX_SENSORS: usize = 1_000;
+/// A file can't promise more route runs than this.
+const MAX_TOTAL: i128 = 1_000_000;
+
+/// What one worker has written so far, checked as far as one file can be.
+#[derive(Clone, Debug)]
+pub struct Checkpoint {
+    pub(crate) records: Vec<Record>,
+    pub(crate) total: u32,
+    pub(crate) sensors: Vec<Text>,
+    pub(crate) ended: bool,
+    pub(crate) warnings: Vec<String>,
+}
+
+impl Checkpoint {
+    /// How many routes the worker has finished.
+    pub fn done(&self) -> u32 {
+        u32::try_from(self.records.len()).unwrap_or(u32::MAX)
+    }
+
+    /// How many the file says it will finish.
+    pub fn total(&self) -> u32 {
+        self.total
+    }
+
+    /// Whether the evaluator came to its regular end: the file has a global record of its own. After a crashed simulation it
+    /// has none, even when no route is missing.
+    pub fn ended(&self) -> bool {
+        self.ended
+    }
+}
+
+/// Reads the file of the worker at position `pair` (from 0) of the plan.
+///
+/// `Ok(None)`: there is nothing yet; the file is empty, half-written or not JSON, and another round will find it whole.
+pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Checkpoint>, Refusal> {
+    let value = match json::read(bytes) {
+        Ok(value) => value,
+        Err(ReadError::NotJson) => return Ok(None),
+        Err(ReadError::NotUtf8) => return Err(Refusal::NotUtf8 { pair }),
+        Err(ReadError::Limit(limit)) => return Err(Refusal::Limit { pair, limit }),
+    };
+    if value.is_falsy() {
+        return Ok(None);
+    }
+    let file = File::of(pair, &value)?;
+    if plan.is_pod() && file.progress.is_empty() && file.records.is_empty() {
+        return Ok(None);
+    }
+    let sensors = sensors(plan, pair, file.sensors)?;
+    let total = total(plan, pair, file.progress)?;
+    let ended = file.inner.get("global_record").is_some_and(|global| !global.is_falsy());
+    let records = records(plan, pair, file.records)?;
+    if plan.is_pod() {
+        plausible::check_file(plan, pair, total, &records)?;
+    }
+    let warnings = verified(plan, pair, &records)?;
+    Ok(Some(Checkpoint {
+        records,
+        total,
+        sensors,
+        ended,
+        warnings,
+    }))
+}
+
+/// The parts of the JSON a checkpoint can't be without.
+struct File<'a> {
+    inner: &'a Object,
+    records: &'a [Value],
+    progress: &'a [Value],
+    sensors: &'a Value,
+}
+
+impl<'a> File<'a> {
+    fn of(pair: usize, value: &'a Value) -> Result<Self, Refusal> {
+        let shape = |place, wanted| Refusal::Shape { pair, place, wanted };
+        let outer = value.as_object().ok_or_else(|| shape("the whole file", "an object"))?;
+        let inner = outer
+            .get("_checkpoint")
+            .and_then(Value::as_object)
+            .ok_or_else(|| shape("_checkpoint", "an object"))?;
+        let list = |key: &str, place| {
+            inner
+                .get(key)
+                .and_then(Value::as_list)
+                .ok_or_else(|| shape(place, "a list"))
+        };
+        Ok(Self {
+            inner,
+            records: list("records", "_checkpoint.records")?,
+            progress: list("progress", "_checkpoint.progress")?,
+            sensors: outer.get("sensors").ok_or_else(|| shape("sensors", "a list"))?,
+        })
+    }
+}
+
+fn sensors(plan: &Plan, pair: usize, value: &Value) -> Result<Vec<Text>, Refusal> {
+    if value.is_falsy() {
+        return Ok(Vec::new());
+    }
+    let list = value.as_list().ok_or(Refusal::Shape {
+        pair,
+        place: "sensors",
+        wanted: "a list",
+    })?;
+    if list.len() > MAX_SENSORS {
+        return Err(Refusal::Limit {
+            pair,
+            limit: Limit::Sensors,
+        });
+    }
+    let mut sensors = Vec::with_capacity(list.len());
+    for (i, item) in list.iter().enumerate() {
+        let Value::Text(text) = item else {
+            return Err(Refusal::Shape {
+                pair,
+                place: "sensors",
+                wanted: "a list of names",
+            });
+        };
+        if plan.is_pod() && text.as_str().and_then(crate::names::sensor_name).is_none() {
+            return Err(Refusal::Sensor {
+                pair: Some(pair),
+                sensor: i + 1,
+            });
+        }
+        sensors.push(text.clone());
+    }
+    Ok(sensors)
+}
+
+fn total(plan: &Plan, pair: usize, progress: &[Value]) -> Result<u32, Refusal> {
+    let shape = Refusal::Shape {
+        pair,
+        place: "_checkpoint.progress",
+        wanted: "a pair of whole numbers",
+    };
+    let [done, Value::Int(total @ 0..=MAX_TOTAL), ..] = progress else {
+        return Err(shape);
+    };
+    let is_pair = matches!(done, Value::Int(0..=MAX_TOTAL)) && progress.len() == 2;
+    if plan.is_pod() && !is_pair {
+        return Err(shape);
+    }
+    u32::try_from(*total).map_err(|_| shape)
+}
+
+fn records(plan: &Plan, pair: usize, values: &[Value]) -> Result<Vec<Record>, Refusal> {
+    if values.len() > MAX_RECORDS {
+        return Err(Refusal::Limit {
+            pair,
+            limit: Limit::Records,
+        });
+    }
+    let mut records = Vec::with_capacity(values.len());
+    for (i, value) in values.iter().enumerate() {
+        let record = Record::of(plan.format, i + 1, value).map_err(|(record, problem)| Refusal::Record {
+            pair,
+            record,
+            problem,
+        })?;
+        records.push(record);
+    }
+    Ok(records)
+}
+
+fn verified(plan: &Plan, pair: usize, records: &[Record]) -> Result<Vec<String>, Refusal> {
+    let mut warnings = Vec::new();
+    if plan.verify == Verify::Off {
+        return Ok(warnings);
+    }
+    for record in records {
+        if let Err(problem) = verify::check(plan.format, record) {
+            let refusal = Refusal::Record {
+                pair,
+                record: record.name.clone(),
+                problem,
+            };
+            if plan.verify == Verify::Refuse {
+                return Err(refusal);
+            }
+            warnings.push(refusal.to_string());
+        }
+    }
+    Ok(warnings)
+}

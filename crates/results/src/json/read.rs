@@ -1,0 +1,445 @@
+//! The reader: bytes to a value, within limits that hold whatever the bytes are. One recursive descent, depth counted.
+
+use super::{Object, Text, Value};
+
+/// A bound a hostile file ran into.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Limit {
+    /// Size of the whole file.
+    #[error("is larger than 64 MiB")]
+    Size,
+    /// Lists and objects inside each other.
+    #[error("is nested deeper than 64 levels")]
+    Depth,
+    /// Values of any kind.
+    #[error("holds more than 500,000 values")]
+    Values,
+    /// Length of one text.
+    #[error("holds a text longer than 1 MiB")]
+    Text,
+    /// Length of one number.
+    #[error("holds a number of more than 4,096 characters")]
+    Number,
+    /// Route records.
+    #[error("holds more than 10,000 records")]
+    Records,
+    /// Sensors.
+    #[error("holds more than 1,000 sensors")]
+    Sensors,
+    /// Size of what is written from it.
+    #[error("would make the merged file larger than 64 MiB")]
+    Output,
+}
+
+/// The largest file that is read, in bytes.
+const MAX_SIZE: usize = 64 << 20;
+const MAX_DEPTH: usize = 64;
+const MAX_VALUES: usize = 500_000;
+const MAX_TEXT: usize = 1 << 20;
+const MAX_NUMBER: usize = 4096;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ReadError {
+    /// Empty, half-written or something else altogether.
+    NotJson,
+    NotUtf8,
+    Limit(Limit),
+}
+
+/// Reads one value. A file that ends inside a multi-byte character is half-written, so not JSON.
+pub(crate) fn read(bytes: &[u8]) -> Result<Value, ReadError> {
+    if bytes.len() > MAX_SIZE {
+        return Err(ReadError::Limit(Limit::Size));
+    }
+    if let Err(error) = std::str::from_utf8(bytes) {
+        return Err(if error.error_len().is_none() {
+            ReadError::NotJson
+        } else {
+            ReadError::NotUtf8
+        });
+    }
+    let mut reader = Reader {
+        bytes,
+        at: 0,
+        values: 0,
+    };
+    reader.space();
+    let value = reader.value(0)?;
+    reader.space();
+    if reader.at == bytes.len() {
+        Ok(value)
+    } else {
+        Err(ReadError::NotJson)
+    }
+}
+
+struct Reader<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    values: usize,
+}
+
+type Read<T> = Result<T, ReadError>;
+
+impl Reader<'_> {
+    fn peek(&self) -> Option<u8> {
+        self.bytes.get(self.at).copied()
+    }
+
+    fn next(&mut self) -> Read<u8> {
+        let byte = self.peek().ok_or(ReadError::NotJson)?;
+        self.at += 1;
+        Ok(byte)
+    }
+
+    /// Steps over the token if it is next.
+    fn take(&mut self, token: &[u8]) -> bool {
+        let here = self.bytes.get(self.at..).is_some_and(|rest| rest.starts_with(token));
+        if here {
+            self.at += token.len();
+        }
+        here
+    }
+
+    fn space(&mut self) {
+        while matches!(self.peek(), Some(b' ' | b'\t' | b'\n' | b'\r')) {
+            self.at += 1;
+        }
+    }
+
+    fn value(&mut self, depth: usize) -> Read<Value> {
+        self.values += 1;
+        if self.values > MAX_VALUES {
+            return Err(ReadError::Limit(Limit::Values));
+        }
+        if depth > MAX_DEPTH {
+            return Err(ReadError::Limit(Limit::Depth));
+        }
+        match self.peek().ok_or(ReadError::NotJson)? {
+            b'{' => self.object(depth),
+            b'[' => self.list(depth),
+            b'"' => {
+                self.at += 1;
+                self.text().map(Value::Text)
+            }
+            b'-' | b'0'..=b'9' => self.number(),
+            _ => self.word(),
+        }
+    }
+
+    fn word(&mut self) -> Read<Value> {
+        for (token, value) in [
+            ("null", Value::Null),
+            ("true", Value::Bool(true)),
+            ("false", Value::Bool(false)),
+            ("NaN", Value::Float(f64::NAN)),
+            ("Infinity", Value::Float(f64::INFINITY)),
+        ] {
+            if self.take(token.as_bytes()) {
+                return Ok(value);
+            }
+        }
+        Err(ReadError::NotJson)
+    }
+
+    fn list(&mut self, depth: usize) -> Read<Value> {
+        self.at += 1;
+        let mut items = Vec::new();
+        self.space();
+        if self.take(b"]") {
+            return Ok(Value::List(items));
+        }
+        loop {
+            self.space();
+            items.push(self.value(depth + 1)?);
+            self.space();
+            match self.next()? {
+                b',' => {}
+                b']' => return Ok(Value::List(items)),
+                _ => return Err(ReadError::NotJson),
+            }
+        }
+    }
+
+    fn object(&mut self, depth: usize) -> Read<Value> {
+        self.at += 1;
+        let mut entries = Vec::new();
+        self.space();
+        if self.take(b"}") {
+            return Ok(Value::Object(Object(entries)));
+        }
+        loop {
+            self.space();
+            if !self.take(b"\"") {
+                return Err(ReadError::NotJson);
+            }
+            let key = self.text()?;
+            self.space();
+            if !self.take(b":") {
+                return Err(ReadError::NotJson);
+            }
+            self.space();
+            entries.push((key, self.value(depth + 1)?));
+            self.space();
+            match self.next()? {
+                b',' => {}
+                b'}' => return Ok(Value::Object(Object(without_repeats(entries)))),
+                _ => return Err(ReadError::NotJson),
+            }
+        }
+    }
+
+    /// The rest of a text whose opening quote was read.
+    fn text(&mut self) -> Read<Text> {
+        let mut text = Vec::new();
+        loop {
+            let from = self.at;
+            while self
+                .peek()
+                .is_some_and(|byte| byte >= 0x20 && byte != b'"' && byte != b'\\')
+            {
+                self.at += 1;
+            }
+            text.extend_from_slice(self.bytes.get(from..self.at).unwrap_or_default());
+            if text.len() > MAX_TEXT {
+                return Err(ReadError::Limit(Limit::Text));
+            }
+            match self.next()? {
+                b'"' => return Ok(Text(text.into_boxed_slice())),
+                b'\\' => self.escape(&mut text)?,
+                _ => return Err(ReadError::NotJson),
+            }
+        }
+    }
+
+    fn escape(&mut self, text: &mut Vec<u8>) -> Read<()> {
+        text.push(match self.next()? {
+            byte @ (b'"' | b'\\' | b'/') => byte,
+            b'b' => 0x08,
+            b'f' => 0x0c,
+            b'n' => b'\n',
+            b'r' => b'\r',
+            b't' => b'\t',
+            b'u' => {
+                let code = self.code_point()?;
+                push_code_point(text, code);
+                return Ok(());
+            }
+            _ => return Err(ReadError::NotJson),
+        });
+        Ok(())
+    }
+
+    /// The code point of `\uXXXX`, with a following low half when this is a high one.
+    fn code_point(&mut self) -> Read<u32> {
+        let unit = self.hex4()?;
+        if !(0xd800..0xdc00).contains(&unit) {
+            return Ok(unit);
+        }
+        let after = self.at;
+        if self.take(b"\\u")
+            && let Ok(low @ 0xdc00..=0xdfff) = self.hex4()
+        {
+            return Ok(0x1_0000 + ((unit - 0xd800) << 10) + (low - 0xdc00));
+        }
+        self.at = after;
+        Ok(unit)
+    }
+
+    fn hex4(&mut self) -> Read<u32> {
+        let mut code = 0;
+        for _ in 0..4 {
+            let digit = char::from(self.next()?).to_digit(16).ok_or(ReadError::NotJson)?;
+            code = code << 4 | digit;
+        }
+        Ok(code)
+    }
+
+    fn number(&mut self) -> Read<Value> {
+        let from = self.at;
+        let negative = self.take(b"-");
+        if negative && self.take(b"Infinity") {
+            return Ok(Value::Float(f64::NEG_INFINITY));
+        }
+        if !self.take(b"0") && self.digits() == 0 {
+            return Err(ReadError::NotJson);
+        }
+        let mut is_float = false;
+        if self.take(b".") {
+            is_float = true;
+            if self.digits() == 0 {
+                return Err(ReadError::NotJson);
+            }
+        }
+        if self.take(b"e") || self.take(b"E") {
+            is_float = true;
+            let _sign = self.take(b"+") || self.take(b"-");
+            if self.digits() == 0 {
+                return Err(ReadError::NotJson);
+            }
+        }
+        if self.at - from > MAX_NUMBER {
+            return Err(ReadError::Limit(Limit::Number));
+        }
+        let text = self
+            .bytes
+            .get(from..self.at)
+            .and_then(|b| std::str::from_utf8(b).ok())
+            .unwrap_or_default();
+        if is_float {
+            return text.parse().map(Value::Float).map_err(|_| ReadError::NotJson);
+        }
+        Ok(text.parse().map_or_else(|_| Value::BigInt(text.into()), Value::Int))
+    }
+
+    fn digits(&mut self) -> usize {
+        let from = self.at;
+        while self.peek().is_some_and(|byte| byte.is_ascii_digit()) {
+            self.at += 1;
+        }
+        self.at - from
+    }
+}
+
+fn push_code_point(text: &mut Vec<u8>, code: u32) {
+    if let Some(c) = char::from_u32(code) {
+        text.extend_from_slice(c.encode_utf8(&mut [0; 4]).as_bytes());
+        return;
+    }
+    let [.., high, low] = code.to_be_bytes();
+    text.extend_from_slice(&[0xed, 0x80 | (high & 0x0f) << 2 | low >> 6, 0x80 | low & 0x3f]);
+}
+
+/// A repeated key keeps its first place and gets its last value. By sorting, since the keys are a stranger's choice.
+fn without_repeats(mut entries: Vec<(Text, Value)>) -> Vec<(Text, Value)> {
+    let mut order: Vec<usize> = (0..entries.len()).collect();
+    order.sort_by(|&a, &b| {
+        entries
+            .get(a)
+            .map(|e| &e.0)
+            .cmp(&entries.get(b).map(|e| &e.0))
+            .then(a.cmp(&b))
+    });
+    let same = |a: usize, b: usize| entries.get(a).map(|e| &e.0) == entries.get(b).map(|e| &e.0);
+    let groups: Vec<Vec<usize>> = order
+        .chunk_by(|&a, &b| same(a, b))
+        .filter(|group| group.len() > 1)
+        .map(<[usize]>::to_vec)
+        .collect();
+    if groups.is_empty() {
+        return entries;
+    }
+    let mut drop = vec![false; entries.len()];
+    for group in groups {
+        if let [first, .., last] = group.as_slice() {
+            let value = entries
+                .get_mut(*last)
+                .map(|entry| std::mem::replace(&mut entry.1, Value::Null));
+            if let (Some(entry), Some(value)) = (entries.get_mut(*first), value) {
+                entry.1 = value;
+            }
+        }
+        for index in group.into_iter().skip(1) {
+            if let Some(flag) = drop.get_mut(index) {
+                *flag = true;
+            }
+        }
+    }
+    let mut dropped = drop.into_iter();
+    entries.retain(|_| !dropped.next().unwrap_or(false));
+    entries
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ok(text: &str) -> Value {
+        read(text.as_bytes()).unwrap()
+    }
+
+    #[test]
+    fn numbers_keep_their_kind() {
+        assert_eq!(ok("0"), Value::Int(0));
+        assert_eq!(ok("-0"), Value::Int(0));
+        assert_eq!(ok("-0.0"), Value::Float(-0.0));
+        assert_eq!(ok("1E2"), Value::Float(100.0));
+        assert_eq!(ok("1e999"), Value::Float(f64::INFINITY));
+        assert_eq!(ok("-Infinity"), Value::Float(f64::NEG_INFINITY));
+        assert!(matches!(ok("NaN"), Value::Float(f) if f.is_nan()));
+        let big = "1".repeat(60);
+        assert_eq!(ok(&big), Value::BigInt(big.clone().into()));
+    }
+
+    #[test]
+    fn what_python_does_not_read_is_not_json() {
+        for text in [
+            "",
+            " ",
+            "{",
+            "[1",
+            "[1,]",
+            "{\"a\":1,}",
+            "{a:1}",
+            "01",
+            "1.",
+            ".5",
+            "+1",
+            "1e",
+            "-",
+            "--1",
+            "-NaN",
+            "nan",
+            "\"\u{1}\"",
+            "\"\\x\"",
+            "\"\\u12\"",
+            "\"a",
+            "1 2",
+            "\u{feff}{}",
+            "tru",
+            "[1 2]",
+            "{\"a\" 1}",
+            "'a'",
+        ] {
+            assert_eq!(read(text.as_bytes()), Err(ReadError::NotJson), "{text:?}");
+        }
+    }
+
+    #[test]
+    fn escapes_and_surrogates() {
+        assert_eq!(ok(r#""\u00e9\ud83d\ude97\/\"\b""#).as_str(), Some("é🚗/\"\u{8}"));
+        for lone in [r#""\ud83d""#, r#""\ude97\ud83d""#, r#""\ud83dx""#, r#""\ud83d\u0041""#] {
+            assert!(matches!(ok(lone), Value::Text(_)), "{lone}");
+            assert_eq!(ok(lone).as_str(), None, "{lone}");
+        }
+    }
+
+    #[test]
+    fn the_last_of_repeated_keys_wins_in_the_first_place() {
+        assert_eq!(ok(r#"{"a":1,"b":2,"a":3,"c":4,"a":5}"#), ok(r#"{"a":5,"b":2,"c":4}"#));
+        assert_ne!(ok(r#"{"a":1,"b":2}"#), ok(r#"{"b":2,"a":1}"#));
+    }
+
+    #[test]
+    fn limits_hold() {
+        let nested = |n| format!("{}{}", "[".repeat(n), "]".repeat(n));
+        assert!(read(nested(64).as_bytes()).is_ok());
+        assert_eq!(read(nested(66).as_bytes()), Err(ReadError::Limit(Limit::Depth)));
+        assert_eq!(
+            read("[".repeat(1_000_000).as_bytes()),
+            Err(ReadError::Limit(Limit::Depth))
+        );
+        let long = format!("\"{}\"", "x".repeat(MAX_TEXT + 1));
+        assert_eq!(read(long.as_bytes()), Err(ReadError::Limit(Limit::Text)));
+        let many = format!("[{}1]", "1,".repeat(MAX_VALUES));
+        assert_eq!(read(many.as_bytes()), Err(ReadError::Limit(Limit::Values)));
+        assert_eq!(read("1".repeat(5000).as_bytes()), Err(ReadError::Limit(Limit::Number)));
+        assert_eq!(read(&vec![b' '; MAX_SIZE + 1]), Err(ReadError::Limit(Limit::Size)));
+    }
+
+    #[test]
+    fn a_cut_character_is_half_written_and_a_wrong_one_is_refused() {
+        assert_eq!(read(&[b'"', 0xc3]), Err(ReadError::NotJson));
+        assert_eq!(read(&[b'"', 0xff, b'"']), Err(ReadError::NotUtf8));
+    }
+}

@@ -1,0 +1,146 @@
+//! What a run was asked to do: format, slices, strictness. Owns the types the callers fill in and the check that they make
+//! sense together; knows nothing of checkpoints.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Refusal;
+
+/// The checkpoint format: Leaderboard 1.0, or 2.0 and everything after it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Format {
+    /// Leaderboard 1.0.
+    V1,
+    /// Leaderboard 2.0, 2.1 and later.
+    V2,
+}
+
+/// How much of a strange checkpoint is put up with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Strictness {
+    /// A person's own files: free status texts, unknown infraction sources, NaN.
+    Offline,
+    /// A stranger's files whose content is published: known statuses and sensors only, plausible numbers, ids inside the
+    /// pair's slice.
+    Pod,
+}
+
+/// What happens when the scores of a record do not follow from its infractions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Verify {
+    /// Nothing is recomputed.
+    Off,
+    /// The mismatch is listed in [`Merged::warnings`](crate::Merged::warnings).
+    Warn,
+    /// The file is refused.
+    Refuse,
+}
+
+/// The routes of one pair, as inclusive positions: `{first: 5, last: 9}` are five routes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Slice {
+    /// First route id.
+    pub first: u32,
+    /// Last route id, itself included.
+    pub last: u32,
+}
+
+impl Slice {
+    /// How many routes the slice holds; 0 for one written backwards.
+    pub fn routes(self) -> u32 {
+        if self.last < self.first {
+            0
+        } else {
+            (self.last - self.first).saturating_add(1)
+        }
+    }
+
+    pub(crate) fn contains(self, id: i64) -> bool {
+        (i64::from(self.first)..=i64::from(self.last)).contains(&id)
+    }
+}
+
+/// What a run was asked to do.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Plan {
+    /// The checkpoint format of the workers.
+    pub format: Format,
+    /// How much of a strange checkpoint is put up with.
+    pub strictness: Strictness,
+    /// The slice of each pair, in the order of the workers. Empty: unknown, so completeness is judged from the files alone,
+    /// as the original does.
+    pub pairs: Vec<Slice>,
+    /// Routes of the whole run; the sum over `pairs` when these are known.
+    pub routes: u32,
+    /// How often each route is driven.
+    pub repetitions: u32,
+    /// What happens when the scores of a record do not follow from its infractions.
+    pub verify: Verify,
+    /// Switches the deliberate differences from the original off.
+    pub as_original: bool,
+}
+
+impl Plan {
+    /// A plan that knows nothing but the format: for files whose run is not known.
+    pub fn lenient(format: Format) -> Self {
+        Self {
+            format,
+            strictness: Strictness::Offline,
+            pairs: Vec::new(),
+            routes: 0,
+            repetitions: 1,
+            verify: Verify::Off,
+            as_original: false,
+        }
+    }
+
+    /// Whether the plan says which pairs and routes there are, and is to be believed more than the files.
+    pub(crate) fn decides(&self) -> bool {
+        !self.pairs.is_empty() && !self.as_original
+    }
+
+    pub(crate) fn is_pod(&self) -> bool {
+        self.strictness == Strictness::Pod
+    }
+
+    /// How many records the pair's file ends with; `None` when the plan does not know.
+    pub(crate) fn expected_of(&self, pair: usize) -> Option<u32> {
+        self.pairs
+            .get(pair)
+            .map(|slice| slice.routes().saturating_mul(self.repetitions))
+    }
+
+    /// How many records the whole run ends with; `None` when the plan does not know.
+    pub(crate) fn expected(&self) -> Option<u32> {
+        self.decides().then(|| self.routes.saturating_mul(self.repetitions))
+    }
+
+    /// Refuses a plan whose parts contradict each other.
+    pub fn check(&self) -> Result<(), Refusal> {
+        let refuse = |problem: String| Err(Refusal::Plan { problem });
+        if self.pairs.is_empty() {
+            return Ok(());
+        }
+        if self.repetitions == 0 {
+            return refuse("it has no repetition".to_owned());
+        }
+        if let Some(slice) = self.pairs.iter().find(|slice| slice.last < slice.first) {
+            return refuse(format!("the slice {}-{} is written backwards", slice.first, slice.last));
+        }
+        let covered: u64 = self.pairs.iter().map(|slice| u64::from(slice.routes())).sum();
+        if covered != u64::from(self.routes) {
+            return refuse(format!("its slices hold {covered} routes, but it says {}", self.routes));
+        }
+        let mut slices = self.pairs.clone();
+        slices.sort_by_key(|slice| slice.first);
+        if let Some([a, b]) = slices.array_windows::<2>().find(|[a, b]| b.first <= a.last) {
+            return refuse(format!(
+                "the slices {}-{} and {}-{} overlap",
+                a.first, a.last, b.first, b.last
+            ));
+        }
+        if self.routes.checked_mul(self.repetitions).is_none() {
+            return refuse("it has more records than can be counted".to_owned());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,161 @@
+//! EvalAI's files: results.json, stdout.txt, metadata.json. Called with the merge's outcome each round, byte for byte what
+//! the original's rendering scripts write.
+
+use crate::json::{KeyOrder, Node, write};
+use crate::merge::{Line, Merged};
+use crate::names::{metrics, sensor_name};
+use crate::number::Number;
+use crate::{Format, Metric, Plan, Refusal};
+
+const RATIO_DIGITS: usize = 4;
+/// Simulated frames per second.
+const FRAMES: f64 = 20.0;
+
+/// What EvalAI gets.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Files {
+    /// The metrics: a list with one object, to be sent as text. All zero until the run is final.
+    pub results_json: String,
+    /// The summary a participant reads.
+    pub stdout_txt: String,
+    /// The merged file; `None` when there is none.
+    pub metadata_json: Option<String>,
+}
+
+/// Renders EvalAI's files; `None` when there is nothing merged yet.
+pub fn render(plan: &Plan, merged: Option<&Merged>) -> Result<Files, Refusal> {
+    let results_json = results(plan.format, merged)?;
+    let Some(merged) = merged else {
+        return Ok(Files {
+            results_json,
+            stdout_txt: NOTHING_YET.to_owned(),
+            metadata_json: None,
+        });
+    };
+    Ok(Files {
+        results_json,
+        stdout_txt: stdout(plan.format, merged)?,
+        metadata_json: Some(merged.text.clone()),
+    })
+}
+
+// "avaialable" is the original's, and the text is compared byte for byte.
+const NOTHING_YET: &str = "Initializing the submission, no data avaialable yet.\n\
+    More information will be found here once the submission starts running.\n";
+
+fn results(format: Format, merged: Option<&Merged>) -> Result<String, Refusal> {
+    let global = merged.and_then(|merged| merged.view.global.as_ref());
+    let number = |metric| Node::Number(global.map_or(Number::ZERO, |global| global.metric(metric)));
+    let accuracies = metrics(format)
+        .iter()
+        .map(|metric| (metric.name.as_bytes(), number(metric)))
+        .collect();
+    let split = Node::object([
+        ("split", Node::Str("leaderboard")),
+        ("show_to_participant", Node::Bool(true)),
+        ("accuracies", Node::Object(accuracies)),
+    ]);
+    let order = if format == Format::V1 {
+        KeyOrder::Sorted
+    } else {
+        KeyOrder::AsGiven
+    };
+    write(&Node::List(vec![split]), order).map_err(|limit| Refusal::Output { limit })
+}
+
+fn stdout(format: Format, merged: &Merged) -> Result<String, Refusal> {
+    let current = if merged.view.global.is_some() { "" } else { "current " };
+    let mut lines = vec![
+        format!("Here is a summary of the submission's {current}results"),
+        String::new(),
+    ];
+    lines.extend(["General information:", "- Sensors:"].map(str::to_owned));
+    lines.extend(
+        sensors(merged)?
+            .into_iter()
+            .map(|(name, count)| format!("  - {count} {name}")),
+    );
+    let (done, total) = (merged.done, merged.total);
+    lines.push(if done == total {
+        format!("- All {total} route have been completed")
+    } else {
+        format!("- Completed {done} out of the {total} routes")
+    });
+    let whole = whole_ratio(&merged.view.routes);
+    lines.push(format!("- Submission ratio of {}x", whole.text()));
+    lines.push(format!("- Submission FPS of {}", frames(whole).text()));
+    if let Some(global) = &merged.view.global {
+        lines.push("- Results:".to_owned());
+        let result = |metric: &Metric| format!("  - {}: {}", metric.name, global.metric(metric).text());
+        lines.extend(metrics(format).iter().map(result));
+    }
+    lines.push(String::new());
+    if !merged.view.routes.is_empty() {
+        lines.push("Glossary of each route:".to_owned());
+    }
+    lines.extend(
+        merged
+            .view
+            .routes
+            .iter()
+            .enumerate()
+            .flat_map(|(index, line)| glossary(index, line)),
+    );
+    lines.push(String::new());
+    Ok(lines.join("\n"))
+}
+
+fn glossary(index: usize, line: &Line) -> [String; 6] {
+    let ratio = ratio(line);
+    [
+        String::new(),
+        format!("- Index: {index}"),
+        format!("  - Route ID: {}", line.route_id),
+        format!("  - Status: {}", line.status),
+        format!("  - Ratio: {}x", ratio.rounded(RATIO_DIGITS).text()),
+        format!("  - FPS: {}", frames(ratio).text()),
+    ]
+}
+
+/// Each kind of sensor and how many, in the order of their first appearance.
+fn sensors(merged: &Merged) -> Result<Vec<(&'static str, usize)>, Refusal> {
+    let mut counted: Vec<(&str, usize)> = Vec::new();
+    for (i, sensor) in merged.view.sensors.iter().enumerate() {
+        let name = sensor.as_str().and_then(sensor_name).ok_or(Refusal::Sensor {
+            pair: None,
+            sensor: i + 1,
+        })?;
+        match counted.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, count)) => *count += 1,
+            None => counted.push((name, 1)),
+        }
+    }
+    Ok(counted)
+}
+
+/// Simulated seconds per real second; a whole 0 where nothing was measured.
+fn ratio(route: &Line) -> Number {
+    if route.system.is_zero() {
+        Number::ZERO
+    } else {
+        Number::Float(route.game.as_f64() / route.system.as_f64())
+    }
+}
+
+fn whole_ratio(routes: &[Line]) -> Number {
+    let sum = |of: fn(&Line) -> Number| routes.iter().fold(Number::ZERO, |sum, route| sum.plus(of(route)));
+    let (game, system) = (sum(|route| route.game), sum(|route| route.system));
+    let exact = if system.is_zero() {
+        0.0
+    } else {
+        game.as_f64() / system.as_f64()
+    };
+    Number::Float(exact).rounded(RATIO_DIGITS)
+}
+
+fn frames(ratio: Number) -> Number {
+    match ratio {
+        Number::Int(i) => Number::Int(i * 20),
+        Number::Float(f) => Number::Float(FRAMES * f).rounded(RATIO_DIGITS),
+    }
+}

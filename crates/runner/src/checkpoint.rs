@@ -1,0 +1,273 @@
+//! The agent's checkpoint file: are the results complete, are there partial ones? The file is the agent's and hostile:
+//! nothing is followed, nothing blocks, and what is read is bounded.
+//!
+//! Called before the agent's command starts and after all its processes have ended. The scores inside are not its matter.
+
+use std::fmt;
+use std::fs::{self, File, OpenOptions, Permissions};
+use std::io::{BufReader, ErrorKind, Read};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::path::Path;
+
+use nix::fcntl::OFlag;
+use serde::Deserialize;
+use serde::de::{Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use thiserror::Error;
+
+/// No larger checkpoint is read, in bytes.
+pub(crate) const MAX_BYTES: u64 = 64 << 20;
+
+/// What a checkpoint says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Checkpoint {
+    /// `_checkpoint.global_record` is an object with something in it: the evaluator came to its end.
+    pub(crate) complete: bool,
+    /// `_checkpoint.progress` is a list with something in it: there is something to resume.
+    pub(crate) partial: bool,
+}
+
+/// Why there is no checkpoint to read.
+#[derive(Debug, Error)]
+pub(crate) enum Unreadable {
+    #[error("there is no checkpoint file")]
+    Missing,
+    #[error("the checkpoint is not a regular file")]
+    NotRegular,
+    #[error("the checkpoint is larger than {} MiB", MAX_BYTES >> 20)]
+    TooLarge,
+    #[error("the checkpoint cannot be read: {0}")]
+    Io(std::io::Error),
+    #[error("the checkpoint is not a checkpoint's JSON (line {line}, column {column})")]
+    Malformed { line: usize, column: usize },
+}
+
+/// Reads the checkpoint at `path`.
+pub(crate) fn read(path: &Path) -> Result<Checkpoint, Unreadable> {
+    let file = open(path)?;
+    if file.metadata().map_err(Unreadable::Io)?.len() > MAX_BYTES {
+        return Err(Unreadable::TooLarge);
+    }
+    let document: Document = serde_json::from_reader(BufReader::with_capacity(64 << 10, file.take(MAX_BYTES)))
+        .map_err(|error| Unreadable::Malformed {
+            line: error.line(),
+            column: error.column(),
+        })?;
+    let Inner {
+        global_record,
+        progress,
+    } = document.checkpoint;
+    Ok(Checkpoint {
+        complete: global_record == Filled::Object,
+        partial: progress == Filled::List,
+    })
+}
+
+/// Makes the checkpoint readable for `logcopy`, which runs as another user. Only for when no process of the agent lives,
+/// since the file is looked at first and changed afterwards.
+pub(crate) fn make_readable(path: &Path) {
+    let regular = fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_file());
+    if regular && let Err(error) = fs::set_permissions(path, Permissions::from_mode(0o644)) {
+        crate::say(format_args!("the mode of {} stays as it is: {error}", path.display()));
+    }
+}
+
+fn open(path: &Path) -> Result<File, Unreadable> {
+    let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
+    // Looked at first, because opening a device can act; looked at again below, because it may have been swapped.
+    match fs::symlink_metadata(path) {
+        Ok(metadata) if metadata.is_file() => {}
+        Ok(_) => return Err(Unreadable::NotRegular),
+        Err(error) if error.kind() == ErrorKind::NotFound => return Err(Unreadable::Missing),
+        Err(error) => return Err(Unreadable::Io(error)),
+    }
+    let file = OpenOptions::new()
+        .read(true)
+        .custom_flags(flags.bits())
+        .open(path)
+        .map_err(Unreadable::Io)?;
+    if file.metadata().map_err(Unreadable::Io)?.is_file() {
+        Ok(file)
+    } else {
+        Err(Unreadable::NotRegular)
+    }
+}
+
+#[derive(Deserialize)]
+struct Document {
+    #[serde(rename = "_checkpoint")]
+    checkpoint: Inner,
+}
+
+#[derive(Deserialize)]
+struct Inner {
+    #[serde(default)]
+    global_record: Filled,
+    #[serde(default)]
+    progress: Filled,
+}
+
+/// The outermost shape of a value; what is inside is skipped without being kept.
+#[derive(Debug, Default, PartialEq)]
+enum Filled {
+    Object,
+    List,
+    #[default]
+    Nothing,
+}
+
+impl<'de> Deserialize<'de> for Filled {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(Shape)
+    }
+}
+
+struct Shape;
+
+impl<'de> Visitor<'de> for Shape {
+    type Value = Filled;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("any value")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Filled, A::Error> {
+        let mut filled = Filled::Nothing;
+        while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {
+            filled = Filled::Object;
+        }
+        Ok(filled)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Filled, A::Error> {
+        let mut filled = Filled::Nothing;
+        while list.next_element::<IgnoredAny>()?.is_some() {
+            filled = Filled::List;
+        }
+        Ok(filled)
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<Filled, E> {
+        Ok(Filled::Nothing)
+    }
+
+    fn visit_i64<E>(self, _: i64) -> Result<Filled, E> {
+        Ok(Filled::Nothing)
+    }
+
+    fn visit_u64<E>(self, _: u64) -> Result<Filled, E> {
+        Ok(Filled::Nothing)
+    }
+
+    fn visit_f64<E>(self, _: f64) -> Result<Filled, E> {
+        Ok(Filled::Nothing)
+    }
+
+    fn visit_str<E>(self, _: &str) -> Result<Filled, E> {
+        Ok(Filled::Nothing)
+    }
+
+    fn visit_unit<E>(self) -> Result<Filled, E> {
+        Ok(Filled::Nothing)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+    use std::process::Command;
+
+    use super::*;
+
+    fn read_text(text: &str) -> Result<Checkpoint, Unreadable> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("agent_results.json");
+        fs::write(&path, text).unwrap();
+        read(&path)
+    }
+
+    #[test]
+    fn the_record_and_the_progress_decide() {
+        let cases = [
+            (
+                r#"{"_checkpoint": {"global_record": {"index": -1}, "progress": [5, 5]}}"#,
+                true,
+                true,
+            ),
+            (
+                r#"{"_checkpoint": {"global_record": {}, "progress": [2, 5]}, "sensors": []}"#,
+                false,
+                true,
+            ),
+            (
+                r#"{"_checkpoint": {"global_record": {}, "progress": [], "records": [{}]}}"#,
+                false,
+                false,
+            ),
+            (r#"{"_checkpoint": {}}"#, false, false),
+            (
+                r#"{"_checkpoint": {"global_record": null, "progress": "12"}}"#,
+                false,
+                false,
+            ),
+            (
+                r#"{"_checkpoint": {"global_record": [1], "progress": {"a": 1}}}"#,
+                false,
+                false,
+            ),
+            (
+                r#"{"_checkpoint": {"global_record": 1.5, "progress": true}}"#,
+                false,
+                false,
+            ),
+        ];
+        for (text, complete, partial) in cases {
+            assert_eq!(read_text(text).unwrap(), Checkpoint { complete, partial }, "{text}");
+        }
+    }
+
+    #[test]
+    fn broken_files_are_malformed() {
+        let half = r#"{"_checkpoint": {"global_record": {"index": -1}"#;
+        let twice = r#"{"_checkpoint": {"global_record": {"a": 1}}} {}"#;
+        let deep = format!(r#"{{"_checkpoint": {{"progress": {}"#, "[".repeat(1_000_000));
+        for text in ["", "[]", "{}", "null", half, twice, &deep] {
+            assert!(
+                matches!(read_text(text), Err(Unreadable::Malformed { .. })),
+                "{text:.40}"
+            );
+        }
+    }
+
+    #[test]
+    fn only_a_regular_file_of_bounded_size_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        assert!(matches!(read(&at("missing")), Err(Unreadable::Missing)));
+        assert!(matches!(read(folder.path()), Err(Unreadable::NotRegular)));
+
+        fs::write(at("real"), r#"{"_checkpoint": {"global_record": {"a": 1}}}"#).unwrap();
+        symlink(at("real"), at("link")).unwrap();
+        assert!(matches!(read(&at("link")), Err(Unreadable::NotRegular)));
+
+        assert!(Command::new("mkfifo").arg(at("fifo")).status().unwrap().success());
+        assert!(matches!(read(&at("fifo")), Err(Unreadable::NotRegular)));
+
+        File::create(at("sparse")).unwrap().set_len(10 << 30).unwrap();
+        assert!(matches!(read(&at("sparse")), Err(Unreadable::TooLarge)));
+        assert!(read(&at("real")).unwrap().complete);
+    }
+
+    #[test]
+    fn the_mode_of_a_regular_file_is_opened_and_no_link_is_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (real, link) = (folder.path().join("real"), folder.path().join("link"));
+        fs::write(&real, "{}").unwrap();
+        fs::set_permissions(&real, Permissions::from_mode(0o600)).unwrap();
+        symlink(&real, &link).unwrap();
+        let mode = || fs::metadata(&real).unwrap().permissions().mode() & 0o777;
+        make_readable(&link);
+        assert_eq!(mode(), 0o600);
+        make_readable(&real);
+        assert_eq!(mode(), 0o644);
+    }
+}

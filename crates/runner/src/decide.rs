@@ -1,0 +1,286 @@
+//! What a runner does next: pure functions of what it sees. Three questions in a container's life, each with its table of
+//! tests: what next while it lives ([`next`]), what its end means ([`conclude`]), and when it may leave ([`leave`]).
+//!
+//! Called by `run`, which does the looking and the doing. Knows no clock, no file, no process.
+//!
+//! Rounds: both sides count their own crashes and name their files with the count. A side that has not started in a round
+//! its peer has crashed in steps over it (its own crash file, no exit); one that has started is brought down. So
+//! the two counts meet again however far apart the containers restart.
+
+use leaderboard_runner::protocol::Side;
+
+/// How far this container has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Phase {
+    /// Nothing is launched. An agent waits here for its simulator.
+    Opening,
+    /// A simulator's server runs; its port has not answered yet.
+    Booting,
+    /// This round's start file is written.
+    Running,
+}
+
+/// The command, seen from outside.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Child {
+    /// Not launched, or alive (and, in [`Phase::Booting`], not answering).
+    Quiet,
+    /// A simulator's server that answers.
+    Ready,
+    /// It ended by itself.
+    Ended,
+}
+
+/// The world at one moment. All of the peer is about this side's present round.
+#[expect(clippy::struct_excessive_bools, reason = "each is one independent observation")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Seen {
+    pub(crate) own_started: bool,
+    pub(crate) own_done: bool,
+    pub(crate) peer_started: bool,
+    pub(crate) peer_crashed: bool,
+    pub(crate) peer_done: bool,
+    pub(crate) cancel: bool,
+    /// `logcopy.done`: the final results are stored.
+    pub(crate) stored: bool,
+    pub(crate) child: Child,
+    /// SIGTERM came from outside.
+    pub(crate) terminated: bool,
+    /// The agent has printed nothing for too long.
+    pub(crate) idle: bool,
+    /// The simulator's server, or the agent's simulator, is late.
+    pub(crate) overdue: bool,
+}
+
+/// Why a round is stepped over without an exit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Skip {
+    /// This side was killed in it without a word.
+    SilentDeath,
+    /// The peer crashed in it before this side started.
+    CatchUp,
+}
+
+/// Why this container comes to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Cause {
+    Terminated,
+    AlreadyDone,
+    PeerDone,
+    PeerCrashed,
+    Cancelled,
+    ChildEnded,
+    Idle,
+    NotReady,
+    /// With the exit code of a shell that cannot start a command.
+    CannotStart(i32),
+    /// The status folder cannot be written, so nothing can be agreed.
+    Mute,
+}
+
+/// What to do next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Action {
+    Wait,
+    Skip(Skip),
+    Launch,
+    /// Write the simulator's start file.
+    Announce,
+    /// End all processes and conclude.
+    End(Cause),
+}
+
+/// What to do next while nothing has ended yet.
+pub(crate) fn next(side: Side, phase: Phase, seen: &Seen) -> Action {
+    if seen.terminated {
+        return Action::End(Cause::Terminated);
+    }
+    match (side, phase) {
+        (_, Phase::Opening) => opening(side, seen),
+        (_, Phase::Booting) => booting(seen),
+        (Side::Simulator, Phase::Running) => simulator_running(seen),
+        (Side::Agent, Phase::Running) => agent_running(seen),
+    }
+}
+
+fn opening(side: Side, seen: &Seen) -> Action {
+    if seen.own_done {
+        return Action::End(Cause::AlreadyDone);
+    }
+    if side == Side::Simulator && seen.peer_done {
+        return Action::End(Cause::PeerDone);
+    }
+    if seen.own_started {
+        return Action::Skip(Skip::SilentDeath);
+    }
+    if seen.cancel || seen.stored {
+        return Action::End(Cause::Cancelled);
+    }
+    if seen.peer_crashed {
+        return Action::Skip(Skip::CatchUp);
+    }
+    match side {
+        Side::Simulator => Action::Launch,
+        Side::Agent if seen.peer_started => Action::Launch,
+        Side::Agent if seen.overdue => Action::End(Cause::NotReady),
+        Side::Agent => Action::Wait,
+    }
+}
+
+fn booting(seen: &Seen) -> Action {
+    if seen.peer_done {
+        Action::End(Cause::PeerDone)
+    } else if seen.cancel || seen.stored {
+        Action::End(Cause::Cancelled)
+    } else if seen.child == Child::Ended {
+        Action::End(Cause::ChildEnded)
+    } else if seen.peer_crashed {
+        Action::Skip(Skip::CatchUp)
+    } else if seen.child == Child::Ready {
+        Action::Announce
+    } else if seen.overdue {
+        Action::End(Cause::NotReady)
+    } else {
+        Action::Wait
+    }
+}
+
+/// The agent's word comes first: complete results are complete, whatever became of the server.
+fn simulator_running(seen: &Seen) -> Action {
+    if seen.peer_done {
+        Action::End(Cause::PeerDone)
+    } else if seen.cancel {
+        Action::End(Cause::Cancelled)
+    } else if seen.peer_crashed {
+        Action::End(Cause::PeerCrashed)
+    } else if seen.child == Child::Ended {
+        Action::End(Cause::ChildEnded)
+    } else {
+        Action::Wait
+    }
+}
+
+/// The command's own end comes first: only then its results are judged in spite of a cancel.
+fn agent_running(seen: &Seen) -> Action {
+    if seen.child == Child::Ended {
+        Action::End(Cause::ChildEnded)
+    } else if seen.cancel {
+        Action::End(Cause::Cancelled)
+    } else if seen.peer_crashed {
+        Action::End(Cause::PeerCrashed)
+    } else if seen.idle {
+        Action::End(Cause::Idle)
+    } else {
+        Action::Wait
+    }
+}
+
+/// The file an end is announced with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum EndMark {
+    Done,
+    Crash,
+}
+
+/// What the exit waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Hold {
+    /// Nothing.
+    Free,
+    /// The peer's end of the same round.
+    Peer,
+    /// `logcopy.done`, as long as storing the results may take.
+    Flush,
+    /// `logcopy.done`, as long as a cancel may take.
+    Cancel,
+}
+
+/// What an end means.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Conclusion {
+    pub(crate) mark: Option<EndMark>,
+    pub(crate) hold: Hold,
+    pub(crate) code: i32,
+}
+
+/// Exit code after a SIGTERM from outside, as a shell reports it.
+pub(crate) const CODE_TERMINATED: i32 = 143;
+/// Exit code when the status folder cannot be written (EX_IOERR).
+pub(crate) const CODE_MUTE: i32 = 74;
+
+const SIMULATOR_DONE: Conclusion = Conclusion {
+    mark: Some(EndMark::Done),
+    hold: Hold::Flush,
+    code: 0,
+};
+
+/// What the end means, once every process has ended. `complete`: the agent's checkpoint has its global record.
+pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
+    let silent = |hold, code| Conclusion { mark: None, hold, code };
+    let hold = |hold| if side == Side::Simulator { hold } else { Hold::Free };
+    match cause {
+        Cause::Terminated => silent(Hold::Free, CODE_TERMINATED),
+        Cause::Mute => silent(Hold::Free, CODE_MUTE),
+        Cause::AlreadyDone => silent(hold(Hold::Flush), 0),
+        Cause::Cancelled => silent(hold(Hold::Cancel), 0),
+        Cause::PeerDone => SIMULATOR_DONE,
+        Cause::PeerCrashed | Cause::ChildEnded | Cause::Idle | Cause::NotReady | Cause::CannotStart(_) => {
+            let ran = !matches!(cause, Cause::NotReady | Cause::CannotStart(_));
+            if side == Side::Simulator && seen.peer_done {
+                SIMULATOR_DONE
+            } else if side == Side::Agent && ran && complete {
+                Conclusion {
+                    mark: Some(EndMark::Done),
+                    hold: Hold::Peer,
+                    code: 0,
+                }
+            } else if seen.cancel {
+                silent(hold(Hold::Cancel), 0)
+            } else {
+                let code = if let Cause::CannotStart(code) = cause { code } else { 1 };
+                Conclusion {
+                    mark: Some(EndMark::Crash),
+                    hold: Hold::Peer,
+                    code,
+                }
+            }
+        }
+    }
+}
+
+/// What to do while the exit is held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Leave {
+    Wait,
+    /// Hold for something else from now on.
+    Hold(Conclusion),
+    Exit(i32),
+}
+
+/// Whether the container may exit. `over`: the present hold has lasted as long as it may.
+pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool) -> Leave {
+    let Conclusion { hold, code, .. } = conclusion;
+    let exit_or_wait = |exit, code| if exit { Leave::Exit(code) } else { Leave::Wait };
+    if seen.terminated || hold == Hold::Free {
+        return Leave::Exit(code);
+    }
+    let cancelled = Conclusion {
+        mark: None,
+        hold: Hold::Cancel,
+        code: 0,
+    };
+    match (hold, side) {
+        (Hold::Peer, Side::Simulator) if seen.peer_done => Leave::Hold(SIMULATOR_DONE),
+        // Exit 0, since after another code the container would be restarted for nothing.
+        (Hold::Peer, _) if seen.stored => Leave::Exit(0),
+        (Hold::Peer, Side::Simulator) if seen.cancel => Leave::Hold(cancelled),
+        (Hold::Peer, Side::Agent) if seen.cancel => Leave::Exit(0),
+        (Hold::Peer, _) => exit_or_wait(seen.peer_crashed || seen.peer_done || over, code),
+        (Hold::Flush, _) if seen.cancel && !seen.stored && !over => Leave::Hold(cancelled),
+        _ => exit_or_wait(seen.stored || over, code),
+    }
+}
+
+#[cfg(test)]
+#[path = "decide_tests.rs"]
+mod tests;

@@ -1,0 +1,141 @@
+//! How each side's command is prepared: its environment, its words, where its output goes. Called by `run`.
+
+use std::env;
+use std::ffi::{OsStr, OsString};
+use std::fs::File;
+use std::io;
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+use crate::checkpoint;
+use crate::group::{self, Group};
+use crate::tee::Tee;
+use leaderboard_runner::args::{Job, Role};
+use leaderboard_runner::expand::expand;
+
+/// Starts the command; an agent's with the tee of its output. `round`: crashes so far.
+pub(crate) fn launch(job: &Job, round: u32) -> io::Result<(Group, Option<Tee>)> {
+    match &job.role {
+        Role::Simulator { .. } => {
+            let mut command = group::command(&job.command, &[]);
+            Ok((Group::spawn(command.stdin(no_input()))?, None))
+        }
+        Role::Agent {
+            work,
+            checkpoint,
+            log_limit,
+            python_path,
+            ..
+        } => {
+            let partial = checkpoint::read(checkpoint).is_ok_and(|found| found.partial);
+            let own = |name: &str| env::var_os(name);
+            let mut environment = vec![("RESUME", resume(own("RESUME"), round, partial))];
+            if let Some(front) = python_path {
+                environment.push(("PYTHONPATH", in_front(front, own("PYTHONPATH"))));
+            }
+            let words = expand_all(&job.command, &environment);
+            let (tee, writer) = Tee::open(work, *log_limit)?;
+            let mut command = group::command(&words, &environment);
+            command.stdin(no_input()).stdout(writer.try_clone()?).stderr(writer);
+            Ok((Group::spawn(&mut command)?, Some(tee)))
+        }
+    }
+}
+
+/// Nothing to read. A container's own stdin is that already, so one without /dev/null goes on with it.
+fn no_input() -> Stdio {
+    File::open("/dev/null").map_or_else(|_| Stdio::inherit(), Stdio::from)
+}
+
+/// `1` or empty: for the evaluator any text means yes.
+fn resume(outside: Option<OsString>, round: u32, partial: bool) -> OsString {
+    let yes = outside.is_some_and(|value| value == "1") || round > 0 || partial;
+    if yes { "1".into() } else { OsString::new() }
+}
+
+fn in_front(front: &OsStr, image: Option<OsString>) -> OsString {
+    let mut path = front.to_owned();
+    if let Some(image) = image.filter(|image| !image.is_empty()) {
+        path.push(":");
+        path.push(image);
+    }
+    path
+}
+
+fn expand_all(words: &[OsString], environment: &[(&str, OsString)]) -> Vec<OsString> {
+    let lookup = |name: &OsStr| {
+        let made = environment
+            .iter()
+            .find(|(made, _)| *made == name)
+            .map(|(_, value)| value.clone());
+        made.or_else(|| env::var_os(name))
+    };
+    words.iter().map(|word| expand(word, lookup)).collect()
+}
+
+/// Whether a server answers on the port.
+pub(crate) fn answers(port: u16) -> bool {
+    let address = SocketAddr::from(([127, 0, 0, 1], port));
+    let Ok(stream) = TcpStream::connect_timeout(&address, Duration::from_millis(100)) else {
+        return false;
+    };
+    // A free port of the ephemeral range can be answered by our own end of the connection.
+    stream.local_addr().is_ok_and(|own| own != address)
+}
+
+/// The program's name, for messages.
+pub(crate) fn program(job: &Job) -> &OsStr {
+    job.command
+        .first()
+        .map_or(OsStr::new(""), |program| Path::new(program).as_os_str())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+
+    use super::*;
+
+    #[test]
+    fn resume_is_1_or_empty() {
+        let cases = [
+            (None, 0, false, ""),
+            (Some("1"), 0, false, "1"),
+            (Some("no"), 0, false, ""),
+            (Some(""), 1, false, "1"),
+            (None, 0, true, "1"),
+        ];
+        for (outside, round, partial, expected) in cases {
+            assert_eq!(
+                resume(outside.map(OsString::from), round, partial),
+                expected,
+                "{outside:?} {round} {partial}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_images_python_path_comes_last() {
+        assert_eq!(in_front(OsStr::new("/a:/b"), Some("/c".into())), "/a:/b:/c");
+        assert_eq!(in_front(OsStr::new("/a"), Some(OsString::new())), "/a");
+        assert_eq!(in_front(OsStr::new("/a"), None), "/a");
+    }
+
+    #[test]
+    fn words_see_the_made_environment_first() {
+        let made = [("PATH", OsString::from("made")), ("RESUME", OsString::new())];
+        let words = ["$(PATH)", "--resume=$(RESUME)", "$(NOBODY_HAS_THIS)"].map(OsString::from);
+        assert_eq!(expand_all(&words, &made), ["made", "--resume=", "$(NOBODY_HAS_THIS)"]);
+    }
+
+    #[test]
+    fn a_port_answers_only_while_somebody_listens() {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        assert!(answers(port));
+        drop(listener);
+        assert!(!answers(port));
+    }
+}

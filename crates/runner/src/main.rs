@@ -1,0 +1,76 @@
+//! `leaderboard-runner`: PID 1 of every simulator and agent container. Parses its arguments and lives one life (`run`).
+//!
+//! It runs inside any image: no shell, any uid, a read-only root. It has one thread and no heap growth with the output.
+
+mod checkpoint;
+mod decide;
+mod group;
+mod launch;
+mod memory;
+mod report;
+mod run;
+mod tee;
+mod wake;
+
+use std::fmt;
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+use nix::sys::prctl;
+use nix::sys::stat::{Mode, umask};
+
+use crate::run::Runner;
+use crate::wake::Signals;
+use leaderboard_runner::args::{self, Request};
+
+/// Wrong arguments (EX_USAGE).
+const CODE_USAGE: u8 = 64;
+/// The kernel refuses what the runner cannot do without (EX_OSERR).
+const CODE_KERNEL: u8 = 71;
+
+fn main() -> ExitCode {
+    match args::parse(std::env::args_os().skip(1)) {
+        Ok(Request::Run(job)) => run(*job),
+        Ok(Request::Version) => print(concat!("leaderboard-runner ", env!("CARGO_PKG_VERSION"), "\n")),
+        Ok(Request::Help) => print(args::USAGE),
+        Err(error) => {
+            say(format_args!("{error}\n{}", args::USAGE.trim_end()));
+            ExitCode::from(CODE_USAGE)
+        }
+    }
+}
+
+fn run(job: args::Job) -> ExitCode {
+    let signals = match Signals::open() {
+        Ok(signals) => signals,
+        Err(error) => {
+            say(format_args!("signals cannot be handled: {error}"));
+            return ExitCode::from(CODE_KERNEL);
+        }
+    };
+    umask(Mode::from_bits_truncate(0o022));
+    // The command has the same uid: without this it could read and change the runner's memory.
+    for (what, result) in [
+        ("dumpable", prctl::set_dumpable(false)),
+        ("subreaper", prctl::set_child_subreaper(true)),
+    ] {
+        if let Err(error) = result {
+            say(format_args!("prctl {what}: {error}"));
+        }
+    }
+    let code = Runner::new(job, signals).run();
+    ExitCode::from(u8::try_from(code).unwrap_or(1))
+}
+
+fn print(text: &str) -> ExitCode {
+    match io::stdout().write_all(text.as_bytes()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(_) => ExitCode::FAILURE,
+    }
+}
+
+/// One line on stderr. Standard output is the command's.
+pub(crate) fn say(text: fmt::Arguments<'_>) {
+    // Nobody is left to tell when stderr is gone.
+    let _ = writeln!(io::stderr(), "leaderboard-runner: {text}");
+}

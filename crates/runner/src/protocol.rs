@@ -1,0 +1,395 @@
+//! The status files: their names, who writes which, and reading them without trusting anybody's folder.
+//!
+//! Called by the runner (writes its own sub-folder) and by `logcopy` (writes `logcopy/`, reads all). Every reader asks for
+//! exact names and never lists a folder, so what else a container puts into its own folder costs and means nothing.
+//! Knows the file system and nothing else.
+
+use std::fmt;
+use std::fs::{self, OpenOptions};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use thiserror::Error;
+
+/// The sub-folder that only `logcopy` writes.
+pub const LOGCOPY_FOLDER: &str = "logcopy";
+
+/// Rounds a pair may count. Far above any `retries.pair`; it bounds what a reader looks up for a folder full of forgeries.
+pub const MAX_ROUNDS: u32 = 1000;
+
+/// The number of a simulator–agent pair: 1 to 999.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Pair(u16);
+
+/// A text or number that names no pair.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("a pair is a number from 1 to 999 without leading zeros")]
+pub struct NotAPair;
+
+impl Pair {
+    /// The pair with this number, if there may be one.
+    pub const fn new(number: u16) -> Option<Self> {
+        if number >= 1 && number <= 999 {
+            Some(Self(number))
+        } else {
+            None
+        }
+    }
+
+    /// Its number, from 1.
+    pub const fn get(self) -> u16 {
+        self.0
+    }
+}
+
+impl fmt::Display for Pair {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl FromStr for Pair {
+    type Err = NotAPair;
+
+    fn from_str(text: &str) -> Result<Self, NotAPair> {
+        exact_number(text)
+            .and_then(|number| u16::try_from(number).ok())
+            .and_then(Self::new)
+            .ok_or(NotAPair)
+    }
+}
+
+/// The two containers of a pair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Side {
+    /// Runs the simulator's server.
+    Simulator,
+    /// Runs the participant's agent.
+    Agent,
+}
+
+impl Side {
+    /// The other one of the pair.
+    #[must_use]
+    pub const fn peer(self) -> Self {
+        match self {
+            Self::Simulator => Self::Agent,
+            Self::Agent => Self::Simulator,
+        }
+    }
+
+    /// `simulator` or `agent`, as in container and file names.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Simulator => "simulator",
+            Self::Agent => "agent",
+        }
+    }
+}
+
+impl fmt::Display for Side {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// One container that speaks the protocol. Its text (`agent-2`) is its container's name and its folder's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Member {
+    /// Which side of the pair.
+    pub side: Side,
+    /// Which pair.
+    pub pair: Pair,
+}
+
+impl Member {
+    /// The other container of the same pair.
+    #[must_use]
+    pub const fn peer(self) -> Self {
+        Self {
+            side: self.side.peer(),
+            pair: self.pair,
+        }
+    }
+
+    /// Parses `simulator-<n>` or `agent-<n>`.
+    pub fn parse(text: &str) -> Option<Self> {
+        let (side, pair) = text.split_once('-')?;
+        let side = [Side::Simulator, Side::Agent]
+            .into_iter()
+            .find(|known| known.name() == side)?;
+        Some(Self {
+            side,
+            pair: pair.parse().ok()?,
+        })
+    }
+}
+
+impl fmt::Display for Member {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}-{}", self.side, self.pair)
+    }
+}
+
+/// What a member's file says. The number is the round: the crashes of that side before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Mark {
+    /// Simulator: the server answers. Agent: the command is about to start.
+    Start(u32),
+    /// This round ended without complete results.
+    Crash(u32),
+    /// The pair's results are complete.
+    Done,
+}
+
+/// One status file. All are empty: the name is the message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum StatusFile {
+    /// `<member>/<member>.start<c>`, `.crash<c>` or `.done`, written by that member.
+    Of(Member, Mark),
+    /// `logcopy/simulation.cancel`, written by `logcopy`: everybody stops.
+    Cancel,
+    /// `logcopy/logcopy.done`, written by `logcopy`: the final results are stored.
+    Stored,
+}
+
+impl StatusFile {
+    /// The sub-folder it lies in, which is also the only one its writer can write.
+    pub fn folder(&self) -> String {
+        match self {
+            Self::Of(member, _) => member.to_string(),
+            Self::Cancel | Self::Stored => LOGCOPY_FOLDER.to_owned(),
+        }
+    }
+
+    /// Its name. Names are unique over all folders, so that they can also be stored flat.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Of(member, Mark::Start(round)) => format!("{member}.start{round}"),
+            Self::Of(member, Mark::Crash(round)) => format!("{member}.crash{round}"),
+            Self::Of(member, Mark::Done) => format!("{member}.done"),
+            Self::Cancel => "simulation.cancel".to_owned(),
+            Self::Stored => "logcopy.done".to_owned(),
+        }
+    }
+
+    /// Where it lies under the status folder `root`.
+    pub fn path(&self, root: &Path) -> PathBuf {
+        root.join(self.folder()).join(self.name())
+    }
+
+    /// The file `name` in the sub-folder `folder`; `None` for every other name, and for one in a foreign folder.
+    pub fn parse(folder: &str, name: &str) -> Option<Self> {
+        if folder == LOGCOPY_FOLDER {
+            return [Self::Cancel, Self::Stored]
+                .into_iter()
+                .find(|file| file.name() == name);
+        }
+        let member = Member::parse(folder)?;
+        let mark = name.strip_prefix(folder)?.strip_prefix('.')?;
+        let mark = if mark == "done" {
+            Mark::Done
+        } else if let Some(round) = mark.strip_prefix("start") {
+            Mark::Start(exact_round(round)?)
+        } else {
+            Mark::Crash(exact_round(mark.strip_prefix("crash")?)?)
+        };
+        Some(Self::Of(member, mark))
+    }
+
+    /// Whether it is there. What kind of file it is does not matter.
+    pub fn exists(&self, root: &Path) -> bool {
+        fs::symlink_metadata(self.path(root)).is_ok()
+    }
+
+    /// Creates it (and its sub-folder, where no mount made it). One that is there already is fine.
+    pub fn create(&self, root: &Path) -> io::Result<()> {
+        let already = |result: io::Result<()>| match result {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(()),
+            other => other,
+        };
+        let folder = root.join(self.folder());
+        if !folder.is_dir() {
+            already(fs::create_dir(&folder))?;
+        }
+        let new = OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .mode(0o644)
+            .open(folder.join(self.name()));
+        already(new.map(drop))
+    }
+}
+
+/// How far a member has come, read from its own folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Progress {
+    /// Its crashes so far, which is also the number of its present round.
+    pub crashes: u32,
+    /// It has started in the present round.
+    pub started: bool,
+    /// It is done.
+    pub done: bool,
+}
+
+impl Progress {
+    /// Reads it. An unreadable or missing folder reads as a member that has not begun.
+    pub fn read(root: &Path, member: Member) -> Self {
+        let exists = |mark| StatusFile::Of(member, mark).exists(root);
+        let crashes = (0..MAX_ROUNDS).take_while(|round| exists(Mark::Crash(*round))).count();
+        let crashes = u32::try_from(crashes).unwrap_or(MAX_ROUNDS);
+        Self {
+            crashes,
+            started: exists(Mark::Start(crashes)),
+            done: exists(Mark::Done),
+        }
+    }
+}
+
+/// All status files that are there for the pairs 1 to `pairs`, for a reader that reports or stores them. A member's files
+/// beyond the first round it has not crashed in are left out.
+pub fn present(root: &Path, pairs: u16) -> Vec<StatusFile> {
+    let members = (1..=pairs)
+        .filter_map(Pair::new)
+        .flat_map(|pair| [Side::Simulator, Side::Agent].map(|side| Member { side, pair }));
+    let mut files = Vec::new();
+    for member in members {
+        let crashes = Progress::read(root, member).crashes;
+        let rounds = (0..=crashes).flat_map(|round| [Mark::Start(round), Mark::Crash(round)]);
+        files.extend(rounds.chain([Mark::Done]).map(|mark| StatusFile::Of(member, mark)));
+    }
+    files.extend([StatusFile::Cancel, StatusFile::Stored]);
+    files.retain(|file| file.exists(root));
+    files
+}
+
+fn exact_round(text: &str) -> Option<u32> {
+    exact_number(text).filter(|round| *round <= MAX_ROUNDS)
+}
+
+fn exact_number(text: &str) -> Option<u32> {
+    let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    if !digits || (text.len() > 1 && text.starts_with('0')) {
+        return None;
+    }
+    text.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn member(side: Side, pair: u16) -> Member {
+        Member {
+            side,
+            pair: Pair::new(pair).unwrap(),
+        }
+    }
+
+    #[test]
+    fn every_file_is_read_back_from_its_folder_and_name() {
+        let agent = member(Side::Agent, 12);
+        let simulator = member(Side::Simulator, 1);
+        let cases = [
+            (
+                StatusFile::Of(simulator, Mark::Start(0)),
+                "simulator-1",
+                "simulator-1.start0",
+            ),
+            (
+                StatusFile::Of(simulator, Mark::Crash(10)),
+                "simulator-1",
+                "simulator-1.crash10",
+            ),
+            (StatusFile::Of(agent, Mark::Done), "agent-12", "agent-12.done"),
+            (StatusFile::Cancel, "logcopy", "simulation.cancel"),
+            (StatusFile::Stored, "logcopy", "logcopy.done"),
+        ];
+        for (file, folder, name) in cases {
+            assert_eq!((file.folder().as_str(), file.name().as_str()), (folder, name));
+            assert_eq!(StatusFile::parse(folder, name), Some(file));
+        }
+    }
+
+    #[test]
+    fn other_names_and_foreign_folders_mean_nothing() {
+        let cases = [
+            ("agent-1", "simulator-1.done"),
+            ("agent-1", "agent-2.done"),
+            ("agent-1", "simulation.cancel"),
+            ("agent-1", "logcopy.done"),
+            ("logcopy", "agent-1.done"),
+            ("agent-1", "agent-1.done2"),
+            ("agent-1", "agent-1.crash"),
+            ("agent-1", "agent-1.crash01"),
+            ("agent-1", "agent-1.crash+1"),
+            ("agent-1", "agent-1.crash1001"),
+            ("agent-1", "agent-1.crash99999999999"),
+            ("agent-1", "agent-1.done.tmp"),
+            ("agent-01", "agent-01.done"),
+            ("agent-0", "agent-0.done"),
+            ("agent-1000", "agent-1000.done"),
+            ("", ""),
+            (".", "agent-1.done"),
+        ];
+        for (folder, name) in cases {
+            assert_eq!(StatusFile::parse(folder, name), None, "{folder}/{name}");
+        }
+    }
+
+    #[test]
+    fn progress_counts_crashes_without_gaps() {
+        let root = tempfile::tempdir().unwrap();
+        let agent = member(Side::Agent, 1);
+        assert_eq!(Progress::read(root.path(), agent), Progress::default());
+        for mark in [Mark::Start(0), Mark::Crash(0), Mark::Start(1), Mark::Crash(5)] {
+            StatusFile::Of(agent, mark).create(root.path()).unwrap();
+        }
+        assert_eq!(
+            Progress::read(root.path(), agent),
+            Progress {
+                crashes: 1,
+                started: true,
+                done: false
+            }
+        );
+        StatusFile::Of(agent, Mark::Crash(1)).create(root.path()).unwrap();
+        StatusFile::Of(agent, Mark::Done).create(root.path()).unwrap();
+        assert_eq!(
+            Progress::read(root.path(), agent),
+            Progress {
+                crashes: 2,
+                started: false,
+                done: true
+            }
+        );
+    }
+
+    #[test]
+    fn creating_twice_is_fine_and_present_lists_what_is_valid() {
+        let root = tempfile::tempdir().unwrap();
+        let files = [
+            StatusFile::Of(member(Side::Simulator, 1), Mark::Start(0)),
+            StatusFile::Of(member(Side::Agent, 1), Mark::Crash(0)),
+            StatusFile::Of(member(Side::Agent, 1), Mark::Start(1)),
+            StatusFile::Of(member(Side::Agent, 2), Mark::Done),
+            StatusFile::Stored,
+        ];
+        for file in files.iter().chain(&files) {
+            file.create(root.path()).unwrap();
+        }
+        fs::write(root.path().join("agent-1/simulator-1.done"), "").unwrap();
+        fs::write(root.path().join("agent-1/agent-1.crash7"), "").unwrap();
+        assert_eq!(present(root.path(), 2), files);
+        assert_eq!(present(root.path(), 1).len(), 4);
+    }
+
+    #[test]
+    fn a_status_folder_that_cannot_be_written_is_an_error() {
+        let root = tempfile::tempdir().unwrap();
+        fs::write(root.path().join("logcopy"), "").unwrap();
+        assert!(StatusFile::Cancel.create(root.path()).is_err());
+    }
+}

@@ -1,0 +1,221 @@
+//! The verdict: its sentence, and writing it where the kubelet finds it. Called by `run`.
+
+use std::env;
+use std::ffi::OsStr;
+use std::fs::OpenOptions;
+use std::io::{self, ErrorKind, Write};
+use std::os::unix::fs::OpenOptionsExt;
+
+use leaderboard_runner::protocol::Side;
+use leaderboard_runner::verdict::{Verdict, What};
+use nix::fcntl::OFlag;
+
+use crate::checkpoint::{Checkpoint, Unreadable};
+use crate::decide::Cause;
+use crate::group::Status;
+
+/// What is known about an end.
+#[derive(Debug)]
+pub(crate) struct End<'a> {
+    pub(crate) side: Side,
+    pub(crate) cause: Cause,
+    /// How the command ended, if it was started.
+    pub(crate) status: Option<Status>,
+    pub(crate) out_of_memory: bool,
+    /// The agent's checkpoint, if it was looked at.
+    pub(crate) results: Option<&'a Result<Checkpoint, Unreadable>>,
+    /// What went wrong, for the causes that are errors.
+    pub(crate) detail: Option<&'a str>,
+}
+
+/// The verdict on it.
+pub(crate) fn verdict(end: &End<'_>) -> Verdict {
+    let (exit_code, signal) = match end.status {
+        Some(Status::Exited(code)) => (Some(code), None),
+        Some(Status::Killed(signal)) => (None, signal),
+        None => (None, None),
+    };
+    let mut why = reason(end);
+    if end.out_of_memory {
+        why.push_str("; the kernel killed a process of this container for lack of memory");
+    }
+    if let Some(results) = end.results {
+        why.push_str("; ");
+        why.push_str(&results_text(results));
+    }
+    Verdict {
+        what: what(end),
+        exit_code,
+        signal,
+        out_of_memory: end.out_of_memory,
+        why,
+    }
+}
+
+const fn what(end: &End<'_>) -> What {
+    match end.cause {
+        Cause::Terminated => What::Stopped,
+        Cause::AlreadyDone | Cause::PeerDone => What::Finished,
+        Cause::PeerCrashed => What::PeerCrashed,
+        Cause::Cancelled => What::Cancelled,
+        Cause::Idle => What::Idle,
+        Cause::NotReady => What::NotReady,
+        Cause::CannotStart(_) | Cause::Mute => What::CannotStart,
+        Cause::ChildEnded => match end.status {
+            Some(Status::Exited(_)) => What::Exited,
+            _ => What::Killed,
+        },
+    }
+}
+
+fn reason(end: &End<'_>) -> String {
+    let of = |simulator: &str, agent: &str| if end.side == Side::Simulator { simulator } else { agent }.to_owned();
+    match end.cause {
+        Cause::Terminated => "the container was told to end from outside".to_owned(),
+        Cause::AlreadyDone => "the pair was done before this container began".to_owned(),
+        Cause::PeerDone => "the agent is done, so the server was stopped".to_owned(),
+        Cause::PeerCrashed => of(
+            "the agent crashed, so the server was stopped",
+            "the simulator crashed, so the agent was stopped",
+        ),
+        Cause::Cancelled => "the submission was stopped".to_owned(),
+        Cause::Idle => "the agent printed nothing for too long and was stopped".to_owned(),
+        Cause::NotReady => of(
+            "the server did not answer on its port in time",
+            "the simulator was not ready in time",
+        ),
+        Cause::CannotStart(_) | Cause::Mute => end.detail.unwrap_or("the command could not be started").to_owned(),
+        Cause::ChildEnded => match end.status {
+            Some(Status::Exited(code)) => format!("the command exited with code {code}"),
+            Some(Status::Killed(Some(signal))) => format!("the command died of signal {signal}"),
+            Some(Status::Killed(None)) | None => "the command ended in an unknown way".to_owned(),
+        },
+    }
+}
+
+fn results_text(results: &Result<Checkpoint, Unreadable>) -> String {
+    match results {
+        Ok(Checkpoint { complete: true, .. }) => "its results are complete".to_owned(),
+        Ok(Checkpoint { partial: true, .. }) => "its results are partial (no global record)".to_owned(),
+        Ok(_) => "its checkpoint holds no results".to_owned(),
+        Err(error) => error.to_string(),
+    }
+}
+
+/// Replaces the termination message by `verdict`. A container without that file goes without.
+pub(crate) fn write(verdict: &Verdict) {
+    let path = env::var_os("LEADERBOARD_TERMINATION_LOG");
+    let path = path.as_deref().unwrap_or(OsStr::new("/dev/termination-log"));
+    let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
+    // Written in place: the file is a mount of its own, so nothing can be renamed over it.
+    let opened = OpenOptions::new()
+        .write(true)
+        .truncate(true)
+        .custom_flags(flags.bits())
+        .open(path);
+    let written = opened.and_then(|mut file| file.write_all(verdict.to_json().as_bytes()));
+    if let Err(error) = written
+        && error.kind() != ErrorKind::NotFound
+    {
+        crate::say(format_args!("the termination message cannot be written: {error}"));
+    }
+}
+
+/// Why a command could not be started.
+pub(crate) fn cannot_start(program: &OsStr, error: &io::Error) -> String {
+    format!("{} cannot be started: {error}", program.to_string_lossy())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const END: End<'_> = End {
+        side: Side::Agent,
+        cause: Cause::ChildEnded,
+        status: Some(Status::Exited(3)),
+        out_of_memory: false,
+        results: None,
+        detail: None,
+    };
+
+    #[test]
+    fn the_sentence_says_what_ended_and_what_is_left() {
+        let partial = Ok(Checkpoint {
+            complete: false,
+            partial: true,
+        });
+        let missing = Err(Unreadable::Missing);
+        let killed = Some(Status::Killed(Some(9)));
+        let cases = [
+            (
+                End {
+                    results: Some(&partial),
+                    ..END
+                },
+                What::Exited,
+                "the command exited with code 3; its results are partial (no global record)",
+            ),
+            (
+                End {
+                    status: killed,
+                    out_of_memory: true,
+                    results: Some(&missing),
+                    ..END
+                },
+                What::Killed,
+                "the command died of signal 9; the kernel killed a process of this container for lack of memory; there is no checkpoint file",
+            ),
+            (
+                End {
+                    cause: Cause::PeerCrashed,
+                    status: killed,
+                    ..END
+                },
+                What::PeerCrashed,
+                "the simulator crashed, so the agent was stopped",
+            ),
+            (
+                End {
+                    cause: Cause::CannotStart(127),
+                    status: None,
+                    detail: Some("x"),
+                    ..END
+                },
+                What::CannotStart,
+                "x",
+            ),
+            (
+                End {
+                    side: Side::Simulator,
+                    cause: Cause::NotReady,
+                    ..END
+                },
+                What::NotReady,
+                "the server did not answer on its port in time",
+            ),
+        ];
+        for (end, what, why) in cases {
+            let verdict = verdict(&end);
+            assert_eq!((verdict.what, verdict.why.as_str()), (what, why));
+        }
+    }
+
+    #[test]
+    fn the_numbers_are_the_commands_own() {
+        let exited = verdict(&END);
+        assert_eq!(
+            (exited.exit_code, exited.signal, exited.out_of_memory),
+            (Some(3), None, false)
+        );
+        let killed = verdict(&End {
+            status: Some(Status::Killed(Some(11))),
+            out_of_memory: true,
+            ..END
+        });
+        assert_eq!(
+            (killed.exit_code, killed.signal, killed.out_of_memory),
+            (None, Some(11), true)
+        );
+    }
+}

@@ -1,0 +1,398 @@
+//! One container's life: looks at the world, asks `decide`, does what it says. Called by `main`.
+//!
+//! All waiting is one `poll` over signals, changed folders and the command's output; a look once a second stands behind it.
+//! No policy here: what follows from what is `decide`'s.
+
+use std::io;
+use std::os::fd::AsFd;
+use std::time::{Duration, Instant};
+
+use leaderboard_runner::protocol::{MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
+use leaderboard_runner::verdict::Verdict;
+use nix::errno::Errno;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::signal::Signal;
+
+use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Phase, Seen, Skip};
+use crate::group::{Group, spawn_code};
+use crate::launch;
+use crate::tee::Tee;
+use crate::wake::{Folders, Signals};
+use crate::{checkpoint, memory, report, say};
+use leaderboard_runner::args::{Job, Role};
+
+/// Behind inotify, for whatever it misses.
+const SLOW_POLL: Duration = Duration::from_secs(1);
+const PROBE_EVERY: Duration = Duration::from_millis(100);
+/// After SIGKILL, and for the last output: then the rest is given up.
+const LAST_WAIT: Duration = Duration::from_secs(10);
+
+/// One container of a pair.
+#[derive(Debug)]
+pub(crate) struct Runner {
+    job: Job,
+    me: Member,
+    round: u32,
+    phase: Phase,
+    /// When the present phase, or an agent's present round, began.
+    since: Instant,
+    next_probe: Instant,
+    signals: Signals,
+    folders: Folders,
+    terminated: bool,
+    group: Option<Group>,
+    tee: Option<Tee>,
+    memory_kills: u64,
+    detail: Option<String>,
+}
+
+impl Runner {
+    /// Prepares it; nothing is started or written yet.
+    pub(crate) fn new(job: Job, signals: Signals) -> Self {
+        let me = job.member();
+        let logcopy = StatusFile::Stored.folder();
+        let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy]);
+        let round = Progress::read(&job.status, me).crashes;
+        let now = Instant::now();
+        Self {
+            job,
+            me,
+            round,
+            phase: Phase::Opening,
+            since: now,
+            next_probe: now,
+            signals,
+            folders,
+            terminated: false,
+            group: None,
+            tee: None,
+            memory_kills: memory::kills(),
+            detail: None,
+        }
+    }
+
+    /// Lives, ends, and returns the exit code.
+    pub(crate) fn run(mut self) -> i32 {
+        report::write(&Verdict::silent_death());
+        let cause = self.live();
+        self.end_processes();
+        let conclusion = self.conclude(cause);
+        let code = self.hold(conclusion);
+        self.say(&format!("exit {code}"));
+        code
+    }
+
+    fn live(&mut self) -> Cause {
+        loop {
+            let seen = self.look();
+            let done = match decide::next(self.me.side, self.phase, &seen) {
+                Action::Wait => {
+                    self.wait(self.patience());
+                    Ok(())
+                }
+                Action::Skip(skip) => self.skip(skip),
+                Action::Launch => self.launch(),
+                Action::Announce => self.announce(),
+                Action::End(cause) => return cause,
+            };
+            if let Err(cause) = done {
+                return cause;
+            }
+        }
+    }
+
+    fn look(&mut self) -> Seen {
+        self.folders.refresh();
+        if let Some(group) = &mut self.group {
+            group.reap();
+        }
+        let child = self.child();
+        let round = self.round;
+        let of = |member, mark| StatusFile::Of(member, mark).exists(&self.job.status);
+        let (me, peer) = (self.me, self.me.peer());
+        Seen {
+            own_started: of(me, Mark::Start(round)),
+            own_done: of(me, Mark::Done),
+            peer_started: of(peer, Mark::Start(round)),
+            peer_crashed: of(peer, Mark::Crash(round)),
+            peer_done: of(peer, Mark::Done),
+            cancel: StatusFile::Cancel.exists(&self.job.status),
+            stored: StatusFile::Stored.exists(&self.job.status),
+            child,
+            terminated: self.terminated,
+            idle: self.idle_left() == Some(Duration::ZERO),
+            overdue: self.ready_left() == Some(Duration::ZERO),
+        }
+    }
+
+    fn child(&mut self) -> Child {
+        if self.group.as_ref().is_some_and(|group| group.status().is_some()) {
+            return Child::Ended;
+        }
+        if let (Phase::Booting, Role::Simulator { port, .. }) = (self.phase, &self.job.role)
+            && Instant::now() >= self.next_probe
+        {
+            self.next_probe = Instant::now() + PROBE_EVERY;
+            if launch::answers(*port) {
+                return Child::Ready;
+            }
+        }
+        Child::Quiet
+    }
+
+    /// Until the agent has been silent for too long.
+    fn idle_left(&self) -> Option<Duration> {
+        let (Role::Agent { idle, .. }, Some(tee)) = (&self.job.role, &self.tee) else {
+            return None;
+        };
+        Some(idle.saturating_sub(tee.last_output().elapsed()))
+    }
+
+    /// Until the server, or the agent's simulator, is late. An agent grants its simulator the time to say so first.
+    fn ready_left(&self) -> Option<Duration> {
+        let limit = match (self.me.side, self.phase) {
+            (Side::Simulator, Phase::Booting) => self.job.ready,
+            (Side::Agent, Phase::Opening) => self.job.ready + self.job.peer,
+            _ => return None,
+        };
+        Some(limit.saturating_sub(self.since.elapsed()))
+    }
+
+    fn patience(&self) -> Duration {
+        let probe = (self.phase == Phase::Booting).then_some(PROBE_EVERY);
+        [probe, self.idle_left(), self.ready_left()]
+            .into_iter()
+            .flatten()
+            .fold(SLOW_POLL, Duration::min)
+    }
+
+    fn skip(&mut self, skip: Skip) -> Result<(), Cause> {
+        let round = self.round;
+        self.mark(Mark::Crash(round))?;
+        self.say(match skip {
+            Skip::SilentDeath => "was killed in this round without a word; it counts as a crash",
+            Skip::CatchUp => "the other side crashed in this round before this one started; on to the next",
+        });
+        if round + 1 >= MAX_ROUNDS {
+            return Err(self.mute("the status folder holds more crashes than can be counted".to_owned()));
+        }
+        self.round = round + 1;
+        if self.me.side == Side::Agent {
+            self.since = Instant::now();
+        }
+        Ok(())
+    }
+
+    fn launch(&mut self) -> Result<(), Cause> {
+        if self.me.side == Side::Agent {
+            self.mark(Mark::Start(self.round))?;
+        }
+        self.since = Instant::now();
+        match launch::launch(&self.job, self.round) {
+            Ok((group, tee)) => {
+                self.say("the command is started");
+                (self.group, self.tee) = (Some(group), tee);
+                self.phase = if self.me.side == Side::Agent {
+                    Phase::Running
+                } else {
+                    Phase::Booting
+                };
+                Ok(())
+            }
+            Err(error) => {
+                self.detail = Some(report::cannot_start(launch::program(&self.job), &error));
+                Err(Cause::CannotStart(spawn_code(&error)))
+            }
+        }
+    }
+
+    fn announce(&mut self) -> Result<(), Cause> {
+        self.mark(Mark::Start(self.round))?;
+        self.say(&format!(
+            "the server answers after {:.1} s",
+            self.since.elapsed().as_secs_f64()
+        ));
+        self.phase = Phase::Running;
+        Ok(())
+    }
+
+    fn mark(&mut self, mark: Mark) -> Result<(), Cause> {
+        let file = StatusFile::Of(self.me, mark);
+        let created = file.create(&self.job.status);
+        created.map_err(|error| self.mute(format!("the status file {} cannot be created: {error}", file.name())))
+    }
+
+    fn mute(&mut self, detail: String) -> Cause {
+        self.detail = Some(detail);
+        Cause::Mute
+    }
+
+    /// Ends everything the command has started: SIGTERM to its group, after the grace SIGKILL, also to what had left the
+    /// group; then reads the rest of the output.
+    fn end_processes(&mut self) {
+        if let Some(group) = &self.group {
+            group.signal(Signal::SIGTERM);
+        }
+        let begin = Instant::now();
+        let (grace, limit) = (self.job.grace, self.job.grace + LAST_WAIT);
+        while let Some(group) = &mut self.group {
+            group.reap();
+            let (group_lives, spent) = (group.lives(), begin.elapsed());
+            if group_lives && spent >= grace {
+                group.signal(Signal::SIGKILL);
+            }
+            let stragglers = if !group_lives || spent >= grace {
+                Group::kill_children()
+            } else {
+                0
+            };
+            if !group_lives && stragglers == 0 {
+                break;
+            }
+            if spent >= limit {
+                self.say("processes are left that do not die of SIGKILL");
+                break;
+            }
+            // Only the command's own end comes as a signal; that of its grandchildren, while their parent lives, does not.
+            self.wait(Duration::from_millis(20));
+        }
+        self.drain_output();
+    }
+
+    fn drain_output(&mut self) {
+        let begin = Instant::now();
+        while self.tee.as_ref().is_some_and(|tee| !tee.finished()) {
+            if begin.elapsed() >= LAST_WAIT {
+                let unsent = self.tee.as_ref().map_or(0, Tee::unsent);
+                self.say(&format!(
+                    "the output did not end; {unsent} bytes of it were not taken by standard output"
+                ));
+                break;
+            }
+            self.wait(PROBE_EVERY);
+        }
+    }
+
+    fn conclude(&mut self, cause: Cause) -> Conclusion {
+        let ran = self.group.is_some();
+        let results = match &self.job.role {
+            Role::Agent { checkpoint, .. } if ran => {
+                checkpoint::make_readable(checkpoint);
+                Some(checkpoint::read(checkpoint))
+            }
+            _ => None,
+        };
+        let complete = matches!(&results, Some(Ok(found)) if found.complete);
+        let verdict = report::verdict(&report::End {
+            side: self.me.side,
+            cause,
+            status: self.group.as_ref().and_then(Group::status),
+            out_of_memory: ran && memory::kills() > self.memory_kills,
+            results: results.as_ref(),
+            detail: self.detail.as_deref(),
+        });
+        report::write(&verdict);
+        self.say(&verdict.why);
+        let seen = self.look();
+        self.announce_end(decide::conclude(self.me.side, cause, complete, &seen))
+    }
+
+    /// Writes the file that belongs to the conclusion; without it nobody could rely on the conclusion.
+    fn announce_end(&mut self, conclusion: Conclusion) -> Conclusion {
+        let mark = match conclusion.mark {
+            None => return conclusion,
+            Some(EndMark::Done) => Mark::Done,
+            Some(EndMark::Crash) => Mark::Crash(self.round),
+        };
+        let Err(cause) = self.mark(mark) else { return conclusion };
+        let detail = self.detail.as_deref();
+        let end = report::End {
+            side: self.me.side,
+            cause,
+            status: None,
+            out_of_memory: false,
+            results: None,
+            detail,
+        };
+        let verdict = report::verdict(&end);
+        report::write(&verdict);
+        self.say(&verdict.why);
+        Conclusion {
+            mark: None,
+            hold: Hold::Free,
+            code: decide::CODE_MUTE,
+        }
+    }
+
+    fn hold(&mut self, mut conclusion: Conclusion) -> i32 {
+        let mut since = Instant::now();
+        loop {
+            let left = self.hold_limit(conclusion.hold).saturating_sub(since.elapsed());
+            let seen = self.look();
+            match decide::leave(self.me.side, conclusion, &seen, left.is_zero()) {
+                Leave::Exit(code) => return code,
+                Leave::Wait => self.wait(left.min(SLOW_POLL)),
+                Leave::Hold(next) => {
+                    since = Instant::now();
+                    conclusion = self.announce_end(next);
+                }
+            }
+        }
+    }
+
+    fn hold_limit(&self, hold: Hold) -> Duration {
+        match (hold, &self.job.role) {
+            (Hold::Peer, _) => self.job.peer,
+            (Hold::Flush, Role::Simulator { flush, .. }) => *flush,
+            (Hold::Cancel, Role::Simulator { cancel, .. }) => *cancel,
+            (Hold::Free | Hold::Flush | Hold::Cancel, _) => Duration::ZERO,
+        }
+    }
+
+    /// Waits until something may have changed, at most `limit`, and handles signals and output.
+    fn wait(&mut self, limit: Duration) {
+        let readable = self.poll(limit).unwrap_or_else(|error| {
+            self.say(&format!("cannot wait for events: {error}"));
+            // Only a lack of kernel memory can bring us here; a pause keeps it from becoming a busy loop.
+            std::thread::sleep(PROBE_EVERY);
+            false
+        });
+        self.terminated |= self.signals.drain();
+        self.folders.drain();
+        if let Some(tee) = &mut self.tee {
+            if readable {
+                tee.read();
+            }
+            tee.write();
+        }
+        if let Some(group) = &mut self.group {
+            group.reap();
+        }
+    }
+
+    /// Polls; whether the command's output is readable.
+    fn poll(&self, limit: Duration) -> nix::Result<bool> {
+        let stdout = io::stdout();
+        let awake = self.signals.fds().into_iter().chain(self.folders.fd());
+        let mut descriptors: Vec<_> = awake.map(|fd| PollFd::new(fd, PollFlags::POLLIN)).collect();
+        // Input is read only while stdout has taken all of it, so a slow reader slows the command and costs no memory.
+        let input = self.tee.as_ref().and_then(Tee::input);
+        let output = self.tee.as_ref().is_some_and(Tee::wants_stdout);
+        if let Some(input) = input {
+            descriptors.push(PollFd::new(input, PollFlags::POLLIN));
+        } else if output {
+            descriptors.push(PollFd::new(stdout.as_fd(), PollFlags::POLLOUT));
+        }
+        // A millisecond more, so that what is waited for is over when we look again.
+        let milliseconds = u16::try_from(limit.as_millis() + 1).unwrap_or(u16::MAX);
+        match poll(&mut descriptors, PollTimeout::from(milliseconds)) {
+            Ok(_) | Err(Errno::EINTR) => {}
+            Err(error) => return Err(error),
+        }
+        Ok(input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true))
+    }
+
+    fn say(&self, text: &str) {
+        say(format_args!("{} round {}: {text}", self.me, self.round));
+    }
+}

@@ -1,0 +1,210 @@
+//! What goes wrong in an agent on purpose: the knobs of `AGENT_KNOBS`, and how the checkpoint gets to disk under them.
+//! Called by `evaluator` at fixed moments, so that the evaluator itself reads like an honest one.
+
+use std::{
+    fs, io,
+    os::unix::fs::{FileTypeExt, PermissionsExt, symlink},
+    path::{Path, PathBuf},
+    thread,
+    time::Duration,
+};
+
+use nix::{
+    sys::signal::{SigSet, Signal},
+    sys::stat::Mode,
+    unistd::mkfifo,
+};
+use serde_json::Number;
+
+use crate::{
+    checkpoint::{Checkpoint, Record, write_in_pieces},
+    flags::Format,
+    knobs::{Knobs, Known, Shape},
+};
+
+/// The agent's knobs; `README.md` tells people what each does.
+pub const KNOBS: &[Known] = &[
+    ("crash", Shape::At),
+    ("hang", Shape::At),
+    ("oom", Shape::At),
+    ("reject", Shape::At),
+    ("print-routes", Shape::PlainOrAt),
+    ("nonsense", Shape::At),
+    ("deep", Shape::At),
+    ("huge", Shape::At),
+    ("nan", Shape::At),
+    ("forge", Shape::Plain),
+    ("symlink", Shape::Value),
+    ("fifo", Shape::Plain),
+    ("mode0600", Shape::Plain),
+    ("spam", Shape::Value),
+    ("print-env", Shape::Plain),
+    ("noexit", Shape::Plain),
+    ("ignore-term", Shape::Plain),
+];
+
+/// Between two pieces of a checkpoint.
+const BETWEEN_PIECES: Duration = Duration::from_millis(2);
+const OOM_STEP: usize = 16 << 20;
+/// Where `oom` gives up: a container without a memory limit must not take the machine with it.
+const OOM_END: usize = 4 << 30;
+const DEPTH: usize = 200_000;
+const HUGE: usize = 65 << 20;
+
+/// The faults of this worker.
+#[derive(Debug)]
+pub struct Faults {
+    knobs: Knobs,
+    format: Format,
+    path: PathBuf,
+    /// Where the `once` markers lie: the checkpoint's folder, which outlives the container.
+    markers: PathBuf,
+}
+
+impl Faults {
+    /// `path` is the checkpoint's.
+    pub fn new(knobs: Knobs, format: Format, path: &Path) -> Self {
+        let markers = path.parent().map(Path::to_path_buf).unwrap_or_default();
+        Self {
+            knobs,
+            format,
+            path: path.to_path_buf(),
+            markers,
+        }
+    }
+
+    /// Before anything else.
+    pub fn at_start(&self) {
+        if self.knobs.has("ignore-term") {
+            ignore_term();
+        }
+        if self.knobs.has("print-env") {
+            for (name, value) in std::env::vars_os() {
+                println!("{}={}", name.display(), value.display());
+            }
+        }
+        let bytes: usize = self
+            .knobs
+            .value("spam")
+            .and_then(|bytes| bytes.parse().ok())
+            .unwrap_or(0);
+        let line = "spam ".repeat(20);
+        for _ in 0..bytes / (line.len() + 1) {
+            println!("{line}");
+        }
+    }
+
+    /// In the middle of a route; `number` counts the worker's routes from 1.
+    pub fn in_route(&self, number: usize, routes: &Path) {
+        let fires = |name| self.knobs.fires(name, number, &self.markers);
+        if fires("print-routes") || (number == 1 && self.knobs.has("print-routes")) {
+            println!("{}", fs::read_to_string(routes).unwrap_or_default());
+            abort("Segmentation fault (core dumped)");
+        }
+        if fires("crash") {
+            abort("Segmentation fault (core dumped)");
+        }
+        if fires("oom") {
+            exhaust_memory();
+        }
+        if fires("hang") {
+            forever();
+        }
+    }
+
+    /// Are the agent's sensors refused at this route?
+    pub fn rejects(&self, number: usize) -> bool {
+        self.knobs.fires("reject", number, &self.markers)
+    }
+
+    /// Changes a finished record.
+    pub fn falsify(&self, number: usize, record: &mut Record) {
+        if self.knobs.has("forge") {
+            record.scores.score_route = Number::from(100);
+            record.scores.score_penalty = 1.0;
+            record.scores.score_composed = 100.0;
+        }
+        if self.knobs.fires("nan", number, &self.markers) {
+            record.scores.score_composed = f64::NAN;
+        }
+    }
+
+    /// Writes the checkpoint after the `number`-th route.
+    pub fn write(&self, checkpoint: &Checkpoint, number: usize) -> io::Result<()> {
+        if self.knobs.has("fifo") {
+            return self.make_fifo();
+        }
+        let holds = |name| self.knobs.holds(name, number, &self.markers);
+        let text = match () {
+            () if holds("nonsense") => {
+                "{\"_checkpoint\": {\"records\": \"all of them\", \"global_record\": 7}}".to_owned()
+            }
+            () if holds("deep") => "[".repeat(DEPTH),
+            () if holds("huge") => " ".repeat(HUGE),
+            () => checkpoint.text(self.format)?,
+        };
+        let Some(target) = self.knobs.value("symlink") else {
+            write_in_pieces(&self.path, &text, || thread::sleep(BETWEEN_PIECES))?;
+            let private = self.knobs.has("mode0600");
+            return if private {
+                fs::set_permissions(&self.path, fs::Permissions::from_mode(0o600))
+            } else {
+                Ok(())
+            };
+        };
+        fs::write(self.path.with_extension("hidden"), text)?;
+        remove(&self.path)?;
+        symlink(target, &self.path)
+    }
+
+    /// After the last write.
+    pub fn at_end(&self) {
+        if self.knobs.has("noexit") {
+            forever();
+        }
+    }
+
+    fn make_fifo(&self) -> io::Result<()> {
+        if fs::symlink_metadata(&self.path).is_ok_and(|found| found.file_type().is_fifo()) {
+            return Ok(());
+        }
+        remove(&self.path)?;
+        mkfifo(&self.path, Mode::from_bits_truncate(0o666)).map_err(io::Error::from)
+    }
+}
+
+/// SIGTERM stays pending for ever. Must be called before any thread starts.
+pub fn ignore_term() {
+    let mut set = SigSet::empty();
+    set.add(Signal::SIGTERM);
+    if let Err(error) = set.thread_block() {
+        eprintln!("SIGTERM can't be blocked, so `ignore-term` has no effect: {error}");
+    }
+}
+
+fn remove(path: &Path) -> io::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+fn abort(last_words: &str) -> ! {
+    eprintln!("{last_words}");
+    std::process::abort()
+}
+
+fn exhaust_memory() -> ! {
+    let mut hoard = Vec::new();
+    while hoard.len() * OOM_STEP < OOM_END {
+        // Filled with ones: zero pages would cost nothing.
+        hoard.push(vec![1_u8; OOM_STEP]);
+    }
+    abort("MemoryError: the limit of this stand-in was reached before one of the container")
+}
+
+fn forever() -> ! {
+    loop {
+        thread::park();
+    }
+}

@@ -1,0 +1,15 @@
+//! Stand-ins for the images of a challenge: a simulator and an agent that behave as CARLA and the Leaderboard do towards
+//! whoever runs them, in milliseconds and without a GPU. The programs in `bin/` call `simulator::run` and
+//! `evaluator::run`. Nothing here knows the operator: it is written from the Leaderboard's own behaviour, so that it
+//! can contradict the operator.
+
+pub mod checkpoint;
+pub mod evaluator;
+pub mod faults;
+pub mod flags;
+pub mod knobs;
+pub mod link;
+pub mod routes;
+pub mod scenario;
+pub mod simulator;
+pub mod statistics;

@@ -1,0 +1,9 @@
+//! The agent and the simulator as processes, each test in a folder of its own.
+
+// `cfg(test)` tells clippy that the helpers may unwrap too.
+#[cfg(test)]
+mod agent;
+#[cfg(test)]
+mod simulator;
+#[cfg(test)]
+mod support;

@@ -1,0 +1,36 @@
+//! A stand-in for EvalAI's API: the demo's participants push into it, the operator reports to it, the tests read it.
+//!
+//! Started by the binary `evalai-stand-in` and, inside tests, by [`serve`]. It knows nothing of the operator: what it
+//! does is what EvalAI's own server was seen to do, including what is wrong with it (no state machine, duplicate
+//! leaderboard rows after concurrent results, whole rows saved late).
+//!
+//! The pure part ([`state`], [`update`], [`submissions`], [`views`], [`python`], [`throttle`], [`routes`]) knows no
+//! network and no clock; [`server`] and `handlers` put HTTP around it.
+
+pub mod body;
+pub mod control;
+pub mod errors;
+pub mod faults;
+mod handlers;
+mod leaderboards;
+pub mod log;
+pub mod model;
+mod pages;
+pub mod python;
+pub mod queue;
+pub mod reply;
+pub mod routes;
+pub mod seed;
+pub mod server;
+pub mod sqs;
+pub mod state;
+pub mod submissions;
+pub mod throttle;
+pub mod update;
+pub mod views;
+
+pub use faults::Knobs;
+pub use queue::{MemoryQueues, Message, Queues};
+pub use seed::Seed;
+pub use server::{Config, Handle, serve};
+pub use state::State;

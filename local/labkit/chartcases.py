@@ -1,0 +1,150 @@
+"""Owns what the chart must refuse, and what its two accounts must be allowed and not be allowed to do. Data only, read by `charttest`."""
+
+from dataclasses import dataclass
+
+RELEASE = "leaderboard-operator"
+SYSTEM = "leaderboard-system"
+NAMESPACES = (SYSTEM, "leaderboard", "carla-10", "carla-20", "other")
+CONTROLLER = f"{RELEASE}-controller"
+BRIDGE = f"{RELEASE}-bridge"
+
+# Values that a person may get wrong, and a word that the refusal must hold.
+REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
+    (("contoller.replicas=2",), "contoller"),
+    (("controller.replica=2",), "replica"),
+    (("bridge.enable=false",), "enable"),
+    (('bridge.enabled="false"',), "boolean"),
+    (('controller.concurrency="16"',), "integer"),
+    (("controller.concurrency=0",), "concurrency"),
+    (("controller.replicas=-1",), "replicas"),
+    (('image.repository="registry.example/operator@sha256:0"',), "repository"),
+    (('image.digest="0123"',), "digest"),
+    (('image.pullPolicy="always"',), "pullPolicy"),
+    (('watchNamespace="My_Namespace"',), "watchNamespace"),
+    (('leaderboards=["leaderboard"]',), "leaderboards"),
+    (('leaderboards=[{"namespace":"leaderboard"}]',), "secrets"),
+    (('leaderboards=[{"namespace":"leaderboard","secrets":["evalai","evalai"]}]',), "equal"),
+    (('aws.endpointUrl="localhost:4566"',), "endpointUrl"),
+    (('aws.accessKeyId="AKIA"',), "accessKeyId"),
+    (('controller.roleArn="leaderboard-controller"',), "roleArn"),
+    (('log.format="yaml"',), "format"),
+    (('crds.install="no"',), "boolean"),
+)
+
+
+@dataclass(frozen=True)
+class Access:
+    """A question to the authorizer and its right answer. `resource` is `[group/]resource[:subresource]`."""
+
+    account: str
+    allowed: bool
+    verb: str
+    resource: str
+    namespace: str = "leaderboard"
+    name: str = ""
+
+
+def may(account: str, verbs: str, resource: str, namespace: str = "leaderboard", name: str = "") -> list[Access]:
+    return [Access(account, True, verb, resource, namespace, name) for verb in verbs.split()]
+
+
+def may_not(account: str, verbs: str, resource: str, namespace: str = "leaderboard", name: str = "") -> list[Access]:
+    return [Access(account, False, verb, resource, namespace, name) for verb in verbs.split()]
+
+
+OWN = "leaderboard.carla.org"
+
+
+def work(controller: str, namespace: str) -> list[Access]:
+    """What the controller can't work without, in one namespace."""
+    return [
+        *may(controller, "get list watch patch", f"{OWN}/leaderboards", namespace),
+        *may(controller, "get list watch create patch", f"{OWN}/submissions", namespace),
+        *may(controller, "patch", f"{OWN}/submissions:status", namespace),
+        *may(controller, "patch", f"{OWN}/leaderboards:status", namespace),
+        *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
+        *may(controller, "get list watch create patch delete", "batch/jobs", namespace),
+        *may(controller, "get list watch patch delete", "pods", namespace),
+        *may(controller, "get list", "events", namespace),
+        *may(controller, "create patch", "events.k8s.io/events", namespace),
+        *may(controller, "get create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
+    ]
+
+
+def intake(bridge: str, namespace: str) -> list[Access]:
+    """What the bridge can't work without, in one namespace."""
+    return [
+        *may(bridge, "get list watch", f"{OWN}/leaderboards", namespace),
+        *may(bridge, "get create patch", f"{OWN}/submissions", namespace),
+        *may(bridge, "create patch", "events.k8s.io/events", namespace),
+    ]
+
+
+def never(controller: str, bridge: str) -> list[Access]:
+    """What neither may do, whatever the values."""
+    return [
+        *may_not(controller, "create update delete", f"{OWN}/leaderboards"),
+        *may_not(controller, "update delete deletecollection", f"{OWN}/submissions"),
+        *may_not(controller, "create update", "pods"),
+        *may_not(controller, "create", "pods:exec"),
+        *may_not(controller, "get", "pods:log"),
+        *may_not(controller, "deletecollection", "batch/jobs"),
+        *may_not(controller, "delete", "networking.k8s.io/networkpolicies"),
+        *may_not(controller, "list watch create patch delete", "secrets"),
+        *may_not(controller, "get", "secrets", name="another"),
+        *may_not(controller, "get", "secrets", "other", "evalai"),
+        *may_not(controller, "get", "secrets", SYSTEM, "aws"),
+        *may_not(controller, "get update", "coordination.k8s.io/leases", SYSTEM, "another"),
+        *may_not(controller, "create", "coordination.k8s.io/leases", "leaderboard"),
+        *may_not(controller, "create", "serviceaccounts:token", SYSTEM),
+        *may_not(controller, "list", "nodes", ""),
+        *may_not(bridge, "list watch update delete", f"{OWN}/submissions"),
+        *may_not(bridge, "patch", f"{OWN}/submissions:status"),
+        *may_not(bridge, "patch", f"{OWN}/leaderboards"),
+        *may_not(bridge, "get list create", "pods"),
+        *may_not(bridge, "get list create", "batch/jobs"),
+        *may_not(bridge, "get", "secrets", name="evalai"),
+        *may_not(bridge, "get create update", "coordination.k8s.io/leases", SYSTEM, RELEASE),
+    ]
+
+
+def lease(controller: str) -> list[Access]:
+    return [
+        *may(controller, "create", "coordination.k8s.io/leases", SYSTEM),
+        *may(controller, "get update", "coordination.k8s.io/leases", SYSTEM, RELEASE),
+    ]
+
+
+CLUSTER_WIDE = (
+    *work(CONTROLLER, "leaderboard"),
+    *work(CONTROLLER, "other"),
+    *intake(BRIDGE, "leaderboard"),
+    *intake(BRIDGE, "other"),
+    *never(CONTROLLER, BRIDGE),
+    *lease(CONTROLLER),
+    *may(CONTROLLER, "get", "secrets", name="evalai"),
+)
+# ci/roles.yaml: another account, secrets in two namespaces.
+WITH_ROLES = (
+    *work("controller", "carla-10"),
+    *lease("controller"),
+    *never("controller", BRIDGE),
+    *may("controller", "get", "secrets", "carla-10", "evalai"),
+    *may("controller", "get", "secrets", "carla-10", "evalai-old"),
+    *may("controller", "get", "secrets", "carla-20", "evalai"),
+    *may_not("controller", "get", "secrets", "carla-20", "evalai-old"),
+    *may_not(CONTROLLER, "get", f"{OWN}/submissions", "carla-10"),
+)
+# ci/namespaced.yaml.
+NAMESPACED = (
+    *work(CONTROLLER, "leaderboard"),
+    *intake(BRIDGE, "leaderboard"),
+    *never(CONTROLLER, BRIDGE),
+    *lease(CONTROLLER),
+    *may(CONTROLLER, "get", "secrets", name="evalai"),
+    *may_not(CONTROLLER, "get list create patch", f"{OWN}/submissions", "other"),
+    *may_not(CONTROLLER, "get list create", "batch/jobs", "other"),
+    *may_not(CONTROLLER, "list", "pods", ""),
+    *may_not(BRIDGE, "get list", f"{OWN}/leaderboards", "other"),
+)

@@ -1,0 +1,270 @@
+"""Owns the checks of the Helm chart: text, values, what it renders, and what a real API server makes of it.
+
+Called by `lab chart-test`. The API server is a throwaway one without nodes; it answers what the two accounts may do and what not.
+"""
+
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from . import apiserver, chartcases, schemas, tools
+from .chartcases import RELEASE, SYSTEM, Access
+from .console import say, seconds
+from .errors import LabError
+from .kube import Kube
+from .settings import Settings
+
+CRDS = ("leaderboards.leaderboard.carla.org", "submissions.leaderboard.carla.org")
+
+
+def run(settings: Settings, update: bool) -> None:
+    """All checks; raises with the first ones that fail."""
+    chart = settings.repository / "charts" / RELEASE
+    generated, copied = settings.repository / "crds", chart / "files" / "crds"
+    if update:
+        copy_definitions(generated, copied)
+    folder = tools.ensure(settings, apiserver.TOOLS)
+    check("the chart's copy of crds/", lambda: same_definitions(generated, copied))
+    check("a reason above every rule", lambda: rules_have_reasons(chart))
+    started = time.monotonic()
+    with apiserver.running(settings, folder) as kube:
+        say(f"an API server of its own is ready ({seconds(time.monotonic() - started)})")
+        for name in chartcases.NAMESPACES:
+            kube.run("kubectl", "create", "namespace", name)
+        check("helm lint --strict", lambda: lint(kube, chart))
+        check("values that must be refused", lambda: refused_values(kube, chart))
+        check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart))
+        check("server-side dry run", lambda: dry_run(kube, chart))
+        check("install, rights cluster-wide", lambda: installed(kube, chart))
+        check("the demo's manifests", lambda: demo_manifests(kube, settings.repository / "examples" / "demo"))
+        check("upgrade with roles, several leaderboards", lambda: upgraded(kube, chart))
+        check("uninstall keeps the definitions", lambda: uninstalled(kube))
+        check("install, rights in one namespace", lambda: namespaced(kube, chart))
+
+
+def check(what: str, work: Callable[[], str]) -> None:
+    """One check; its answer is a short summary. A failed one ends the test."""
+    started = time.monotonic()
+    try:
+        summary = work()
+    except LabError as error:
+        raise LabError(f"chart: {what}: {error}") from error
+    print(f"ok    {what:<48} {summary} ({seconds(time.monotonic() - started)})", flush=True)
+
+
+def copy_definitions(generated: Path, copied: Path) -> None:
+    copied.mkdir(parents=True, exist_ok=True)
+    for stale in copied.glob("*.yaml"):
+        stale.unlink()
+    for file in generated.glob("*.yaml"):
+        shutil.copyfile(file, copied / file.name)
+
+
+def same_definitions(generated: Path, copied: Path) -> str:
+    wanted = {file.name: file.read_text() for file in generated.glob("*.yaml")}
+    found = {file.name: file.read_text() for file in copied.glob("*.yaml")}
+    if not wanted:
+        raise LabError(f"{generated} is empty: run `make crds`")
+    if wanted != found:
+        raise LabError("the copy differs from crds/: run `local/lab chart-test --update`")
+    for name, text in wanted.items():
+        # The template puts the annotation there by text.
+        if text.count("\nmetadata:\n") != 1 or "\nmetadata:\n  annotations:" in text:
+            raise LabError(f"{name} has another shape than templates/crds.yaml expects")
+    return f"{len(wanted)} files"
+
+
+def rules_have_reasons(chart: Path) -> str:
+    """A right without a reason can't be reviewed."""
+    count = 0
+    for file in sorted((chart / "templates").glob("*-rbac.yaml")):
+        lines = file.read_text().splitlines()
+        for number, line in enumerate(lines):
+            if line.strip().startswith("- apiGroups:"):
+                count += 1
+                if not lines[number - 1].strip().startswith("#"):
+                    raise LabError(
+                        f"{file.name}:{number + 1} gives a right and does not say why: write a comment above it"
+                    )
+    return f"{count} rules"
+
+
+def values_files(chart: Path) -> list[Path | None]:
+    """None is values.yaml alone."""
+    return [None, *sorted((chart / "ci").glob("*.yaml"))]
+
+
+def with_values(file: Path | None) -> list[str]:
+    return [] if file is None else [f"--values={file}"]
+
+
+def lint(kube: Kube, chart: Path) -> str:
+    for file in values_files(chart):
+        done = kube.attempt("helm", "lint", "--strict", str(chart), *with_values(file))
+        if done.returncode != 0:
+            raise LabError(f"{file or 'values.yaml'}: {done.stdout.strip()[-600:]}")
+    return f"{len(values_files(chart))} sets of values"
+
+
+def refused_values(kube: Kube, chart: Path) -> str:
+    for settings, word in chartcases.REFUSED:
+        done = kube.attempt("helm", "template", "x", str(chart), *(f"--set-json={one}" for one in settings))
+        if done.returncode == 0:
+            raise LabError(f"{' '.join(settings)} was taken")
+        if word not in done.stderr:
+            raise LabError(f"{' '.join(settings)} was refused without the word {word}: {done.stderr.strip()[-300:]}")
+    return f"{len(chartcases.REFUSED)} mistakes"
+
+
+def render(kube: Kube, chart: Path, file: Path | None) -> str:
+    return kube.run("helm", "template", RELEASE, str(chart), f"--namespace={SYSTEM}", *with_values(file))
+
+
+def conform(kube: Kube, chart: Path) -> str:
+    document = json.loads(kube.run("kubectl", "get", "--raw", "/openapi/v2"))
+    objects = 0
+    with tempfile.TemporaryDirectory(prefix="leaderboard-schemas-") as folder:
+        for name, schema in schemas.files(document):
+            (Path(folder) / name).write_text(json.dumps(schema))
+        argv = ["kubeconform", "-strict", "-summary", "-output=json", f"-schema-location={folder}/{schemas.TEMPLATE}"]
+        for file in values_files(chart):
+            done = kube.attempt(*argv, given=render(kube, chart, file))
+            answer = json.loads(done.stdout or "{}")
+            if done.returncode != 0:
+                raise LabError(f"{file or 'values.yaml'}: {describe(answer) or done.stderr.strip()[-300:]}")
+            objects += answer["summary"]["valid"]
+    return f"{objects} objects"
+
+
+def describe(answer: dict[str, Any]) -> str:
+    bad = [one for one in answer.get("resources", []) if one["status"] != "statusValid"]
+    return "; ".join(f"{one['kind']} {one['name']}: {one['msg']}" for one in bad)[:600]
+
+
+def dry_run(kube: Kube, chart: Path) -> str:
+    """The server's own answer to each rendering; the Pods in it must be as confined as they claim."""
+    objects = 0
+    for file in values_files(chart):
+        argv = ["apply", "--server-side", "--dry-run=server", "--validate=strict", "--filename=-", "--output=json"]
+        items = json.loads(kube.run("kubectl", *argv, given=render(kube, chart, file)))["items"]
+        objects += len(items)
+        for item in items:
+            if item["kind"] == "Deployment":
+                confined(item)
+    return f"{objects} objects"
+
+
+def confined(deployment: dict[str, Any]) -> None:
+    name, pod = deployment["metadata"]["name"], deployment["spec"]["template"]["spec"]
+    rules = [pod["securityContext"].get("runAsNonRoot") is True]
+    rules.append(pod["securityContext"].get("seccompProfile") == {"type": "RuntimeDefault"})
+    for container in pod["containers"]:
+        context = container["securityContext"]
+        rules.append(context.get("readOnlyRootFilesystem") is True)
+        rules.append(context.get("allowPrivilegeEscalation") is False)
+        rules.append(context.get("capabilities") == {"drop": ["ALL"]})
+        rules.append({"livenessProbe", "readinessProbe"} <= container.keys())
+        rules.append("memory" in container["resources"].get("limits", {}))
+    if not all(rules):
+        raise LabError(f"Deployment {name} is less confined than the chart claims: {pod['securityContext']}")
+
+
+def helm(kube: Kube, chart: Path, *more: str) -> None:
+    kube.run("helm", "upgrade", "--install", RELEASE, str(chart), f"--namespace={SYSTEM}", *more)
+
+
+def installed(kube: Kube, chart: Path) -> str:
+    helm(kube, chart, '--set-json=leaderboards=[{"namespace":"leaderboard","secrets":["evalai"]}]')
+    return rights(kube, chartcases.CLUSTER_WIDE)
+
+
+def demo_manifests(kube: Kube, folder: Path) -> str:
+    """They are applied by the demo alone, which few run; the server must take them, without a word."""
+    files = [file for file in sorted(folder.glob("*.yaml")) if file.name != "values.yaml"]
+    for file in files:
+        argv = ["apply", "--server-side", "--dry-run=server", "--validate=strict", f"--filename={file}"]
+        done = kube.attempt("kubectl", *argv)
+        if done.returncode != 0 or done.stderr:
+            raise LabError(f"{file.name}: {done.stderr.strip()[-400:]}")
+    return f"{len(files)} files"
+
+
+def upgraded(kube: Kube, chart: Path) -> str:
+    helm(kube, chart, f"--values={chart / 'ci' / 'roles.yaml'}")
+    return rights(kube, chartcases.WITH_ROLES)
+
+
+def uninstalled(kube: Kube) -> str:
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
+    kube.run("kubectl", "get", "crd", *CRDS)
+    left = kube.json(
+        "kubectl", "get", "clusterroles,clusterrolebindings", "--selector=app.kubernetes.io/part-of=" + RELEASE
+    )
+    if left["items"]:
+        raise LabError(f"{len(left['items'])} cluster roles or bindings are left behind")
+    return "and nothing else"
+
+
+def namespaced(kube: Kube, chart: Path) -> str:
+    helm(kube, chart, f"--values={chart / 'ci' / 'namespaced.yaml'}")
+    summary = rights(kube, chartcases.NAMESPACED)
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
+    # Their finalizer takes a moment.
+    gone = ["wait", "--for=delete", "--timeout=30s", *(f"crd/{name}" for name in CRDS)]
+    if kube.attempt("kubectl", *gone).returncode != 0:
+        raise LabError("crds.keep=false, and the definitions outlive the release")
+    return summary
+
+
+def rights(kube: Kube, cases: tuple[Access, ...]) -> str:
+    """Asks the server's authorizer each question, in one request after the other of one kubectl."""
+    reviews = "\n---\n".join(json.dumps(review(case)) for case in cases)
+    answers = documents(kube.run("kubectl", "create", "--filename=-", "--output=json", given=reviews))
+    wrong = [
+        f"{case.account} may {'not ' if case.allowed else ''}{case.verb} {case.resource} in {case.namespace or 'the cluster'}"
+        for case, answer in zip(cases, answers, strict=True)
+        if answer["status"].get("allowed", False) != case.allowed
+    ]
+    if wrong:
+        raise LabError("; ".join(wrong))
+    return f"{len(cases)} questions to the authorizer"
+
+
+def review(case: Access) -> dict[str, Any]:
+    group, _, rest = case.resource.rpartition("/") if case.resource.count("/") else ("", "", case.resource)
+    resource, _, subresource = rest.partition(":")
+    attributes = {
+        "namespace": case.namespace,
+        "verb": case.verb,
+        "group": group,
+        "resource": resource,
+        "subresource": subresource,
+        "name": case.name,
+    }
+    user = f"system:serviceaccount:{SYSTEM}:{case.account}"
+    groups = ["system:serviceaccounts", "system:authenticated"]
+    return {
+        "apiVersion": "authorization.k8s.io/v1",
+        "kind": "SubjectAccessReview",
+        "spec": {"user": user, "groups": groups, "resourceAttributes": attributes},
+    }
+
+
+def documents(text: str) -> list[dict[str, Any]]:
+    """JSON objects one after the other, or one List of them."""
+    found, decoder, place = [], json.JSONDecoder(), 0
+    while place < len(text):
+        value, place = decoder.raw_decode(text, place)
+        found += value["items"] if value.get("kind") == "List" else [value]
+        place = skip_blanks(text, place)
+    return found
+
+
+def skip_blanks(text: str, place: int) -> int:
+    while place < len(text) and text[place].isspace():
+        place += 1
+    return place

@@ -1,0 +1,113 @@
+"""Owns the commands of `local/lab`: arguments in, exit code out. Results go to stdout, everything else to stderr."""
+
+import argparse
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from . import aws, charttest, cluster, demo, image, pythonenv, testrun, tools
+from .console import say
+from .errors import LabError
+from .settings import API_SERVICE_ADDRESS, HOST_ADDRESS, PORTS, Settings, client_environment, load
+from .toolsets import SETS
+
+ALL_TOOLS = [name for tool_set in SETS.values() for name in tool_set.tools if name != "pause"]
+
+
+def parser() -> argparse.ArgumentParser:
+    top = argparse.ArgumentParser(
+        prog="local/lab", description="A real one-node Kubernetes cluster with an AWS stand-in, on this machine."
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands.add_parser("up", help="start the cluster, or repair it; prints what to put into the environment")
+    commands.add_parser("down", help="end the cluster and remove its data")
+    commands.add_parser("status", help="what runs; exits with 1 unless everything does")
+    commands.add_parser("env", help='print shell exports: `eval "$(local/lab env)"`')
+    named = commands.add_parser("tools", help="build the pinned tools that are missing; prints their folder")
+    named.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(ALL_TOOLS)}; none: all of them")
+    stand_in = commands.add_parser("aws", help="run the AWS stand-in alone, in the foreground")
+    stand_in.add_argument("--port", type=int, default=PORTS["aws"])
+    stand_in.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS")
+    commands.add_parser(
+        "aws-venv", help="print the folder of programs of the Python environment with ministack and boto3"
+    )
+    commands.add_parser("demo", help="start everything, run one submission from message to score, and check it")
+    tests = commands.add_parser("test", help="run the tests; prints what each layer took")
+    tests.add_argument("--core", action="store_true", help="only the layers that need neither root nor a node")
+    tests.add_argument("--filter", default="", metavar="TEXT", help="only tests whose name contains TEXT")
+    tests.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        choices=testrun.NAMES,
+        metavar="LAYER",
+        help=f"only this layer (may be repeated): {', '.join(testrun.NAMES)}",
+    )
+    chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
+    chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
+    images = commands.add_parser(
+        "image", help="make images and push them to the cluster's registry; prints their references"
+    )
+    images.add_argument("file", type=Path, metavar="FILE.toml")
+    images.add_argument("--profile", default="local", help="cargo profile of the binaries (default: local)")
+    images.add_argument("--bin", action="append", default=[], metavar="NAME=PATH", help="a binary in place of cargo's")
+    images.add_argument(
+        "--tar", type=Path, metavar="OUT", help="write an archive instead of pushing (a file with one image)"
+    )
+    return top
+
+
+def run(settings: Settings, arguments: argparse.Namespace) -> int:
+    """Carries out one command and returns the exit code."""
+    match arguments.command:
+        case "up":
+            cluster.up(settings)
+            say('in your shell: eval "$(local/lab env)", or only the line below')
+            print(f"export KUBECONFIG={shlex.quote(str(settings.kubeconfig))}")
+        case "down":
+            cluster.down(settings)
+        case "status":
+            return 0 if cluster.status(settings) else 1
+        case "env":
+            print_environment(settings)
+        case "tools":
+            print(tools.ensure(settings, arguments.names or ALL_TOOLS, os.environ.get("KUBEBUILDER_ASSETS")))
+        case "aws":
+            aws.foreground(settings, arguments.bind, arguments.port)
+        case "aws-venv":
+            print(pythonenv.ensure(settings))
+        case "demo":
+            demo.run(settings)
+        case "test":
+            return 0 if testrun.run(settings, arguments.core, arguments.filter, arguments.only) else 1
+        case "chart-test":
+            charttest.run(settings, arguments.update)
+        case "image":
+            target = image.target_folder(settings.repository, os.environ)
+            search = image.Search(image.given_binaries(arguments.bin), target, arguments.profile)
+            print("\n".join(image.make(settings, arguments.file, search, arguments.tar)))
+    return 0
+
+
+def print_environment(settings: Settings) -> None:
+    """Shell lines that make kubectl, helm and every AWS client speak to the lab."""
+    for name, value in client_environment(settings).items():
+        print(f"export {name}={shlex.quote(value)}")
+    for name in ("NO_PROXY", "no_proxy"):
+        print(f'export {name}="{HOST_ADDRESS},{API_SERVICE_ADDRESS}${{{name}:+,${name}}}"')
+    folder = tools.gather(settings, {})
+    print(f'export PATH={shlex.quote(str(folder))}:"$PATH"')
+
+
+def main(repository: Path, argv: Sequence[str]) -> int:
+    """The program: 0 fine, 1 `status` of something that does not run, 2 an error with its next step, 130 interrupted."""
+    try:
+        return run(load(repository), parser().parse_args(argv))
+    except LabError as error:
+        print(f"lab: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("lab: interrupted; run the same command again to go on", file=sys.stderr)
+        return 130

@@ -1,0 +1,95 @@
+"""Owns what a person sees while something runs: progress lines and heartbeats on stderr. stdout is for results only."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from .errors import LabError
+
+HEARTBEAT_SECONDS = 30
+NETWORK_WORDS = (
+    "dial tcp",
+    "no such host",
+    "Temporary failure resolving",
+    "Could not connect to",
+    "Failed to fetch",
+    "NewConnectionError",
+    "Network is unreachable",
+    "proxyconnect",
+    "i/o timeout",
+    "TLS handshake timeout",
+)
+
+
+def say(text: str) -> None:
+    """Prints one progress line."""
+    print(f"lab: {text}", file=sys.stderr, flush=True)
+
+
+def seconds(value: float) -> str:
+    """A duration for people: `4.2 s`, `37 s` or `6 min 27 s`."""
+    if value < 10:
+        return f"{value:.1f} s"
+    if value < 120:
+        return f"{value:.0f} s"
+    return f"{int(value) // 60} min {int(value) % 60} s"
+
+
+def network_failure(output: str) -> str | None:
+    """The line of a registry client's output that says that the network failed, if there is one."""
+    lines = [line.strip() for line in output.splitlines()]
+    return next((line for line in reversed(lines) if any(word in line for word in NETWORK_WORDS)), None)
+
+
+def run_long(
+    argv: Sequence[str],
+    what: str,
+    log: Path,
+    *,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    keep: Sequence[int] = (),
+    progress: Callable[[str], str] | None = None,
+) -> None:
+    """Runs a command that may take minutes: its output goes to `log`, a heartbeat to stderr; raises LabError if it fails.
+
+    `progress` makes of the log so far how far it is, for the heartbeat.
+    The command inherits the descriptors in `keep`: a lock among them is held as long as the command lives, even if we die.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+    with log.open("wb") as sink:
+        child = subprocess.Popen(
+            argv, cwd=cwd, env=env, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT, pass_fds=keep
+        )
+        try:
+            while True:
+                try:
+                    code = child.wait(timeout=HEARTBEAT_SECONDS)
+                    break
+                except subprocess.TimeoutExpired:
+                    far = progress(log.read_text(errors="replace")) if progress else "still running"
+                    say(f"  {what}: {far} after {seconds(time.monotonic() - started)}")
+        except BaseException:
+            child.terminate()
+            child.wait()
+            raise
+    if code != 0:
+        raise LabError(failure_line(what, code, log))
+
+
+def failure_line(what: str, code: int, log: Path) -> str:
+    """One line for a failed command: the network's words if the network failed, else its first error, else its last line."""
+    output = log.read_text(errors="replace")
+    network = network_failure(output)
+    if network is not None:
+        return (
+            f"{what}: the registry can't be reached ({network[:200]}); "
+            f"check the network or the proxy settings, then run the same command again"
+        )
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    # A compiler says first what is wrong, everything else says it last.
+    words = next((line for line in lines if line.startswith("error")), lines[-1] if lines else "no output")
+    return f"{what} failed with exit code {code} ({words[:200]}); the whole output is in {log}"

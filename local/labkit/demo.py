@@ -1,0 +1,285 @@
+"""Owns the demo: from nothing to one submission whose score is in Kubernetes, S3, DynamoDB and EvalAI, and equal to what it must be.
+
+Called by `lab demo`. Every step may be repeated, so the demo goes on where it was interrupted, and a second run only submits again.
+"""
+
+import json
+import os
+import shlex
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from . import aws, build, cluster, demo_check, evalai_server, image, packages, tools
+from .console import say, seconds
+from .demo_check import Findings
+from .errors import LabError
+from .follow import follow
+from .kube import Kube, of_lab
+from .settings import HOST_ADDRESS, PORTS, Settings
+
+SYSTEM = "leaderboard-system"
+NAMESPACE = "leaderboard"
+LEADERBOARD = "leaderboard-20"
+RELEASE = "leaderboard-operator"
+CHALLENGE, PHASE, SPLIT = 1, 1, 1
+PARTICIPANT, ORGANIZER = "local-team-a-token", "local-organizer-token"
+CONTENTS, SIMULATOR, AGENT = "challenge/contents:1", "challenge/simulator:1", "challenge/agent:standard"
+OPERATOR = "leaderboard-operator:dev"
+CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
+RUN_PATIENCE = 600
+STEPS = 9
+
+
+def run(settings: Settings) -> None:
+    """The whole demo; raises if a step fails or the result is not the expected one."""
+    started = time.monotonic()
+    cluster.check_machine(settings)
+    folder = prepare(settings)
+    kube = of_lab(settings, folder)
+    pinned = make_images(settings)
+    step(6, "EvalAI's stand-in", "1 s")
+    evalai_server.ensure(settings, build.program(settings, "evalai-stand-in"))
+    install(settings, kube, pinned)
+    apply_leaderboard(settings, kube, pinned)
+    submission = submit_and_follow(settings, kube, pinned[AGENT])
+    findings = collect(settings, kube, submission)
+    show(kube, findings)
+    check(settings, findings)
+    say(f"the demo is done ({seconds(time.monotonic() - started)})")
+    print(next_steps(settings, findings))
+
+
+def step(number: int, what: str, usual: str) -> None:
+    say(f"[{number}/{STEPS}] {what} (usually {usual})")
+
+
+def prepare(settings: Settings) -> Path:
+    """Steps 1 to 4: everything that has to be built, and the cluster. Returns the folder of tools."""
+    step(1, "pinned tools: Kubernetes, etcd, helm", "14 min the first time, then nothing")
+    tools.check_space(settings.state)
+    packages.ensure(settings)
+    folder = tools.ensure(settings, [*cluster.CLUSTER_TOOLS, "helm"])
+    step(2, "the operator and EvalAI's stand-in", "8 min the first time, then 1 s")
+    build.programs(settings)
+    step(3, "the programs that go into other images", "1 min the first time, then 1 s")
+    build.static_programs(settings)
+    step(4, "the cluster and the AWS stand-in", "15 s, or 1 s if they run")
+    cluster.up(settings)
+    return folder
+
+
+def make_images(settings: Settings) -> dict[str, str]:
+    """Step 5: pushes all images; returns repository:tag → the reference with its digest."""
+    step(5, "images, made here and pushed to the AWS stand-in's registry", "20 s, or 5 s if they are there")
+    if not CERTIFICATES.exists():
+        raise LabError(
+            f"{CERTIFICATES} is missing, which goes into the operator's image: apt-get install ca-certificates"
+        )
+    search = image.Search({}, image.target_folder(settings.repository, os.environ), build.PROFILE)
+    made = []
+    for name in ("operator-image.toml", "challenge/images.toml"):
+        made += image.make(settings, settings.local / name, search, None)
+    return {reference.partition("@")[0].removeprefix(f"{settings.registry}/"): reference for reference in made}
+
+
+def install(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
+    """Step 7: the chart, with the operator's image by its digest."""
+    step(7, f"the operator, by its Helm chart, in the namespace {SYSTEM}", "10 s")
+    for name in ("namespaces.yaml", "secrets.yaml"):
+        apply(settings, kube, name, pinned)
+    unblock(kube)
+    values = manifest(settings, "values.yaml", {})
+    digest = pinned[OPERATOR].partition("@")[2]
+    chart = str(settings.repository / "charts" / RELEASE)
+    argv = [
+        "upgrade",
+        RELEASE,
+        chart,
+        "--install",
+        f"--namespace={SYSTEM}",
+        "--values=-",
+        f"--set=image.digest={digest}",
+    ]
+    # The definitions may be there already, applied by hand.
+    argv += ["--take-ownership", "--force-conflicts"]
+    done = kube.attempt("helm", *argv, "--wait", "--timeout=180s", given=values)
+    if done.returncode != 0:
+        raise LabError(f"helm could not install the operator: {words(done.stderr)}; {why_not_ready(kube)}")
+
+
+def take_away(kube: Kube) -> None:
+    """Uninstalls the demo's operator, which serves all namespaces and would read the queues of others; definitions stay."""
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}", "--ignore-not-found", "--wait", "--timeout=120s")
+
+
+def unblock(kube: Kube) -> None:
+    """Removes the record of an upgrade that was killed: Helm would refuse the next one because of it."""
+    for status in ("pending-install", "pending-upgrade", "pending-rollback"):
+        selector = f"owner=helm,name={RELEASE},status={status}"
+        kube.run("kubectl", "delete", "secret", f"--namespace={SYSTEM}", f"--selector={selector}")
+
+
+def why_not_ready(kube: Kube) -> str:
+    """The last words of the Pods that are not ready, and where to look."""
+    said = []
+    for component in ("controller", "bridge"):
+        selector = f"app.kubernetes.io/component={component}"
+        log = kube.attempt("kubectl", "logs", f"--namespace={SYSTEM}", f"--selector={selector}", "--tail=1")
+        said.append(f"{component}: {words(log.stdout or log.stderr)}")
+    return f"{'; '.join(said)}; see `kubectl -n {SYSTEM} get pods,events`"
+
+
+def words(text: str) -> str:
+    return " | ".join(line.strip() for line in text.strip().splitlines()[-3:])[-400:] or "no word"
+
+
+def apply_leaderboard(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
+    """Step 8: the Leaderboard; waits until the controller says that it can serve."""
+    step(8, f"the Leaderboard {LEADERBOARD} in the namespace {NAMESPACE}", "3 s")
+    apply(settings, kube, "leaderboard.yaml", pinned)
+    wanted = ["wait", "--for=condition=Ready", f"leaderboard/{LEADERBOARD}", f"--namespace={NAMESPACE}"]
+    done = kube.attempt("kubectl", *wanted, "--timeout=120s")
+    if done.returncode != 0:
+        board = kube.json("kubectl", "get", "leaderboard", LEADERBOARD, f"--namespace={NAMESPACE}")
+        ready = [one for one in board.get("status", {}).get("conditions", []) if one["type"] == "Ready"]
+        reason = f"{ready[0]['reason']}: {ready[0]['message']}" if ready else "the controller has not looked at it"
+        raise LabError(f"Leaderboard {LEADERBOARD} does not become Ready: {reason}; see the controller's log")
+
+
+def apply(settings: Settings, kube: Kube, name: str, pinned: dict[str, str]) -> None:
+    text = manifest(settings, name, pinned)
+    kube.run("kubectl", "apply", "--filename=-", given=text, action=f"kubectl apply of examples/demo/{name}")
+
+
+def manifest(settings: Settings, name: str, pinned: dict[str, str]) -> str:
+    """A file of examples/demo with this lab's ports, and images by their digests: a tag would not be pulled again."""
+    text = (settings.repository / "examples" / "demo" / name).read_text()
+    text = text.replace(f"{HOST_ADDRESS}:{PORTS['aws']}", settings.registry)
+    text = text.replace(f"http://{HOST_ADDRESS}:{PORTS['evalai']}", settings.evalai_endpoint)
+    if settings.ports["aws"] != PORTS["aws"]:
+        text = text.replace(f"ports: [{PORTS['aws']}]", f"ports: [{settings.ports['aws']}]")
+    for image_name, reference in pinned.items():
+        text = text.replace(f"image: {settings.registry}/{image_name}\n", f"image: {reference}\n")
+    return text
+
+
+@dataclass(frozen=True)
+class Submitted:
+    """What EvalAI calls it, and its Submission."""
+
+    key: int
+    team: int
+    name: str
+
+
+def submit_and_follow(settings: Settings, kube: Kube, agent: str) -> Submitted:
+    """Step 9: a participant pushes; EvalAI publishes into SQS; from there on nobody helps."""
+    step(9, "a participant of team-a submits to EvalAI, phase SENSORS", "30 s until the score is published")
+    row = evalai_server.submit(settings, PARTICIPANT, CHALLENGE, PHASE, agent)
+    since = time.monotonic()
+    submitted = Submitted(row["id"], row["participant_team"], f"submission-{row['id']}")
+    tell(
+        f"{'0 s':>8}  EvalAI has submission {submitted.key} and has put its message into SQS: {message(settings, submitted.key)}"
+    )
+    wait = ["wait", "--for=create", f"submission/{submitted.name}", f"--namespace={NAMESPACE}", "--timeout=60s"]
+    done = kube.attempt("kubectl", *wait)
+    if done.returncode != 0:
+        raise LabError(
+            f"the bridge made no Submission of the message within 60 s; see `kubectl -n {SYSTEM} logs deployment/{RELEASE}-bridge`"
+        )
+    follow(kube, NAMESPACE, submitted.name, since, RUN_PATIENCE, tell)
+    return submitted
+
+
+def tell(line: str) -> None:
+    print(f"    {line}", flush=True)
+
+
+def message(settings: Settings, key: int) -> str:
+    """The message as EvalAI published it."""
+    published = evalai_server.call(settings, "GET", "/_stand-in/state").get("published", [])
+    bodies = [one.get("body", one.get("message", one)) for one in published]
+    mine = [body for body in bodies if str(key) == str(body.get("submission_pk"))]
+    return json.dumps(mine[-1]) if mine else "(see /_stand-in/state)"
+
+
+def collect(settings: Settings, kube: Kube, submitted: Submitted) -> Findings:
+    """Reads all four places, each by itself."""
+    arguments = [LEADERBOARD, f"{submitted.key}/", LEADERBOARD, str(submitted.team), str(submitted.key)]
+    stored = json.loads(aws.call_client(settings, "aws_results", arguments))
+    state = evalai_server.call(settings, "GET", "/_stand-in/state")
+    rows = state.get("rows", {})
+    entries = [row for row in (rows.values() if isinstance(rows, dict) else rows) if row["submission"] == submitted.key]
+    return Findings(
+        submission=kube.json("kubectl", "get", "submission", submitted.name, f"--namespace={NAMESPACE}"),
+        objects=stored["objects"],
+        texts=stored["texts"],
+        row=stored["row"],
+        evalai=evalai_server.call(settings, "GET", f"/api/jobs/submission/{submitted.key}", token=ORGANIZER),
+        entries=entries,
+    )
+
+
+def show(kube: Kube, found: Findings) -> None:
+    """Prints what the four places hold."""
+    name = found.submission["metadata"]["name"]
+    heading("kubectl get submissions -o wide")
+    table = kube.run("kubectl", "get", "submission", name, f"--namespace={NAMESPACE}", "--output=wide")
+    print(table.rstrip())
+    heading("Timeline (UTC, to the second where Kubernetes keeps seconds)")
+    print("\n".join(demo_check.timeline(found.submission)))
+    heading(f"S3: {found.submission['status'].get('results', '')}")
+    for key, size in sorted(found.objects.items()):
+        print(f"{size:>9}  {key}")
+    heading(f"DynamoDB: table {LEADERBOARD}")
+    for column, value in sorted((found.row or {}).items()):
+        print(f"{column:<38}{value}")
+    heading("EvalAI")
+    for field in ("status", "participant_team_name", "started_at", "completed_at", "execution_time", "job_name"):
+        print(f"{field:<38}{found.evalai.get(field)}")
+    for entry in found.entries:
+        for metric, value in entry.get("result", {}).items():
+            print(f"  {metric:<36}{value}")
+
+
+def heading(text: str) -> None:
+    print(f"\n--- {text}", flush=True)
+
+
+def check(settings: Settings, found: Findings) -> None:
+    """Raises with every difference from local/challenge/expected.json."""
+    expected: dict[str, Any] = json.loads((settings.local / "challenge" / "expected.json").read_text())
+    differences = demo_check.differences(expected, found)
+    heading("The same in all four places?")
+    if differences:
+        print("\n".join(differences))
+        raise LabError(
+            f"{len(differences)} differences from local/challenge/expected.json, the first: {differences[0]}"
+        )
+    metrics = len(expected["metrics"])
+    score = expected["metrics"]["Driving score"]
+    print(
+        f"Yes: status, progress, score {score} and all {metrics} metrics agree in Kubernetes, S3, DynamoDB and EvalAI,\n"
+        "and equal local/challenge/expected.json, which was worked out by hand."
+    )
+
+
+def next_steps(settings: Settings, found: Findings) -> str:
+    """What a person may do now."""
+    name, key = found.submission["metadata"]["name"], found.evalai["id"]
+    stand_in = shlex.quote(os.path.relpath(build.program(settings, "evalai-stand-in")))
+    agents = f"{settings.registry}/challenge/agent"
+    at = "" if settings.ports["evalai"] == PORTS["evalai"] else f" --server {settings.evalai_endpoint}"
+    return f"""
+What to try next:
+  eval "$(local/lab env)"                                   # kubectl, helm and AWS's variables for this shell
+  kubectl -n {NAMESPACE} describe submission {name}
+  {stand_in} submit {agents}:crash-once --phase 2{at}
+  {stand_in} submit {agents}:print-routes{at}
+  kubectl -n {NAMESPACE} get submissions --watch
+  {stand_in} show {key}{at}
+  http://127.0.0.1:{settings.ports["evalai"]}/                                    # EvalAI's submissions and leaderboards
+  make demo                                                 # once more: a new submission
+  make down                                                 # end everything"""

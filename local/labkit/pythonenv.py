@@ -1,0 +1,42 @@
+"""Owns the virtual environment with the AWS stand-in and its client; it lives in the tool cache, keyed by its requirements."""
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from .console import run_long, say
+from .errors import LabError
+from .settings import Settings
+from .tools import lock
+
+
+def ensure(settings: Settings) -> Path:
+    """Makes the virtual environment if it is not there, and returns its folder of programs."""
+    requirements = settings.local / "requirements.txt"
+    key = hashlib.sha256(requirements.read_bytes() + platform.python_version().encode()).hexdigest()[:16]
+    folder = settings.cache / f"python-{key}"
+    # Scripts in it hold its name, so it can't be renamed: the mark says that it is whole.
+    mark = folder / ".complete"
+    if not mark.exists():
+        with lock(settings.cache / f"{folder.name}.lock", "the Python environment"):
+            if not mark.exists():
+                build(folder, requirements, settings)
+                mark.touch()
+    return folder / "bin"
+
+
+def build(folder: Path, requirements: Path, settings: Settings) -> None:
+    say("installing the AWS stand-in (ministack) and boto3, usually 15 s")
+    shutil.rmtree(folder, ignore_errors=True)
+    made = subprocess.run([sys.executable, "-m", "venv", str(folder)], capture_output=True, text=True, check=False)
+    if made.returncode != 0:
+        raise LabError(
+            f"{sys.executable} can't make a virtual environment: install its venv module (Debian: apt-get install python3-venv)"
+        )
+    pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    log = settings.cache / f"{folder.name}.log"
+    run_long([*pip, "--requirement", str(requirements)], "installing Python packages", log, env=dict(os.environ))

@@ -1,0 +1,195 @@
+"""Owns the order of all tests and what each layer needs around it. Called by `lab test`, which `make test` and `.ci/run` call.
+
+A layer's own output goes through unchanged, so that the closing lines of the runners can be seen; a table closes the run.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from . import build, charttest, cluster, demo, kube, pythonenv, tools
+from .console import say, seconds
+from .errors import LabError
+from .settings import Settings, client_environment, without_proxy
+from .toolsets import ENVTEST_TOOLS
+
+# Test programs of cargo with a layer of their own, as they need an API server or a node.
+APART = ("api", "cluster")
+OPERATOR = "leaderboard-operator"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked for: the settings, and the part of a test's name, empty for all tests."""
+
+    settings: Settings
+    filter: str
+
+
+@dataclass(frozen=True)
+class Layer:
+    name: str
+    about: str
+    # Raises LabError if it fails.
+    work: Callable[[Plan], None]
+    # Needs root and a node.
+    is_cluster: bool = False
+
+
+@dataclass(frozen=True)
+class Result:
+    name: str
+    seconds: float
+    # Empty: it passed.
+    failure: str
+
+
+def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -> bool:
+    """Runs the layers in order, going on after a failure; returns whether all of them passed."""
+    chosen = [layer for layer in LAYERS if not (core and layer.is_cluster) and (not only or layer.name in only)]
+    if not chosen:
+        raise LabError("no layer is left to run: the cluster's needs a node, so leave --core out")
+    plan = Plan(settings, name_filter)
+    results: list[Result] = []
+    for layer in chosen:
+        results.append(run_layer(plan, layer, results))
+    print(table(results), flush=True)
+    return not any(result.failure for result in results)
+
+
+def run_layer(plan: Plan, layer: Layer, before: Sequence[Result]) -> Result:
+    if layer.name != "lab" and any(result.name == "build" and result.failure for result in before):
+        return Result(layer.name, 0, "not run, as the build failed")
+    say(f"--- {layer.name}: {layer.about}")
+    started = time.monotonic()
+    try:
+        layer.work(plan)
+        failure = ""
+    except LabError as error:
+        failure = str(error)
+        say(f"{layer.name} failed: {failure}")
+    return Result(layer.name, time.monotonic() - started, failure)
+
+
+def table(results: Sequence[Result]) -> str:
+    """Each layer with its time, and what failed."""
+    lines = [""]
+    for result in results:
+        lines.append(f"{result.name:<9}{seconds(result.seconds):>13}   {result.failure or 'passed'}")
+    total = seconds(sum(result.seconds for result in results))
+    failed = [result.name for result in results if result.failure]
+    lines.append(f"{'all':<9}{total:>13}   {'failed: ' + ', '.join(failed) if failed else 'passed'}")
+    return "\n".join(lines)
+
+
+def lab(plan: Plan) -> None:
+    local = plan.settings.local
+    argv = [sys.executable, "-m", "unittest", "discover", "--start-directory", str(local / "tests")]
+    argv += ["--top-level-directory", str(local)] + (["-k", plan.filter] if plan.filter else [])
+    code = call(plan, argv, {"PYTHONDONTWRITEBYTECODE": "1"})
+    # 5: no test has such a name, which is for other layers to have.
+    if code not in (0, 5 if plan.filter else 0):
+        raise LabError("python3 -m unittest found failures, see above")
+
+
+def compile_all(plan: Plan) -> None:
+    """Everything at once: the tests, and with them the programs that the later layers run."""
+    argv = ["test", "--workspace", "--profile", build.PROFILE, "--no-run"]
+    build.cargo(plan.settings, argv, "building the tests", 600)
+    build.static_programs(plan.settings)
+
+
+def unit(plan: Plan) -> None:
+    """Pure logic, scenarios against a mock, processes against folders and stand-ins of this machine."""
+    names = [name for name in test_targets(plan.settings) if name not in APART]
+    cargo_test(plan, ["--lib", "--bins", *(f"--test={name}" for name in names)], test_environment(plan.settings))
+
+
+def api(plan: Plan) -> None:
+    require_target(plan.settings, "api")
+    cargo_test(plan, ["--test=api"], test_environment(plan.settings))
+
+
+def chart(plan: Plan) -> None:
+    if plan.filter:
+        say("no single test here has a name: left out because of --filter")
+        return
+    charttest.run(plan.settings, update=False)
+
+
+def in_cluster(plan: Plan) -> None:
+    """The real thing: the node, the images and the AWS stand-in; EvalAI's runs inside of the tests."""
+    require_target(plan.settings, "cluster")
+    cluster.check_machine(plan.settings)
+    folder = tools.ensure(plan.settings, [*cluster.CLUSTER_TOOLS, "helm"])
+    cluster.up(plan.settings)
+    demo.take_away(kube.of_lab(plan.settings, folder))
+    images = demo.make_images(plan.settings)
+    env = {
+        **test_environment(plan.settings),
+        **without_proxy(os.environ),
+        **client_environment(plan.settings),
+        "PATH": f"{folder}:{os.environ.get('PATH', '')}",
+        # What Pods run beside the participant's image; the test starts controller and bridge itself, to kill them.
+        "LEADERBOARD_OPERATOR_IMAGE": images[demo.OPERATOR],
+        "LEADERBOARD_OPERATOR_BIN": str(build.program(plan.settings, OPERATOR)),
+    }
+    cargo_test(plan, ["--test=cluster"], env)
+
+
+def test_environment(settings: Settings) -> dict[str, str]:
+    """Where the tests find an API server and the AWS stand-in."""
+    assets = tools.ensure(settings, ENVTEST_TOOLS, os.environ.get("KUBEBUILDER_ASSETS"))
+    ministack = pythonenv.ensure(settings) / "ministack"
+    return {"KUBEBUILDER_ASSETS": str(assets), "LEADERBOARD_MINISTACK": str(ministack)}
+
+
+def cargo_test(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> None:
+    build.check_cargo()
+    argv = ["cargo", "test", "--workspace", "--profile", build.PROFILE, "--no-fail-fast", *targets]
+    if call(plan, argv + ([plan.filter] if plan.filter else []), env) != 0:
+        raise LabError("cargo test found failures, see above")
+
+
+def call(plan: Plan, argv: Sequence[str], env: dict[str, str]) -> int:
+    """Runs a test runner with its output left as it is."""
+    sys.stdout.flush()
+    whole = {**os.environ, "CARGO_TERM_PROGRESS_WHEN": "never", **env}
+    return subprocess.run(
+        argv, cwd=plan.settings.repository, env=whole, stdin=subprocess.DEVNULL, check=False
+    ).returncode
+
+
+def test_targets(settings: Settings) -> list[str]:
+    """The names of all test programs that have a file of their own."""
+    argv = ["cargo", "metadata", "--no-deps", "--format-version=1"]
+    done = subprocess.run(argv, cwd=settings.repository, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise LabError(f"cargo metadata failed: {done.stderr.strip()[-300:]}")
+    return names_of_tests(json.loads(done.stdout))
+
+
+def names_of_tests(metadata: dict[str, Any]) -> list[str]:
+    targets = [target for package in metadata["packages"] for target in package["targets"]]
+    return sorted({target["name"] for target in targets if target["kind"] == ["test"]})
+
+
+def require_target(settings: Settings, name: str) -> None:
+    if name not in test_targets(settings):
+        raise LabError(f"there is no test program {name}: tests/{name}.rs is missing")
+
+
+LAYERS = (
+    Layer("lab", "local/ itself, in Python", lab),
+    Layer("build", "all tests, and the programs they run", compile_all),
+    Layer("unit", "pure logic, mock clients, and processes on this machine", unit),
+    Layer("api", "a real API server, without nodes", api),
+    Layer("chart", "the Helm chart, against an API server", chart),
+    Layer("cluster", "a real node with containers", in_cluster, is_cluster=True),
+)
+NAMES = tuple(layer.name for layer in LAYERS)

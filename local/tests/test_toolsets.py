@@ -1,0 +1,85 @@
+"""The keys of the tool cache, the order of building, and whose binaries win."""
+
+import os
+import tempfile
+import unittest
+from pathlib import Path
+
+from labkit import settings, tools
+from labkit.errors import LabError
+from labkit.toolsets import SETS, build_flags, cache_key, in_build_order, kubernetes_ldflags
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+class Keys(unittest.TestCase):
+    def test_the_key_follows_from_everything_that_decides_the_build(self) -> None:
+        with tempfile.TemporaryDirectory() as name:
+            module = Path(name)
+            keys = set()
+            for file, text in (("go.mod", "a"), ("go.mod", "b"), ("go.sum", "x"), ("main.go", "package main")):
+                (module / file).write_text(text)
+                keys.add(cache_key(module, ["-trimpath"], "linux/x86_64"))
+            keys.add(cache_key(module, ["-trimpath", "-race"], "linux/x86_64"))
+            last = cache_key(module, ["-trimpath"], "linux/aarch64")
+            self.assertEqual(len(keys | {last}), 6)
+            (module / "notes.txt").write_text("does not matter")
+            self.assertEqual(cache_key(module, ["-trimpath"], "linux/aarch64"), last)
+            self.assertRegex(last, r"^[0-9a-f]{16}$")
+
+    def test_content_can_not_wander_from_one_file_to_the_next(self) -> None:
+        with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as two:
+            for folder, mod, total in ((one, "ab", "c"), (two, "a", "bc")):
+                (Path(folder) / "go.mod").write_text(mod)
+                (Path(folder) / "go.sum").write_text(total)
+            self.assertNotEqual(cache_key(Path(one), [], ""), cache_key(Path(two), [], ""))
+
+
+class Sets(unittest.TestCase):
+    def test_every_set_has_its_module_and_names_every_tool_in_it(self) -> None:
+        for tool_set in SETS.values():
+            module = REPOSITORY / "local" / "tools" / tool_set.name / "go.mod"
+            lines = module.read_text().split()
+            for tool in tool_set.tools.values():
+                self.assertTrue(tool.package == "." or tool.package in lines, tool.package)
+            self.assertIn("-trimpath", build_flags(tool_set))
+
+    def test_the_order_is_the_order_of_the_sets_without_repeats(self) -> None:
+        order = [name for _, name in in_build_order(["crane", "kubectl", "etcd", "crane", "kube-apiserver"])]
+        self.assertEqual(order, ["etcd", "kube-apiserver", "kubectl", "crane"])
+
+    def test_an_unknown_tool_is_refused_with_those_there_are(self) -> None:
+        with self.assertRaisesRegex(LabError, "no tool is called kubeadm: choose from .*kubectl"):
+            in_build_order(["kubeadm"])
+
+    def test_the_version_is_linked_into_both_packages(self) -> None:
+        flags = kubernetes_ldflags("v1.35.4")
+        self.assertEqual(flags.count("gitVersion=v1.35.4"), 2)
+        self.assertEqual(flags.count("gitMinor=35"), 2)
+
+
+class Envtest(unittest.TestCase):
+    def test_its_binaries_win_for_the_three_that_it_has(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            binary = Path(folder) / "etcd"
+            binary.write_text("#!/bin/sh\n")
+            binary.chmod(0o755)
+            self.assertEqual(tools.from_assets(folder, "etcd"), binary)
+            self.assertIsNone(tools.from_assets(folder, "kubelet"))
+            self.assertIsNone(tools.from_assets(None, "etcd"))
+            with self.assertRaisesRegex(LabError, "has no executable kubectl"):
+                tools.from_assets(folder, "kubectl")
+
+    def test_the_folder_that_is_returned_links_to_them(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            for name in ("etcd", "kubectl"):
+                (Path(folder) / name).write_text("#!/bin/sh\n")
+                (Path(folder) / name).chmod(0o755)
+            lab = settings.load(REPOSITORY, {"LEADERBOARD_TOOLS": f"{folder}/cache"})
+            place = tools.ensure(lab, ["etcd", "kubectl"], folder)
+            self.assertEqual(os.readlink(place / "etcd"), f"{folder}/etcd")
+            self.assertEqual(tools.ensure(lab, ["etcd", "kubectl"], folder), place)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,3 @@
+module leaderboard-operator/tools/pause
+
+go 1.25.0

@@ -1,0 +1,133 @@
+//! Conditions by the API conventions: one of each type, `lastTransitionTime` moves only when the status does.
+//!
+//! Called by the controller. Pure: the time is handed in.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use schemars::{Schema, SchemaGenerator};
+
+/// The submission has a Leaderboard, a track, an image and a place in EvalAI.
+pub const ACCEPTED: &str = "Accepted";
+/// An agent of the present attempt runs.
+pub const RUNNING: &str = "Running";
+/// The final results are in S3.
+pub const ARCHIVED: &str = "Archived";
+/// The end is in DynamoDB.
+pub const RECORDED: &str = "Recorded";
+/// The end is in EvalAI.
+pub const PUBLISHED: &str = "Published";
+/// Nothing moves, although it should.
+pub const STALLED: &str = "Stalled";
+/// The submission has come to its end: True in Finished, Failed and Cancelled.
+pub const FINISHED: &str = "Finished";
+/// A Leaderboard can run submissions.
+pub const READY: &str = "Ready";
+/// A Leaderboard that is being deleted waits for its submissions.
+pub const TERMINATING: &str = "Terminating";
+
+/// The truth of a condition.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Truth {
+    True,
+    False,
+    Unknown,
+}
+
+impl Truth {
+    /// As Kubernetes writes it.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::True => "True",
+            Self::False => "False",
+            Self::Unknown => "Unknown",
+        }
+    }
+}
+
+impl From<bool> for Truth {
+    fn from(value: bool) -> Self {
+        if value { Self::True } else { Self::False }
+    }
+}
+
+/// Sets one condition. Returns whether anything but times changed.
+pub fn set(
+    conditions: &mut Vec<Condition>,
+    type_: &str,
+    truth: Truth,
+    reason: &str,
+    message: &str,
+    generation: Option<i64>,
+    now: &Time,
+) -> bool {
+    let fresh = Condition {
+        type_: type_.into(),
+        status: truth.as_str().into(),
+        reason: reason.into(),
+        message: message.into(),
+        observed_generation: generation,
+        last_transition_time: now.clone(),
+    };
+    let Some(old) = conditions.iter_mut().find(|c| c.type_ == type_) else {
+        conditions.push(fresh);
+        return true;
+    };
+    let kept = if old.status == fresh.status {
+        old.last_transition_time.clone()
+    } else {
+        now.clone()
+    };
+    let fresh = Condition {
+        last_transition_time: kept,
+        ..fresh
+    };
+    let changed = *old != fresh;
+    *old = fresh;
+    changed
+}
+
+/// Removes one condition.
+pub fn remove(conditions: &mut Vec<Condition>, type_: &str) {
+    conditions.retain(|c| c.type_ != type_);
+}
+
+/// The condition of a type.
+pub fn get<'a>(conditions: &'a [Condition], type_: &str) -> Option<&'a Condition> {
+    conditions.iter().find(|c| c.type_ == type_)
+}
+
+/// Whether the condition of a type is True.
+pub fn is_true(conditions: &[Condition], type_: &str) -> bool {
+    get(conditions, type_).is_some_and(|c| c.status == "True")
+}
+
+/// A list of conditions, one of each type.
+pub(super) fn schema(generator: &mut SchemaGenerator) -> Schema {
+    let item = generator.subschema_for::<Condition>();
+    schemars::json_schema!({
+        "type": "array",
+        "items": item,
+        "x-kubernetes-list-type": "map",
+        "x-kubernetes-list-map-keys": ["type"]
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(second: i64) -> Time {
+        Time(jiff::Timestamp::from_second(second).unwrap())
+    }
+
+    #[test]
+    fn the_transition_time_moves_only_with_the_status() {
+        let mut list = Vec::new();
+        assert!(set(&mut list, READY, Truth::False, "A", "a", Some(1), &at(1)));
+        assert!(set(&mut list, READY, Truth::False, "B", "b", Some(1), &at(2)));
+        assert_eq!(list[0].last_transition_time, at(1));
+        assert!(!set(&mut list, READY, Truth::False, "B", "b", Some(1), &at(3)));
+        assert!(set(&mut list, READY, Truth::True, "C", "", Some(1), &at(4)));
+        assert_eq!(list[0].last_transition_time, at(4));
+        assert_eq!(list.len(), 1);
+    }
+}

@@ -1,0 +1,138 @@
+//! Values that depend on more than one field: computed here and nowhere else, shown in status.
+//!
+//! Pure. Called by the controller (plans, Jobs) and by the commands that run without a cluster.
+
+use super::leaderboard_parts::{ResultsFormat, Storage, Track};
+use super::submission::Submission;
+use super::{LeaderboardSpec, RunPlan};
+
+/// How many of what one track runs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// Simulator-agent pairs.
+    pub pairs: usize,
+    /// Routes, not counting repetitions.
+    pub routes: usize,
+    /// Repetitions of each route.
+    pub repetitions: usize,
+    /// ROUTES_SUBSET of each pair.
+    pub slices: Vec<String>,
+}
+
+/// What a track of this Leaderboard runs.
+pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
+    let pairs = positive(track.pairs.unwrap_or(spec.pairs));
+    let routes = positive(track.routes.unwrap_or(spec.routes));
+    let repetitions = positive(track.repetitions.or(spec.repetitions).unwrap_or(match spec.results {
+        ResultsFormat::V1 => 5,
+        ResultsFormat::V2 => 1,
+    }));
+    let slices = track.route_subsets.clone().unwrap_or_else(|| slices(routes, pairs));
+    Shape {
+        pairs: slices.len(),
+        routes,
+        repetitions,
+        slices,
+    }
+}
+
+/// Shares `routes` out over `pairs` as `ceil(k*R/N) .. ceil((k+1)*R/N)-1`; a pair without a route is left out,
+/// because an empty ROUTES_SUBSET would run all of them.
+pub fn slices(routes: usize, pairs: usize) -> Vec<String> {
+    (0..pairs)
+        .map(|k| ((k * routes).div_ceil(pairs), ((k + 1) * routes).div_ceil(pairs)))
+        .filter(|(first, end)| first < end)
+        .map(|(first, end)| format!("{first}-{}", end - 1))
+        .collect()
+}
+
+/// First and last route of a slice such as `5-9`.
+pub fn slice_bounds(slice: &str) -> Option<(u32, u32)> {
+    let (first, last) = slice.split_once('-')?;
+    let (first, last) = (first.parse().ok()?, last.parse().ok()?);
+    (first <= last).then_some((first, last))
+}
+
+/// Run id of a Submission: its id in EvalAI, else its name.
+pub fn run_id(submission: &Submission) -> String {
+    match &submission.spec.evalai {
+        Some(evalai) => evalai.submission.to_string(),
+        None => submission.metadata.name.clone().unwrap_or_default(),
+    }
+}
+
+/// Key prefix of a run in its bucket, with the final slash.
+pub fn key_prefix(storage: &Storage, run_id: &str) -> String {
+    format!("{}{run_id}/", storage.prefix.as_deref().unwrap_or_default())
+}
+
+/// Address of a run's results for people.
+pub fn results_url(storage: &Storage, run_id: &str) -> String {
+    format!(
+        "s3://{}/{}{run_id}",
+        storage.bucket,
+        storage.prefix.as_deref().unwrap_or_default()
+    )
+}
+
+/// The plan of a submission's first attempt. `image` is the participant's, `resume` says that stored results are taken up.
+pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: String, image: String, resume: bool) -> RunPlan {
+    let shape = shape(spec, track);
+    RunPlan {
+        run_id,
+        results: spec.results,
+        track: track.name.clone(),
+        codename: track.codename.clone(),
+        phase: track.phase,
+        slices: shape.slices,
+        routes: i32::try_from(shape.routes).unwrap_or(i32::MAX),
+        repetitions: i32::try_from(shape.repetitions).unwrap_or(i32::MAX),
+        storage: spec.storage.clone(),
+        image,
+        contents_image: spec.contents.image.clone(),
+        simulator_image: spec.simulator.image.clone(),
+        resume,
+    }
+}
+
+fn positive(value: i32) -> usize {
+    usize::try_from(value).unwrap_or(1).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn twenty_routes_over_four_pairs_are_the_original_table() {
+        assert_eq!(slices(20, 4), ["0-4", "5-9", "10-14", "15-19"]);
+    }
+
+    #[test]
+    fn slices_cover_every_route_once_for_any_numbers() {
+        for routes in 1..60 {
+            for pairs in 1..20 {
+                let all: Vec<u32> = slices(routes, pairs)
+                    .iter()
+                    .flat_map(|s| {
+                        let (first, last) = slice_bounds(s).unwrap();
+                        first..=last
+                    })
+                    .collect();
+                assert_eq!(
+                    all,
+                    (0..u32::try_from(routes).unwrap()).collect::<Vec<_>>(),
+                    "{routes} over {pairs}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_slice_must_be_two_numbers_in_order() {
+        assert_eq!(slice_bounds("5-9"), Some((5, 9)));
+        for bad in ["", "5", "9-5", "a-b", "-1-2"] {
+            assert_eq!(slice_bounds(bad), None, "{bad}");
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! The kind `Leaderboard`: one version of a leaderboard, what it runs and where its results go.
+//!
+//! Owns the top level of the spec, its cross-field rules and the status. The parts are in `leaderboard_parts`.
+//! What depends on another field has no schema default: `api::effective` computes it.
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use kube::CustomResource;
+use kube::KubeSchema;
+use serde::{Deserialize, Serialize};
+
+use super::leaderboard_parts::{
+    AgentContainer, ContentsContainer, Deadlines, Evalai, LogGroup, Network, PodIdentity, Queue, Retries, Running,
+    SimulatorContainer, Storage, Table, Track,
+};
+use super::leaderboard_parts::{ResultsFormat, Verify};
+
+/// One leaderboard version: its tracks, the images that run it, and the services its results go to.
+#[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[kube(
+    group = "leaderboard.carla.org",
+    version = "v1alpha1",
+    kind = "Leaderboard",
+    plural = "leaderboards",
+    shortname = "lb",
+    category = "challenges",
+    namespaced,
+    status = "LeaderboardStatus",
+    doc = "One leaderboard version: its tracks, the images that run it, and the services its results go to.",
+    derive = "PartialEq",
+    validation = Rule::new("size(self.metadata.name) <= 52").message("metadata.name may have at most 52 characters: labels and policies are named after it"),
+    validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes a label and part of other names"),
+    printcolumn = r#"{"name":"Ready","type":"string","jsonPath":".status.conditions[?(@.type==\"Ready\")].status"}"#,
+    printcolumn = r#"{"name":"Reason","type":"string","jsonPath":".status.conditions[?(@.type==\"Ready\")].reason"}"#,
+    printcolumn = r#"{"name":"Pending","type":"integer","jsonPath":".status.counts.pending"}"#,
+    printcolumn = r#"{"name":"Running","type":"integer","jsonPath":".status.counts.running"}"#,
+    printcolumn = r#"{"name":"Finished","type":"integer","jsonPath":".status.counts.finished"}"#,
+    printcolumn = r#"{"name":"Failed","type":"integer","jsonPath":".status.counts.failed"}"#,
+    printcolumn = r#"{"name":"Budget","type":"string","jsonPath":".status.budget","priority":1}"#,
+    printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#
+)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("self.results == oldSelf.results").message("results is immutable: checkpoints of one format cannot be merged with the other's; make a new Leaderboard"),
+    validation = Rule::new("self.storage.bucket == oldSelf.storage.bucket").message("storage.bucket is immutable: finished results would no longer be found; make a new Leaderboard"),
+    validation = Rule::new("has(self.storage.prefix) == has(oldSelf.storage.prefix) && (!has(self.storage.prefix) || self.storage.prefix == oldSelf.storage.prefix)").message("storage.prefix is immutable: finished results would no longer be found; make a new Leaderboard"),
+    validation = Rule::new("!has(oldSelf.evalai) || has(self.evalai)").message("evalai cannot be removed: its submissions would never be published; make a new Leaderboard"),
+    validation = Rule::new("!has(oldSelf.evalai) || !has(self.evalai) || self.evalai.challenge == oldSelf.evalai.challenge").message("evalai.challenge is immutable: its submissions belong to that challenge; make a new Leaderboard"),
+    validation = Rule::new("self.tracks.filter(t, has(t.phase)).all(t, self.tracks.exists_one(u, has(u.phase) && u.phase == t.phase))").message("two tracks have the same phase: a message could not be told which one it is for"),
+    validation = Rule::new("!has(self.evalai) || self.tracks.exists(t, has(t.phase))").message("evalai is set but no track has a phase: no submission of the challenge could be served; give a track the id of its phase"),
+    validation = Rule::new("has(self.evalai) || !self.tracks.exists(t, has(t.phase))").message("a track has a phase but evalai is missing: set evalai, or leave the phase out for a local leaderboard"),
+    validation = Rule::new("!has(self.queue) || has(self.evalai)").message("queue needs evalai: its messages name a challenge and a phase of it"),
+    validation = Rule::new("self.tracks.all(t, (has(t.pairs) ? t.pairs : self.pairs) <= (has(t.routes) ? t.routes : self.routes))").message("a track has more pairs than routes, so a pair would have nothing to drive; lower pairs, or set the track's own"),
+    validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || size(t.routeSubsets) == (has(t.pairs) ? t.pairs : self.pairs))").message("a track's routeSubsets must have one entry for each of its pairs"),
+    validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || t.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.routes) ? t.routes : self.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
+    validation = Rule::new("self.results == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
+    validation = Rule::new("self.deadlines.idleSeconds > self.periodSeconds").message("deadlines.idleSeconds must be longer than periodSeconds: an agent would be stopped before its first report")
+)]
+pub struct LeaderboardSpec {
+    /// Where submissions come from and scores are published. Absent: a local leaderboard, nothing is reported.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evalai: Option<Evalai>,
+    /// What participants submit to: sensors, map, and so on.
+    #[schemars(length(min = 1, max = 32))]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
+    pub tracks: Vec<Track>,
+    /// Format of the checkpoints: V1 is Leaderboard 1.0, V2 is 2.0 and later.
+    pub results: ResultsFormat,
+    /// The init container that brings the private contents.
+    pub contents: ContentsContainer,
+    /// The simulator of each pair.
+    pub simulator: SimulatorContainer,
+    /// How the submitted image is run.
+    #[serde(default)]
+    pub agent: AgentContainer,
+    /// Simulator-agent pairs that share out the routes.
+    #[serde(default = "defaults::pairs")]
+    #[schemars(range(min = 1, max = 16))]
+    pub pairs: i32,
+    /// Routes of a run, not counting repetitions.
+    #[serde(default = "defaults::routes")]
+    #[schemars(range(min = 1, max = 10000))]
+    pub routes: i32,
+    /// How often each route is run. Default: 5 in V1, 1 in V2.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 100))]
+    pub repetitions: Option<i32>,
+    /// Crashes and infrastructure failures that are forgiven.
+    #[serde(default)]
+    pub retries: Retries,
+    /// When waiting, starting, running and stopping have taken too long.
+    #[serde(default)]
+    pub deadlines: Deadlines,
+    /// The SQS queue that the bridge polls.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub queue: Option<Queue>,
+    /// The S3 bucket of results and logs.
+    pub storage: Storage,
+    /// The DynamoDB table of submissions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub table: Option<Table>,
+    /// The CloudWatch log group of container logs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub log_group: Option<LogGroup>,
+    /// Who the Pod's own containers are towards S3.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pod_identity: Option<PodIdentity>,
+    /// What the Pods of strangers may reach.
+    #[serde(default)]
+    pub network: Network,
+    /// RuntimeClass of the Pods, for example `gvisor`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 253))]
+    pub runtime_class_name: Option<String>,
+    /// How many submissions run at once.
+    #[serde(default)]
+    pub running: Running,
+    /// No new submission starts while true; running ones go on.
+    #[serde(default)]
+    pub paused: bool,
+    /// What is done with scores that do not follow from their infractions.
+    #[serde(default)]
+    pub verify: Verify,
+    /// A partial PodTemplateSpec laid over ours: objects deep, lists by name, `simulator` and `agent` address all pairs, null removes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(schema_with = "super::leaderboard_parts::raw_object")]
+    pub pod: Option<serde_json::Value>,
+    /// Time between two rounds of merging, uploading and reporting.
+    #[serde(default = "defaults::period_seconds")]
+    #[schemars(range(min = 1, max = 600))]
+    pub period_seconds: i64,
+    /// How long a finished Job is kept.
+    #[serde(default = "defaults::ttl_seconds_after_finished")]
+    #[schemars(range(min = 0, max = 31_536_000))]
+    pub ttl_seconds_after_finished: i32,
+    /// How long a deleted Submission waits for its results to be published.
+    #[serde(default = "defaults::finalize_seconds")]
+    #[schemars(range(min = 0, max = 604_800))]
+    pub finalize_seconds: i64,
+}
+
+/// What the operator last saw of a Leaderboard.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct LeaderboardStatus {
+    /// Generation of the spec that this status speaks of.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub observed_generation: Option<i64>,
+    /// Submissions by state.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub counts: Option<Counts>,
+    /// Requests to EvalAI in the last minute and the limit, as `12/54`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<String>,
+    /// What each track effectively runs, as `pairs x routes x repetitions`.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub tracks: BTreeMap<String, String>,
+    /// `Ready`, `Terminating`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(schema_with = "super::conditions::schema")]
+    pub conditions: Vec<Condition>,
+}
+
+/// Submissions of a Leaderboard by state; `resumed` counts as running.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    pub pending: i32,
+    pub running: i32,
+    pub finished: i32,
+    pub failed: i32,
+    pub cancelled: i32,
+}
+
+mod defaults {
+    pub(super) fn pairs() -> i32 {
+        4
+    }
+    pub(super) fn routes() -> i32 {
+        20
+    }
+    pub(super) fn period_seconds() -> i64 {
+        10
+    }
+    pub(super) fn ttl_seconds_after_finished() -> i32 {
+        86_400
+    }
+    pub(super) fn finalize_seconds() -> i64 {
+        900
+    }
+}

@@ -1,0 +1,371 @@
+//! The parts of a Leaderboard's spec, each with its own rules and defaults: what runs, where, how long, and who may do what.
+//!
+//! Owned by `api`. Every object with defaulted children implements `Default` by the same functions its fields use,
+//! so that a half-filled object reads back whole.
+
+#![allow(
+    clippy::struct_field_names,
+    reason = "durations are named by their unit; the derived schema repeats the struct without its attributes"
+)]
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext, Toleration};
+use kube::KubeSchema;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::{Deserialize, Serialize};
+
+pub use super::leaderboard_services::*;
+
+/// Format of the checkpoints.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ResultsFormat {
+    /// Leaderboard 1.0.
+    V1,
+    /// Leaderboard 2.0 and later.
+    V2,
+}
+
+/// What is done with scores that do not follow from their infractions.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Verify {
+    /// Nothing is recomputed.
+    Off,
+    /// A difference is shown, the results count.
+    #[default]
+    Warn,
+    /// A difference makes the results invalid.
+    Refuse,
+}
+
+/// A track: what one phase of the challenge asks for.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("!has(self.routeSubsets) || self.routeSubsets.all(s, int(s.split('-')[0]) <= int(s.split('-')[1]))").message("an entry of routeSubsets ends before it begins; write first-last, for example 5-9"))]
+pub struct Track {
+    /// Name of the track in this Leaderboard, a DNS label.
+    #[schemars(length(min = 1, max = 32), regex(pattern = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"))]
+    pub name: String,
+    /// What the agent gets as CHALLENGE_TRACK_CODENAME, for example `SENSORS`.
+    #[schemars(length(min = 1, max = 64), regex(pattern = r"^[A-Za-z0-9_.-]+$"))]
+    pub codename: String,
+    /// Id of the EvalAI phase; absent for a local track.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1))]
+    pub phase: Option<i64>,
+    /// Overrides the Leaderboard's routes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 10000))]
+    pub routes: Option<i32>,
+    /// Overrides the Leaderboard's repetitions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 100))]
+    pub repetitions: Option<i32>,
+    /// Overrides the Leaderboard's pairs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 16))]
+    pub pairs: Option<i32>,
+    /// ROUTES_SUBSET of each pair in place of equal slices, each as `first-last`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(
+        length(min = 1, max = 16),
+        inner(length(max = 16), regex(pattern = r"^[0-9]{1,5}-[0-9]{1,5}$"))
+    )]
+    pub route_subsets: Option<Vec<String>>,
+    /// File of the routes in the contents.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^/[A-Za-z0-9_./-]+$"))]
+    pub routes_file: Option<String>,
+    /// File of the scenarios in the contents (V1).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^/[A-Za-z0-9_./-]+$"))]
+    pub scenarios_file: Option<String>,
+    /// Nodes that may run this track.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[schemars(extend("maxProperties" = 32))]
+    pub node_selector: BTreeMap<String, String>,
+    /// Taints its Pods tolerate.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(length(max = 32))]
+    pub tolerations: Vec<Toleration>,
+}
+
+/// The init container that copies the private contents into shared volumes.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("!has(self.args) || has(self.command)").message("contents.args without contents.command would be added to the default command; write the command too"))]
+pub struct ContentsContainer {
+    /// Image with the private contents.
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
+    pub image: String,
+    /// Default: copies `$LEADERBOARD_ROOT`, `$SCENARIO_RUNNER_ROOT` and `$CARLA_PYTHON_API_ROOT`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub command: Option<Vec<String>>,
+    /// Arguments of the command.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub args: Option<Vec<String>>,
+    /// Further environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env: Vec<EnvVar>,
+    /// Requests and limits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resources: Option<ResourceRequirements>,
+    /// In place of the safe default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub security_context: Option<SecurityContext>,
+}
+
+/// The simulator container of each pair.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("!has(self.args) || has(self.command)").message("simulator.args without simulator.command would be added to the default command; write the command too"))]
+pub struct SimulatorContainer {
+    /// Image of the simulator.
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
+    pub image: String,
+    /// Default: CARLA's start script with the flags of the version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub command: Option<Vec<String>>,
+    /// Arguments of the command.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub args: Option<Vec<String>>,
+    /// Further environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env: Vec<EnvVar>,
+    /// Requests and limits, for example one `nvidia.com/gpu`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resources: Option<ResourceRequirements>,
+    /// In place of the safe default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub security_context: Option<SecurityContext>,
+}
+
+/// How the submitted image is run in each pair.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too"))]
+pub struct AgentContainer {
+    /// Default: the Leaderboard's evaluator with the flags of the version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub command: Option<Vec<String>>,
+    /// Arguments of the command.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub args: Option<Vec<String>>,
+    /// Further environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub env: Vec<EnvVar>,
+    /// Requests and limits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resources: Option<ResourceRequirements>,
+    /// In place of the safe default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub security_context: Option<SecurityContext>,
+    /// Bytes of `leaderboard.log` after which the file is no longer written.
+    #[serde(default = "defaults::log_limit")]
+    #[schemars(range(min = 1_048_576, max = 1_099_511_627_776_i64))]
+    pub log_limit: i64,
+}
+
+/// What is forgiven before a submission fails.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Retries {
+    /// Crashes a pair may have.
+    #[serde(default = "defaults::retries_pair")]
+    #[schemars(range(min = 0, max = 100))]
+    pub pair: i32,
+    /// New Jobs after infrastructure failures.
+    #[serde(default = "defaults::retries_infrastructure")]
+    #[schemars(range(min = 0, max = 100))]
+    pub infrastructure: i32,
+}
+
+/// Time limits.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds must be shorter than runSeconds: it could never be reached"),
+    validation = Rule::new("self.readySeconds < self.runSeconds").message("deadlines.readySeconds must be shorter than runSeconds: the run would end before a simulator may be ready"),
+    validation = Rule::new("self.cancelSeconds <= self.flushSeconds").message("deadlines.cancelSeconds may not be longer than flushSeconds: a cancelled run would be given more time for its results than a finished one")
+)]
+#[allow(
+    clippy::struct_field_names,
+    reason = "the unit belongs into the name of every duration of the API"
+)]
+pub struct Deadlines {
+    /// Until a node is found; 0 waits for ever and says why.
+    #[serde(default = "defaults::schedule_seconds")]
+    #[schemars(range(min = 0, max = 31_536_000))]
+    pub schedule_seconds: i64,
+    /// From the Pod's scheduling to its first agent.
+    #[serde(default = "defaults::start_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub start_seconds: i64,
+    /// Until a simulator answers.
+    #[serde(default = "defaults::ready_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub ready_seconds: i64,
+    /// An agent without output is stopped.
+    #[serde(default = "defaults::idle_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub idle_seconds: i64,
+    /// Of a run, from its first agent.
+    #[serde(default = "defaults::run_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub run_seconds: i64,
+    /// From a cancel to the end of the Pod.
+    #[serde(default = "defaults::cancel_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub cancel_seconds: i64,
+    /// How long a finished Pod waits for its results to be stored.
+    #[serde(default = "defaults::flush_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub flush_seconds: i64,
+}
+
+/// Who `workspace` and `logcopy` are towards S3. No other container of the Pod gets it.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("has(self.roleArn) != has(self.secretRef)").message("podIdentity needs exactly one of roleArn and secretRef"),
+    validation = Rule::new("!has(self.roleArn) || has(self.serviceAccountName)").message("podIdentity.roleArn needs serviceAccountName: the role trusts the token of that account")
+)]
+pub struct PodIdentity {
+    /// ServiceAccount of the Pod; it needs no rights in the cluster.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 253))]
+    pub service_account_name: Option<String>,
+    /// Role assumed with the account's own token, limited to the run's prefix.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 2048), regex(pattern = r"^arn:"))]
+    pub role_arn: Option<String>,
+    /// Secret with `AWS_ACCESS_KEY_ID` and `AWS_SECRET_ACCESS_KEY`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 253))]
+    pub secret_ref: Option<String>,
+}
+
+/// What the Pods of strangers may reach, by NetworkPolicy.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct Network {
+    /// Addresses, S3's first of all: where policies are enforced, nothing can be stored without them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(length(max = 32))]
+    pub egress: Vec<Egress>,
+    /// Whether names may be looked up.
+    #[serde(default = "defaults::yes")]
+    pub dns: bool,
+}
+
+/// One range of addresses.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
+#[x_kube(validation = Rule::new("isCIDR(self.cidr)").message("network.egress[].cidr is not a range of addresses such as 10.0.0.0/16"))]
+pub struct Egress {
+    /// A range such as `10.0.0.0/16`.
+    #[schemars(length(min = 1, max = 64))]
+    pub cidr: String,
+    /// TCP ports; none means all.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(length(max = 32), inner(range(min = 1, max = 65535)))]
+    pub ports: Vec<i32>,
+}
+
+/// How many submissions run at once; absent means no limit.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("!has(self.total) || !has(self.perTeam) || self.perTeam <= self.total").message("running.perTeam is larger than running.total: it could never be reached"))]
+pub struct Running {
+    /// Of this Leaderboard.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1))]
+    pub total: Option<i32>,
+    /// Of one team.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1))]
+    pub per_team: Option<i32>,
+}
+
+impl Default for AgentContainer {
+    fn default() -> Self {
+        Self {
+            command: None,
+            args: None,
+            env: Vec::new(),
+            resources: None,
+            security_context: None,
+            log_limit: defaults::log_limit(),
+        }
+    }
+}
+
+impl Default for Retries {
+    fn default() -> Self {
+        Self {
+            pair: defaults::retries_pair(),
+            infrastructure: defaults::retries_infrastructure(),
+        }
+    }
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self {
+            egress: Vec::new(),
+            dns: true,
+        }
+    }
+}
+
+impl Default for Deadlines {
+    fn default() -> Self {
+        Self {
+            schedule_seconds: defaults::schedule_seconds(),
+            start_seconds: defaults::start_seconds(),
+            ready_seconds: defaults::ready_seconds(),
+            idle_seconds: defaults::idle_seconds(),
+            run_seconds: defaults::run_seconds(),
+            cancel_seconds: defaults::cancel_seconds(),
+            flush_seconds: defaults::flush_seconds(),
+        }
+    }
+}
+
+/// An object that the API server keeps as it is.
+pub(super) fn raw_object(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ "type": "object", "nullable": true, "x-kubernetes-preserve-unknown-fields": true })
+}
+
+mod defaults {
+    pub(super) fn log_limit() -> i64 {
+        2 << 30
+    }
+    pub(super) fn retries_pair() -> i32 {
+        4
+    }
+    pub(super) fn retries_infrastructure() -> i32 {
+        2
+    }
+    pub(super) fn schedule_seconds() -> i64 {
+        0
+    }
+    pub(super) fn start_seconds() -> i64 {
+        1800
+    }
+    pub(super) fn ready_seconds() -> i64 {
+        3600
+    }
+    pub(super) fn idle_seconds() -> i64 {
+        800
+    }
+    pub(super) fn run_seconds() -> i64 {
+        86_400
+    }
+    pub(super) fn cancel_seconds() -> i64 {
+        120
+    }
+    pub(super) fn flush_seconds() -> i64 {
+        1800
+    }
+    pub(super) fn yes() -> bool {
+        true
+    }
+}

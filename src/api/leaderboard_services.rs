@@ -1,0 +1,229 @@
+//! The parts of a Leaderboard's spec that say where submissions come from and where results go: EvalAI, SQS, S3,
+//! DynamoDB and CloudWatch, each with its own rules and defaults.
+//!
+//! Owned by `api`; `leaderboard_parts` hands them on.
+
+use kube::KubeSchema;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Who may read the tail of a failed submission's log in EvalAI.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LogTail {
+    /// Only the challenge's hosts: an agent can print the private routes.
+    #[default]
+    Hosts,
+    /// The participant too.
+    Participants,
+}
+
+/// The EvalAI challenge that submissions come from.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("!self.apiServer.matches('^https?://[^/]+(/.*)?/api(/|$)')").message("evalai.apiServer is the server's root without /api, for example https://eval.ai"),
+    validation = Rule::new("!self.apiServer.contains('?') && !self.apiServer.contains('#') && !self.apiServer.contains('@')").message("evalai.apiServer may hold neither a query nor credentials: the token belongs into a Secret")
+)]
+pub struct Evalai {
+    /// Root of the server, for example `https://eval.ai`.
+    #[schemars(length(max = 512), regex(pattern = r"^https?://[^/\s]+(/\S*)?$"))]
+    pub api_server: String,
+    /// Id of the challenge.
+    #[schemars(range(min = 1))]
+    pub challenge: i64,
+    /// Codename of the dataset split that results belong to.
+    #[serde(default = "defaults::split")]
+    #[schemars(length(min = 1, max = 128))]
+    pub split: String,
+    /// A host's token.
+    pub token: Token,
+    /// Requests per minute of this token; the server's own limit is 60, shared with the host's browser.
+    #[serde(default = "defaults::requests_per_minute")]
+    #[schemars(range(min = 6, max = 6000))]
+    pub requests_per_minute: i32,
+    /// Time between two sweeps for submissions whose message was lost.
+    #[serde(default = "defaults::sweep_seconds")]
+    #[schemars(range(min = 5, max = 86400))]
+    pub sweep_seconds: i64,
+    /// Who may read the tail of a failed submission's log.
+    #[serde(default)]
+    pub log_tail: LogTail,
+}
+
+/// Where EvalAI's token is kept: exactly one of the two.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("has(self.secretKeyRef) != has(self.secretsManager)").message("evalai.token needs exactly one of secretKeyRef and secretsManager"))]
+pub struct Token {
+    /// A key of a Secret in the Leaderboard's namespace.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub secret_key_ref: Option<SecretKey>,
+    /// An entry of AWS Secrets Manager that holds a JSON object.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub secrets_manager: Option<SecretsManagerKey>,
+}
+
+/// A key of a Secret.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct SecretKey {
+    /// Name of the Secret.
+    #[schemars(length(min = 1, max = 253))]
+    pub name: String,
+    /// Key within it.
+    #[schemars(length(min = 1, max = 253))]
+    pub key: String,
+}
+
+/// A key of a JSON object in AWS Secrets Manager.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct SecretsManagerKey {
+    /// Name or ARN of the entry.
+    #[schemars(length(min = 1, max = 2048))]
+    pub id: String,
+    /// Key within its JSON object.
+    #[serde(default = "defaults::secrets_manager_key")]
+    #[schemars(length(min = 1, max = 253))]
+    pub key: String,
+    /// AWS region; default: the operator's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 64))]
+    pub region: Option<String>,
+    /// Endpoint in place of AWS's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub endpoint: Option<String>,
+}
+
+/// What becomes of messages for a challenge or phase that no Leaderboard serves.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Foreign {
+    /// They go to the dead-letter queue.
+    #[default]
+    DeadLetter,
+    /// They are left for another reader of the queue.
+    Leave,
+}
+
+/// The SQS queue that EvalAI puts its messages in.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("!has(self.deadLetterUrl) || self.deadLetterUrl != self.url").message("queue.deadLetterUrl is the queue itself: a bad message would come back for ever"),
+    validation = Rule::new("!has(self.deadLetterUrl) || self.url.endsWith('.fifo') == self.deadLetterUrl.endsWith('.fifo')").message("a FIFO queue needs a FIFO dead-letter queue, a standard queue a standard one")
+)]
+pub struct Queue {
+    /// URL of the queue.
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub url: String,
+    /// AWS region; default: the operator's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 64))]
+    pub region: Option<String>,
+    /// Endpoint in place of AWS's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub endpoint: Option<String>,
+    /// Where messages go that can't be used.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub dead_letter_url: Option<String>,
+    /// How long a message may wait for its Leaderboard to be applied.
+    #[serde(default = "defaults::unknown_after_seconds")]
+    #[schemars(range(min = 0, max = 1_209_600))]
+    pub unknown_after_seconds: i64,
+    /// What becomes of messages that nobody serves.
+    #[serde(default)]
+    pub foreign: Foreign,
+}
+
+/// The S3 bucket of results and logs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct Storage {
+    /// Name of the bucket.
+    #[schemars(length(min = 3, max = 63), regex(pattern = r"^[a-z0-9][a-z0-9.-]*[a-z0-9]$"))]
+    pub bucket: String,
+    /// Put before each run's id; empty, or ends with a slash.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^([A-Za-z0-9_][A-Za-z0-9_.-]*/)*$"))]
+    pub prefix: Option<String>,
+    /// AWS region; default: the operator's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 64))]
+    pub region: Option<String>,
+    /// Endpoint in place of AWS's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub endpoint: Option<String>,
+    /// Bytes one run may store; files beyond it are left out and named.
+    #[serde(default = "defaults::storage_limit")]
+    #[schemars(range(min = 16_777_216, max = 1_099_511_627_776_i64))]
+    pub limit: i64,
+}
+
+/// The DynamoDB table of submissions.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("has(self.partitionKey) == has(self.sortKey)").message("table.partitionKey and table.sortKey are set together, or both are read from the table"),
+    validation = Rule::new("!has(self.partitionKey) || !has(self.sortKey) || self.partitionKey != self.sortKey").message("table.partitionKey and table.sortKey are the same key")
+)]
+pub struct Table {
+    /// Name of the table.
+    #[schemars(length(min = 3, max = 255), regex(pattern = r"^[A-Za-z0-9_.-]+$"))]
+    pub name: String,
+    /// AWS region; default: the operator's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 64))]
+    pub region: Option<String>,
+    /// Endpoint in place of AWS's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub endpoint: Option<String>,
+    /// Name of the partition key; default: what the table says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 255))]
+    pub partition_key: Option<String>,
+    /// Name of the sort key; default: what the table says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 255))]
+    pub sort_key: Option<String>,
+}
+
+/// The CloudWatch log group of container logs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct LogGroup {
+    /// Name of the log group.
+    #[schemars(length(min = 1, max = 512))]
+    pub name: String,
+    /// AWS region; default: the operator's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 64))]
+    pub region: Option<String>,
+    /// Endpoint in place of AWS's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
+    pub endpoint: Option<String>,
+}
+
+mod defaults {
+    pub(super) fn split() -> String {
+        "leaderboard".into()
+    }
+    pub(super) fn requests_per_minute() -> i32 {
+        54
+    }
+    pub(super) fn sweep_seconds() -> i64 {
+        60
+    }
+    pub(super) fn secrets_manager_key() -> String {
+        "auth_token".into()
+    }
+    pub(super) fn unknown_after_seconds() -> i64 {
+        900
+    }
+    pub(super) fn storage_limit() -> i64 {
+        20 << 30
+    }
+}

@@ -1,0 +1,23 @@
+//! The Kubernetes API of the operator: the kinds, their rules, and every name that more than one room uses.
+//!
+//! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
+
+pub mod conditions;
+pub mod effective;
+pub mod leaderboard;
+pub mod leaderboard_parts;
+pub mod leaderboard_services;
+pub mod names;
+pub mod reasons;
+pub mod submission;
+pub mod submission_status;
+
+pub use leaderboard::{Leaderboard, LeaderboardSpec, LeaderboardStatus};
+pub use leaderboard_parts::*;
+pub use submission::{EvalaiRef, Submission, SubmissionSpec, Team};
+pub use submission_status::*;
+
+/// API group of both kinds.
+pub const GROUP: &str = "leaderboard.carla.org";
+/// The served and stored version.
+pub const VERSION: &str = "v1alpha1";

@@ -1,0 +1,70 @@
+//! Every name that more than one room writes or reads: labels, annotations, finalizers, field managers, Jobs.
+//!
+//! Pure. A name changed here is an API change.
+
+/// Label: name of the Submission, on Jobs and Pods.
+pub const LABEL_SUBMISSION: &str = "leaderboard.carla.org/submission";
+/// Label: attempt, on Jobs and Pods.
+pub const LABEL_ATTEMPT: &str = "leaderboard.carla.org/attempt";
+/// Label: name of the Leaderboard, on Submissions made by the bridge, Jobs, Pods and policies.
+pub const LABEL_LEADERBOARD: &str = "leaderboard.carla.org/leaderboard";
+/// Label: run id, on Jobs and Pods.
+pub const LABEL_RUN: &str = "leaderboard.carla.org/run";
+/// Label: EvalAI phase, on Submissions made by the bridge.
+pub const LABEL_PHASE: &str = "leaderboard.carla.org/phase";
+/// Label of everything the operator makes.
+pub const LABEL_MANAGED_BY: &str = "app.kubernetes.io/managed-by";
+/// Value of the label above.
+pub const OPERATOR: &str = "leaderboard-operator";
+
+/// Annotation on a Submission: which message made or bumped it, `{"message": id, "sent": milliseconds}`.
+pub const ANNOTATION_INGESTED: &str = "leaderboard.carla.org/ingested";
+/// Annotation on a Pod: why it is to stop, `Cancel`, `Retries` or `RunDeadline`.
+pub const ANNOTATION_STOP: &str = "leaderboard.carla.org/stop";
+/// Annotation on a Job: which infrastructure retry of the attempt it is.
+pub const ANNOTATION_RETRY: &str = "leaderboard.carla.org/retry";
+
+/// Finalizer of a Submission: held until its end is published and recorded.
+pub const FINALIZER_SUBMISSION: &str = "leaderboard.carla.org/publish";
+/// Finalizer of a Leaderboard: held while live or unpublished Submissions refer to it.
+pub const FINALIZER_LEADERBOARD: &str = "leaderboard.carla.org/in-use";
+
+/// Field manager of Submission status.
+pub const MANAGER_STATUS: &str = "leaderboard-operator/status";
+/// Field manager of what `ingest` creates and bumps.
+pub const MANAGER_INGEST: &str = "leaderboard-operator/ingest";
+/// Field manager of Jobs, Pods' annotations and policies.
+pub const MANAGER_CHILDREN: &str = "leaderboard-operator/children";
+/// Field manager of finalizers.
+pub const MANAGER_FINALIZER: &str = "leaderboard-operator/finalizer";
+
+/// Name of the init container with the private contents.
+pub const CONTAINER_CONTENTS: &str = "contents";
+/// Name of the init container that prepares the volumes.
+pub const CONTAINER_WORKSPACE: &str = "workspace";
+/// Name of the sidecar that merges, uploads and reports.
+pub const CONTAINER_LOGCOPY: &str = "logcopy";
+
+/// Name of an agent's container; pairs count from 1.
+pub fn agent_container(pair: usize) -> String {
+    format!("agent-{pair}")
+}
+
+/// Name of a simulator's container; pairs count from 1.
+pub fn simulator_container(pair: usize) -> String {
+    format!("simulator-{pair}")
+}
+
+/// Name of the Submission of an EvalAI submission.
+pub fn submission(id: i64) -> String {
+    format!("submission-{id}")
+}
+
+/// Name of the Job of one attempt; `retry` counts the Jobs that infrastructure failures ended before it.
+pub fn job(submission: &str, attempt: i64, retry: i32) -> String {
+    if retry == 0 {
+        format!("{submission}-{attempt}")
+    } else {
+        format!("{submission}-{attempt}-r{retry}")
+    }
+}

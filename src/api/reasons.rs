@@ -1,0 +1,87 @@
+//! Every reason that a status, a condition or an event may give, with what it means.
+//!
+//! Pure. Each reason appears in docs/states.md.
+
+/// No reason needed: all is well.
+pub const OK: &str = "Ok";
+
+// Why a submission is Pending.
+pub const WAITING_FOR_SLOT: &str = "WaitingForSlot";
+pub const PAUSED: &str = "Paused";
+pub const UNSCHEDULABLE: &str = "Unschedulable";
+pub const QUOTA_EXCEEDED: &str = "QuotaExceeded";
+pub const IMAGE_PULL: &str = "ImagePull";
+pub const CONTAINER_CONFIG: &str = "ContainerConfig";
+/// The Pod is being scheduled, pulls images or fills its volumes.
+pub const PREPARING: &str = "Preparing";
+/// EvalAI is asked whether this submission still wants to run.
+pub const ASKING_EVALAI: &str = "AskingEvalAI";
+/// A Job of the same name belongs to an older object and is going away.
+pub const JOB_NAME_TAKEN: &str = "JobNameTaken";
+
+// Why a submission is not accepted.
+pub const LEADERBOARD_NOT_FOUND: &str = "LeaderboardNotFound";
+pub const TRACK_NOT_FOUND: &str = "TrackNotFound";
+pub const IMAGE_MISSING: &str = "ImageMissing";
+pub const LEADERBOARD_NOT_READY: &str = "LeaderboardNotReady";
+
+// While a submission runs.
+pub const ACCEPTED: &str = "Accepted";
+pub const RUNNING: &str = "Running";
+pub const RESUMED: &str = "Resumed";
+pub const REPLACING: &str = "Replacing";
+pub const STOPPING: &str = "Stopping";
+
+// Ends.
+pub const FINISHED: &str = "Finished";
+pub const CANCELLED: &str = "Cancelled";
+pub const ENDED_IN_EVALAI: &str = "EndedInEvalAI";
+pub const DELETED: &str = "Deleted";
+
+// Failures of the participant.
+pub const NOT_ELIGIBLE: &str = "NotEligible";
+pub const AGENT_CRASHED: &str = "AgentCrashed";
+pub const OUT_OF_MEMORY: &str = "OutOfMemory";
+pub const IDLE: &str = "Idle";
+pub const TIME_LIMIT: &str = "TimeLimit";
+pub const INVALID_RESULTS: &str = "InvalidResults";
+pub const CANNOT_START: &str = "CannotStart";
+pub const DISK_FULL: &str = "DiskFull";
+
+// Failures of the infrastructure.
+pub const SIMULATION_CRASHED: &str = "SimulationCrashed";
+pub const RESULTS_NOT_STORED: &str = "ResultsNotStored";
+pub const JOB_DELETED: &str = "JobDeleted";
+pub const PREFIX_IN_USE: &str = "PrefixInUse";
+pub const START_DEADLINE: &str = "StartDeadline";
+pub const SCHEDULE_DEADLINE: &str = "ScheduleDeadline";
+pub const JOB_FAILED: &str = "JobFailed";
+pub const NODE_LOST: &str = "NodeLost";
+pub const POD_REFUSED: &str = "PodRefused";
+
+// Of the other conditions.
+pub const NOT_WANTED: &str = "NotWanted";
+pub const STORED: &str = "Stored";
+pub const NOT_STORED: &str = "NotStored";
+pub const WRITTEN: &str = "Written";
+pub const WAITING: &str = "Waiting";
+pub const REFUSED: &str = "Refused";
+
+// Of a Leaderboard.
+pub const READY: &str = "Ready";
+pub const TOKEN_MISSING: &str = "TokenMissing";
+pub const TOKEN_REFUSED: &str = "TokenRefused";
+pub const PHASE_CONFLICT: &str = "PhaseConflict";
+pub const PREFIX_CONFLICT: &str = "PrefixConflict";
+pub const INVALID_POD: &str = "InvalidPod";
+pub const QUEUE_BLOCKED: &str = "QueueBlocked";
+pub const IN_USE: &str = "InUse";
+
+// Events only.
+pub const JOB_CREATED: &str = "JobCreated";
+pub const JOB_RECREATED: &str = "JobRecreated";
+pub const RELEASED_UNPUBLISHED: &str = "ReleasedUnpublished";
+/// The challenge's phases, splits or metric labels are not those of the Leaderboard.
+pub const LABELS_DIFFER: &str = "LabelsDiffer";
+/// The bucket, or what stands in for it, does not answer or refuses.
+pub const BUCKET_UNREACHABLE: &str = "BucketUnreachable";

@@ -1,0 +1,115 @@
+//! The kind `Submission`: one participant's image on one track, small enough to be written by hand.
+//!
+//! Owns the spec and its rules; the status is in `submission_status`. `ingest` creates and bumps it, people apply it.
+
+use kube::{CustomResource, KubeSchema};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::submission_status::SubmissionStatus;
+
+/// One participant's image on one track of a Leaderboard.
+#[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[kube(
+    group = "leaderboard.carla.org",
+    version = "v1alpha1",
+    kind = "Submission",
+    plural = "submissions",
+    shortname = "sub",
+    category = "challenges",
+    namespaced,
+    status = "SubmissionStatus",
+    doc = "One participant's image on one track of a Leaderboard.",
+    derive = "PartialEq",
+    selectable = ".spec.leaderboard",
+    selectable = ".spec.evalai.submission",
+    selectable = ".status.state",
+    validation = Rule::new("size(self.metadata.name) <= 52").message("metadata.name may have at most 52 characters: Jobs and Pods add the attempt to it"),
+    validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes the name of a Job and a label"),
+    validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.state) || oldSelf.status.state != 'Finished' || self.spec.attempt == oldSelf.spec.attempt").message("a finished submission is not resumed; submit it again"),
+    printcolumn = r#"{"name":"Leaderboard","type":"string","jsonPath":".spec.leaderboard"}"#,
+    printcolumn = r#"{"name":"Track","type":"string","jsonPath":".status.track"}"#,
+    printcolumn = r#"{"name":"State","type":"string","jsonPath":".status.state"}"#,
+    printcolumn = r#"{"name":"Progress","type":"string","jsonPath":".status.progress.text"}"#,
+    printcolumn = r#"{"name":"Score","type":"string","jsonPath":".status.score"}"#,
+    printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#,
+    printcolumn = r#"{"name":"Team","type":"string","jsonPath":".status.team.name","priority":1}"#,
+    printcolumn = r#"{"name":"Attempt","type":"integer","jsonPath":".status.attempt","priority":1}"#,
+    printcolumn = r#"{"name":"Reason","type":"string","jsonPath":".status.reason","priority":1}"#,
+    printcolumn = r#"{"name":"Node","type":"string","jsonPath":".status.node","priority":1}"#,
+    printcolumn = r#"{"name":"Results","type":"string","jsonPath":".status.results","priority":1}"#
+)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("self.leaderboard == oldSelf.leaderboard").message("leaderboard is immutable; apply a new Submission"),
+    validation = Rule::new("has(self.image) == has(oldSelf.image) && (!has(self.image) || self.image == oldSelf.image)").message("image is immutable; apply a new Submission"),
+    validation = Rule::new("has(self.evalai) == has(oldSelf.evalai) && (!has(self.evalai) || self.evalai == oldSelf.evalai)").message("evalai is immutable; apply a new Submission"),
+    validation = Rule::new("has(self.track) == has(oldSelf.track) && (!has(self.track) || self.track == oldSelf.track)").message("track is immutable; apply a new Submission"),
+    validation = Rule::new("has(self.evalai) != has(self.track)").message("a Submission has either evalai (its phase tells the track) or a track, not both and not neither"),
+    validation = Rule::new("has(self.evalai) || has(self.image)").message("a Submission without evalai needs an image"),
+    validation = Rule::new("self.attempt >= oldSelf.attempt").message("attempt may only grow"),
+    validation = Rule::new("self.attempt == oldSelf.attempt || !self.cancel").message("to resume, set cancel to false together with the higher attempt"),
+    validation = Rule::new("!oldSelf.cancel || self.cancel || self.attempt > oldSelf.attempt").message("a cancel is undone only by a higher attempt: set cancel to false and raise attempt in one patch")
+)]
+pub struct SubmissionSpec {
+    /// Name of the Leaderboard in the same namespace.
+    #[schemars(length(min = 1, max = 52))]
+    pub leaderboard: String,
+    /// The participant's image; asked from EvalAI when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][^\s]*$"))]
+    pub image: Option<String>,
+    /// Its identity in EvalAI.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evalai: Option<EvalaiRef>,
+    /// Name of the track, for a submission that is not EvalAI's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 32))]
+    pub track: Option<String>,
+    /// Who submitted; asked from EvalAI when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub team: Option<Team>,
+    /// Higher goes first within a team.
+    #[serde(default)]
+    #[schemars(range(min = -1000, max = 1000))]
+    pub priority: i32,
+    /// Grows to resume from what is stored; manifests in git leave it out.
+    #[serde(default = "first_attempt")]
+    #[schemars(range(min = 1, max = 9999))]
+    pub attempt: i64,
+    /// Stops the present attempt and keeps its results; manifests in git leave it out.
+    #[serde(default)]
+    pub cancel: bool,
+}
+
+/// A submission's ids in EvalAI.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct EvalaiRef {
+    /// Id of the challenge.
+    #[schemars(range(min = 1))]
+    pub challenge: i64,
+    /// Id of the phase.
+    #[schemars(range(min = 1))]
+    pub phase: i64,
+    /// Id of the submission.
+    #[schemars(range(min = 1))]
+    pub submission: i64,
+}
+
+/// Who submitted.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq, Eq)]
+#[x_kube(validation = Rule::new("has(self.id) || has(self.name)").message("team needs an id or a name"))]
+pub struct Team {
+    /// Id in EvalAI, in decimal; any text for a local submission.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 128))]
+    pub id: Option<String>,
+    /// Name for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 256))]
+    pub name: Option<String>,
+}
+
+fn first_attempt() -> i64 {
+    1
+}

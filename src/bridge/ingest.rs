@@ -1,0 +1,330 @@
+//! Creates and bumps Submissions: the only code that does. The bridge calls it for messages, the controller's leader
+//! for what its sweep of EvalAI finds.
+//!
+//! `decide_ingest` is pure and holds all policy; `apply` carries it out and is safe twice: names are deterministic,
+//! a bump carries the resourceVersion it was decided on. Knows no queue and no EvalAI.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use kube::Api;
+use kube::api::{ObjectMeta, Patch, PatchParams, PostParams};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use thiserror::Error;
+
+use crate::api::{EvalaiRef, State, Submission, SubmissionSpec, conditions, names};
+
+/// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
+pub const SWEEP_AGE_MS: i64 = 120_000;
+
+/// Longest time one request to the API server may take.
+const CALL_LIMIT: Duration = Duration::from_secs(8);
+/// How often a lost race is looked at again before the caller has to come back later.
+const ROUNDS: usize = 6;
+/// What the annotation names as the message when the sweep made or bumped the object.
+const SWEEP: &str = "sweep";
+
+/// Who says that a submission wants to run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// A message, by its id.
+    Message(String),
+    /// The sweep of EvalAI's lists.
+    Sweep,
+}
+
+impl Source {
+    fn id(&self) -> &str {
+        match self {
+            Self::Message(id) => id,
+            Self::Sweep => SWEEP,
+        }
+    }
+}
+
+/// A submission that wants to run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Incoming {
+    /// Id of the challenge.
+    pub challenge: i64,
+    /// Id of the phase.
+    pub phase: i64,
+    /// Id of the submission.
+    pub submission: i64,
+    /// The participant's image, if it is known.
+    pub image: Option<String>,
+    /// Who says so.
+    pub source: Source,
+    /// When, in milliseconds since 1970: SQS's SentTimestamp, or for the sweep the row's `rerun_resumed_at`, else its
+    /// `submitted_at`.
+    pub sent_ms: i64,
+}
+
+impl Incoming {
+    fn reference(&self) -> EvalaiRef {
+        EvalaiRef {
+            challenge: self.challenge,
+            phase: self.phase,
+            submission: self.submission,
+        }
+    }
+}
+
+/// The annotation that says what made or bumped an object.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Ingested {
+    message: String,
+    sent: i64,
+}
+
+/// What is to be done.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Ingest {
+    /// There is none yet: create this one.
+    Create(Box<Submission>),
+    /// It has ended and is wanted again: raise its attempt, if it still is at this resourceVersion.
+    Bump { attempt: i64, resource_version: String },
+    /// It is known already.
+    Repeat,
+    /// The old one is being deleted: come back when it is gone.
+    Deleting,
+    /// The name belongs to another leaderboard, challenge or phase.
+    IdTaken(String),
+}
+
+/// What was done.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// A Submission was created.
+    Created,
+    /// Its attempt was raised to this number.
+    Bumped(i64),
+    /// It was known already.
+    Repeat,
+    /// The old one is being deleted: come back when it is gone.
+    Deleting,
+    /// The name belongs to another leaderboard, challenge or phase; the text says to which.
+    IdTaken(String),
+}
+
+/// Why nothing could be done.
+#[derive(Debug, Error)]
+pub enum IngestError {
+    /// The API server did not answer in time.
+    #[error("the API server did not answer within {} s while Submission {name} was to be {verb}; it is tried again", CALL_LIMIT.as_secs())]
+    Timeout { name: String, verb: &'static str },
+    /// The API server will not take this object.
+    #[error("the API server refuses Submission {name}: {text}")]
+    Refused { name: String, text: String },
+    /// The API server answered with an error that may pass.
+    #[error("Submission {name} could not be {verb}: {text}; it is tried again")]
+    Failed {
+        name: String,
+        verb: &'static str,
+        text: String,
+    },
+    /// Others changed the object each time.
+    #[error("Submission {name} changed {ROUNDS} times while it was to be bumped; it is tried again")]
+    Contended { name: String },
+}
+
+/// Decides what an incoming submission means for the object of its name, read uncached.
+pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &Incoming) -> Ingest {
+    let Some(existing) = existing else {
+        return Ingest::Create(Box::new(new_submission(leaderboard, incoming)));
+    };
+    if existing.metadata.deletion_timestamp.is_some() {
+        return Ingest::Deleting;
+    }
+    let spec = &existing.spec;
+    if spec.leaderboard != leaderboard || spec.evalai != Some(incoming.reference()) {
+        return Ingest::IdTaken(owner(existing));
+    }
+    match &existing.metadata.resource_version {
+        Some(version) if is_ended(existing) && is_newer(existing, incoming) => Ingest::Bump {
+            attempt: spec.attempt + 1,
+            resource_version: version.clone(),
+        },
+        _ => Ingest::Repeat,
+    }
+}
+
+/// True if the present attempt has ended in a way that a resume can follow.
+fn is_ended(existing: &Submission) -> bool {
+    existing.status.as_ref().is_some_and(|status| {
+        conditions::is_true(&status.conditions, conditions::FINISHED)
+            && matches!(status.state, Some(State::Failed | State::Cancelled))
+            // A raised attempt that the controller has not looked at yet still shows the end of the one before.
+            && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
+    })
+}
+
+/// True if this was sent after what made or bumped the object.
+fn is_newer(existing: &Submission, incoming: &Incoming) -> bool {
+    let recorded = existing
+        .metadata
+        .annotations
+        .as_ref()
+        .and_then(|all| all.get(names::ANNOTATION_INGESTED))
+        .and_then(|text| serde_json::from_str::<Ingested>(text).ok());
+    let Some(recorded) = recorded else {
+        // Made by hand: only what was sent after it was made is a wish to resume it.
+        let created = existing.metadata.creation_timestamp.as_ref();
+        return created.is_some_and(|time| incoming.sent_ms >= time.0.as_millisecond() + 1000);
+    };
+    let is_same = matches!(&incoming.source, Source::Message(id) if *id == recorded.message);
+    // EvalAI notes the time of a resume before it sends the message. A swept row had kept its status for
+    // SWEEP_AGE_MS, so a message sent within that time belongs to the resume that the sweep has already served.
+    let grace = if recorded.message == SWEEP { SWEEP_AGE_MS } else { 0 };
+    !is_same && incoming.sent_ms > recorded.sent.saturating_add(grace)
+}
+
+fn owner(existing: &Submission) -> String {
+    let name = existing.metadata.name.as_deref().unwrap_or_default();
+    let leaderboard = &existing.spec.leaderboard;
+    match existing.spec.evalai {
+        Some(of) => format!(
+            "{name} belongs to leaderboard {leaderboard}, challenge {}, phase {}, submission {}",
+            of.challenge, of.phase, of.submission
+        ),
+        None => format!("{name} belongs to leaderboard {leaderboard} and to no submission of EvalAI"),
+    }
+}
+
+fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
+    Submission {
+        metadata: ObjectMeta {
+            name: Some(names::submission(incoming.submission)),
+            annotations: Some(BTreeMap::from([annotation(incoming)])),
+            labels: Some(BTreeMap::from([
+                (names::LABEL_LEADERBOARD.to_owned(), leaderboard.to_owned()),
+                (names::LABEL_PHASE.to_owned(), incoming.phase.to_string()),
+            ])),
+            finalizers: Some(vec![names::FINALIZER_SUBMISSION.to_owned()]),
+            ..ObjectMeta::default()
+        },
+        spec: SubmissionSpec {
+            leaderboard: leaderboard.to_owned(),
+            image: incoming.image.clone(),
+            evalai: Some(incoming.reference()),
+            track: None,
+            team: None,
+            priority: 0,
+            attempt: 1,
+            cancel: false,
+        },
+        status: None,
+    }
+}
+
+fn annotation(incoming: &Incoming) -> (String, String) {
+    let text = json!({ "message": incoming.source.id(), "sent": incoming.sent_ms }).to_string();
+    (names::ANNOTATION_INGESTED.to_owned(), text)
+}
+
+/// Creates or bumps the Submission in the namespace of `api`, which is that of the Leaderboard.
+pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming) -> Result<Outcome, IngestError> {
+    let name = names::submission(incoming.submission);
+    // Most are new, so the first try creates; the answer AlreadyExists makes the read necessary.
+    let mut existing = None;
+    for _ in 0..ROUNDS {
+        let done = match decide_ingest(leaderboard, existing.as_ref(), incoming) {
+            Ingest::Create(fresh) => create(api, &name, &fresh).await?.then_some(Outcome::Created),
+            Ingest::Bump {
+                attempt,
+                resource_version,
+            } => {
+                let bumped = bump(api, &name, attempt, &resource_version, incoming).await?;
+                bumped.then_some(Outcome::Bumped(attempt))
+            }
+            Ingest::Repeat => Some(Outcome::Repeat),
+            Ingest::Deleting => Some(Outcome::Deleting),
+            Ingest::IdTaken(owner) => Some(Outcome::IdTaken(owner)),
+        };
+        if let Some(outcome) = done {
+            return Ok(outcome);
+        }
+        existing = call(&name, "read", api.get_opt(&name)).await?;
+    }
+    Err(IngestError::Contended { name })
+}
+
+/// False if there is one of that name.
+async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result<bool, IngestError> {
+    let params = PostParams {
+        field_manager: Some(names::MANAGER_INGEST.to_owned()),
+        ..PostParams::default()
+    };
+    let request = api.create(&params, fresh);
+    unless_lost(&[409], name, "created", request).await
+}
+
+/// False if the object is no longer what the decision was made on.
+async fn bump(
+    api: &Api<Submission>,
+    name: &str,
+    attempt: i64,
+    resource_version: &str,
+    incoming: &Incoming,
+) -> Result<bool, IngestError> {
+    let (key, text) = annotation(incoming);
+    let patch = json!({
+        "metadata": { "resourceVersion": resource_version, "annotations": { key: text } },
+        "spec": { "attempt": attempt, "cancel": false },
+    });
+    let params = PatchParams {
+        field_manager: Some(names::MANAGER_INGEST.to_owned()),
+        ..PatchParams::default()
+    };
+    let patch = Patch::Merge(patch);
+    // 404: it was deleted between the read and the patch.
+    unless_lost(&[404, 409], name, "bumped", api.patch(name, &params, &patch)).await
+}
+
+/// True if the request was carried out, false if it lost a race, which these statuses tell.
+async fn unless_lost<T>(
+    lost: &[u16],
+    name: &str,
+    verb: &'static str,
+    request: impl Future<Output = kube::Result<T>>,
+) -> Result<bool, IngestError> {
+    let answer = async {
+        match request.await {
+            Ok(_) => Ok(true),
+            Err(kube::Error::Api(status)) if lost.contains(&status.code) => Ok(false),
+            Err(error) => Err(error),
+        }
+    };
+    call(name, verb, answer).await
+}
+
+async fn call<T>(
+    name: &str,
+    verb: &'static str,
+    request: impl Future<Output = kube::Result<T>>,
+) -> Result<T, IngestError> {
+    let name = name.to_owned();
+    match tokio::time::timeout(CALL_LIMIT, request).await {
+        Ok(Ok(value)) => Ok(value),
+        Ok(Err(kube::Error::Api(status))) if matches!(status.code, 400 | 422) => Err(IngestError::Refused {
+            name,
+            text: status.message.clone(),
+        }),
+        Ok(Err(kube::Error::Api(status))) => Err(IngestError::Failed {
+            name,
+            verb,
+            text: status.message.clone(),
+        }),
+        Ok(Err(error)) => Err(IngestError::Failed {
+            name,
+            verb,
+            text: super::world::chain(&error),
+        }),
+        Err(_) => Err(IngestError::Timeout { name, verb }),
+    }
+}
+
+#[cfg(test)]
+#[path = "ingest_tests.rs"]
+mod tests;

@@ -1,0 +1,331 @@
+//! One SQS queue as the poller needs it: receive, extend, postpone, delete, move to the dead-letter queue.
+//!
+//! Called by the poller. Knows no Leaderboards and no policy; errors name the queue and what to do.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use aws_sdk_sqs::config::http::HttpResponse;
+use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
+use aws_sdk_sqs::types::{
+    ChangeMessageVisibilityBatchRequestEntry, DeleteMessageBatchRequestEntry, Message, MessageAttributeValue,
+    MessageSystemAttributeName, QueueAttributeName,
+};
+use aws_sdk_sqs::{Client, operation::receive_message::ReceiveMessageOutput};
+use thiserror::Error;
+
+use super::Observer;
+use super::route::DeadReason;
+use crate::services::fault::{self, Fault};
+
+/// How long a receive waits for a message, in seconds: the longest that SQS allows.
+const LONG_POLL: i32 = 20;
+/// Most messages of one receive and entries of one batch.
+pub const BATCH: usize = 10;
+/// SQS's own default, used when the attribute may not be read.
+const DEFAULT_VISIBILITY: Duration = Duration::from_secs(30);
+
+/// A message that was received and is ours until its visibility lapses.
+#[derive(Clone, Debug)]
+pub struct Received {
+    /// Id given by SQS.
+    pub id: String,
+    /// What deletes this receive of it.
+    pub receipt: String,
+    /// The body.
+    pub body: String,
+    /// When it was sent, in milliseconds since 1970.
+    pub sent_ms: i64,
+    /// When it was first received, in milliseconds since 1970.
+    pub first_seen_ms: i64,
+    /// How often it has been received, this time included.
+    pub receives: i32,
+    /// Group of a message in a FIFO queue.
+    pub group: Option<String>,
+}
+
+/// Why a queue could not be used.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[error("queue {queue}: {action} failed: {text}; {}", self.next_step())]
+pub struct QueueError {
+    /// URL of the queue.
+    pub queue: String,
+    /// What was tried, as IAM calls it.
+    pub action: &'static str,
+    /// What kind of failure.
+    pub fault: Fault,
+    /// SQS's words.
+    pub text: String,
+}
+
+impl QueueError {
+    fn next_step(&self) -> String {
+        match self.fault {
+            Fault::Denied => format!(
+                "check the operator's AWS credentials and that they allow sqs:{}",
+                self.action
+            ),
+            Fault::Missing => "check queue.url, queue.region and queue.endpoint of its Leaderboards".to_owned(),
+            Fault::Refused => "check the queue's settings".to_owned(),
+            Fault::Throttled | Fault::Unavailable | Fault::Conflict => "it is tried again".to_owned(),
+        }
+    }
+}
+
+/// A queue that is open for reading.
+pub struct Reader {
+    client: Client,
+    url: String,
+    visibility: Duration,
+    observer: Arc<dyn Observer>,
+}
+
+impl Reader {
+    /// Opens a queue: reads how long its messages stay invisible.
+    pub async fn open(client: Client, url: &str, observer: Arc<dyn Observer>) -> Result<Self, QueueError> {
+        let mut reader = Self {
+            client,
+            url: url.to_owned(),
+            visibility: DEFAULT_VISIBILITY,
+            observer,
+        };
+        let answer = reader.client.get_queue_attributes().queue_url(url);
+        let answer = answer
+            .attribute_names(QueueAttributeName::VisibilityTimeout)
+            .send()
+            .await;
+        match reader.answered("GetQueueAttributes", answer) {
+            Ok(output) => {
+                let all = output.attributes();
+                let seconds = all.and_then(|all| all.get(&QueueAttributeName::VisibilityTimeout)?.parse().ok());
+                reader.visibility = seconds.map_or(DEFAULT_VISIBILITY, Duration::from_secs);
+            }
+            Err(error) if error.fault == Fault::Denied => {
+                tracing::warn!(queue = url, %error, "SQS's default visibility of 30 s is assumed");
+            }
+            Err(error) => return Err(error),
+        }
+        Ok(reader)
+    }
+
+    /// How long a received message is ours.
+    pub fn visibility(&self) -> Duration {
+        self.visibility
+    }
+
+    /// Waits up to 20 s for up to `most` messages.
+    pub async fn receive(&self, most: i32) -> Result<Vec<Received>, QueueError> {
+        let answer = self
+            .client
+            .receive_message()
+            .queue_url(&self.url)
+            .max_number_of_messages(most)
+            .wait_time_seconds(LONG_POLL)
+            .message_system_attribute_names(MessageSystemAttributeName::SentTimestamp)
+            .message_system_attribute_names(MessageSystemAttributeName::ApproximateFirstReceiveTimestamp)
+            .message_system_attribute_names(MessageSystemAttributeName::ApproximateReceiveCount)
+            .message_system_attribute_names(MessageSystemAttributeName::MessageGroupId)
+            .send()
+            .await;
+        let output: ReceiveMessageOutput = self.answered("ReceiveMessage", answer)?;
+        Ok(output
+            .messages
+            .unwrap_or_default()
+            .into_iter()
+            .filter_map(received)
+            .collect())
+    }
+
+    /// Keeps messages invisible for so many seconds from now. A lease that is lost already is no error: the message
+    /// then comes back, and ingest is safe twice.
+    pub async fn hold(&self, receipts: &[&str], seconds: i32) -> Result<(), QueueError> {
+        for chunk in receipts.chunks(BATCH) {
+            let mut request = self.client.change_message_visibility_batch().queue_url(&self.url);
+            for (id, receipt) in chunk.iter().enumerate() {
+                let entry = ChangeMessageVisibilityBatchRequestEntry::builder();
+                let entry = entry
+                    .id(id.to_string())
+                    .receipt_handle(*receipt)
+                    .visibility_timeout(seconds)
+                    .build();
+                request = request.entries(entry.map_err(|error| self.unsendable("ChangeMessageVisibility", &error))?);
+            }
+            self.answered("ChangeMessageVisibility", request.send().await)?;
+        }
+        Ok(())
+    }
+
+    /// Deletes messages. What can't be deleted comes back and is a repeat then, so that only a failure of the whole
+    /// request is an error.
+    pub async fn delete(&self, receipts: &[&str]) -> Result<(), QueueError> {
+        for chunk in receipts.chunks(BATCH) {
+            let mut request = self.client.delete_message_batch().queue_url(&self.url);
+            for (id, receipt) in chunk.iter().enumerate() {
+                let entry = DeleteMessageBatchRequestEntry::builder()
+                    .id(id.to_string())
+                    .receipt_handle(*receipt)
+                    .build();
+                request = request.entries(entry.map_err(|error| self.unsendable("DeleteMessage", &error))?);
+            }
+            let output = self.answered("DeleteMessage", request.send().await)?;
+            // An invalid receipt means that it is deleted, or was received again and is deleted then.
+            for failed in output
+                .failed()
+                .iter()
+                .filter(|failed| !failed.code().ends_with("ReceiptHandleIsInvalid"))
+            {
+                let (code, text) = (failed.code(), failed.message().unwrap_or_default());
+                tracing::warn!(
+                    queue = self.url,
+                    code,
+                    text,
+                    "a message could not be deleted and will come back"
+                );
+            }
+        }
+        Ok(())
+    }
+
+    /// Puts a copy of a message into the dead-letter queue; the caller then deletes it here. A crash between the two
+    /// makes two copies.
+    pub async fn send_dead(&self, to: &str, message: &Received, reason: &DeadReason) -> Result<(), QueueError> {
+        let fields = [
+            ("reason", reason.word().to_owned()),
+            ("detail", reason.detail().to_owned()),
+            ("queue", self.url.clone()),
+            ("messageId", message.id.clone()),
+            ("firstSeen", iso(message.first_seen_ms)),
+        ];
+        let mut request = self.client.send_message().queue_url(to).message_body(&message.body);
+        for (name, text) in fields.into_iter().filter(|(_, text)| !text.is_empty()) {
+            let value = MessageAttributeValue::builder()
+                .data_type("String")
+                .string_value(printable(&text))
+                .build();
+            request = request.message_attributes(name, value.map_err(|error| self.unsendable("SendMessage", &error))?);
+        }
+        if let Some(group) = &message.group {
+            request = request.message_group_id(group).message_deduplication_id(&message.id);
+        }
+        let answer = self.answered("SendMessage", request.send().await);
+        answer.map(|_| ()).map_err(|error| QueueError {
+            queue: to.to_owned(),
+            ..error
+        })
+    }
+
+    /// Counts an answer and turns an error into one that names the queue.
+    fn answered<T, E>(
+        &self,
+        action: &'static str,
+        answer: Result<T, SdkError<E, HttpResponse>>,
+    ) -> Result<T, QueueError>
+    where
+        E: ProvideErrorMetadata + std::error::Error + 'static,
+    {
+        match answer {
+            Ok(output) => {
+                self.observer.call("sqs", action, "ok");
+                Ok(output)
+            }
+            Err(error) => {
+                let fault = fault::of(&error);
+                self.observer.call("sqs", action, fault.as_str());
+                Err(QueueError {
+                    queue: self.url.clone(),
+                    action,
+                    fault,
+                    text: fault::sentence(&error),
+                })
+            }
+        }
+    }
+
+    fn unsendable(&self, action: &'static str, error: &aws_sdk_sqs::error::BuildError) -> QueueError {
+        QueueError {
+            queue: self.url.clone(),
+            action,
+            fault: Fault::Refused,
+            text: error.to_string(),
+        }
+    }
+}
+
+/// How many messages to ask for, so that all are ingested within half of their visibility.
+pub fn batch_size(visibility: Duration, each: Duration) -> i32 {
+    let fit = visibility.as_millis() / 2 / each.as_millis().max(1);
+    i32::try_from(fit).unwrap_or(i32::MAX).clamp(1, 10)
+}
+
+fn received(message: Message) -> Option<Received> {
+    let attributes = message.attributes.unwrap_or_default();
+    let number = |name| attributes.get(&name).and_then(|text| text.parse::<i64>().ok());
+    let now = jiff::Timestamp::now().as_millisecond();
+    Some(Received {
+        id: message.message_id?,
+        receipt: message.receipt_handle?,
+        body: message.body.unwrap_or_default(),
+        sent_ms: number(MessageSystemAttributeName::SentTimestamp).unwrap_or(now),
+        first_seen_ms: number(MessageSystemAttributeName::ApproximateFirstReceiveTimestamp).unwrap_or(now),
+        receives: number(MessageSystemAttributeName::ApproximateReceiveCount)
+            .and_then(|count| i32::try_from(count).ok())
+            .unwrap_or(1),
+        group: attributes.get(&MessageSystemAttributeName::MessageGroupId).cloned(),
+    })
+}
+
+fn iso(milliseconds: i64) -> String {
+    jiff::Timestamp::from_millisecond(milliseconds).map_or_else(|_| String::new(), |time| time.to_string())
+}
+
+/// SQS refuses control characters in attributes.
+fn printable(text: &str) -> String {
+    text.chars()
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .take(1024)
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_as_many_as_fit_in_half_the_visibility() {
+        let ms = Duration::from_millis;
+        for (visibility, each, want) in [
+            (30_000, 20, 10),
+            (30_000, 2_000, 7),
+            (30_000, 60_000, 1),
+            (0, 20, 1),
+            (30_000, 0, 10),
+        ] {
+            assert_eq!(batch_size(ms(visibility), ms(each)), want, "{visibility} {each}");
+        }
+    }
+
+    #[test]
+    fn an_error_names_the_queue_and_the_next_step() {
+        let error = |fault| QueueError {
+            queue: "https://q/1".into(),
+            action: "ReceiveMessage",
+            fault,
+            text: "words".into(),
+        };
+        assert_eq!(
+            error(Fault::Denied).to_string(),
+            "queue https://q/1: ReceiveMessage failed: words; check the operator's AWS credentials and that they allow sqs:ReceiveMessage"
+        );
+        assert!(
+            error(Fault::Missing)
+                .to_string()
+                .ends_with("check queue.url, queue.region and queue.endpoint of its Leaderboards")
+        );
+        assert!(error(Fault::Throttled).to_string().ends_with("it is tried again"));
+    }
+
+    #[test]
+    fn attributes_hold_no_control_characters() {
+        assert_eq!(printable("a\n\u{1}b"), "a  b");
+    }
+}

@@ -1,0 +1,250 @@
+//! What becomes of each message: all of the bridge's policy, as pure functions.
+//!
+//! Called by the poller. Knows no queue, no cluster and no clock: times are handed in as milliseconds since 1970.
+
+use std::sync::Arc;
+
+use kube::ResourceExt;
+
+use super::ingest::{IngestError, Outcome};
+use super::message::{Malformed, Message};
+use crate::api::{Foreign, Leaderboard, Queue};
+
+/// First wait of a message that can't be used yet, in seconds; it doubles with each receive.
+const FIRST_WAIT: i32 = 30;
+/// Longest wait of a message, in seconds.
+pub const LONGEST_WAIT: i32 = 900;
+/// Longest wait of a message that another reader may want, or whose old object is going away, in seconds.
+const SHORT_WAIT: i32 = 60;
+
+/// A message as the policy sees it.
+#[derive(Clone, Debug)]
+pub struct Envelope {
+    /// What it says.
+    pub content: Result<Message, Malformed>,
+    /// When it was sent.
+    pub sent_ms: i64,
+    /// How often it has been received, this time included.
+    pub receives: i32,
+}
+
+/// What the Leaderboards that share a queue say about it.
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
+pub struct Rules {
+    /// Where messages go that can't be used: the oldest Leaderboard's that names one.
+    pub dead_letter: Option<String>,
+    /// How long a message may wait for its Leaderboard, in milliseconds: the longest of all.
+    pub unknown_after_ms: i64,
+    /// True if any of them leaves foreign messages to another reader.
+    pub leaves_foreign: bool,
+}
+
+/// Why a message goes to the dead-letter queue.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum DeadReason {
+    /// It is no message of EvalAI that can be run.
+    Malformed(String),
+    /// No Leaderboard serves its challenge and phase.
+    Unknown(String),
+    /// The name of its Submission belongs to another one.
+    IdTaken(String),
+    /// The API server won't have its Submission.
+    Refused(String),
+}
+
+impl DeadReason {
+    /// The word that the dead letter carries as its attribute `reason`.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Malformed(_) => "Malformed",
+            Self::Unknown(_) => "UnknownPhase",
+            Self::IdTaken(_) => "IdTaken",
+            Self::Refused(_) => "Refused",
+        }
+    }
+
+    /// The sentence that the dead letter carries as its attribute `detail`.
+    pub fn detail(&self) -> &str {
+        match self {
+            Self::Malformed(text) | Self::Unknown(text) | Self::IdTaken(text) | Self::Refused(text) => text,
+        }
+    }
+}
+
+/// What becomes of a message.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Fate {
+    /// It is for this Leaderboard.
+    Ingest { namespace: String, leaderboard: String },
+    /// It can't be used.
+    Dead(DeadReason),
+    /// It comes back after so many seconds.
+    Later { seconds: i32, why: Later },
+    /// It is done with.
+    Delete(Done),
+    /// It comes back when its visibility lapses.
+    Lapse,
+}
+
+/// Why a message comes back later.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Later {
+    /// Its Leaderboard may yet be applied.
+    Unknown,
+    /// It is for another reader of the queue.
+    Foreign,
+    /// Its Submission's predecessor is being deleted.
+    Deleting,
+    /// The API server would not have its Submission.
+    Refused,
+    /// It belongs in a dead-letter queue and there is none.
+    Blocked,
+}
+
+/// Why a message is done with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Done {
+    Created,
+    Bumped,
+    Repeat,
+}
+
+impl Fate {
+    /// A word for metrics and logs.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Ingest { .. } => "ingest",
+            Self::Dead(_) => "dead_letter",
+            Self::Delete(Done::Created) => "created",
+            Self::Delete(Done::Bumped) => "bumped",
+            Self::Delete(Done::Repeat) => "repeat",
+            Self::Lapse => "retried",
+            Self::Later { why, .. } => match why {
+                Later::Unknown => "unknown",
+                Later::Foreign => "foreign",
+                Later::Deleting => "deleting",
+                Later::Refused => "refused",
+                Later::Blocked => "blocked",
+            },
+        }
+    }
+}
+
+/// The Leaderboards that read a queue, the oldest first. Those being deleted take nothing more.
+pub fn readers(url: &str, leaderboards: &[Arc<Leaderboard>]) -> Vec<Arc<Leaderboard>> {
+    let mut readers: Vec<_> = leaderboards
+        .iter()
+        .filter(|lb| lb.metadata.deletion_timestamp.is_none())
+        .filter(|lb| lb.spec.evalai.is_some() && queue_of(lb).is_some_and(|queue| queue.url == url))
+        .cloned()
+        .collect();
+    readers.sort_by_key(|lb| age(lb));
+    readers
+}
+
+/// The queue of a Leaderboard that takes messages.
+pub fn queue_of(leaderboard: &Leaderboard) -> Option<&Queue> {
+    leaderboard.spec.queue.as_ref()
+}
+
+/// Sorts the older Leaderboard first: it serves a phase that several claim.
+fn age(leaderboard: &Leaderboard) -> (Option<jiff::Timestamp>, String, String) {
+    let created = leaderboard.metadata.creation_timestamp.as_ref().map(|time| time.0);
+    (
+        created,
+        leaderboard.name_any(),
+        leaderboard.namespace().unwrap_or_default(),
+    )
+}
+
+/// What the readers of a queue, the oldest first, say about it together.
+pub fn rules(readers: &[Arc<Leaderboard>]) -> Rules {
+    let queues = || readers.iter().filter_map(|lb| queue_of(lb));
+    Rules {
+        dead_letter: queues().find_map(|queue| queue.dead_letter_url.clone()),
+        unknown_after_ms: queues()
+            .map(|queue| queue.unknown_after_seconds)
+            .max()
+            .unwrap_or_default()
+            * 1000,
+        leaves_foreign: queues().any(|queue| queue.foreign == Foreign::Leave),
+    }
+}
+
+/// Tells whom a message is for. `readers` are the queue's, the oldest first; `synced` says that none can be missing.
+pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, synced: bool) -> Fate {
+    // The last Leaderboard of the queue is going away: whoever reads it next decides.
+    if readers.is_empty() {
+        return Fate::Lapse;
+    }
+    let rules = rules(readers);
+    let message = match &envelope.content {
+        Ok(message) => message,
+        Err(Malformed::StaticDataset) if rules.leaves_foreign => {
+            return later(envelope.receives, SHORT_WAIT, Later::Foreign);
+        }
+        Err(malformed) => return Fate::Dead(DeadReason::Malformed(malformed.to_string())),
+    };
+    if let Some(leaderboard) = readers.iter().find(|lb| serves(lb, message)) {
+        return Fate::Ingest {
+            namespace: leaderboard.namespace().unwrap_or_default(),
+            leaderboard: leaderboard.name_any(),
+        };
+    }
+    if rules.leaves_foreign {
+        return later(envelope.receives, SHORT_WAIT, Later::Foreign);
+    }
+    if !synced || !is_overdue(envelope, &rules, now_ms) {
+        return later(envelope.receives, LONGEST_WAIT, Later::Unknown);
+    }
+    Fate::Dead(DeadReason::Unknown(format!(
+        "no Leaderboard that reads this queue serves challenge {}, phase {}",
+        message.challenge, message.phase
+    )))
+}
+
+/// What becomes of a message after its Submission was, or could not be, created or bumped.
+pub fn settle(envelope: &Envelope, outcome: &Result<Outcome, IngestError>, rules: &Rules, now_ms: i64) -> Fate {
+    match outcome {
+        Ok(Outcome::Created) => Fate::Delete(Done::Created),
+        Ok(Outcome::Bumped(_)) => Fate::Delete(Done::Bumped),
+        Ok(Outcome::Repeat) => Fate::Delete(Done::Repeat),
+        Ok(Outcome::Deleting) => later(envelope.receives, SHORT_WAIT, Later::Deleting),
+        Ok(Outcome::IdTaken(owner)) => Fate::Dead(DeadReason::IdTaken(owner.clone())),
+        // Definitions that are newer or older than this program may refuse what others accept.
+        Err(IngestError::Refused { .. }) if !is_overdue(envelope, rules, now_ms) => {
+            later(envelope.receives, LONGEST_WAIT, Later::Refused)
+        }
+        Err(IngestError::Refused { text, .. }) => Fate::Dead(DeadReason::Refused(text.clone())),
+        Err(_) => Fate::Lapse,
+    }
+}
+
+/// A dead letter without a dead-letter queue comes back ever more slowly.
+pub fn blocked(receives: i32) -> Fate {
+    later(receives, LONGEST_WAIT, Later::Blocked)
+}
+
+fn serves(leaderboard: &Leaderboard, message: &Message) -> bool {
+    let spec = &leaderboard.spec;
+    spec.evalai
+        .as_ref()
+        .is_some_and(|evalai| evalai.challenge == message.challenge)
+        && spec.tracks.iter().any(|track| track.phase == Some(message.phase))
+}
+
+fn is_overdue(envelope: &Envelope, rules: &Rules, now_ms: i64) -> bool {
+    now_ms.saturating_sub(envelope.sent_ms) > rules.unknown_after_ms
+}
+
+fn later(receives: i32, longest: i32, why: Later) -> Fate {
+    let doublings = u32::try_from(receives - 1).unwrap_or(0).min(10);
+    Fate::Later {
+        seconds: (FIRST_WAIT << doublings).min(longest),
+        why,
+    }
+}
+
+#[cfg(test)]
+#[path = "route_tests.rs"]
+pub(super) mod tests;

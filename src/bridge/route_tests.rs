@@ -1,0 +1,280 @@
+//! Tables of what becomes of each message.
+
+use serde_json::json;
+
+use super::*;
+
+/// A Leaderboard of challenge 1 with phases 2 and 3, created at this second.
+pub(in crate::bridge) fn board(name: &str, second: i64) -> Leaderboard {
+    let created = jiff::Timestamp::from_second(second).unwrap().to_string();
+    serde_json::from_value(json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1",
+        "kind": "Leaderboard",
+        "metadata": {"name": name, "namespace": "ns", "creationTimestamp": created},
+        "spec": {
+            "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}, {"name": "map", "codename": "MAP", "phase": 3}],
+            "results": "V2",
+            "contents": {"image": "c"},
+            "simulator": {"image": "s"},
+            "storage": {"bucket": "bbb"}
+        }
+    }))
+    .unwrap()
+}
+
+pub(in crate::bridge) fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
+    board.spec.queue = Some(serde_json::from_value(json!({"url": url})).unwrap());
+    Arc::new(board)
+}
+
+fn with(mut board: Arc<Leaderboard>, change: fn(&mut Leaderboard)) -> Arc<Leaderboard> {
+    change(Arc::make_mut(&mut board));
+    board
+}
+
+const URL: &str = "https://q/1";
+const NOW: i64 = 10_000_000;
+
+fn one() -> Vec<Arc<Leaderboard>> {
+    vec![with_queue(board("a", 1), URL)]
+}
+
+fn envelope(challenge: i64, phase: i64, age_seconds: i64) -> Envelope {
+    Envelope {
+        content: Ok(Message {
+            challenge,
+            phase,
+            submission: 7,
+            image: None,
+        }),
+        sent_ms: NOW - age_seconds * 1000,
+        receives: 1,
+    }
+}
+
+fn to(name: &str) -> Fate {
+    Fate::Ingest {
+        namespace: "ns".into(),
+        leaderboard: name.into(),
+    }
+}
+
+fn wait(seconds: i32, why: Later) -> Fate {
+    Fate::Later { seconds, why }
+}
+
+fn unknown(challenge: i64, phase: i64) -> Fate {
+    Fate::Dead(DeadReason::Unknown(format!(
+        "no Leaderboard that reads this queue serves challenge {challenge}, phase {phase}"
+    )))
+}
+
+fn leaving() -> Vec<Arc<Leaderboard>> {
+    vec![with(one().remove(0), |lb| queue_mut(lb).foreign = Foreign::Leave)]
+}
+
+fn queue_mut(leaderboard: &mut Leaderboard) -> &mut Queue {
+    leaderboard.spec.queue.as_mut().unwrap()
+}
+
+fn check(what: &str, envelope: &Envelope, readers: &[Arc<Leaderboard>], synced: bool, want: &Fate) {
+    assert_eq!(route(envelope, readers, NOW, synced), *want, "{what}");
+}
+
+#[test]
+fn a_known_message_goes_to_its_leaderboard() {
+    check("known", &envelope(1, 2, 0), &one(), true, &to("a"));
+    check("known, its other phase", &envelope(1, 3, 0), &one(), true, &to("a"));
+    check("known, not synced yet", &envelope(1, 2, 0), &one(), false, &to("a"));
+    check("known and old", &envelope(1, 2, 100_000), &one(), true, &to("a"));
+    check(
+        "known, among those left to others",
+        &envelope(1, 2, 0),
+        &leaving(),
+        true,
+        &to("a"),
+    );
+    check(
+        "nobody reads the queue any more",
+        &envelope(1, 2, 0),
+        &[],
+        true,
+        &Fate::Lapse,
+    );
+}
+
+#[test]
+fn an_unknown_message_is_given_up_only_when_it_is_old_and_all_is_known() {
+    let at_once = [with(one().remove(0), |lb| queue_mut(lb).unknown_after_seconds = 0)];
+    let waits = wait(30, Later::Unknown);
+    check("young", &envelope(1, 9, 10), &one(), true, &waits);
+    check("at the limit", &envelope(1, 9, 900), &one(), true, &waits);
+    check("sent in the future", &envelope(1, 9, -5000), &one(), true, &waits);
+    check("old, not synced", &envelope(1, 9, 90_000), &one(), false, &waits);
+    check("old", &envelope(1, 9, 901), &one(), true, &unknown(1, 9));
+    check(
+        "of an unknown challenge, old",
+        &envelope(9, 2, 901),
+        &one(),
+        true,
+        &unknown(9, 2),
+    );
+    check("no patience", &envelope(1, 9, 1), &at_once, true, &unknown(1, 9));
+    check(
+        "left to others",
+        &envelope(9, 2, 90_000),
+        &leaving(),
+        true,
+        &wait(30, Later::Foreign),
+    );
+}
+
+#[test]
+fn a_malformed_message_is_given_up_at_once() {
+    let malformed = |why: Malformed| Envelope {
+        content: Err(why),
+        ..envelope(1, 2, 0)
+    };
+    let dead = |why: &Malformed| Fate::Dead(DeadReason::Malformed(why.to_string()));
+    for why in [
+        Malformed::NotAnObject,
+        Malformed::Missing("phase_pk"),
+        Malformed::StaticDataset,
+    ] {
+        check("synced", &malformed(why.clone()), &one(), true, &dead(&why));
+        check("not synced", &malformed(why.clone()), &one(), false, &dead(&why));
+    }
+    check(
+        "left to others",
+        &malformed(Malformed::NotAnObject),
+        &leaving(),
+        true,
+        &dead(&Malformed::NotAnObject),
+    );
+    let theirs = malformed(Malformed::StaticDataset);
+    check(
+        "a static dataset may be theirs",
+        &theirs,
+        &leaving(),
+        true,
+        &wait(30, Later::Foreign),
+    );
+}
+
+#[test]
+fn waits_double_up_to_their_limit() {
+    let seconds = |receives, readers: &[Arc<Leaderboard>]| match route(
+        &Envelope {
+            receives,
+            ..envelope(1, 9, 1)
+        },
+        readers,
+        NOW,
+        true,
+    ) {
+        Fate::Later { seconds, .. } => seconds,
+        other => panic!("{other:?}"),
+    };
+    let receives = [0, 1, 2, 3, 4, 5, 6, 7, 1000, i32::MAX];
+    assert_eq!(
+        receives.map(|n| seconds(n, &one())),
+        [30, 30, 60, 120, 240, 480, 900, 900, 900, 900]
+    );
+    assert_eq!(receives.map(|n| seconds(n, &leaving()))[..4], [30, 30, 60, 60]);
+    assert_eq!(blocked(6), wait(900, Later::Blocked));
+}
+
+#[test]
+fn of_two_that_claim_a_phase_the_older_serves_it() {
+    let queue = |board| with_queue(board, URL);
+    let names = |all: Vec<Arc<Leaderboard>>| readers(URL, &all).iter().map(|lb| lb.name_any()).collect::<Vec<_>>();
+    assert_eq!(names(vec![queue(board("a", 20)), queue(board("b", 10))]), ["b", "a"]);
+    assert_eq!(
+        names(vec![queue(board("b", 10)), queue(board("a", 10))]),
+        ["a", "b"],
+        "then the name tells"
+    );
+    let older_leaves = with(queue(board("b", 10)), |lb| {
+        lb.metadata.deletion_timestamp = lb.metadata.creation_timestamp.clone();
+    });
+    assert_eq!(
+        names(vec![queue(board("a", 20)), older_leaves]),
+        ["a"],
+        "one being deleted takes nothing more"
+    );
+    let elsewhere = with_queue(board("b", 10), "https://q/2");
+    assert_eq!(
+        names(vec![queue(board("a", 20)), elsewhere, Arc::new(board("c", 1))]),
+        ["a"],
+        "other queues are others'"
+    );
+    let both = readers(URL, &[queue(board("a", 20)), queue(board("b", 10))]);
+    assert_eq!(route(&envelope(1, 2, 0), &both, NOW, true), to("b"));
+}
+
+#[test]
+fn leaderboards_that_share_a_queue_agree_on_the_most_patient_rules() {
+    let older = with(with_queue(board("a", 1), URL), |lb| {
+        queue_mut(lb).unknown_after_seconds = 5;
+    });
+    let newer = with(with_queue(board("b", 2), URL), |lb| {
+        let queue = queue_mut(lb);
+        queue.foreign = Foreign::Leave;
+        queue.dead_letter_url = Some("https://q/dead".into());
+    });
+    let want = Rules {
+        dead_letter: Some("https://q/dead".into()),
+        unknown_after_ms: 900_000,
+        leaves_foreign: true,
+    };
+    assert_eq!(rules(&[older, newer]), want);
+}
+
+#[test]
+fn each_outcome_of_ingest_settles_its_message() {
+    let refused = || {
+        Err(IngestError::Refused {
+            name: "submission-7".into(),
+            text: "spec.image is wrong".into(),
+        })
+    };
+    let timeout = || {
+        Err(IngestError::Timeout {
+            name: "submission-7".into(),
+            verb: "created",
+        })
+    };
+    let contended = || {
+        Err(IngestError::Contended {
+            name: "submission-7".into(),
+        })
+    };
+    let cases: Vec<(Result<Outcome, IngestError>, i64, Fate)> = vec![
+        (Ok(Outcome::Created), 0, Fate::Delete(Done::Created)),
+        (Ok(Outcome::Bumped(2)), 0, Fate::Delete(Done::Bumped)),
+        (Ok(Outcome::Repeat), 0, Fate::Delete(Done::Repeat)),
+        (Ok(Outcome::Deleting), 90_000, wait(30, Later::Deleting)),
+        (
+            Ok(Outcome::IdTaken("x".into())),
+            0,
+            Fate::Dead(DeadReason::IdTaken("x".into())),
+        ),
+        (refused(), 900, wait(30, Later::Refused)),
+        (
+            refused(),
+            901,
+            Fate::Dead(DeadReason::Refused("spec.image is wrong".into())),
+        ),
+        (timeout(), 90_000, Fate::Lapse),
+        (contended(), 90_000, Fate::Lapse),
+    ];
+    let rules = rules(&one());
+    for (outcome, age, want) in cases {
+        assert_eq!(
+            settle(&envelope(1, 2, age), &outcome, &rules, NOW),
+            want,
+            "{outcome:?} after {age} s"
+        );
+    }
+}

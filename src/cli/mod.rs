@@ -1,0 +1,91 @@
+//! The command line of `leaderboard-operator`: flags, environment, and which room each subcommand enters.
+//!
+//! Called by the binary alone. Every flag of a server can be given as an environment variable, as the chart does.
+
+mod counters;
+mod offline;
+mod serve;
+
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::observability::logging::Format;
+
+/// Runs the submissions of an AI challenge on Kubernetes.
+#[derive(Parser, Debug)]
+#[command(name = "leaderboard-operator", version, about, long_about = None)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Drives Submissions through their states; the leader of its replicas does.
+    Controller(Controller),
+    /// Makes a Submission from each message of the Leaderboards' queues.
+    Bridge(Server),
+    /// Prepares the volumes of a submission's Pod (an init container).
+    Workspace,
+    /// Merges, uploads and reports the results of a submission's Pod (a sidecar).
+    Logcopy,
+    /// Prints the custom resource definitions.
+    Crd,
+    /// Merges and renders checkpoint files without a cluster.
+    Results(offline::Results),
+}
+
+/// What the servers have in common.
+#[derive(Args, Debug)]
+struct Server {
+    /// Only this namespace; all of them if empty.
+    #[arg(long, env = "LEADERBOARD_NAMESPACE", default_value = "")]
+    namespace: String,
+    /// Where /livez, /readyz and /metrics are served.
+    #[arg(long, env = "LEADERBOARD_HTTP", default_value = "0.0.0.0:8080")]
+    http: std::net::SocketAddr,
+    /// Form of the log.
+    #[arg(long, env = "LEADERBOARD_LOG_FORMAT", value_enum, default_value = "auto")]
+    log_format: Format,
+}
+
+#[derive(Args, Debug)]
+struct Controller {
+    #[command(flatten)]
+    server: Server,
+    /// The operator's own image, which Pods use for workspace and logcopy.
+    #[arg(long, env = "LEADERBOARD_IMAGE")]
+    image: String,
+    /// Pull policy of that image in Pods.
+    #[arg(long, env = "LEADERBOARD_IMAGE_PULL_POLICY")]
+    image_pull_policy: Option<String>,
+    /// Passes at once.
+    #[arg(long, env = "LEADERBOARD_CONCURRENCY", default_value_t = 16, value_parser = clap::value_parser!(u16).range(1..=256))]
+    concurrency: u16,
+    /// Namespace of the Lease: the operator's own.
+    #[arg(long, env = "POD_NAMESPACE", default_value = "default")]
+    lease_namespace: String,
+    /// Name of the Lease.
+    #[arg(long, env = "LEADERBOARD_LEASE", default_value = "leaderboard-operator")]
+    lease: String,
+    /// Name of this replica.
+    #[arg(long, env = "POD_NAME", default_value = "leaderboard-operator")]
+    pod_name: String,
+    /// UID of this replica.
+    #[arg(long, env = "POD_UID", default_value = "")]
+    pod_uid: String,
+}
+
+/// Runs what the command line asks for.
+pub fn run() -> ExitCode {
+    let cli = Cli::parse();
+    match cli.command {
+        Command::Crd => offline::print_crds(),
+        Command::Results(results) => results.run(),
+        Command::Controller(options) => serve::controller(options),
+        Command::Bridge(options) => serve::bridge(options),
+        Command::Workspace => serve::workspace(),
+        Command::Logcopy => serve::logcopy(),
+    }
+}

@@ -1,0 +1,144 @@
+//! Subcommands that stay: `controller`, `bridge`, and the two programs of a Pod. Sets up logging, TLS, clients and the
+//! stop signal, then enters a room.
+
+use std::future::Future;
+use std::path::Path;
+use std::process::ExitCode;
+
+use kube::{Client, Config};
+
+use super::{Controller, Server};
+use crate::bridge::{self, Health};
+use crate::controller::context::Settings;
+use crate::controller::leader::{self, Identity};
+use crate::controller::run::{self, Clients};
+use crate::controller::watches::watch_client;
+use crate::observability::health::HealthServer;
+use crate::observability::logging::{self, Format};
+use crate::observability::shutdown::on_signals;
+use crate::observability::{Observability, text};
+use crate::pod::places::Setting;
+use crate::pod::run::LOGS;
+use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
+use crate::services::aws::Aws;
+
+/// Environment variable with the log filter.
+const ENV_LOG: &str = "RUST_LOG";
+
+pub(super) fn controller(options: Controller) -> ExitCode {
+    start(options.server.log_format, || lead(options))
+}
+
+pub(super) fn bridge(options: Server) -> ExitCode {
+    start(options.log_format, || serve_bridge(options))
+}
+
+pub(super) fn workspace() -> ExitCode {
+    ownlog::start(None);
+    start_quiet(|| async {
+        let setting = Setting::in_pod().map_err(|e| e.to_string())?;
+        workspace_program::main(setting).await.map_err(|e| e.to_string())
+    })
+}
+
+pub(super) fn logcopy() -> ExitCode {
+    // Its log is one of the results as well.
+    ownlog::start(Some(Path::new(LOGS)));
+    start_quiet(|| async {
+        let setting = Setting::in_pod().map_err(|e| e.to_string())?;
+        let stop = on_signals().map_err(|e| e.to_string())?;
+        Box::pin(logcopy_program::main(setting, async move { stop.wait().await }))
+            .await
+            .map_err(|e| e.to_string())
+    })
+}
+
+/// Logs, then works until the end; an error is said once and is the exit code.
+fn start<W>(format: Format, work: impl FnOnce() -> W) -> ExitCode
+where
+    W: Future<Output = Result<(), String>>,
+{
+    if let Err(error) = logging::init(format, std::env::var(ENV_LOG).ok().as_deref()) {
+        eprintln!("leaderboard-operator: {error}");
+        return ExitCode::from(2);
+    }
+    start_quiet(work)
+}
+
+fn start_quiet<W>(work: impl FnOnce() -> W) -> ExitCode
+where
+    W: Future<Output = Result<(), String>>,
+{
+    // It fails only where a provider is installed already, which serves as well.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            eprintln!("leaderboard-operator: no threads can be started: {error}");
+            return ExitCode::FAILURE;
+        }
+    };
+    match runtime.block_on(async { work().await }) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error}");
+            eprintln!("leaderboard-operator: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+async fn lead(options: Controller) -> Result<(), String> {
+    let seen = Observability::new(on_signals().map_err(|e| e.to_string())?);
+    let health = HealthServer::start(options.server.http, seen.clone())
+        .await
+        .map_err(|e| e.to_string())?;
+    let config = cluster().await?;
+    let clients = Clients {
+        api: Client::try_from(config.clone()).map_err(|e| text::kube(&e))?,
+        watch: watch_client(config.clone()).map_err(|e| text::kube(&e))?,
+        lease: leader::lease_client(config).map_err(|e| text::kube(&e))?,
+    };
+    let identity = Identity::of_pod(&options.pod_name, &options.pod_uid);
+    let lease = leader::Settings::new(&options.lease_namespace, &options.lease, identity);
+    let aws = Aws::load().await;
+    let settings = Settings {
+        image: options.image,
+        image_pull_policy: options.image_pull_policy,
+        region: aws.region(),
+        namespace: namespace(&options.server.namespace),
+        concurrency: options.concurrency,
+    };
+    let result = run::run(clients, lease, settings, aws, seen).await;
+    health.close().await;
+    result.map_err(|e| e.to_string())
+}
+
+async fn serve_bridge(options: Server) -> Result<(), String> {
+    let seen = Observability::new(on_signals().map_err(|e| e.to_string())?);
+    let server = HealthServer::start(options.http, seen.clone())
+        .await
+        .map_err(|e| e.to_string())?;
+    let client = Client::try_from(cluster().await?).map_err(|e| text::kube(&e))?;
+    let health = std::sync::Arc::new(Health::default());
+    let settings = bridge::Settings {
+        namespace: namespace(&options.namespace),
+        health: std::sync::Arc::clone(&health),
+        observer: std::sync::Arc::new(super::counters::BridgeCounters::new(&seen)),
+    };
+    let reporting = tokio::spawn(super::counters::report_readiness(health, seen.clone()));
+    bridge::run(client, Aws::load().await, seen.stop.receiver(), settings).await;
+    reporting.abort();
+    server.close().await;
+    Ok(())
+}
+
+async fn cluster() -> Result<Config, String> {
+    Config::infer().await.map_err(|e| {
+        format!("no cluster is configured: {e}; set KUBECONFIG, or run inside a Pod with a service account")
+    })
+}
+
+fn namespace(text: &str) -> Option<String> {
+    (!text.is_empty()).then(|| text.to_owned())
+}

@@ -1,0 +1,143 @@
+//! What every pass of the controller shares: clients, caches and memory.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Event, Pod};
+use kube::api::ListParams;
+use kube::runtime::events::Recorder;
+use kube::runtime::reflector::{ObjectRef, Store};
+use kube::{Api, Client, ResourceExt};
+
+use super::leaderboards::Desk;
+use super::memory::Memory;
+use super::observe::board::Board;
+use super::observe::is_pod_of;
+use super::observe::report::Reports;
+use super::sync::Sync;
+use crate::api::{Leaderboard, Storage, Submission};
+use crate::services::archive::Archive;
+use crate::services::aws::Aws;
+
+/// Time any one call to the API server may take.
+pub const CALL_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// Caches of the API server, filled by one task each.
+pub struct Stores {
+    pub leaderboards: Store<Leaderboard>,
+    pub submissions: Store<Submission>,
+    pub jobs: Store<Job>,
+    pub pods: Store<Pod>,
+}
+
+impl Stores {
+    /// The youngest Pod of a Job.
+    pub fn newest_pod(&self, job: &Job) -> Option<Arc<Pod>> {
+        let pods = self.pods.state().into_iter().filter(|pod| is_pod_of(pod, job));
+        pods.max_by_key(|pod| (pod.metadata.creation_timestamp.clone().map(|t| t.0), pod.name_any()))
+    }
+
+    /// The Submission that a child belongs to.
+    pub fn owner_of(child: &impl ResourceExt) -> Option<ObjectRef<Submission>> {
+        let name = child.labels().get(crate::api::names::LABEL_SUBMISSION)?;
+        Some(ObjectRef::new(name).within(&child.namespace()?))
+    }
+}
+
+/// Settings that come from the command line.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// The operator's own image, which Pods use for `workspace` and `logcopy`.
+    pub image: String,
+    /// Pull policy of that image.
+    pub image_pull_policy: Option<String>,
+    /// AWS region of the operator, handed on to Pods.
+    pub region: Option<String>,
+    /// Only this namespace, or all.
+    pub namespace: Option<String>,
+    /// Passes at once.
+    pub concurrency: u16,
+}
+
+/// Shared by all passes.
+pub struct Context {
+    pub client: Client,
+    pub settings: Settings,
+    pub stores: Stores,
+    pub memory: Memory,
+    pub reports: Reports,
+    pub board: Board,
+    pub desk: Desk,
+    pub sync: Sync,
+    pub aws: Aws,
+    pub recorder: Recorder,
+    archives: Mutex<HashMap<String, Archive>>,
+}
+
+impl Context {
+    pub fn new(client: Client, settings: Settings, stores: Stores, sync: Sync, aws: Aws, recorder: Recorder) -> Self {
+        Self {
+            client,
+            settings,
+            stores,
+            memory: Memory::default(),
+            reports: Reports::default(),
+            board: Board::default(),
+            desk: Desk::default(),
+            sync,
+            aws,
+            recorder,
+            archives: Mutex::default(),
+        }
+    }
+
+    /// The prefix of a run; clients are kept by region and endpoint.
+    pub fn archive(&self, storage: &Storage, run_id: &str) -> Archive {
+        let key = format!("{:?}/{:?}/{}", storage.region, storage.endpoint, storage.bucket);
+        let mut archives = self.archives.lock().unwrap_or_else(PoisonError::into_inner);
+        let shared = archives
+            .entry(key)
+            .or_insert_with(|| Archive::of_run(&self.aws, storage, run_id));
+        shared.at_prefix(crate::api::effective::key_prefix(storage, run_id))
+    }
+
+    /// Half the period of a submission's Leaderboard, in seconds.
+    pub fn half_period(&self, submission: &Submission) -> f64 {
+        let namespace = submission.namespace().unwrap_or_default();
+        let reference = ObjectRef::new(&submission.spec.leaderboard).within(&namespace);
+        let period = self
+            .stores
+            .leaderboards
+            .get(&reference)
+            .map_or(10, |l| l.spec.period_seconds);
+        Duration::from_secs(period.unsigned_abs()).as_secs_f64() / 2.0
+    }
+
+    /// The words of the Job's last FailedCreate event. Events are read only while a Job has no Pod.
+    pub async fn failed_create(&self, namespace: &str, job: &str) -> Option<String> {
+        let events: Api<Event> = Api::namespaced(self.client.clone(), namespace);
+        let selector = format!("involvedObject.kind=Job,involvedObject.name={job},reason=FailedCreate");
+        let params = ListParams::default().fields(&selector).limit(50);
+        let found = tokio::time::timeout(CALL_TIMEOUT, events.list(&params))
+            .await
+            .ok()?
+            .ok()?;
+        let latest = found.items.into_iter().max_by_key(|e| {
+            e.last_timestamp
+                .as_ref()
+                .or(e.first_timestamp.as_ref())
+                .map(|t| t.0)
+                .or(e.event_time.as_ref().map(|t| t.0))
+        })?;
+        latest.message
+    }
+
+    /// Drops everything that is remembered of a Submission that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.memory.forget(uid);
+        self.reports.forget(uid);
+        self.board.release(uid);
+    }
+}

@@ -1,0 +1,216 @@
+//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer.
+
+use std::time::Duration;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after};
+use super::failure::sentence;
+use super::{Action, Tell, accept, stop};
+use crate::api::conditions::{self, Truth};
+use crate::api::{State, reasons};
+use crate::controller::view::{EvalaiEnd, JobSight, JobView};
+
+/// How often an unpublished end is looked at again.
+const AGAIN: Duration = Duration::from_secs(30);
+
+/// Decides for a submission in a terminal state.
+pub(super) fn decide(draft: &mut Draft<'_>) {
+    leave_job(draft);
+    let published = publish(draft);
+    // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
+    let recorded = published != Sync::Waiting && record(draft) == Sync::Done;
+    let complete = published == Sync::Done && recorded;
+    if complete {
+        draft.act(Action::ForgetEvalai);
+    } else {
+        draft.requeue_in(AGAIN);
+    }
+    release(draft, complete);
+}
+
+/// How far another system is with the end.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Sync {
+    /// It knows the end, or need not.
+    Done,
+    /// It will not take it.
+    Refused,
+    Waiting,
+}
+
+/// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
+pub(super) fn leave_job(draft: &mut Draft<'_>) {
+    let JobSight::Ours(job) = &draft.view.job else { return };
+    if job.end.is_some() {
+        return keep_job_for_its_time(draft, job);
+    }
+    if job.deleting {
+        stop::remove_overdue_pod(draft);
+    } else {
+        draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
+    }
+    draft.requeue_in(AGAIN);
+}
+
+fn is_not_wanted(draft: &Draft<'_>, type_: &str) -> bool {
+    conditions::get(&draft.status.conditions, type_).is_some_and(|c| c.reason == reasons::NOT_WANTED)
+}
+
+/// A Leaderboard that is gone can't say what is wanted: what was decided before stands, and what never ran needs nothing.
+fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Sync {
+    if is_not_wanted(draft, type_) {
+        return Sync::Done;
+    }
+    let message = accept::no_leaderboard(draft);
+    draft.condition(type_, Truth::False, reasons::LEADERBOARD_NOT_FOUND, &message);
+    if draft.status.plan.is_none() {
+        Sync::Done
+    } else {
+        Sync::Waiting
+    }
+}
+
+fn publish(draft: &mut Draft<'_>) -> Sync {
+    let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
+    let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
+    if draft.spec().evalai.is_none() || is_evalais {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
+        return Sync::Done;
+    }
+    if conditions::is_true(&draft.status.conditions, conditions::PUBLISHED)
+        || is_not_wanted(draft, conditions::PUBLISHED)
+    {
+        return Sync::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::PUBLISHED);
+    }
+    let view = draft.view.evalai.clone().unwrap_or_default();
+    match view.end {
+        Some(EvalaiEnd::Published { at }) => {
+            draft.status.times.published = Some(Time(at));
+            draft.condition(conditions::PUBLISHED, Truth::True, reasons::WRITTEN, "");
+            draft.event(false, conditions::PUBLISHED, "EvalAI has the result.");
+            Sync::Done
+        }
+        Some(EvalaiEnd::Ended { status }) => {
+            amend(draft, &status);
+            Sync::Done
+        }
+        Some(EvalaiEnd::Refused { message }) => {
+            refused(draft, &message);
+            Sync::Refused
+        }
+        None => {
+            let wish = match draft.status.state {
+                Some(State::Finished) => Tell::Finished,
+                Some(State::Cancelled) => Tell::Cancelled,
+                _ => Tell::Failed,
+            };
+            draft.act(Action::Tell(wish));
+            let message = view
+                .error
+                .map(|e| format!("The last request failed: {}", sentence(&e)))
+                .unwrap_or_default();
+            draft.condition(conditions::PUBLISHED, Truth::False, reasons::WAITING, &message);
+            Sync::Waiting
+        }
+    }
+}
+
+fn refused(draft: &mut Draft<'_>, message: &str) {
+    let message = format!(
+        "EvalAI does not take the result: {} Compare its metrics with the leaderboard of the phase; it is tried again \
+         from time to time.",
+        sentence(message)
+    );
+    let known = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
+    let is_new = known.is_none_or(|c| c.reason != reasons::REFUSED);
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::REFUSED, &message);
+    if is_new {
+        draft.event(true, reasons::REFUSED, message);
+    }
+}
+
+/// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
+fn amend(draft: &mut Draft<'_>, status: &str) {
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
+    if draft.status.state == Some(State::Cancelled) {
+        return;
+    }
+    draft.status.failure = None;
+    let message = format!("EvalAI says {status}, so the result is not published.");
+    draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
+    draft.say(State::Cancelled, reasons::ENDED_IN_EVALAI, message);
+}
+
+fn record(draft: &mut Draft<'_>) -> Sync {
+    if conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
+        return Sync::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::RECORDED);
+    }
+    let Some(view) = draft.view.record.clone() else {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, "");
+        return Sync::Done;
+    };
+    if draft.status.team.as_ref().and_then(|t| t.id.as_ref()).is_none() {
+        let message = "The row needs a team; give spec.team.id to a submission that is not EvalAI's.";
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, message);
+        return Sync::Done;
+    }
+    if view.end_written {
+        draft.condition(conditions::RECORDED, Truth::True, reasons::WRITTEN, "");
+        return Sync::Done;
+    }
+    draft.act(Action::Record { end: true });
+    let (reason, message) = match view.error {
+        Some(error) => (
+            reasons::REFUSED,
+            format!(
+                "The last write failed: {} It is tried again; look at the table and the operator's rights.",
+                sentence(&error)
+            ),
+        ),
+        None => (reasons::WAITING, String::new()),
+    };
+    draft.condition(conditions::RECORDED, Truth::False, reason, &message);
+    Sync::Waiting
+}
+
+fn keep_job_for_its_time(draft: &mut Draft<'_>, job: &JobView) {
+    if !job.has_ttl && !job.deleting {
+        let seconds = draft.leaderboard().map_or(86_400, |l| l.ttl_seconds_after_finished);
+        draft.act(Action::SetJobTtl {
+            name: job.name.clone(),
+            seconds,
+        });
+    }
+}
+
+fn release(draft: &mut Draft<'_>, complete: bool) {
+    let Some(deleted) = draft.submission().metadata.deletion_timestamp.clone() else {
+        return;
+    };
+    if !draft.has_finalizer() {
+        return;
+    }
+    if complete {
+        return draft.act(Action::ReleaseFinalizer);
+    }
+    let patience = draft.leaderboard().map_or(900, |l| l.finalize_seconds);
+    let until = after(deleted.0, patience);
+    if draft.now() >= until {
+        draft.event(
+            true,
+            reasons::RELEASED_UNPUBLISHED,
+            "It was deleted and its end could not be published in time; it is released.",
+        );
+        draft.act(Action::ForgetEvalai);
+        draft.act(Action::ReleaseFinalizer);
+    } else {
+        draft.requeue_at(until);
+    }
+}

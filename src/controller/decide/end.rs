@@ -1,0 +1,198 @@
+//! The end of an attempt: which outcome it has, or whether an infrastructure failure gives it another Job.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after};
+use super::failure::{self, sentence};
+use crate::api::conditions::{self, Truth};
+use crate::api::{Failure, FailureClass, State, reasons};
+use crate::controller::view::{JobEnd, JobSight, ReportSight, View};
+use crate::pod::report::Report;
+
+/// First delay before a new Job after an infrastructure failure; doubles with each.
+const RETRY_SECONDS: i64 = 10;
+/// Most doublings of that delay.
+const MAX_DOUBLINGS: i32 = 8;
+/// Longest delay before a new Job.
+pub(super) const LONGEST_RETRY_SECONDS: i64 = RETRY_SECONDS << MAX_DOUBLINGS;
+/// How long an end waits for a bucket that does not answer; what it stores can still be taken up by a resume.
+const READ_SECONDS: i64 = 86_400;
+
+/// The Job is terminal, or gone because we ended it (`None`).
+pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
+    let view = draft.view;
+    let report = match &view.report {
+        ReportSight::Ours(report) => Some(report.as_ref()),
+        // Without a plan nobody knows where a report would be.
+        ReportSight::NotRead if draft.status.plan.is_some() => return draft.requeue_in(Duration::from_secs(1)),
+        ReportSight::Unreadable(why) if wait_for_bucket(draft, why) => return,
+        ReportSight::Absent | ReportSight::Foreign | ReportSight::NotRead | ReportSight::Unreadable(_) => None,
+    };
+    let complete = report.filter(|r| is_complete(r));
+    if let Some(report) = complete.filter(|r| r.eligible) {
+        return finished(draft, report);
+    }
+    if draft.is_cancelled() {
+        let reason = cancel_reason(draft);
+        let message = if reason == reasons::ENDED_IN_EVALAI {
+            "EvalAI has ended it; what it had reached is kept."
+        } else {
+            "It was cancelled; what it had reached is kept."
+        };
+        return cancelled(draft, reason, message);
+    }
+    let recorded = draft.status.failure.clone();
+    let found = recorded.unwrap_or_else(|| cause(draft, report, complete, job_end));
+    if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
+        return retry(draft, &found);
+    }
+    failed(draft, found);
+}
+
+fn is_complete(report: &Report) -> bool {
+    report.is_final && report.done == report.total && report.total > 0
+}
+
+/// Whether a report says how a run came to its own end, whatever becomes of its Job.
+pub(super) fn is_verdict(report: &Report) -> bool {
+    is_complete(report) || (report.is_final && report.why.is_some())
+}
+
+/// Whether the end still waits until the bucket can be read.
+fn wait_for_bucket(draft: &mut Draft<'_>, why: &str) -> bool {
+    let limit = if draft.is_cancelled() {
+        draft.deadlines().cancel_seconds
+    } else {
+        READ_SECONDS
+    };
+    let message = format!(
+        "Its results cannot be read: {} It goes on when they can.",
+        sentence(why)
+    );
+    let message = draft.stall(reasons::NOT_STORED, &message);
+    let since = draft.stalled_since(reasons::NOT_STORED).unwrap_or(draft.now());
+    let until = after(since, limit);
+    if draft.now() >= until {
+        return false;
+    }
+    draft.say(draft.live_state(), reasons::NOT_STORED, message);
+    draft.requeue_at(until);
+    draft.requeue_in(Duration::from_secs(10));
+    true
+}
+
+/// Ends as Cancelled; nothing needs to be stopped any more.
+pub(super) fn cancelled(draft: &mut Draft<'_>, reason: &str, message: &str) {
+    draft.status.failure = None;
+    close(draft, State::Cancelled, reason, message);
+}
+
+/// Why a cancelled submission was cancelled.
+pub(super) fn cancel_reason(draft: &Draft<'_>) -> &'static str {
+    if draft.spec().cancel {
+        reasons::CANCELLED
+    } else if draft.is_deleting() {
+        reasons::DELETED
+    } else if draft.is_ended_in_evalai() {
+        reasons::ENDED_IN_EVALAI
+    } else {
+        reasons::CANCELLED
+    }
+}
+
+fn cause(draft: &Draft<'_>, report: Option<&Report>, complete: Option<&Report>, job_end: Option<&JobEnd>) -> Failure {
+    // A refused checkpoint may still be mended while the run goes on; only the last word counts.
+    if let Some(why) = report.filter(|r| r.is_final).and_then(|r| r.why.as_deref()) {
+        return failure::invalid_results(why);
+    }
+    if let Some(report) = complete {
+        return failure::not_eligible(&report.entry_status);
+    }
+    match job_end {
+        Some(end) => failure::of_job(&draft.status, end, draft.view.pod.as_ref()),
+        None => failure::job_deleted(),
+    }
+}
+
+/// Failures that a second try may mend.
+fn may_retry(draft: &Draft<'_>, found: &Failure) -> bool {
+    const NOT_MENDABLE: [&str; 3] = [reasons::PREFIX_IN_USE, reasons::JOB_DELETED, reasons::SCHEDULE_DEADLINE];
+    let is_mendable = !NOT_MENDABLE.contains(&found.reason.as_str());
+    // A higher attempt that is wished already takes the place of a retry.
+    let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
+    is_mendable && is_latest && draft.status.retry < draft.retries().infrastructure
+}
+
+fn retry(draft: &mut Draft<'_>, found: &Failure) {
+    let delay = RETRY_SECONDS << draft.status.retry.clamp(0, MAX_DOUBLINGS);
+    let at = after(draft.now(), delay);
+    draft.status.retry += 1;
+    draft.status.job = None;
+    draft.status.node = None;
+    draft.status.failure = None;
+    draft.status.recreated = 0;
+    draft.status.next_try = Some(Time(at));
+    draft.status.times.scheduled = None;
+    draft.status.times.stopping = None;
+    for pair in &mut draft.status.pairs {
+        pair.crashes = 0;
+        pair.last = None;
+    }
+    let what = failure::what_happened(found);
+    let message = format!("{what} It is tried again in {delay} s; this costs no attempt.");
+    draft.moves();
+    draft.condition(conditions::RUNNING, Truth::False, &found.reason, &what);
+    draft.say(State::Pending, reasons::REPLACING, message);
+    draft.requeue_at(at);
+}
+
+fn finished(draft: &mut Draft<'_>, report: &Report) {
+    draft.status.failure = None;
+    let score = draft.status.score.clone().unwrap_or_default();
+    let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
+    close(draft, State::Finished, reasons::FINISHED, &message);
+}
+
+fn failed(draft: &mut Draft<'_>, found: Failure) {
+    let (reason, message) = (found.reason.clone(), found.message.clone());
+    draft.status.failure = Some(found);
+    close(draft, State::Failed, &reason, &message);
+}
+
+fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
+    let ended = draft.view.job_ended_at().unwrap_or(draft.now());
+    draft.status.times.finished = Some(Time(ended.min(draft.now())));
+    draft.status.waiting = None;
+    draft.status.next_try = None;
+    let stored = draft.view.report.ours().is_some_and(|r| r.is_final);
+    let (truth, why) = if stored {
+        (Truth::True, reasons::STORED)
+    } else {
+        (Truth::False, reasons::NOT_STORED)
+    };
+    draft.condition(conditions::ARCHIVED, truth, why, "");
+    draft.condition(conditions::RUNNING, Truth::False, reason, "");
+    draft.moves();
+    draft.condition(conditions::FINISHED, Truth::True, reason, message);
+    if draft.spec().evalai.is_some() {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::WAITING, "");
+    }
+    if draft.view.record.is_some() {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    }
+    draft.say(state, reason, message);
+}
+
+impl View {
+    fn job_ended_at(&self) -> Option<Timestamp> {
+        match &self.job {
+            JobSight::Ours(job) => match job.end.as_ref()? {
+                JobEnd::Complete { at } | JobEnd::Failed { at, .. } => *at,
+            },
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,360 @@
+//! Causes: from what was seen of containers, Jobs and results to a class, a reason and one sentence with the next step.
+//!
+//! Called by the stages of `decide`. The class says whose failure it is; only a participant's is charged.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::Draft;
+use crate::api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
+use crate::controller::view::{ContainerView, EndView, JobEnd, PodView};
+use crate::pod::run::Stop;
+
+/// A failure that is the participant's.
+pub(super) fn participant(reason: &str, message: impl Into<String>) -> Failure {
+    Failure {
+        class: FailureClass::Participant,
+        reason: reason.into(),
+        message: message.into(),
+        charged: true,
+    }
+}
+
+/// A failure that is not: `what` happened, in one sentence; the next step is the reason's.
+pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
+    Failure {
+        class: FailureClass::Infrastructure,
+        reason: reason.into(),
+        message: format!("{what} {}", next_step(reason)).trim_end().to_owned(),
+        charged: false,
+    }
+}
+
+/// What a host does about a failure of the infrastructure that no retry has mended.
+fn next_step(reason: &str) -> &'static str {
+    match reason {
+        // The words of `workspace` hold it already.
+        reasons::PREFIX_IN_USE => "",
+        reasons::JOB_DELETED => "Find out who deletes Jobs in this namespace, then resume it.",
+        reasons::NODE_LOST => "Look at the node, then resume it.",
+        reasons::RESULTS_NOT_STORED => "Look at the log of logcopy and at the bucket, then resume it.",
+        reasons::SIMULATION_CRASHED => {
+            "Look at the simulator's log, then resume it, which repeats the route it was at."
+        }
+        reasons::JOB_FAILED => "Look at the Job's events, then resume it.",
+        reasons::SCHEDULE_DEADLINE => "Add a node or make room, then resume it.",
+        _ => "Mend that, then resume it.",
+    }
+}
+
+/// The message of a failure without the next step, for as long as it may mend itself.
+pub(super) fn what_happened(failure: &Failure) -> String {
+    let message = failure.message.as_str();
+    let next = next_step(&failure.reason);
+    let what = message
+        .strip_suffix(next)
+        .filter(|_| failure.class == FailureClass::Infrastructure);
+    what.unwrap_or(message).trim_end().to_owned()
+}
+
+/// Somebody else's words as a sentence.
+pub(super) fn sentence(words: &str) -> String {
+    let words = words.trim();
+    if words.is_empty() || words.ends_with(['.', '!', '?', '…']) {
+        words.to_owned()
+    } else {
+        format!("{words}.")
+    }
+}
+
+pub(super) fn job_deleted() -> Failure {
+    infrastructure(
+        reasons::JOB_DELETED,
+        "Its Job was deleted again and again by somebody else.",
+    )
+}
+
+pub(super) fn node_lost(node: Option<&str>) -> Failure {
+    let node = node.map_or_else(|| "Its node".to_owned(), |node| format!("Node {node}"));
+    infrastructure(
+        reasons::NODE_LOST,
+        &format!("{node} was lost and its Pod with it; finished routes are kept."),
+    )
+}
+
+pub(super) fn time_limit(seconds: i64) -> Failure {
+    let message = format!(
+        "The run took longer than {seconds} s and was stopped; finished routes are kept. Make the agent faster, or ask the host for more time."
+    );
+    participant(reasons::TIME_LIMIT, message)
+}
+
+pub(super) fn results_not_stored() -> Failure {
+    infrastructure(
+        reasons::RESULTS_NOT_STORED,
+        "The Pod ended before its final results were stored; what was stored is kept.",
+    )
+}
+
+pub(super) fn invalid_results(why: &str) -> Failure {
+    let why = sentence(why);
+    participant(
+        reasons::INVALID_RESULTS,
+        format!("The results cannot be used: {why} Check what the agent writes into its checkpoint, and submit again."),
+    )
+}
+
+/// Results that are complete but do not count.
+pub(super) fn not_eligible(entry_status: &str) -> Failure {
+    if entry_status == "Crashed" {
+        return infrastructure(
+            reasons::SIMULATION_CRASHED,
+            "The simulation crashed during a route, so the results do not count.",
+        );
+    }
+    let message = format!(
+        "The run ended as {entry_status}, so its results do not count. Compare the agent's sensors with those the track \
+         allows, and submit again."
+    );
+    participant(reasons::NOT_ELIGIBLE, message)
+}
+
+/// A Pod that was evicted because the agent's side filled its disk. Another Pod would run into it again.
+pub(super) fn disk_full(pod: &PodView) -> Option<Failure> {
+    let (reason, message) = pod.ended_by_node.as_ref()?;
+    let is_agents = reason == "Evicted" && is_agents_disk(message);
+    is_agents.then(|| {
+        let words = sentence(message);
+        let message =
+            format!("The Pod was evicted because it filled its disk: {words} Write less to disk or to the log.");
+        participant(reasons::DISK_FULL, message)
+    })
+}
+
+/// A limit of the Pod, the logs or an agent; not the node's own shortage, nor a limit of the host's containers.
+fn is_agents_disk(message: &str) -> bool {
+    let signs = [
+        "Pod ephemeral local storage usage exceeds",
+        "EmptyDir volume \"logs\"",
+        "Container agent-",
+    ];
+    !message.starts_with("The node was low on") && signs.iter().any(|sign| message.contains(sign))
+}
+
+/// The stop that a failure calls for.
+pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
+    if failure.is_some_and(|f| f.reason == reasons::TIME_LIMIT) {
+        Stop::RunDeadline
+    } else {
+        Stop::Retries
+    }
+}
+
+/// Remembers how the containers of each pair last ended: their Pod may be gone when the cause is looked for.
+pub(super) fn note_ends(status: &mut SubmissionStatus, pod: &PodView) {
+    for container in &pod.containers {
+        let Some((_, id)) = pair_of(&container.name) else {
+            continue;
+        };
+        let crashes = crashes(container);
+        if crashes > 0 {
+            let pair = pair_entry(status, id);
+            pair.crashes = pair.crashes.max(crashes);
+        }
+    }
+    for pair in &mut status.pairs {
+        if let Some(last) = last_end(pod, pair.id) {
+            pair.last = Some(last);
+        }
+    }
+}
+
+/// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again.
+fn crashes(container: &ContainerView) -> i32 {
+    let end = container.last.as_ref().filter(|_| !container.running);
+    let is_new = end.is_some_and(|end| end.exit_code != 0 && !is_obedient(end));
+    container.restarts.saturating_add(i32::from(is_new))
+}
+
+/// It ended because it was told to.
+fn is_obedient(end: &EndView) -> bool {
+    matches!(end.what.as_deref(), Some("stopped" | "cancelled" | "finished"))
+}
+
+/// How a pair last crashed. Both sides of a round end within moments: a simulator that crashed of itself takes its agent
+/// along, whose own word says less then. One that only followed its agent says `peerCrashed`.
+fn last_end(pod: &PodView, id: i32) -> Option<LastEnd> {
+    let end_of = |wanted: Side| {
+        let of_pair = |c: &&ContainerView| pair_of(&c.name).is_some_and(|(side, pair)| side == wanted && pair == id);
+        let end = pod.containers.iter().find(of_pair)?.last.as_ref()?;
+        (end.exit_code != 0 && !is_obedient(end)).then_some(end)
+    };
+    let agent = end_of(Side::Agent);
+    let simulator = end_of(Side::Simulator);
+    let (side, end) = match (agent, simulator) {
+        (Some(agent), Some(simulator)) if is_followed(simulator, agent) => (Side::Simulator, simulator),
+        (Some(agent), _) => (Side::Agent, agent),
+        (None, simulator) => (Side::Simulator, simulator?),
+    };
+    Some(LastEnd {
+        reason: word(side, end).into(),
+        exit_code: Some(end.exit_code),
+        time: end.at.map(Time),
+    })
+}
+
+fn is_followed(simulator: &EndView, agent: &EndView) -> bool {
+    const SAME_ROUND_SECONDS: i64 = 60;
+    let is_earlier_round = match (simulator.at, agent.at) {
+        (Some(simulator), Some(agent)) => agent.duration_since(simulator).as_secs() > SAME_ROUND_SECONDS,
+        _ => false,
+    };
+    simulator.what.as_deref() != Some("peerCrashed") && !is_earlier_round
+}
+
+/// Whether a pair has crashed as often as it may, or cannot start at all. A count whose cause is not seen yet waits for it.
+pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
+    let limit = draft.retries().pair.max(1);
+    let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
+    let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
+    let worn = crashed().find(|p| p.crashes >= limit);
+    let pair = hopeless.or(worn)?;
+    Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
+}
+
+fn last_word(pair: &PairStatus) -> Option<&str> {
+    pair.last.as_ref().map(|last| last.reason.as_str())
+}
+
+/// The failure of a Job that ended without final results.
+pub(super) fn of_job(status: &SubmissionStatus, end: &JobEnd, pod: Option<&PodView>) -> Failure {
+    if let Some(failure) = pod.and_then(disk_full) {
+        return failure;
+    }
+    match end {
+        JobEnd::Complete { .. } => results_not_stored(),
+        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" => participant(
+            reasons::TIME_LIMIT,
+            "The Pod reached its time limit; finished routes are kept. Make the agent faster, or ask the host for more time.",
+        ),
+        JobEnd::Failed { reason, message, .. } => worst_pair(status).unwrap_or_else(|| {
+            let what = format!("Its Job failed with {reason}: {}", sentence(message));
+            infrastructure(reasons::JOB_FAILED, &what)
+        }),
+    }
+}
+
+fn worst_pair(status: &SubmissionStatus) -> Option<Failure> {
+    let crashed = status.pairs.iter().filter(|p| p.crashes > 0 && p.last.is_some());
+    let pair = crashed.max_by_key(|p| p.crashes)?;
+    Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
+}
+
+fn of_pair(id: i32, crashes: i32, word: &str) -> Failure {
+    let times = if crashes == 1 {
+        "once".to_owned()
+    } else {
+        format!("{crashes} times")
+    };
+    let (reason, message) = match word {
+        "OOMKilled" => (
+            reasons::OUT_OF_MEMORY,
+            format!(
+                "Agent {id} crashed {times}, the last time for lack of memory. Make it smaller; the limit is in the \
+                 track's description."
+            ),
+        ),
+        "idle" => (
+            reasons::IDLE,
+            format!(
+                "Agent {id} ended too early {times}, the last time because it printed nothing for too long. Look for a \
+                 dead end in its code."
+            ),
+        ),
+        "cannotStart" | "startError" => (
+            reasons::CANNOT_START,
+            format!(
+                "Agent {id} could not be started: its command is missing in the image or not for this machine. Rebuild \
+                 the image for linux/amd64."
+            ),
+        ),
+        "notReady" | "peerCrashed" | "simulator" => {
+            let what = if word == "notReady" {
+                "was not ready in time"
+            } else {
+                "crashed"
+            };
+            let what = format!("The simulator of pair {id} failed {times}: it {what}.");
+            return infrastructure(reasons::SIMULATION_CRASHED, &what);
+        }
+        _ => (
+            reasons::AGENT_CRASHED,
+            format!(
+                "Agent {id} crashed {times}. Look at agent/agent{id}/leaderboard.log of the results, mend it and submit \
+                 again."
+            ),
+        ),
+    };
+    participant(reason, message)
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Side {
+    Agent,
+    Simulator,
+}
+
+fn pair_of(container: &str) -> Option<(Side, i32)> {
+    let (side, id) = container.rsplit_once('-')?;
+    let side = match side {
+        "agent" => Side::Agent,
+        "simulator" => Side::Simulator,
+        _ => return None,
+    };
+    Some((side, id.parse().ok()?))
+}
+
+fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
+    if let Some(at) = status.pairs.iter().position(|p| p.id == id) {
+        return &mut status.pairs[at];
+    }
+    let fresh = PairStatus {
+        id,
+        done: 0,
+        total: pair_total(status, id),
+        crashes: 0,
+        state: "Waiting".into(),
+        last: None,
+    };
+    let at = status.pairs.partition_point(|p| p.id < id);
+    status.pairs.insert(at, fresh);
+    &mut status.pairs[at]
+}
+
+fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
+    let slice = status.plan.as_ref().and_then(|plan| {
+        let slice = plan.slices.get(usize::try_from(id).ok()?.checked_sub(1)?)?;
+        let (first, last) = crate::api::effective::slice_bounds(slice)?;
+        i32::try_from(last - first + 1).ok()?.checked_mul(plan.repetitions)
+    });
+    slice.unwrap_or(0)
+}
+
+/// One word for an end: the runner's own, unless the kernel took the memory away while the command ran.
+fn word(side: Side, end: &EndView) -> &str {
+    let what = end.what.as_deref();
+    if side == Side::Simulator {
+        return match what {
+            // Its agent crashed; how is not seen.
+            Some("peerCrashed") => "killed",
+            Some("notReady") => "notReady",
+            _ => "simulator",
+        };
+    }
+    match what {
+        Some(word @ ("peerCrashed" | "notReady" | "idle" | "cannotStart")) => word,
+        _ if end.reason == "OOMKilled" => "OOMKilled",
+        Some(word) => word,
+        None if matches!(end.reason.as_str(), "StartError" | "ContainerCannotRun") => "startError",
+        None => "killed",
+    }
+}

@@ -1,0 +1,309 @@
+//! A submission that has not come to its end: in line, with its Job, without it.
+
+use std::time::Duration;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+
+use super::draft::{Draft, after};
+use super::{Action, Tell, accept, end, failure, job_name, start, stop};
+use crate::api::conditions::{self, Truth};
+use crate::api::{PairStatus, Progress, State, Waiting, reasons};
+use crate::controller::view::{JobSight, JobView, PodView, Turn};
+use crate::pod::report::Report;
+
+/// Times a Job is made again after somebody deleted it.
+const MAX_RECREATED: i32 = 3;
+/// When a submission in line is looked at again, should nothing wake it before.
+const BACKSTOP: Duration = Duration::from_mins(5);
+/// How soon a Job that was just asked for is looked for.
+const LOOK: Duration = Duration::from_secs(15);
+
+/// Decides for a live submission.
+pub(super) fn decide(draft: &mut Draft<'_>) {
+    let view = draft.view;
+    // Without a plan (a status that was lost) nothing can be made again before it is accepted.
+    let has_job = draft.status.job.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
+    match &view.job {
+        // What was seen is of an earlier try; the next pass looks at the present one.
+        JobSight::Ours(job) if job.name != own_job_name(draft) => draft.requeue_in(Duration::from_secs(1)),
+        JobSight::Ours(job) => with_job(draft, job),
+        JobSight::Foreign if !draft.is_to_stop() => name_taken(draft),
+        JobSight::Absent | JobSight::Foreign if has_job => without_its_job(draft),
+        JobSight::Absent | JobSight::Foreign => in_line(draft),
+    }
+}
+
+fn own_job_name(draft: &Draft<'_>) -> String {
+    let name = draft.submission().metadata.name.as_deref().unwrap_or_default();
+    job_name(name, &draft.status)
+}
+
+fn name_taken(draft: &mut Draft<'_>) {
+    let message = format!(
+        "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
+        own_job_name(draft)
+    );
+    let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
+    draft.say(draft.live_state(), reasons::JOB_NAME_TAKEN, message);
+    draft.requeue_in(Duration::from_secs(5));
+}
+
+fn in_line(draft: &mut Draft<'_>) {
+    if draft.is_cancelled() {
+        let reason = end::cancel_reason(draft);
+        let what = if reason == reasons::ENDED_IN_EVALAI {
+            "EvalAI has ended it"
+        } else {
+            "It was cancelled"
+        };
+        let when = if draft.status.retry > 0 {
+            "between two tries; what it had reached is kept"
+        } else {
+            "before it started"
+        };
+        return end::cancelled(draft, reason, &format!("{what} {when}."));
+    }
+    if !accept::decide(draft) {
+        return draft.requeue_in(BACKSTOP);
+    }
+    if waits_for_next_try(draft) {
+        return;
+    }
+    let (position, eta, reason, message) = match draft.view.turn.clone() {
+        Turn::Go => return start_job(draft),
+        Turn::Wait { position, eta } => (
+            position,
+            eta,
+            reasons::WAITING_FOR_SLOT,
+            "All slots of the Leaderboard are in use; running.total and running.perTeam set their number.",
+        ),
+        Turn::Paused { position } => (
+            position,
+            None,
+            reasons::PAUSED,
+            "The Leaderboard is paused; it starts again with paused: false.",
+        ),
+    };
+    draft.status.waiting = Some(Waiting { position, eta });
+    draft.moves();
+    draft.say(State::Pending, reason, message);
+    draft.requeue_in(BACKSTOP);
+}
+
+fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {
+    let Some(at) = draft.status.next_try.as_ref().map(|t| t.0) else {
+        return false;
+    };
+    // A clock that was set back must not turn seconds into days.
+    let latest = after(draft.now(), end::LONGEST_RETRY_SECONDS);
+    if at <= draft.now() || at > latest {
+        return false;
+    }
+    if draft.status.reason.as_deref() != Some(reasons::REPLACING) {
+        let message = "It is tried again after a failure that is not the participant's.";
+        draft.say(State::Pending, reasons::REPLACING, message);
+    }
+    draft.requeue_at(at);
+    true
+}
+
+fn start_job(draft: &mut Draft<'_>) {
+    let name = own_job_name(draft);
+    let (attempt, retry) = (draft.status.attempt.unwrap_or(1), draft.status.retry);
+    let is_new = draft.status.job.is_none();
+    draft.status.waiting = None;
+    draft.status.next_try = None;
+    draft.status.job = Some(name.clone());
+    draft.act(Action::CreateJob { attempt, retry });
+    draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
+    if draft.is_running() {
+        let message = "Its Job was deleted by somebody else; the new one goes on from S3.";
+        start::replacing(draft, message);
+    } else {
+        draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
+        draft.say(State::Pending, reasons::PREPARING, start::PREPARED);
+    }
+    if is_new {
+        draft.event(false, reasons::JOB_CREATED, format!("Its Job is {name}."));
+    }
+    tell(draft);
+    record(draft);
+    draft.requeue_in(LOOK);
+}
+
+/// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
+/// crash or a slow watch looks the same. `start_job` sets the mark, `start::watch` takes it away.
+fn was_seen(draft: &Draft<'_>) -> bool {
+    const BEFORE_IT: [&str; 2] = [reasons::JOB_NAME_TAKEN, reasons::LEADERBOARD_NOT_FOUND];
+    let seen = |c: &Condition| match c.status.as_str() {
+        "True" => !BEFORE_IT.contains(&c.reason.as_str()),
+        _ => c.reason != reasons::PREPARING,
+    };
+    let stalled = conditions::get(&draft.status.conditions, conditions::STALLED);
+    draft.status.times.scheduled.is_some() || stalled.is_some_and(seen)
+}
+
+/// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
+fn without_its_job(draft: &mut Draft<'_>) {
+    // A report from before this Job was seen is its predecessor's.
+    let is_verdict = draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
+    if draft.is_to_stop() || (is_verdict && was_seen(draft)) {
+        return end::decide(draft, None);
+    }
+    if draft.leaderboard().is_none() {
+        let message = accept::no_leaderboard(draft);
+        let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
+        draft.say(draft.live_state(), reasons::LEADERBOARD_NOT_FOUND, message);
+        return draft.requeue_in(BACKSTOP);
+    }
+    if was_seen(draft) {
+        if draft.status.recreated >= MAX_RECREATED {
+            draft.fail(failure::job_deleted());
+            return end::decide(draft, None);
+        }
+        draft.status.recreated += 1;
+        draft.status.times.scheduled = None;
+        draft.event(
+            true,
+            reasons::JOB_RECREATED,
+            "Its Job was deleted by somebody else; it is made again.",
+        );
+    }
+    start_job(draft);
+}
+
+fn with_job(draft: &mut Draft<'_>, job: &JobView) {
+    draft.status.job = Some(job.name.clone());
+    draft.status.waiting = None;
+    draft.status.next_try = None;
+    // An object that was restored from a backup has lost its status and with it the plan.
+    if draft.status.plan.is_none() && !draft.is_to_stop() && !accept::decide(draft) {
+        return draft.requeue_in(LOOK);
+    }
+    let view = draft.view;
+    if let Some(pod) = &view.pod {
+        take_pod(draft, pod);
+    }
+    if let Some(report) = view.report.ours() {
+        take_report(draft, report);
+    }
+    if let Some(job_end) = &job.end {
+        return end::decide(draft, Some(job_end));
+    }
+    if job.deleting {
+        return stop::being_deleted(draft);
+    }
+    if let Some(lost) = stop::lost_pod(draft) {
+        return stop::leave_lost_pod(draft, job, lost);
+    }
+    if !draft.is_to_stop() {
+        watch_run(draft);
+    }
+    if !draft.is_to_stop() {
+        start::watch(draft, job);
+    }
+    if draft.is_to_stop() {
+        return stop::decide(draft, job);
+    }
+    tell(draft);
+    if draft.is_running() {
+        record(draft);
+    }
+    draft.requeue_in(period(draft));
+}
+
+fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
+    let known = draft.status.node.take();
+    draft.status.node = pod.node.clone().or(known);
+    let times = &mut draft.status.times;
+    times.scheduled = times.scheduled.take().or(pod.scheduled.map(Time));
+    times.started = times.started.take().or(pod.agent_started.map(Time));
+    failure::note_ends(&mut draft.status, pod);
+}
+
+fn take_report(draft: &mut Draft<'_>, report: &Report) {
+    let clamp = |n: u32| i32::try_from(n).unwrap_or(i32::MAX);
+    draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
+    if let Some(score) = report.score {
+        let complete = report.is_final && report.done == report.total;
+        draft.status.score = Some(if complete {
+            format!("{score:.2}")
+        } else {
+            format!("~{score:.2}")
+        });
+    }
+    // Until the present Pod's first round the report is its predecessor's, whose crashes are forgiven or counted already.
+    let is_present = draft.view.pod.as_ref().is_some_and(|p| p.uid == report.pod_uid);
+    let old = std::mem::take(&mut draft.status.pairs);
+    draft.status.pairs = report
+        .pairs
+        .iter()
+        .map(|pair| {
+            let known = old.iter().find(|p| p.id == clamp(pair.id));
+            let told = if is_present { clamp(pair.crashes) } else { 0 };
+            PairStatus {
+                id: clamp(pair.id),
+                done: clamp(pair.done),
+                total: clamp(pair.total),
+                crashes: told.max(known.map_or(0, |k| k.crashes)),
+                state: pair.state.clone(),
+                last: known.and_then(|k| k.last.clone()),
+            }
+        })
+        .collect();
+}
+
+/// Limits of a run under way: disk, crashes, time.
+fn watch_run(draft: &mut Draft<'_>) {
+    let evicted = draft.view.pod.as_ref().and_then(failure::disk_full);
+    if let Some(found) = evicted.or_else(|| failure::retries_used_up(draft)) {
+        return draft.fail(found);
+    }
+    let Some(since) = run_since(draft) else { return };
+    let deadline = after(since, draft.deadlines().run_seconds);
+    if draft.now() >= deadline {
+        draft.fail(failure::time_limit(draft.deadlines().run_seconds));
+    } else {
+        draft.requeue_at(deadline);
+    }
+}
+
+/// When the clock of the run began: with its first agent. A Job that replaces one which the infrastructure took away has
+/// the whole time again, from its Pod's scheduling: waiting for a node costs the participant nothing.
+fn run_since(draft: &Draft<'_>) -> Option<jiff::Timestamp> {
+    let times = &draft.status.times;
+    let started = times.started.as_ref()?.0;
+    match &times.scheduled {
+        Some(scheduled) => Some(started.max(scheduled.0)),
+        None => (draft.status.retry == 0 && draft.status.recreated == 0).then_some(started),
+    }
+}
+
+/// What EvalAI hears of a live submission; it is told once, however often it is wished.
+fn tell(draft: &mut Draft<'_>) {
+    if draft.spec().evalai.is_none() {
+        return;
+    }
+    if !draft.is_running() {
+        // Between two tries EvalAI keeps saying running.
+        if draft.status.times.started.is_none() {
+            draft.act(Action::Tell(Tell::Queued));
+        }
+        return;
+    }
+    draft.act(Action::Tell(Tell::Running));
+    let done = draft.view.report.ours().map(|r| r.done);
+    if done.is_some_and(|d| d > 0) && done != draft.view.partial_told {
+        draft.act(Action::Tell(Tell::Partial));
+    }
+}
+
+fn record(draft: &mut Draft<'_>) {
+    if draft.view.record.is_some() {
+        draft.act(Action::Record { end: false });
+    }
+}
+
+fn period(draft: &Draft<'_>) -> Duration {
+    Duration::from_secs(draft.leaderboard().map_or(10, |l| l.period_seconds).unsigned_abs())
+}

@@ -1,0 +1,111 @@
+//! What is to be done for one submission: a pure function from a `View` to a `Plan`.
+//!
+//! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
+//! one in the view, and no `async`. One file a stage of life: `accept`, `live`, `start`, `stop`, `end`, `after`; `failure`
+//! names the causes of an end, `trouble` those of a wait.
+
+mod accept;
+mod after;
+mod draft;
+mod end;
+mod failure;
+mod live;
+mod start;
+mod stop;
+#[cfg(test)]
+mod tests;
+mod trouble;
+
+use std::time::Duration;
+
+use super::view::View;
+use crate::api::{SubmissionStatus, names};
+use crate::pod::run::Stop;
+use draft::Draft;
+
+/// What a pass wants: the status to show, then the actions in order, then the events.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    pub status: SubmissionStatus,
+    pub actions: Vec<Action>,
+    pub events: Vec<Event>,
+    /// When to look again without any other cause.
+    pub requeue: Option<Duration>,
+}
+
+/// One thing to do. All are safe to repeat.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Action {
+    /// Put our finalizer on the object; goes before the status.
+    AddFinalizer,
+    /// Take our finalizer off the object.
+    ReleaseFinalizer,
+    /// Create the Job of this attempt and retry.
+    CreateJob { attempt: i64, retry: i32 },
+    /// Delete a Job and its Pods with this grace period.
+    DeleteJob {
+        name: String,
+        uid: String,
+        grace_seconds: i64,
+    },
+    /// Remove a Pod that does not end.
+    ForceDeletePod { name: String, uid: String },
+    /// Write our own mark into `logcopy/owner`, so that a Pod we lost sight of stops itself.
+    TakeOwnership,
+    /// Tell the Pod to stop.
+    AnnotateStop { pod: String, stop: Stop },
+    /// Let Kubernetes remove the finished Job after its time.
+    SetJobTtl { name: String, seconds: i32 },
+    /// Ask EvalAI for the submission.
+    AskEvalai,
+    /// Tell EvalAI.
+    Tell(Tell),
+    /// Nothing more is wanted from EvalAI for this object.
+    ForgetEvalai,
+    /// Write the row.
+    Record { end: bool },
+}
+
+/// What EvalAI is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tell {
+    Queued,
+    Running,
+    Partial,
+    Finished,
+    Failed,
+    Cancelled,
+}
+
+/// An event of Kubernetes, published after the status was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Event {
+    pub warning: bool,
+    pub reason: String,
+    pub message: String,
+}
+
+/// Decides one pass.
+pub fn decide(view: &View) -> Plan {
+    let mut draft = Draft::new(view);
+    if !draft.has_finalizer() && !draft.is_deleting() {
+        draft.act(Action::AddFinalizer);
+    }
+    if draft.begin_attempt() {
+        after::leave_job(&mut draft);
+        draft.requeue_in(Duration::ZERO);
+        return draft.into_plan();
+    }
+    if !draft.is_finished() {
+        live::decide(&mut draft);
+    }
+    if draft.is_finished() {
+        after::decide(&mut draft);
+    }
+    draft.into_plan()
+}
+
+/// Name of the Job that the present attempt has or will have.
+pub fn job_name(submission: &str, status: &SubmissionStatus) -> String {
+    names::job(submission, status.attempt.unwrap_or(1), status.retry)
+}

@@ -1,0 +1,149 @@
+//! The way to an end that is not the run's own: stops, deleted Jobs, lost Pods. Every path ends in bounded time.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after};
+use super::{Action, failure, start};
+use crate::api::reasons;
+use crate::controller::view::{JobView, PodView};
+use crate::pod::run::Stop;
+
+/// Added to `cancelSeconds` before a Pod that was told to stop is deleted.
+const STOP_MARGIN_SECONDS: i64 = 15;
+/// Grace of a Pod that is deleted because it did not stop by itself.
+pub(super) const DELETE_GRACE_SECONDS: i64 = 60;
+/// How long a Pod may be past its grace before its node is given up.
+const LOST_MARGIN_SECONDS: i64 = 30;
+/// How soon a deletion is looked at again.
+const SOON: Duration = Duration::from_secs(2);
+
+/// Brings a Job to its end: first by word, then by deletion, then by force.
+pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
+    let since = stopping_since(draft);
+    show(draft);
+    let view = draft.view;
+    // Without agents there is nothing to store; with them, a logcopy that is being restarted may still do so.
+    let listening = view
+        .pod
+        .as_ref()
+        .filter(|p| p.logcopy_running || p.agent_started.is_some());
+    let Some(pod) = listening else {
+        draft.act(delete(job, DELETE_GRACE_SECONDS));
+        return draft.requeue_in(SOON);
+    };
+    let delete_at = after(since, draft.deadlines().cancel_seconds + STOP_MARGIN_SECONDS);
+    let force_at = after(delete_at, DELETE_GRACE_SECONDS + STOP_MARGIN_SECONDS);
+    if draft.now() >= force_at {
+        force(draft, pod);
+        draft.act(delete(job, 0));
+        draft.requeue_in(SOON);
+    } else if draft.now() >= delete_at {
+        draft.act(delete(job, DELETE_GRACE_SECONDS));
+        draft.requeue_at(force_at);
+    } else {
+        annotate(draft, pod);
+        draft.requeue_at(delete_at);
+    }
+}
+
+/// When the stop began. A clock that was set back must not put its end off, so the stop begins anew then.
+fn stopping_since(draft: &mut Draft<'_>) -> Timestamp {
+    let now = draft.now();
+    let since = draft.status.times.stopping.as_ref().map_or(now, |t| t.0.min(now));
+    draft.status.times.stopping = Some(Time(since));
+    since
+}
+
+fn show(draft: &mut Draft<'_>) {
+    let failure = draft.status.failure.as_ref().filter(|_| !draft.is_cancelled());
+    let message = match failure {
+        Some(failure) if failure.reason == reasons::NODE_LOST => {
+            let what = failure::what_happened(failure);
+            return start::replacing(draft, &what);
+        }
+        Some(failure) => format!(
+            "{} It is being stopped; what it has reached is kept.",
+            failure::what_happened(failure)
+        ),
+        None => "It is being stopped as wished; what it has reached is kept.".to_owned(),
+    };
+    draft.say(draft.live_state(), reasons::STOPPING, message);
+}
+
+fn annotate(draft: &mut Draft<'_>, pod: &PodView) {
+    if pod.stop.is_some() {
+        return;
+    }
+    let stop = if draft.is_cancelled() {
+        Stop::Cancel
+    } else {
+        failure::stop_of(draft.status.failure.as_ref())
+    };
+    draft.act(Action::AnnotateStop {
+        pod: pod.name.clone(),
+        stop,
+    });
+}
+
+/// Deletes a Job with its Pods.
+pub(super) fn delete(job: &JobView, grace_seconds: i64) -> Action {
+    Action::DeleteJob {
+        name: job.name.clone(),
+        uid: job.uid.clone(),
+        grace_seconds,
+    }
+}
+
+/// The fence goes first: what a Pod we can't reach still writes counts for nobody.
+fn force(draft: &mut Draft<'_>, pod: &PodView) {
+    draft.act(Action::TakeOwnership);
+    draft.act(Action::ForceDeletePod {
+        name: pod.name.clone(),
+        uid: pod.uid.clone(),
+    });
+}
+
+/// We, or somebody else, deleted the Job; it goes with its Pod.
+pub(super) fn being_deleted(draft: &mut Draft<'_>) {
+    if draft.is_to_stop() {
+        stopping_since(draft);
+        show(draft);
+    } else {
+        start::replacing(draft, "Its Job is being deleted by somebody else; it is made again.");
+    }
+    remove_overdue_pod(draft);
+    draft.requeue_in(Duration::from_secs(5));
+}
+
+/// Removes by force a Pod that outstays its grace.
+pub(super) fn remove_overdue_pod(draft: &mut Draft<'_>) {
+    let view = draft.view;
+    let overdue = |pod: &&PodView| {
+        pod.delete_by
+            .is_some_and(|by| view.now >= after(by, STOP_MARGIN_SECONDS))
+    };
+    if let Some(pod) = view.pod.as_ref().filter(overdue) {
+        force(draft, pod);
+    }
+}
+
+/// A Pod that is past its grace although nobody told it to stop: its node is gone, and the Job would wait for it.
+pub(super) fn lost_pod<'a>(draft: &Draft<'a>) -> Option<&'a PodView> {
+    let is_given_up = |f: &crate::api::Failure| f.reason == reasons::NODE_LOST;
+    let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));
+    let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
+    (draft.now() >= after(pod.delete_by?, LOST_MARGIN_SECONDS)).then_some(pod)
+}
+
+/// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
+pub(super) fn leave_lost_pod(draft: &mut Draft<'_>, job: &JobView, pod: &PodView) {
+    let found = failure::node_lost(pod.node.as_deref());
+    start::replacing(draft, &failure::what_happened(&found));
+    draft.fail(found);
+    force(draft, pod);
+    draft.act(delete(job, 0));
+    draft.requeue_in(SOON);
+}

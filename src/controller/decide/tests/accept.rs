@@ -1,0 +1,174 @@
+//! From a new object to a pinned plan.
+
+use std::sync::Arc;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::builders::*;
+use crate::api::State::{Cancelled, Pending};
+use crate::api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, STALLED};
+use crate::api::{LeaderboardStatus, conditions, reasons};
+use crate::controller::decide::{Action, Tell};
+use crate::controller::view::Standing;
+
+#[test]
+fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
+    let mut world = World::local();
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let (attempt, retry) = (1, 0);
+    assert_eq!(plan.actions[0], Action::CreateJob { attempt, retry });
+    assert_eq!(events(&plan), [reasons::PREPARING, reasons::JOB_CREATED]);
+    assert_eq!(condition(&plan, ACCEPTED), ("True".into(), reasons::ACCEPTED.into()));
+    assert_eq!(condition(&plan, FINISHED).0, "False");
+    let status = world.status();
+    assert_eq!(status.job.as_deref(), Some("sub-1"));
+    assert_eq!(status.track.as_deref(), Some("sensors"));
+    assert_eq!(status.results.as_deref(), Some("s3://results/sub"));
+    assert_eq!(status.team.unwrap().id.as_deref(), Some("t1"));
+    assert_eq!(status.times.submitted, Some(Time(at(0))));
+    let pinned = status.plan.unwrap();
+    assert_eq!(pinned.slices, ["0-1", "2-3"]);
+    assert_eq!((pinned.image.as_str(), pinned.resume), ("team/agent:1", false));
+}
+
+#[test]
+fn our_finalizer_goes_on_first() {
+    let mut world = World::local();
+    world.submission().metadata.finalizers = None;
+    assert_eq!(world.pass().actions[0], Action::AddFinalizer);
+}
+
+#[test]
+fn evalais_submission_takes_team_and_time_from_evalai_and_says_queued() {
+    let mut world = World::evalai();
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert_eq!(tells(&plan), [Tell::Queued]);
+    let status = world.status();
+    assert_eq!(status.plan.as_ref().unwrap().run_id, "77");
+    assert_eq!(
+        status.plan.unwrap().image,
+        "team/agent:1",
+        "the object's image goes before EvalAI's"
+    );
+    assert_eq!(status.times.submitted, Some(Time(at(-60))));
+    assert_eq!(status.team.unwrap().name.as_deref(), Some("Team"));
+}
+
+#[test]
+fn an_image_is_taken_from_evalai_where_the_object_names_none() {
+    let mut world = World::evalai();
+    world.submission().spec.image = None;
+    world.pass();
+    assert_eq!(world.status().plan.unwrap().image, "ecr/agent:9");
+
+    let mut world = World::evalai();
+    world.submission().spec.image = None;
+    world.in_evalai().info.as_mut().unwrap().image = None;
+    let plan = world.pass_to(Pending, reasons::IMAGE_MISSING);
+    assert_eq!(condition(&plan, ACCEPTED).0, "False");
+    assert!(!creates(&plan));
+}
+
+#[test]
+fn evalai_is_asked_and_its_silence_shown() {
+    let mut world = World::evalai();
+    world.in_evalai().info = None;
+    let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
+    assert!(has(&plan, |a| *a == Action::AskEvalai) && !creates(&plan));
+    assert_eq!(condition(&plan, ACCEPTED).0, "Unknown");
+
+    world.in_evalai().error = Some("401 Unauthorized, request 7".into());
+    let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
+    assert!(plan.status.message.unwrap().contains("401 Unauthorized"));
+    assert_eq!(condition(&world.pass(), STALLED).0, "True");
+    // Another request id of the same error is not another write.
+    let before = world.status();
+    world.in_evalai().error = Some("401 Unauthorized, request 8".into());
+    assert_eq!(world.pass().status, before);
+}
+
+#[test]
+fn what_evalai_has_ended_never_runs_and_is_not_written() {
+    let mut world = World::evalai();
+    world.in_evalai().info = Some(crate::controller::view::EvalaiInfo {
+        standing: Standing::Ended,
+        status: "cancelled".into(),
+        ..info()
+    });
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert!(!creates(&plan) && tells(&plan).is_empty());
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::NOT_WANTED.into())
+    );
+}
+
+#[test]
+fn resumed_in_evalai_takes_up_what_is_stored() {
+    let mut world = World::evalai();
+    world.in_evalai().info.as_mut().unwrap().standing = Standing::Resumed;
+    world.pass();
+    assert!(world.status().plan.unwrap().resume);
+}
+
+#[test]
+fn an_unknown_leaderboard_or_track_is_waited_for() {
+    let mut world = World::local();
+    let leaderboard = world.view.leaderboard.take();
+    let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_FOUND);
+    assert_eq!(
+        condition(&plan, ACCEPTED),
+        ("False".into(), reasons::LEADERBOARD_NOT_FOUND.into())
+    );
+    assert!(events(&world.pass()).is_empty(), "one event a transition");
+
+    world.view.leaderboard = leaderboard;
+    world.leaderboard().tracks[0].name = "map".into();
+    let plan = world.pass_to(Pending, reasons::TRACK_NOT_FOUND);
+    assert!(plan.status.message.unwrap().contains("whose tracks are map"));
+
+    world.leaderboard().tracks[0].name = "sensors".into();
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+}
+
+#[test]
+fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
+    let mut world = World::local();
+    let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
+    let status = leaderboard.status.get_or_insert_with(LeaderboardStatus::default);
+    let mut not_ready = |reason: &str| {
+        let now = Time(at(0));
+        conditions::set(
+            &mut status.conditions,
+            READY,
+            conditions::Truth::False,
+            reason,
+            "spec.pod: no",
+            None,
+            &now,
+        );
+    };
+    not_ready(reasons::INVALID_POD);
+    let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_READY);
+    assert!(
+        plan.status
+            .message
+            .unwrap()
+            .contains("(InvalidPod): spec.pod: no. Mend it")
+    );
+
+    let mut world = World::local();
+    let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
+    let status = leaderboard.status.get_or_insert_with(LeaderboardStatus::default);
+    let now = Time(at(0));
+    conditions::set(
+        &mut status.conditions,
+        READY,
+        conditions::Truth::False,
+        reasons::QUEUE_BLOCKED,
+        "",
+        None,
+        &now,
+    );
+    assert!(creates(&world.pass()), "a blocked queue is the bridge's affair");
+}

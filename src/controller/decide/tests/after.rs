@@ -1,0 +1,182 @@
+//! After the end: EvalAI, the table, the Job's time to live.
+
+use super::builders::*;
+use crate::api::State::{Cancelled, Failed, Finished};
+use crate::api::conditions::{PUBLISHED, RECORDED};
+use crate::api::reasons;
+use crate::controller::decide::{Action, Tell};
+use crate::controller::view::{EvalaiEnd, ReportSight};
+
+fn finished() -> World {
+    let mut world = World::evalai().running();
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    world.view.report = ReportSight::NotRead;
+    world
+}
+
+fn failed() -> World {
+    let mut world = World::evalai().running();
+    world.see(ended("agent-1", 3, "exited", 1, 100));
+    world.pass();
+    world.complete();
+    world.pass_to(Failed, reasons::AGENT_CRASHED);
+    world
+}
+
+#[test]
+fn evalai_first_then_the_table_then_rest() {
+    for (mut world, state, wish) in [(finished(), Finished, Tell::Finished), (failed(), Failed, Tell::Failed)] {
+        world.job().has_ttl = true;
+        let plan = world.pass();
+        assert_eq!(plan.actions, [Action::Tell(wish)]);
+        assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::WAITING.into()));
+        world.published();
+        let plan = world.pass();
+        assert_eq!(condition(&plan, PUBLISHED).0, "True");
+        assert_eq!(events(&plan), ["Published"]);
+        assert_eq!(plan.actions, [Action::Record { end: true }]);
+        world.recorded();
+        let plan = world.pass();
+        assert_eq!(condition(&plan, RECORDED).0, "True");
+        assert_eq!(
+            (plan.actions.as_slice(), plan.requeue),
+            ([Action::ForgetEvalai].as_slice(), None)
+        );
+        // The services have forgotten; the conditions remember.
+        world.view.evalai = None;
+        world.view.record = Some(crate::controller::view::RecordView::default());
+        let plan = world.pass();
+        assert_eq!(
+            (plan.status.state, plan.actions.as_slice()),
+            (Some(state), [Action::ForgetEvalai].as_slice())
+        );
+    }
+}
+
+#[test]
+fn evalais_end_wins_until_ours_is_answered_and_not_after() {
+    for mut world in [finished(), failed()] {
+        world.in_evalai().end = Some(EvalaiEnd::Ended {
+            status: "cancelled".into(),
+        });
+        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        assert_eq!(
+            condition(&plan, PUBLISHED),
+            ("False".into(), reasons::NOT_WANTED.into())
+        );
+        assert_eq!(tells(&plan), []);
+        world.recorded();
+        world.pass();
+        world.view.evalai = None;
+        assert_eq!(tells(&world.pass()), [], "also when EvalAI's word is forgotten");
+    }
+    let mut world = finished();
+    world.published();
+    world.pass();
+    world.in_evalai().end = Some(EvalaiEnd::Ended {
+        status: "cancelled".into(),
+    });
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn a_cancelled_one_that_evalai_ended_too_is_told_once() {
+    let mut world = World::evalai();
+    world.submission().spec.cancel = true;
+    assert_eq!(tells(&world.pass_to(Cancelled, reasons::CANCELLED)), [Tell::Cancelled]);
+    world.in_evalai().end = Some(EvalaiEnd::Ended {
+        status: "cancelled".into(),
+    });
+    world.pass();
+    world.recorded();
+    world.pass();
+    world.view.evalai = None;
+    assert_eq!(tells(&world.pass_to(Cancelled, reasons::CANCELLED)), []);
+}
+
+#[test]
+fn a_refused_result_is_said_once_and_does_not_hold_up_the_row() {
+    let mut world = finished();
+    world.in_evalai().end = Some(EvalaiEnd::Refused {
+        message: "metric x is unknown".into(),
+    });
+    let plan = world.pass();
+    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::REFUSED.into()));
+    assert_eq!(events(&plan), [reasons::REFUSED]);
+    assert!(has(&plan, |a| *a == Action::Record { end: true }));
+    assert!(world.pass().events.is_empty());
+    world.recorded();
+    let plan = world.pass();
+    assert!(plan.requeue.is_some() && !has(&plan, |a| *a == Action::ForgetEvalai));
+}
+
+#[test]
+fn an_outage_is_shown_and_waited_for() {
+    let mut world = finished();
+    world.in_evalai().error = Some("502 Bad Gateway".into());
+    let plan = world.pass();
+    assert_eq!(tells(&plan), [Tell::Finished]);
+    let shown = crate::api::conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert_eq!(shown.message, "The last request failed: 502 Bad Gateway.");
+
+    world.published();
+    world.view.record.as_mut().unwrap().error = Some("AccessDenied".into());
+    let plan = world.pass();
+    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::REFUSED.into()));
+    assert_eq!(plan.status.state, Some(Finished));
+    world.recorded();
+    assert_eq!(condition(&world.pass(), RECORDED).0, "True");
+}
+
+#[test]
+fn what_is_not_wanted_is_not_waited_for() {
+    let mut world = World::local().running();
+    world.view.record = None;
+    world.complete();
+    world.report(final_report());
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_WANTED);
+    assert_eq!(condition(&plan, RECORDED).1, reasons::NOT_WANTED);
+    assert_eq!(plan.requeue, None);
+
+    let mut world = World::local();
+    world.submission().spec.team = None;
+    let mut world = world.running();
+    world.complete();
+    world.report(final_report());
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let shown = crate::api::conditions::get(&plan.status.conditions, RECORDED).unwrap();
+    assert!(shown.message.contains("spec.team.id"));
+}
+
+#[test]
+fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
+    let mut world = finished();
+    world.view.leaderboard = None;
+    world.view.evalai = None;
+    world.view.record = None;
+    let plan = world.pass();
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::LEADERBOARD_NOT_FOUND.into())
+    );
+    assert!(plan.requeue.is_some() && tells(&plan).is_empty());
+
+    // What never ran under it needs nothing from it.
+    let mut world = World::evalai();
+    world.view.leaderboard = None;
+    world.pass();
+    world.delete();
+    assert!(has(&world.pass_to(Cancelled, reasons::DELETED), |a| *a
+        == Action::ReleaseFinalizer));
+}
+
+#[test]
+fn a_finished_job_gets_its_time_to_live_once() {
+    let mut world = finished();
+    assert!(has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
+    world.job().has_ttl = true;
+    assert!(!has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
+}

@@ -1,0 +1,174 @@
+//! Crashes of a pair: whose they are, how many are forgiven.
+
+use super::builders::*;
+use crate::api::FailureClass::{Infrastructure, Participant};
+use crate::api::State::{Finished, Running};
+use crate::api::reasons;
+use crate::pod::run::Stop;
+
+/// How often each side of pair 1 ends how, and what comes of it.
+#[test]
+fn a_pair_that_always_fails_ends_the_run_by_its_cause() {
+    let cases = [
+        (
+            "agent crashes",
+            Some("exited"),
+            Some("peerCrashed"),
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
+            "agent is killed",
+            Some("silentDeath"),
+            None,
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
+            "agent crashes unseen",
+            None,
+            Some("peerCrashed"),
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
+            "agent is idle",
+            Some("idle"),
+            Some("peerCrashed"),
+            reasons::IDLE,
+            Participant,
+        ),
+        (
+            "agent cannot start",
+            Some("cannotStart"),
+            Some("peerCrashed"),
+            reasons::CANNOT_START,
+            Participant,
+        ),
+        (
+            "simulator crashes",
+            Some("peerCrashed"),
+            Some("exited"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+        (
+            "and the agent with it",
+            Some("exited"),
+            Some("killed"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+        (
+            "simulator cannot start",
+            None,
+            Some("cannotStart"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+        (
+            "simulator is late",
+            Some("notReady"),
+            Some("notReady"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+    ];
+    for (what, agent, simulator, reason, class) in cases {
+        let mut world = World::local().running();
+        for (name, word) in [("agent-1", agent), ("simulator-1", simulator)] {
+            if let Some(word) = word {
+                world.see(ended(name, 3, word, 1, 100));
+            }
+        }
+        let plan = world.pass_to(Running, reasons::STOPPING);
+        let failure = plan.status.failure.clone().unwrap();
+        assert_eq!((failure.reason.as_str(), failure.class), (reason, class), "{what}");
+        assert_eq!(annotated(&plan), Some(Stop::Retries), "{what}");
+        assert_eq!(
+            plan.status.pairs[0].crashes, 4,
+            "{what}: the end that is not restarted yet counts"
+        );
+    }
+}
+
+#[test]
+fn fewer_crashes_than_allowed_are_forgiven() {
+    let mut world = World::local().running();
+    world.see(ended("agent-1", 2, "exited", 1, 100));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!(plan.status.pairs[0].crashes, 3);
+    world.report(final_report());
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn memory_is_the_cause_only_of_the_agents_own_end() {
+    let oom = |what: &str, name: &str| {
+        let mut container = ended(name, 3, what, 137, 100);
+        container.last.as_mut().unwrap().reason = "OOMKilled".into();
+        container
+    };
+    let cases = [
+        ("agent-1", "", reasons::OUT_OF_MEMORY),
+        ("agent-1", "silentDeath", reasons::OUT_OF_MEMORY),
+        ("agent-1", "killed", reasons::OUT_OF_MEMORY),
+        ("agent-1", "idle", reasons::IDLE),
+        ("agent-1", "peerCrashed", reasons::SIMULATION_CRASHED),
+        ("simulator-1", "killed", reasons::SIMULATION_CRASHED),
+    ];
+    for (name, what, reason) in cases {
+        let mut world = World::local().running();
+        world.see(oom(what, name));
+        assert_eq!(world.pass().status.failure.unwrap().reason, reason, "{name} {what}");
+    }
+}
+
+#[test]
+fn the_last_round_decides_whose_crash_it_was() {
+    let mut world = World::local().running();
+    world.see(ended("agent-1", 1, "exited", 1, 100));
+    world.pass();
+    let mut agent = ended("agent-1", 2, "exited", 1, 100);
+    agent.running = true;
+    world.see(agent);
+    world.see(ended("simulator-1", 3, "exited", 1, 900));
+    let failure = world.pass().status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn a_simulators_crash_of_an_earlier_round_does_not_excuse_the_agent() {
+    let mut world = World::local().running();
+    let mut simulator = ended("simulator-1", 1, "exited", 1, 100);
+    simulator.running = true;
+    world.see(simulator);
+    world.see(ended("agent-1", 3, "exited", 1, 900));
+    let failure = world.pass().status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::AGENT_CRASHED);
+}
+
+#[test]
+fn a_count_without_a_cause_waits_for_it() {
+    let mut world = World::local().running();
+    let mut told = report(1);
+    told.pairs[0].crashes = 4;
+    world.report(told);
+    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
+    world.see(ended("agent-1", 3, "exited", 1, 100));
+    world.pass_to(Running, reasons::STOPPING);
+}
+
+#[test]
+fn ends_on_command_are_no_crashes() {
+    let mut world = World::local().running();
+    world.report(report(1));
+    for what in ["stopped", "cancelled"] {
+        world.see(ended("agent-1", 0, what, 143, 100));
+        let plan = world.pass_to(Running, reasons::RUNNING);
+        assert_eq!(plan.status.pairs.len(), 2);
+        assert!(plan.status.pairs.iter().all(|p| p.crashes == 0 && p.last.is_none()));
+    }
+}

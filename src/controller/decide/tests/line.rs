@@ -1,0 +1,93 @@
+//! In line: slots, pauses, and the Leaderboard's changes before the first Job.
+
+use super::builders::*;
+use crate::api::State::{Cancelled, Pending};
+use crate::api::{Waiting, reasons};
+use crate::controller::view::{JobSight, Turn};
+
+#[test]
+fn who_waits_sees_place_and_time() {
+    let mut world = World::local();
+    let eta = Some("20m-40m".to_owned());
+    world.view.turn = Turn::Wait {
+        position: 3,
+        eta: eta.clone(),
+    };
+    let plan = world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+    assert_eq!(plan.status.waiting, Some(Waiting { position: 3, eta }));
+    assert!(!creates(&plan));
+
+    world.view.turn = Turn::Wait { position: 2, eta: None };
+    let plan = world.pass();
+    assert_eq!(plan.status.waiting.unwrap().position, 2);
+    assert!(plan.events.is_empty(), "a step forward is no transition");
+
+    world.view.turn = Turn::Paused { position: 1 };
+    assert_eq!(events(&world.pass_to(Pending, reasons::PAUSED)), [reasons::PAUSED]);
+
+    world.view.turn = Turn::Go;
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert!(creates(&plan));
+    assert_eq!(plan.status.waiting, None);
+}
+
+#[test]
+fn images_follow_the_leaderboard_until_the_job_is_made_and_the_rest_is_pinned() {
+    let mut world = World::local();
+    world.view.turn = Turn::Wait { position: 1, eta: None };
+    world.pass();
+    world.leaderboard().simulator.image = "simulator:2".into();
+    world.leaderboard().pairs = 4;
+    world.view.turn = Turn::Go;
+    world.pass();
+    let pinned = world.status().plan.unwrap();
+    assert_eq!(pinned.simulator_image, "simulator:2");
+    assert_eq!(pinned.slices.len(), 2);
+}
+
+#[test]
+fn a_job_of_an_older_object_is_waited_for_and_never_taken() {
+    let mut world = World::local();
+    world.view.job = JobSight::Foreign;
+    let plan = world.pass_to(Pending, reasons::JOB_NAME_TAKEN);
+    assert!(!creates(&plan));
+    world.view.job = JobSight::Absent;
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+
+    // Also when it was only seen after ours had been asked for: it is no deletion of ours then.
+    world.view.job = JobSight::Foreign;
+    world.pass_to(Pending, reasons::JOB_NAME_TAKEN);
+    world.view.job = JobSight::Absent;
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert!(creates(&plan));
+    assert_eq!(plan.status.recreated, 0);
+}
+
+#[test]
+fn a_cancel_ends_the_wait_at_once() {
+    let turns = [Turn::Wait { position: 1, eta: None }, Turn::Paused { position: 1 }];
+    for turn in turns {
+        let mut world = World::local();
+        world.view.turn = turn;
+        world.pass();
+        world.submission().spec.cancel = true;
+        let plan = world.pass_to(Cancelled, reasons::CANCELLED);
+        assert_eq!(plan.status.waiting, None);
+        assert!(!creates(&plan));
+    }
+    let mut world = World::local();
+    world.view.job = JobSight::Foreign;
+    world.pass();
+    world.submission().spec.cancel = true;
+    world.pass_to(Cancelled, reasons::CANCELLED);
+}
+
+#[test]
+fn a_job_that_is_slow_to_show_is_asked_for_again_without_counting() {
+    let mut world = World::local();
+    for _ in 0..10 {
+        let plan = world.pass_to(Pending, reasons::PREPARING);
+        assert!(creates(&plan));
+        assert_eq!(plan.status.recreated, 0);
+    }
+}

@@ -1,0 +1,16 @@
+//! Tables and properties of `decide`, by stage of life. Every pass of every table also obeys `rules`.
+
+mod accept;
+mod after;
+mod builders;
+mod crashes;
+mod docs;
+mod end;
+mod failure;
+mod line;
+mod properties;
+mod resume;
+mod rules;
+mod run;
+mod start;
+mod stop;

@@ -1,0 +1,158 @@
+//! What holds for every pass in every world.
+
+use std::collections::HashSet;
+
+use crate::api::conditions::{self, FINISHED, PUBLISHED};
+use crate::api::{FailureClass, State, SubmissionStatus};
+use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
+use crate::controller::view::{JobSight, View};
+
+/// Passes after which nothing may change any more in a world that stands still.
+const SETTLED_AFTER: usize = 5;
+
+/// Checks one pass, and that the world comes to rest after it.
+pub fn check(view: &View, plan: &Plan) {
+    terminal_states_stay(view, plan);
+    one_job(view, plan);
+    tells_fit(view, plan);
+    status_is_whole(plan);
+    conditions_are_conventional(plan);
+    live_ones_are_looked_at_again(plan);
+    comes_to_rest(view, plan);
+}
+
+fn is_finished(status: &SubmissionStatus) -> bool {
+    conditions::is_true(&status.conditions, FINISHED)
+}
+
+fn terminal_states_stay(view: &View, plan: &Plan) {
+    let Some(before) = view.submission.status.as_ref().filter(|s| is_finished(s)) else {
+        return;
+    };
+    let after = &plan.status;
+    let is_resumed = before.state != Some(State::Finished) && Some(view.submission.spec.attempt) > before.attempt;
+    if is_resumed {
+        assert_eq!(after.attempt, Some(view.submission.spec.attempt));
+        assert_eq!(after.state, Some(State::Pending));
+        assert!(!is_finished(after));
+        return;
+    }
+    assert!(is_finished(after), "left a terminal state: {after:?}");
+    assert_eq!(after.attempt, before.attempt);
+    let may_amend = !conditions::is_true(&before.conditions, PUBLISHED) && after.state == Some(State::Cancelled);
+    assert!(
+        after.state == before.state || may_amend,
+        "{:?} -> {:?}",
+        before.state,
+        after.state
+    );
+}
+
+fn one_job(view: &View, plan: &Plan) {
+    let created = plan.actions.iter().filter_map(|a| match a {
+        Action::CreateJob { attempt, retry } => Some((*attempt, *retry)),
+        _ => None,
+    });
+    let created: Vec<_> = created.collect();
+    assert!(created.len() <= 1, "two Jobs in one pass");
+    if let Some((attempt, retry)) = created.first() {
+        assert!(
+            !matches!(view.job, JobSight::Ours(_)),
+            "a second Job beside the present one"
+        );
+        assert!(!is_finished(&plan.status));
+        assert_eq!((plan.status.attempt, plan.status.retry), (Some(*attempt), *retry));
+        assert_eq!(plan.status.job, Some(job_name("sub", &plan.status)));
+        assert!(plan.status.plan.is_some(), "a Job without a plan");
+        assert!(view.leaderboard.is_some(), "a Job without a Leaderboard");
+    }
+    for action in &plan.actions {
+        if let Action::DeleteJob { name, uid, .. } = action {
+            let is_seen = matches!(&view.job, JobSight::Ours(job) if job.name == *name && job.uid == *uid);
+            assert!(is_seen, "deletes a Job it does not see");
+        }
+    }
+}
+
+fn tells_fit(view: &View, plan: &Plan) {
+    let before = view.submission.status.as_ref();
+    let is_new_attempt = before.is_some_and(|s| s.attempt.is_some() && s.attempt != plan.status.attempt);
+    for action in &plan.actions {
+        let Action::Tell(tell) = action else { continue };
+        assert!(
+            view.submission.spec.evalai.is_some(),
+            "tells EvalAI of a local submission"
+        );
+        assert!(!is_new_attempt, "what was seen is the old attempt's");
+        let state = plan.status.state;
+        let fits = match tell {
+            Tell::Queued => state == Some(State::Pending),
+            Tell::Running | Tell::Partial => matches!(state, Some(State::Running | State::Resumed)),
+            Tell::Finished => state == Some(State::Finished),
+            Tell::Failed => state == Some(State::Failed),
+            Tell::Cancelled => state == Some(State::Cancelled),
+        };
+        assert!(fits, "{tell:?} in {state:?}");
+    }
+}
+
+fn status_is_whole(plan: &Plan) {
+    let status = &plan.status;
+    let state = status.state.expect("a state");
+    assert_eq!(
+        state.is_terminal(),
+        is_finished(status),
+        "the state is computed from the conditions"
+    );
+    assert!(status.reason.as_ref().is_some_and(|r| !r.is_empty()));
+    assert!(status.waiting.is_none() || state == State::Pending);
+    let failure = status.failure.as_ref();
+    match state {
+        State::Failed => assert!(failure.is_some(), "Failed without a failure"),
+        State::Finished | State::Cancelled => assert_eq!(failure, None),
+        _ => {}
+    }
+    if let Some(failure) = failure {
+        assert_eq!(failure.charged, failure.class == FailureClass::Participant);
+        assert!(failure.message.contains(". "), "no next step: {}", failure.message);
+    }
+    if let Some(message) = &status.message {
+        assert!(message.ends_with(['.', '…']), "no sentence: {message}");
+        assert!(!message.contains(".."), "{message}");
+    }
+}
+
+fn conditions_are_conventional(plan: &Plan) {
+    let mut seen = HashSet::new();
+    for condition in &plan.status.conditions {
+        assert!(seen.insert(&condition.type_), "{} twice", condition.type_);
+        assert!(["True", "False", "Unknown"].contains(&condition.status.as_str()));
+        let is_camel = condition.reason.chars().next().is_some_and(|c| c.is_ascii_uppercase())
+            && condition.reason.chars().all(|c| c.is_ascii_alphanumeric());
+        assert!(is_camel, "reason of {}: {:?}", condition.type_, condition.reason);
+    }
+}
+
+fn live_ones_are_looked_at_again(plan: &Plan) {
+    if !is_finished(&plan.status) {
+        assert!(plan.requeue.is_some(), "forgotten while {:?}", plan.status.reason);
+    }
+}
+
+/// A status that is decided again in the same world changes no more, and tells no more events.
+fn comes_to_rest(view: &View, plan: &Plan) {
+    let mut view = view.clone();
+    let mut last = plan.clone();
+    for _ in 0..SETTLED_AFTER {
+        std::sync::Arc::make_mut(&mut view.submission).status = Some(last.status);
+        last = decide(&view);
+    }
+    std::sync::Arc::make_mut(&mut view.submission).status = Some(last.status.clone());
+    let again = decide(&view);
+    assert_eq!(again.status, last.status, "a write each pass");
+    // The pass that releases a deleted object is its last.
+    if !again.actions.contains(&Action::ReleaseFinalizer) {
+        assert_eq!(again.events, Vec::new(), "an event each pass");
+    }
+    assert_eq!(again.actions, last.actions);
+}

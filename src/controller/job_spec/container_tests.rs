@@ -1,0 +1,315 @@
+//! What each container of a built Job gets, and what it must not get.
+
+use serde_json::{Value, json};
+
+use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
+use super::{JobInput, build_json, run_document};
+use crate::pod::run::ENV_ROLE_ARN;
+use crate::pod::run::Run;
+
+fn env<'a>(container: &'a Value, name: &str) -> Option<&'a Value> {
+    container["env"]
+        .as_array()?
+        .iter()
+        .find(|variable| variable["name"] == name)
+}
+
+fn value<'a>(container: &'a Value, name: &str) -> Option<&'a str> {
+    env(container, name)?["value"].as_str()
+}
+
+fn is_own(container: &Value) -> bool {
+    container["name"] == "workspace" || container["name"] == "logcopy"
+}
+
+#[test]
+fn the_pairs_share_out_what_the_plan_says() {
+    let job = Case::new("V1", json!({"pairs": 3})).json();
+    let expected = [
+        ("0-6", "2000", "2010", "0"),
+        ("7-13", "2100", "2110", "1"),
+        ("14-19", "2200", "2210", "2"),
+    ];
+    for (pair, (slice, port, traffic, device)) in (1..).zip(expected) {
+        let agent = container(&job, &format!("agent-{pair}"));
+        let simulator = container(&job, &format!("simulator-{pair}"));
+        assert_eq!(value(agent, "ROUTES_SUBSET"), Some(slice));
+        assert_eq!(value(agent, "CARLA_PORT"), Some(port));
+        assert_eq!(value(simulator, "CARLA_PORT"), Some(port));
+        assert_eq!(value(agent, "CARLA_TM_PORT"), Some(traffic));
+        for container in [agent, simulator] {
+            assert_eq!(value(container, "NVIDIA_VISIBLE_DEVICES"), Some(device));
+        }
+        assert!(
+            simulator["command"]
+                .as_array()
+                .unwrap()
+                .contains(&json!(format!("--port={port}")))
+        );
+    }
+    assert_eq!(
+        job["spec"]["template"]["spec"]["containers"].as_array().unwrap().len(),
+        6
+    );
+}
+
+#[test]
+fn resume_is_1_or_empty() {
+    for (attempt, taken_up, expected) in [(1, false, ""), (1, true, "1"), (2, false, "1"), (2, true, "1")] {
+        let mut case = Case::new("V2", json!({}));
+        case.attempt = attempt;
+        case.plan.resume = taken_up;
+        let job = case.json();
+        assert_eq!(
+            value(container(&job, "agent-2"), "RESUME"),
+            Some(expected),
+            "{attempt} {taken_up}"
+        );
+    }
+}
+
+#[test]
+fn a_track_brings_its_files_and_repetitions() {
+    let track = json!({"name": "sensors", "codename": "MAP", "routesFile": "/r/a.xml", "scenariosFile": "/r/b.json", "repetitions": 2});
+    let job = Case::new("V1", json!({"tracks": [track]})).json();
+    let agent = container(&job, "agent-1");
+    let expected = [
+        ("ROUTES", "/r/a.xml"),
+        ("SCENARIOS", "/r/b.json"),
+        ("REPETITIONS", "2"),
+        ("CHALLENGE_TRACK_CODENAME", "MAP"),
+    ];
+    for (name, expected) in expected {
+        assert_eq!(value(agent, name), Some(expected));
+    }
+}
+
+#[test]
+fn a_track_that_was_taken_away_leaves_the_plan() {
+    let mut case = Case::new("V1", json!({}));
+    case.leaderboard.spec.tracks.clear();
+    let job = case.json();
+    assert_eq!(
+        value(container(&job, "agent-1"), "CHALLENGE_TRACK_CODENAME"),
+        Some("SENSORS")
+    );
+    assert_eq!(job, Case::new("V1", json!({})).json());
+}
+
+#[test]
+fn only_our_own_containers_have_an_identity() {
+    let identities = [
+        json!({"podIdentity": role()}),
+        json!({"podIdentity": {"secretRef": "writer"}}),
+        json!({}),
+    ];
+    for identity in identities {
+        let job = Case::new("V2", identity.clone()).json();
+        assert_eq!(job["spec"]["template"]["spec"]["automountServiceAccountToken"], false);
+        for container in containers(&job) {
+            let mounts = container["volumeMounts"].as_array().unwrap();
+            let token = mounts.iter().any(|mount| mount["name"] == "identity");
+            let env_of = container["env"].as_array().map(Vec::as_slice).unwrap_or_default();
+            let identities = env_of.iter().filter(|variable| {
+                let name = variable["name"].as_str().unwrap();
+                name.starts_with("AWS_")
+                    || name == ENV_ROLE_ARN
+                    || variable.pointer("/valueFrom/secretKeyRef").is_some()
+            });
+            if is_own(container) {
+                assert_eq!(
+                    token,
+                    identity["podIdentity"]["roleArn"].is_string(),
+                    "{}",
+                    container["name"]
+                );
+                assert_eq!(value(container, ENV_ROLE_ARN).is_some(), token);
+                let secret = identity["podIdentity"]["secretRef"].is_string();
+                assert_eq!(env(container, "AWS_SECRET_ACCESS_KEY").is_some(), secret);
+                assert_eq!(value(container, "AWS_REGION"), Some("eu-west-1"));
+            } else {
+                assert!(!token, "{}", container["name"]);
+                assert_eq!(identities.count(), 0, "{}", container["name"]);
+                assert!(mounts.iter().all(|mount| mount["name"] != "podinfo"));
+                assert!(
+                    mounts
+                        .iter()
+                        .all(|mount| mount["name"] != "logs" || mount["subPath"].is_string())
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn eks_is_told_every_stranger() {
+    let pod = json!({"spec": {"initContainers": [{"name": "metrics", "image": "m", "restartPolicy": "Always"}]}});
+    let job = Case::new("V2", json!({"pairs": 2, "pod": pod})).json();
+    assert_eq!(
+        job["spec"]["template"]["metadata"]["annotations"]["eks.amazonaws.com/skip-containers"],
+        "contents,metrics,simulator-1,simulator-2,agent-1,agent-2"
+    );
+}
+
+#[test]
+fn secrets_are_named_and_never_written() {
+    let job = Case::new("V2", json!({"podIdentity": {"secretRef": "writer"}})).json();
+    for name in ["workspace", "logcopy"] {
+        let known = |key: &str| env(container(&job, name), key).unwrap().clone();
+        for key in ["AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"] {
+            assert_eq!(
+                known(key),
+                json!({"name": key, "valueFrom": {"secretKeyRef": {"name": "writer", "key": key}}})
+            );
+        }
+        assert_eq!(
+            known("AWS_SESSION_TOKEN")["valueFrom"]["secretKeyRef"]["optional"],
+            true
+        );
+    }
+    // The only references to Secrets, and no literal beside them.
+    let text = job.to_string();
+    assert_eq!(text.matches("secretKeyRef").count(), 6);
+    assert!(!text.contains("evalai"));
+}
+
+#[test]
+fn a_hostile_image_name_cannot_ask_kubernetes_for_a_secret() {
+    let mut case = Case::new("V2", json!({"podIdentity": {"secretRef": "writer"}}));
+    case.plan.image = "x/$(AWS_SECRET_ACCESS_KEY)$$(AWS_SECRET_ACCESS_KEY)".into();
+    let job = case.json();
+    let written = value(container(&job, "logcopy"), "LEADERBOARD_RUN").unwrap();
+    let handed_on = super::command_tests::kubernetes_expand(written, &|name| Some(format!("<{name}>")));
+    let run: Run = serde_json::from_str(&handed_on).unwrap();
+    assert_eq!(run, run_document(&case.input()));
+    assert_eq!(run.plan.image, case.plan.image);
+}
+
+#[test]
+fn the_run_document_is_the_plan_and_its_times() {
+    let mut case = Case::new(
+        "V2",
+        json!({"periodSeconds": 5, "verify": "Refuse", "logGroup": {"name": "g"}}),
+    );
+    case.attempt = 2;
+    let run = run_document(&case.input());
+    assert_eq!(
+        (run.namespace.as_str(), run.submission.as_str(), run.uid.as_str()),
+        ("challenge", "submission-4711", "submission-uid")
+    );
+    assert_eq!(
+        (run.attempt, run.period_seconds, run.flush_seconds, run.cancel_seconds),
+        (2, 5, 1800, 120)
+    );
+    assert_eq!(run.plan, case.plan);
+    assert_eq!(run.verify, crate::api::Verify::Refuse);
+    assert_eq!(run.log_group.unwrap().name, "g");
+}
+
+#[test]
+fn every_container_is_confined_unless_the_host_says_otherwise() {
+    let job = Case::new(
+        "V2",
+        json!({"simulator": {"image": "s", "securityContext": {"privileged": true}}}),
+    )
+    .json();
+    for container in containers(&job) {
+        let context = &container["securityContext"];
+        if container["name"].as_str().unwrap().starts_with("simulator") {
+            assert_eq!(context, &json!({"privileged": true}));
+            continue;
+        }
+        assert_eq!(context["allowPrivilegeEscalation"], false);
+        assert_eq!(context["capabilities"], json!({"drop": ["ALL"]}));
+        assert_eq!(context["seccompProfile"], json!({"type": "RuntimeDefault"}));
+        assert_eq!(context.get("runAsUser").is_some(), is_own(container));
+        assert_eq!(context.get("readOnlyRootFilesystem").is_some(), is_own(container));
+    }
+}
+
+#[test]
+fn status_folders_are_read_by_all_and_written_by_their_own() {
+    let job = Case::new("V2", json!({})).json();
+    for container in containers(&job)
+        .into_iter()
+        .filter(|container| container["command"][1] == "agent" || container["command"][1] == "simulator")
+    {
+        let name = container["name"].as_str().unwrap();
+        let mounts = container["volumeMounts"].as_array().unwrap();
+        let at = |path: &str| mounts.iter().position(|mount| mount["mountPath"] == path).unwrap();
+        let (all, own) = (at("/tmp/status"), at(&format!("/tmp/status/{name}")));
+        assert!(all < own);
+        assert_eq!(
+            mounts[all],
+            json!({"name": "logs", "mountPath": "/tmp/status", "subPath": "containers-status", "readOnly": true})
+        );
+        assert_eq!(mounts[own]["subPath"], format!("containers-status/{name}"));
+        assert_eq!(mounts[own].get("readOnly"), None);
+        assert_eq!(mounts[at("/leaderboard-tools")]["readOnly"], true);
+        if let Some(pair) = name.strip_prefix("agent-") {
+            assert_eq!(mounts[at("/tmp/agent")]["subPath"], format!("agent/agent{pair}"));
+            for contents in ["leaderboard", "scenario_runner", "CARLA"] {
+                assert_eq!(mounts[at(&format!("/workspace/{contents}"))]["readOnly"], true);
+            }
+        } else {
+            assert_eq!(mounts[at("/home/carla/CarlaUE4/Saved")]["subPath"], "simulator");
+        }
+    }
+}
+
+#[test]
+fn logs_have_room_for_all_that_the_limits_allow() {
+    let gib = 1_i64 << 30;
+    let cases = [
+        (json!({}), 20 + 4 * 2 + 1),
+        (
+            json!({"pairs": 1, "agent": {"logLimit": gib}, "storage": {"bucket": "results", "limit": 5 * gib}}),
+            5 + 1 + 1,
+        ),
+    ];
+    for (more, expected) in cases {
+        let job = Case::new("V2", more).json();
+        let volumes = job["spec"]["template"]["spec"]["volumes"].as_array().unwrap().clone();
+        let logs = volumes.iter().find(|volume| volume["name"] == "logs").unwrap();
+        assert_eq!(logs["emptyDir"]["sizeLimit"], (expected * gib).to_string());
+    }
+}
+
+#[test]
+fn the_hosts_variables_win_but_not_over_the_plan() {
+    let env = json!([{"name": "ROUTES_SUBSET", "value": "0-99"}, {"name": "NVIDIA_VISIBLE_DEVICES", "value": "all"}, {"name": "MINE", "value": "x"}]);
+    let job = Case::new("V2", json!({"agent": {"env": env}})).json();
+    let agent = container(&job, "agent-1");
+    assert_eq!(value(agent, "ROUTES_SUBSET"), Some("0-4"));
+    assert_eq!(value(agent, "NVIDIA_VISIBLE_DEVICES"), Some("all"));
+    assert_eq!(value(agent, "MINE"), Some("x"));
+    let names: Vec<&str> = agent["env"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|v| v["name"].as_str().unwrap())
+        .collect();
+    let mut unique = names.clone();
+    unique.sort_unstable();
+    unique.dedup();
+    assert_eq!(names.len(), unique.len(), "{names:?}");
+}
+
+#[test]
+fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
+    let case = Case::new("V2", json!({}));
+    let input = JobInput {
+        image_pull_policy: Some("Always"),
+        region: Some("us-west-2"),
+        ..case.input()
+    };
+    let job = build_json(&input);
+    for container in containers(&job) {
+        assert_eq!(container.get("imagePullPolicy").is_some(), is_own(container));
+        if is_own(container) {
+            assert_eq!(container["image"], OPERATOR_IMAGE);
+            assert_eq!(value(container, "AWS_REGION"), Some("us-west-2"));
+            assert_eq!(value(container, "AWS_EC2_METADATA_DISABLED"), Some("true"));
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! The containers that start before the pairs: `contents` of the host, and our own `workspace` and `logcopy`. Pure.
+//!
+//! Only our own two ever get an identity towards AWS.
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::api::core::v1::{
+    Capabilities, Container, EnvVar, EnvVarSource, ObjectFieldSelector, ResourceRequirements, SeccompProfile,
+    SecretKeySelector, SecurityContext,
+};
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+
+use super::{JobInput, commands, run_document, variable, volumes};
+use crate::api::names;
+use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
+
+/// `workspace` and `logcopy` run as nobody in particular: with every capability dropped root could read no more than any
+/// other uid, and all that they write to is a volume (0777) or a folder that the kubelet or they themselves made there.
+/// Files they restore are 0666 in folders of 0777, so that the agents' uids, whatever they are, can go on with them.
+const OWN_UID: i64 = 65532;
+
+/// Copies the private contents into their volumes.
+pub(super) fn contents(input: &JobInput<'_>) -> Container {
+    let spec = &input.spec().contents;
+    let host = spec
+        .command
+        .as_deref()
+        .map(|command| commands::words(command, spec.args.as_deref()));
+    Container {
+        name: names::CONTAINER_CONTENTS.into(),
+        image: Some(input.plan.contents_image.clone()),
+        command: Some(host.unwrap_or_else(commands::contents)),
+        env: (!spec.env.is_empty()).then(|| spec.env.clone()),
+        resources: spec.resources.clone(),
+        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
+        volume_mounts: Some(volumes::of_contents()),
+        ..Container::default()
+    }
+}
+
+/// Prepares the volumes and restores what an earlier attempt stored.
+pub(super) fn workspace(input: &JobInput<'_>) -> Container {
+    Container {
+        volume_mounts: Some(volumes::of_workspace(input)),
+        resources: Some(resources(["50m", "64Mi"], "512Mi")),
+        ..own(input, names::CONTAINER_WORKSPACE)
+    }
+}
+
+/// Merges, uploads and reports beside the pairs.
+pub(super) fn logcopy(input: &JobInput<'_>) -> Container {
+    Container {
+        restart_policy: Some("Always".into()),
+        volume_mounts: Some(volumes::of_logcopy(input)),
+        resources: Some(resources(["100m", "128Mi"], "1Gi")),
+        ..own(input, names::CONTAINER_LOGCOPY)
+    }
+}
+
+fn own(input: &JobInput<'_>, name: &str) -> Container {
+    Container {
+        name: name.into(),
+        image: Some(input.operator_image.into()),
+        image_pull_policy: input.image_pull_policy.map(Into::into),
+        command: Some(vec!["leaderboard-operator".into(), name.into()]),
+        env: Some(own_env(input)),
+        security_context: Some(SecurityContext {
+            read_only_root_filesystem: Some(true),
+            run_as_non_root: Some(true),
+            run_as_user: Some(OWN_UID),
+            run_as_group: Some(OWN_UID),
+            ..confined()
+        }),
+        ..Container::default()
+    }
+}
+
+fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
+    let run = serde_json::to_string(&run_document(input)).unwrap_or_default();
+    let mut env = vec![
+        variable(ENV_RUN, &run),
+        EnvVar {
+            name: ENV_POD_UID.into(),
+            value_from: Some(EnvVarSource {
+                field_ref: Some(ObjectFieldSelector {
+                    field_path: "metadata.uid".into(),
+                    api_version: None,
+                }),
+                ..EnvVarSource::default()
+            }),
+            value: None,
+        },
+        // The node's own role is no identity of ours: what answers us at the metadata address answers the agents too.
+        variable("AWS_EC2_METADATA_DISABLED", "true"),
+    ];
+    let region = input.region.or(input.plan.storage.region.as_deref());
+    env.extend(region.map(|region| variable("AWS_REGION", region)));
+    if let Some(identity) = &input.spec().pod_identity {
+        env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));
+        env.extend(identity.secret_ref.iter().flat_map(|secret| {
+            [
+                from_secret(secret, "AWS_ACCESS_KEY_ID", false),
+                from_secret(secret, "AWS_SECRET_ACCESS_KEY", false),
+                from_secret(secret, "AWS_SESSION_TOKEN", true),
+            ]
+        }));
+    }
+    env
+}
+
+fn from_secret(secret: &str, key: &str, optional: bool) -> EnvVar {
+    EnvVar {
+        name: key.into(),
+        value_from: Some(EnvVarSource {
+            secret_key_ref: Some(SecretKeySelector {
+                name: secret.into(),
+                key: key.into(),
+                optional: optional.then_some(true),
+            }),
+            ..EnvVarSource::default()
+        }),
+        value: None,
+    }
+}
+
+/// No limit on local storage: Kubernetes would take it for the limit of the whole Pod and evict that.
+fn resources(requests: [&str; 2], memory: &str) -> ResourceRequirements {
+    let quantity = |text: &str| Quantity(text.into());
+    let [cpu, requested] = requests.map(quantity);
+    ResourceRequirements {
+        requests: Some(BTreeMap::from([("cpu".into(), cpu), ("memory".into(), requested)])),
+        limits: Some(BTreeMap::from([("memory".into(), quantity(memory))])),
+        ..ResourceRequirements::default()
+    }
+}
+
+/// The default for every container: no capability, no new privileges. The uid stays the image's.
+pub(super) fn confined() -> SecurityContext {
+    SecurityContext {
+        allow_privilege_escalation: Some(false),
+        capabilities: Some(Capabilities {
+            drop: Some(vec!["ALL".into()]),
+            add: None,
+        }),
+        seccomp_profile: Some(SeccompProfile {
+            type_: "RuntimeDefault".into(),
+            localhost_profile: None,
+        }),
+        ..SecurityContext::default()
+    }
+}

@@ -1,0 +1,297 @@
+//! The Job of one attempt: names, labels, deadlines, volumes, and which container gets what.
+//!
+//! Pure: no client, no clock, no error. Called by the controller when an attempt starts, and for the dry run that checks a
+//! Leaderboard. It owns everything the Pod is made of; what the containers then do is in `pod` and in the runner.
+
+mod commands;
+mod init;
+mod pairs;
+mod volumes;
+
+#[cfg(test)]
+mod command_tests;
+#[cfg(test)]
+mod container_tests;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::api::batch::v1::{Job, JobSpec};
+use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
+use kube::Resource;
+use kube::api::{DynamicObject, TypeMeta};
+use serde_json::{Value, json};
+
+use super::pod_overlay;
+use crate::api::{Deadlines, Leaderboard, LeaderboardSpec, RunPlan, Submission, Track, names};
+use crate::pod::run::Run;
+
+pub(super) use pairs::FIXED_ENV;
+pub(super) use volumes::{CONTENTS_VOLUMES, OWN_VOLUMES, protected_mounts};
+
+/// Annotation that keeps EKS from putting the ServiceAccount's role into the containers it names.
+pub const ANNOTATION_SKIP_CONTAINERS: &str = "eks.amazonaws.com/skip-containers";
+
+/// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
+const GRACE_SECONDS: i64 = 600;
+/// Seconds a Pod stays on a node that is not ready or not reachable; Kubernetes' own default is 300.
+const LOST_NODE_SECONDS: i64 = 60;
+/// What the net under all deadlines allows beyond their sum, in seconds.
+const NET_SECONDS: i64 = 1800;
+/// Restarts beyond those of the pairs that do not end the Job: `contents`, `workspace` and `logcopy` count too.
+const SPARE_RESTARTS: i32 = 20;
+
+/// What a Job is built from.
+#[derive(Clone, Copy, Debug)]
+pub struct JobInput<'a> {
+    /// Whose attempt it is; name, namespace and UID are used.
+    pub submission: &'a Submission,
+    /// How it is run.
+    pub leaderboard: &'a Leaderboard,
+    /// What is run, pinned at acceptance.
+    pub plan: &'a RunPlan,
+    /// From 1.
+    pub attempt: i64,
+    /// Jobs of this attempt that infrastructure failures ended.
+    pub retry: i32,
+    /// The operator's own image: `workspace` and `logcopy` are in it.
+    pub operator_image: &'a str,
+    /// Pull policy of that image; `None` is Kubernetes' default.
+    pub image_pull_policy: Option<&'a str>,
+    /// The operator's own AWS region, for what the Leaderboard gives no region.
+    pub region: Option<&'a str>,
+}
+
+impl JobInput<'_> {
+    fn spec(&self) -> &LeaderboardSpec {
+        &self.leaderboard.spec
+    }
+
+    fn deadlines(&self) -> &Deadlines {
+        &self.leaderboard.spec.deadlines
+    }
+
+    fn pairs(&self) -> usize {
+        self.plan.slices.len()
+    }
+
+    fn submission_name(&self) -> &str {
+        self.submission.metadata.name.as_deref().unwrap_or_default()
+    }
+
+    /// The track; `None` if an edit of the Leaderboard has taken it away since.
+    fn track(&self) -> Option<&Track> {
+        self.spec().tracks.iter().find(|track| track.name == self.plan.track)
+    }
+}
+
+/// The Job with the Leaderboard's `pod` laid over it, as far as this client's types know its fields.
+///
+/// For reading. Create what [`build_json`] or [`build_object`] return: newer Pod fields survive there. An overlay that
+/// does not fit the types, which `pod_overlay::validate_overlay` refuses, is left out.
+pub fn build(input: &JobInput<'_>) -> Job {
+    serde_json::from_value(build_json(input)).unwrap_or_else(|_| ours(input))
+}
+
+/// The Job as it is created: ours, with the Leaderboard's `pod` laid over its template.
+///
+/// An overlay that `pod_overlay::validate_overlay` refuses is not applied at all, so that nothing gets around its rules.
+pub fn build_json(input: &JobInput<'_>) -> Value {
+    // Maps with text as keys and finite numbers always become JSON.
+    let mut job = serde_json::to_value(ours(input)).unwrap_or_default();
+    let overlay = input
+        .spec()
+        .pod
+        .as_ref()
+        .filter(|pod| pod_overlay::validate_overlay(pod).is_ok());
+    if let Some(template) = job.pointer_mut("/spec/template") {
+        if let Some(overlay) = overlay {
+            pod_overlay::apply(template, overlay);
+        }
+        skip_strangers(template);
+    }
+    job
+}
+
+/// [`build_json`] for `kube::Api::<DynamicObject>::create`.
+pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
+    let mut job = build_json(input);
+    DynamicObject {
+        types: Some(TypeMeta::resource::<Job>()),
+        metadata: metadata(input),
+        data: json!({ "spec": job["spec"].take() }),
+    }
+}
+
+/// What the Pod is told, as `LEADERBOARD_RUN`.
+pub fn run_document(input: &JobInput<'_>) -> Run {
+    let unsigned = |seconds: i64| u64::try_from(seconds).unwrap_or_default();
+    let (spec, meta) = (input.spec(), &input.submission.metadata);
+    Run {
+        namespace: meta.namespace.clone().unwrap_or_default(),
+        submission: input.submission_name().to_owned(),
+        uid: meta.uid.clone().unwrap_or_default(),
+        attempt: input.attempt,
+        plan: input.plan.clone(),
+        verify: spec.verify,
+        period_seconds: unsigned(spec.period_seconds),
+        flush_seconds: unsigned(spec.deadlines.flush_seconds),
+        cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
+        log_group: spec.log_group.clone(),
+    }
+}
+
+fn ours(input: &JobInput<'_>) -> Job {
+    Job {
+        metadata: metadata(input),
+        spec: Some(JobSpec {
+            completions: Some(1),
+            parallelism: Some(1),
+            backoff_limit: Some(backoff_limit(input)),
+            // The default starts the next Pod while the old one still writes.
+            pod_replacement_policy: Some("Failed".into()),
+            template: template(input),
+            ..JobSpec::default()
+        }),
+        status: None,
+    }
+}
+
+fn metadata(input: &JobInput<'_>) -> ObjectMeta {
+    ObjectMeta {
+        name: Some(names::job(input.submission_name(), input.attempt, input.retry)),
+        namespace: input.submission.metadata.namespace.clone(),
+        labels: Some(labels(input)),
+        annotations: Some(BTreeMap::from([(
+            names::ANNOTATION_RETRY.into(),
+            input.retry.to_string(),
+        )])),
+        owner_references: Some(vec![OwnerReference {
+            api_version: Submission::api_version(&()).into_owned(),
+            kind: Submission::kind(&()).into_owned(),
+            name: input.submission_name().to_owned(),
+            uid: input.submission.metadata.uid.clone().unwrap_or_default(),
+            controller: Some(true),
+            block_owner_deletion: Some(true),
+        }]),
+        ..ObjectMeta::default()
+    }
+}
+
+fn labels(input: &JobInput<'_>) -> BTreeMap<String, String> {
+    let leaderboard = input.leaderboard.metadata.name.clone().unwrap_or_default();
+    BTreeMap::from([
+        (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
+        (names::LABEL_SUBMISSION.into(), input.submission_name().to_owned()),
+        (names::LABEL_ATTEMPT.into(), input.attempt.to_string()),
+        (names::LABEL_LEADERBOARD.into(), leaderboard),
+        (names::LABEL_RUN.into(), input.plan.run_id.clone()),
+    ])
+}
+
+/// A net only: the controller counts the crashes of each pair itself. This limit is one budget over all containers, and
+/// at it the Pod is deleted with its statuses.
+fn backoff_limit(input: &JobInput<'_>) -> i32 {
+    let pairs = i32::try_from(input.pairs()).unwrap_or(i32::MAX);
+    pairs
+        .saturating_mul(2)
+        .saturating_mul(input.spec().retries.pair)
+        .saturating_add(SPARE_RESTARTS)
+}
+
+/// The net for an absent controller. It belongs to the Pod and not to the Job, whose own would count the wait for a node.
+fn active_deadline(deadlines: &Deadlines) -> i64 {
+    [
+        deadlines.start_seconds,
+        deadlines.run_seconds,
+        deadlines.cancel_seconds,
+        deadlines.flush_seconds,
+    ]
+    .into_iter()
+    .fold(NET_SECONDS, i64::saturating_add)
+    .min(i32::MAX.into())
+}
+
+fn template(input: &JobInput<'_>) -> PodTemplateSpec {
+    PodTemplateSpec {
+        metadata: Some(ObjectMeta {
+            labels: Some(labels(input)),
+            // Moving a run to another node costs hours of simulation.
+            annotations: Some(BTreeMap::from([
+                ("cluster-autoscaler.kubernetes.io/safe-to-evict".into(), "false".into()),
+                ("karpenter.sh/do-not-disrupt".into(), "true".into()),
+            ])),
+            ..ObjectMeta::default()
+        }),
+        spec: Some(pod(input)),
+    }
+}
+
+fn pod(input: &JobInput<'_>) -> PodSpec {
+    let pairs = 1..=input.pairs();
+    let identity = input.spec().pod_identity.as_ref();
+    let node_selector = input
+        .track()
+        .map(|track| track.node_selector.clone())
+        .filter(|nodes| !nodes.is_empty());
+    PodSpec {
+        restart_policy: Some("OnFailure".into()),
+        init_containers: Some(vec![
+            init::contents(input),
+            init::workspace(input),
+            init::logcopy(input),
+        ]),
+        containers: pairs
+            .clone()
+            .map(|pair| pairs::simulator(input, pair))
+            .chain(pairs.map(|pair| pairs::agent(input, pair)))
+            .collect(),
+        volumes: Some(volumes::all(input)),
+        active_deadline_seconds: Some(active_deadline(input.deadlines())),
+        termination_grace_period_seconds: Some(GRACE_SECONDS),
+        service_account_name: identity.and_then(|identity| identity.service_account_name.clone()),
+        automount_service_account_token: Some(false),
+        enable_service_links: Some(false),
+        share_process_namespace: Some(false),
+        runtime_class_name: input.spec().runtime_class_name.clone(),
+        node_selector,
+        tolerations: Some(tolerations(input)),
+        ..PodSpec::default()
+    }
+}
+
+fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
+    let lost_node = ["not-ready", "unreachable"].map(|what| Toleration {
+        key: Some(format!("node.kubernetes.io/{what}")),
+        operator: Some("Exists".into()),
+        effect: Some("NoExecute".into()),
+        toleration_seconds: Some(LOST_NODE_SECONDS),
+        ..Toleration::default()
+    });
+    let track = input.track().map(|track| track.tolerations.clone()).unwrap_or_default();
+    lost_node.into_iter().chain(track).collect()
+}
+
+/// Names every container but our own two for EKS, those of the overlay too.
+fn skip_strangers(template: &mut Value) {
+    let strangers: Vec<&str> = ["/spec/initContainers", "/spec/containers"]
+        .into_iter()
+        .filter_map(|list| template.pointer(list)?.as_array())
+        .flatten()
+        .filter_map(|container| container["name"].as_str())
+        .filter(|name| ![names::CONTAINER_WORKSPACE, names::CONTAINER_LOGCOPY].contains(name))
+        .collect();
+    let strangers = strangers.join(",");
+    template["metadata"]["annotations"][ANNOTATION_SKIP_CONTAINERS] = strangers.into();
+}
+
+/// A variable with a literal value: what Kubernetes would expand in it stays as it is.
+fn variable(name: &str, value: &str) -> EnvVar {
+    EnvVar {
+        name: name.into(),
+        value: Some(commands::literal(value)),
+        value_from: None,
+    }
+}

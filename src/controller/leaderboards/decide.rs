@@ -1,0 +1,320 @@
+//! What a Leaderboard's status says, and when it may go: a pure function of what one pass saw.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::ResourceExt;
+
+use crate::api::conditions::{self, Truth};
+use crate::api::leaderboard::Counts;
+use crate::api::{Leaderboard, LeaderboardStatus, effective, names, reasons};
+
+/// What one pass saw of a Leaderboard.
+#[derive(Clone, Debug)]
+pub struct LeaderboardView {
+    pub now: Timestamp,
+    pub leaderboard: Arc<Leaderboard>,
+    /// All Leaderboards that the operator sees, this one included.
+    pub all: Vec<Arc<Leaderboard>>,
+    pub counts: Counts,
+    /// Submissions that are live or not yet published and recorded.
+    pub in_use: usize,
+    /// Why its Pods could not be made.
+    pub invalid_pod: Option<String>,
+    /// Why its bucket or table cannot be used.
+    pub unreachable: Option<(&'static str, String)>,
+    pub evalai: EvalaiStanding,
+    /// Requests of the last minute and the limit.
+    pub budget: Option<(u32, u32)>,
+}
+
+/// How a Leaderboard stands with EvalAI.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum EvalaiStanding {
+    NotWanted,
+    NoToken(String),
+    TokenRefused(String),
+    /// Its phases or labels do not fit the challenge.
+    Misfit(String),
+    /// Not checked yet, or EvalAI does not answer.
+    Unchecked(Option<String>),
+    Fits {
+        /// Something to be said although it works, such as a token that ends soon.
+        note: Option<String>,
+    },
+}
+
+/// What a pass wants.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LeaderboardPlan {
+    pub status: LeaderboardStatus,
+    /// Put the finalizer on (`true`) or take it off (`false`).
+    pub finalizer: Option<bool>,
+}
+
+/// Decides one pass.
+pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
+    let leaderboard = &view.leaderboard;
+    let mut status = leaderboard.status.clone().unwrap_or_default();
+    let generation = leaderboard.metadata.generation;
+    status.observed_generation = generation;
+    status.counts = Some(view.counts);
+    status.budget = view.budget.map(|(used, limit)| format!("{used}/{limit}"));
+    status.tracks = tracks(leaderboard);
+    let now = Time(view.now);
+    let (truth, reason, message) = ready(view);
+    conditions::set(
+        &mut status.conditions,
+        conditions::READY,
+        truth,
+        reason,
+        &message,
+        generation,
+        &now,
+    );
+    let deleting = leaderboard.metadata.deletion_timestamp.is_some();
+    if deleting && view.in_use > 0 {
+        let message = format!(
+            "{} submissions are live or unpublished; it goes when they are done.",
+            view.in_use
+        );
+        conditions::set(
+            &mut status.conditions,
+            conditions::TERMINATING,
+            Truth::True,
+            reasons::IN_USE,
+            &message,
+            generation,
+            &now,
+        );
+    }
+    let held = leaderboard
+        .finalizers()
+        .iter()
+        .any(|f| f == names::FINALIZER_LEADERBOARD);
+    let finalizer = match (deleting, held) {
+        (false, false) => Some(true),
+        (true, true) if view.in_use == 0 => Some(false),
+        _ => None,
+    };
+    LeaderboardPlan { status, finalizer }
+}
+
+/// The first thing that is wrong, the gravest first.
+fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
+    let no = |reason, message: String| (Truth::False, reason, message);
+    if let Some(older) = phase_conflict(view) {
+        return no(
+            reasons::PHASE_CONFLICT,
+            format!("Leaderboard {older} is older and serves a phase of this one; give each phase to one Leaderboard."),
+        );
+    }
+    if let Some(other) = prefix_conflict(view) {
+        return no(
+            reasons::PREFIX_CONFLICT,
+            format!(
+                "Leaderboard {other} of another EvalAI server stores below the same bucket and prefix; set storage.prefix."
+            ),
+        );
+    }
+    if let Some(why) = &view.invalid_pod {
+        return no(reasons::INVALID_POD, why.clone());
+    }
+    if let Some((reason, why)) = &view.unreachable {
+        return no(reason, why.clone());
+    }
+    match &view.evalai {
+        EvalaiStanding::NoToken(why) => no(reasons::TOKEN_MISSING, why.clone()),
+        EvalaiStanding::TokenRefused(why) => no(reasons::TOKEN_REFUSED, why.clone()),
+        EvalaiStanding::Misfit(why) => no(reasons::LABELS_DIFFER, why.clone()),
+        EvalaiStanding::Unchecked(why) => {
+            let why = why
+                .clone()
+                .unwrap_or_else(|| "EvalAI is being asked for its phases and labels.".into());
+            (Truth::Unknown, reasons::ASKING_EVALAI, why)
+        }
+        EvalaiStanding::Fits { note } => (Truth::True, reasons::READY, note.clone().unwrap_or_default()),
+        EvalaiStanding::NotWanted => (Truth::True, reasons::READY, String::new()),
+    }
+}
+
+/// An older Leaderboard of the same server that serves one of our phases.
+fn phase_conflict(view: &LeaderboardView) -> Option<String> {
+    let mine = &view.leaderboard;
+    let server = server(mine)?;
+    let phases: Vec<i64> = mine.spec.tracks.iter().filter_map(|t| t.phase).collect();
+    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && age(l) < age(mine));
+    others
+        .filter(|l| {
+            l.spec
+                .tracks
+                .iter()
+                .any(|t| t.phase.is_some_and(|p| phases.contains(&p)))
+        })
+        .map(|l| qualified(l))
+        .next()
+}
+
+fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
+    let mine = &view.leaderboard;
+    let place = |l: &Leaderboard| {
+        (
+            l.spec.storage.bucket.clone(),
+            l.spec.storage.prefix.clone(),
+            l.spec.storage.endpoint.clone(),
+        )
+    };
+    let others = others(view).filter(|l| place(l) == place(mine) && age(l) < age(mine));
+    let foreign = |l: &&Arc<Leaderboard>| matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
+    others.filter(|l| foreign(l)).map(|l| qualified(l)).next()
+}
+
+fn others(view: &LeaderboardView) -> impl Iterator<Item = &Arc<Leaderboard>> {
+    view.all
+        .iter()
+        .filter(|l| l.uid() != view.leaderboard.uid() && l.metadata.deletion_timestamp.is_none())
+}
+
+fn server(leaderboard: &Leaderboard) -> Option<String> {
+    leaderboard
+        .spec
+        .evalai
+        .as_ref()
+        .map(|e| e.api_server.trim_end_matches('/').to_owned())
+}
+
+fn age(leaderboard: &Leaderboard) -> (Option<Timestamp>, String) {
+    (
+        leaderboard.metadata.creation_timestamp.as_ref().map(|t| t.0),
+        leaderboard.name_any(),
+    )
+}
+
+fn qualified(leaderboard: &Leaderboard) -> String {
+    format!(
+        "{}/{}",
+        leaderboard.namespace().unwrap_or_default(),
+        leaderboard.name_any()
+    )
+}
+
+fn tracks(leaderboard: &Leaderboard) -> BTreeMap<String, String> {
+    let shape = |track| {
+        let shape = effective::shape(&leaderboard.spec, track);
+        format!(
+            "{} pairs, {} routes, {} repetitions",
+            shape.pairs, shape.routes, shape.repetitions
+        )
+    };
+    leaderboard
+        .spec
+        .tracks
+        .iter()
+        .map(|t| (t.name.clone(), shape(t)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) -> Arc<Leaderboard> {
+        let spec = json!({
+            "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+            "results": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            "storage": {"bucket": "bucket", "prefix": prefix},
+        });
+        let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
+        object.metadata.namespace = Some("ns".into());
+        object.metadata.uid = Some(name.into());
+        object.metadata.creation_timestamp = Some(Time(Timestamp::from_second(second).unwrap()));
+        Arc::new(object)
+    }
+
+    fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
+        LeaderboardView {
+            now: Timestamp::from_second(1000).unwrap(),
+            leaderboard: Arc::clone(mine),
+            all: all.to_vec(),
+            counts: Counts::default(),
+            in_use: 0,
+            invalid_pod: None,
+            unreachable: None,
+            evalai: EvalaiStanding::Fits { note: None },
+            budget: Some((3, 54)),
+        }
+    }
+
+    fn reason(plan: &LeaderboardPlan) -> (String, String) {
+        let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+        (condition.status.clone(), condition.reason.clone())
+    }
+
+    #[test]
+    fn of_two_with_the_same_phase_the_older_serves() {
+        let old = leaderboard("old", 1, 7, "https://e", "a/");
+        let new = leaderboard("new", 2, 7, "https://e/", "b/");
+        let all = [Arc::clone(&old), Arc::clone(&new)];
+        assert_eq!(
+            reason(&decide(&view(&old, &all))),
+            ("True".into(), reasons::READY.into())
+        );
+        assert_eq!(
+            reason(&decide(&view(&new, &all))),
+            ("False".into(), reasons::PHASE_CONFLICT.into())
+        );
+    }
+
+    #[test]
+    fn two_servers_may_not_share_a_prefix() {
+        let old = leaderboard("old", 1, 7, "https://one", "a/");
+        let new = leaderboard("new", 2, 8, "https://two", "a/");
+        let all = [Arc::clone(&old), Arc::clone(&new)];
+        assert_eq!(
+            reason(&decide(&view(&new, &all))),
+            ("False".into(), reasons::PREFIX_CONFLICT.into())
+        );
+    }
+
+    #[test]
+    fn it_stays_while_submissions_need_it() {
+        let mut one = leaderboard("one", 1, 7, "https://e", "a/").as_ref().clone();
+        one.metadata.finalizers = Some(vec![names::FINALIZER_LEADERBOARD.into()]);
+        one.metadata.deletion_timestamp = Some(Time(Timestamp::from_second(900).unwrap()));
+        let one = Arc::new(one);
+        let mut seen = view(&one, &[]);
+        seen.in_use = 2;
+        let plan = decide(&seen);
+        assert_eq!(plan.finalizer, None);
+        assert!(conditions::is_true(&plan.status.conditions, conditions::TERMINATING));
+        seen.in_use = 0;
+        assert_eq!(decide(&seen).finalizer, Some(false));
+    }
+
+    #[test]
+    fn what_is_wrong_with_evalai_is_said() {
+        let one = leaderboard("one", 1, 7, "https://e", "a/");
+        let cases = [
+            (EvalaiStanding::NoToken("x".into()), "False", reasons::TOKEN_MISSING),
+            (
+                EvalaiStanding::TokenRefused("x".into()),
+                "False",
+                reasons::TOKEN_REFUSED,
+            ),
+            (EvalaiStanding::Misfit("x".into()), "False", reasons::LABELS_DIFFER),
+            (EvalaiStanding::Unchecked(None), "Unknown", reasons::ASKING_EVALAI),
+            (EvalaiStanding::NotWanted, "True", reasons::READY),
+        ];
+        for (evalai, status, expected) in cases {
+            let seen = LeaderboardView {
+                evalai,
+                ..view(&one, &[])
+            };
+            assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.to_owned()));
+        }
+    }
+}

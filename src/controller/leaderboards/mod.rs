@@ -1,0 +1,291 @@
+//! A pass of one Leaderboard: its token and checks, the policy of its Pods, its status and finalizer.
+//!
+//! Reads the token (every five minutes, or when EvalAI refuses it), looks at the bucket, and hands the way to EvalAI to
+//! `sync`. `decide` is pure.
+
+pub mod decide;
+mod probe;
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::api::{Patch, PatchParams};
+use kube::{Api, Resource, ResourceExt};
+use serde_json::json;
+
+use super::context::{CALL_TIMEOUT, Context};
+use super::network_policy::network_policy;
+use super::observe::uid_of;
+use crate::api::leaderboard::Counts;
+use crate::api::{Leaderboard, State, Submission, conditions, names};
+use crate::services::ObjectKey;
+use decide::{LeaderboardPlan, LeaderboardView, decide};
+use probe::Probe;
+
+/// A status whose counts alone have changed is written at most this often.
+const COUNTS_EVERY: Duration = Duration::from_secs(5);
+/// A Leaderboard is looked at this often without any cause.
+const RESYNC: Duration = Duration::from_mins(1);
+
+/// What could not be done for a Leaderboard.
+#[derive(thiserror::Error, Debug)]
+pub enum LeaderboardError {
+    #[error("{what} of Leaderboard {name} failed: {source}")]
+    Kubernetes {
+        what: &'static str,
+        name: String,
+        source: Box<kube::Error>,
+    },
+    #[error("{what} of Leaderboard {name}: the API server did not answer")]
+    Silent { what: &'static str, name: String },
+}
+
+/// What is kept between passes, by UID.
+#[derive(Default)]
+pub struct Desk {
+    probes: Mutex<HashMap<String, Probe>>,
+    written: Mutex<HashMap<String, Timestamp>>,
+}
+
+impl Desk {
+    /// Drops a Leaderboard that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.probes.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
+        self.written.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
+    }
+
+    fn probe(&self, uid: &str) -> Probe {
+        self.probes
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(uid)
+            .cloned()
+            .unwrap_or_default()
+    }
+
+    fn keep(&self, uid: &str, probe: Probe) {
+        self.probes
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .insert(uid.to_owned(), probe);
+    }
+
+    fn counts_may_be_written(&self, uid: &str, now: Timestamp) -> bool {
+        let written = self
+            .written
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(uid)
+            .copied();
+        written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= COUNTS_EVERY)
+    }
+
+    fn wrote(&self, uid: &str, now: Timestamp) {
+        self.written
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .insert(uid.to_owned(), now);
+    }
+}
+
+/// One pass.
+pub async fn reconcile(leaderboard: Arc<Leaderboard>, context: Arc<Context>) -> Result<Duration, LeaderboardError> {
+    let uid = uid_of(leaderboard.as_ref());
+    let now = Timestamp::now();
+    let probe = context.desk.probe(&uid).refresh(&context, &leaderboard, now).await;
+    context.desk.keep(&uid, probe.clone());
+    let view = observe(&context, &leaderboard, &probe, now);
+    let plan = decide(&view);
+    if leaderboard.metadata.deletion_timestamp.is_none() {
+        apply_policy(&context, &leaderboard).await?;
+    }
+    set_finalizer(&context, &leaderboard, &plan).await?;
+    if plan.finalizer == Some(false) {
+        context.sync.set_target(&leaderboard, None);
+        context.sync.hub.retire(&key_of(&leaderboard));
+        return Ok(RESYNC);
+    }
+    write_status(&context, &leaderboard, &plan, now).await
+}
+
+fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now: Timestamp) -> LeaderboardView {
+    let (counts, in_use) = census(context, leaderboard);
+    let key = key_of(leaderboard);
+    LeaderboardView {
+        now,
+        leaderboard: Arc::clone(leaderboard),
+        all: context.stores.leaderboards.state(),
+        counts,
+        in_use,
+        invalid_pod: probe.invalid_pod(),
+        unreachable: probe.unreachable(),
+        evalai: probe.evalai_standing(context, leaderboard, &key, now),
+        budget: context.sync.hub.budget_used(&key),
+    }
+}
+
+fn census(context: &Context, leaderboard: &Leaderboard) -> (Counts, usize) {
+    let mut counts = Counts::default();
+    let mut in_use = 0;
+    let mine =
+        |s: &Submission| s.spec.leaderboard == leaderboard.name_any() && s.namespace() == leaderboard.namespace();
+    for submission in context.stores.submissions.state().into_iter().filter(|s| mine(s)) {
+        match submission.status.as_ref().and_then(|s| s.state) {
+            None | Some(State::Pending) => counts.pending += 1,
+            Some(State::Running | State::Resumed) => counts.running += 1,
+            Some(State::Finished) => counts.finished += 1,
+            Some(State::Failed) => counts.failed += 1,
+            Some(State::Cancelled) => counts.cancelled += 1,
+        }
+        if needs_leaderboard(&submission) {
+            in_use += 1;
+        }
+    }
+    (counts, in_use)
+}
+
+/// Live, or its end is not everywhere yet.
+fn needs_leaderboard(submission: &Submission) -> bool {
+    let conditions = submission
+        .status
+        .as_ref()
+        .map(|s| s.conditions.as_slice())
+        .unwrap_or_default();
+    let waits = |type_: &str| {
+        conditions::get(conditions, type_)
+            .is_some_and(|c| c.status != "True" && c.reason != crate::api::reasons::NOT_WANTED)
+    };
+    !conditions::is_true(conditions, conditions::FINISHED)
+        || waits(conditions::PUBLISHED)
+        || waits(conditions::RECORDED)
+}
+
+async fn apply_policy(context: &Context, leaderboard: &Leaderboard) -> Result<(), LeaderboardError> {
+    let policy = network_policy(leaderboard);
+    let uid = uid_of(leaderboard);
+    if context.desk.probe(&uid).policy_is_applied(leaderboard) {
+        return Ok(());
+    }
+    let namespace = leaderboard.namespace().unwrap_or_default();
+    let api: Api<NetworkPolicy> = Api::namespaced(context.client.clone(), &namespace);
+    let params = PatchParams::apply(names::MANAGER_CHILDREN).force();
+    let name = policy.name_any();
+    let patch = Patch::Apply(&policy);
+    let call_result = call("the NetworkPolicy", leaderboard, api.patch(&name, &params, &patch)).await;
+    call_result?;
+    let probe = context.desk.probe(&uid).with_policy(leaderboard);
+    context.desk.keep(&uid, probe);
+    Ok(())
+}
+
+async fn set_finalizer(
+    context: &Context,
+    leaderboard: &Leaderboard,
+    plan: &LeaderboardPlan,
+) -> Result<(), LeaderboardError> {
+    let Some(wanted) = plan.finalizer else { return Ok(()) };
+    let mut finalizers: Vec<String> = leaderboard
+        .finalizers()
+        .iter()
+        .filter(|f| *f != names::FINALIZER_LEADERBOARD)
+        .cloned()
+        .collect();
+    if wanted {
+        finalizers.push(names::FINALIZER_LEADERBOARD.into());
+    }
+    let version = &leaderboard.metadata.resource_version;
+    let patch = Patch::Merge(json!({ "metadata": { "resourceVersion": version, "finalizers": finalizers } }));
+    let params = PatchParams {
+        field_manager: Some(names::MANAGER_FINALIZER.into()),
+        ..PatchParams::default()
+    };
+    let name = leaderboard.name_any();
+    let api = api(context, leaderboard);
+    let result = call("the finalizer", leaderboard, api.patch(&name, &params, &patch)).await;
+    result.map(|_| ())
+}
+
+/// Writes the status if it says something new; returns when to look again.
+async fn write_status(
+    context: &Context,
+    leaderboard: &Leaderboard,
+    plan: &LeaderboardPlan,
+    now: Timestamp,
+) -> Result<Duration, LeaderboardError> {
+    let old = leaderboard.status.clone().unwrap_or_default();
+    if old == plan.status {
+        return Ok(RESYNC);
+    }
+    let only_numbers = crate::api::LeaderboardStatus {
+        counts: old.counts,
+        budget: old.budget.clone(),
+        ..plan.status.clone()
+    } == old;
+    let uid = uid_of(leaderboard);
+    if only_numbers && !context.desk.counts_may_be_written(&uid, now) {
+        return Ok(COUNTS_EVERY);
+    }
+    if only_numbers && old.counts == plan.status.counts && !context.desk.budget_may_be_written(&uid, now) {
+        return Ok(RESYNC);
+    }
+    let patch = json!({
+        "apiVersion": Leaderboard::api_version(&()),
+        "kind": Leaderboard::kind(&()),
+        "metadata": { "name": leaderboard.name_any(), "uid": uid },
+        "status": plan.status,
+    });
+    let params = PatchParams::apply(names::MANAGER_STATUS).force();
+    let name = leaderboard.name_any();
+    let api = api(context, leaderboard);
+    let body = Patch::Apply(&patch);
+    let result = call("the status", leaderboard, api.patch_status(&name, &params, &body)).await;
+    result?;
+    context.desk.wrote(&uid, now);
+    Ok(RESYNC)
+}
+
+impl Desk {
+    /// The budget moves with each request; alone it is worth a write a minute.
+    fn budget_may_be_written(&self, uid: &str, now: Timestamp) -> bool {
+        let written = self
+            .written
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(uid)
+            .copied();
+        written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= RESYNC)
+    }
+}
+
+fn api(context: &Context, leaderboard: &Leaderboard) -> Api<Leaderboard> {
+    Api::namespaced(context.client.clone(), &leaderboard.namespace().unwrap_or_default())
+}
+
+async fn call<T>(
+    what: &'static str,
+    leaderboard: &Leaderboard,
+    call: impl Future<Output = Result<T, kube::Error>>,
+) -> Result<T, LeaderboardError> {
+    let name = leaderboard.name_any();
+    match tokio::time::timeout(CALL_TIMEOUT, call).await {
+        Ok(Ok(answer)) => Ok(answer),
+        Ok(Err(source)) => Err(LeaderboardError::Kubernetes {
+            what,
+            name,
+            source: Box::new(source),
+        }),
+        Err(_) => Err(LeaderboardError::Silent { what, name }),
+    }
+}
+
+/// The key of a Leaderboard towards EvalAI's room.
+fn key_of(leaderboard: &Leaderboard) -> ObjectKey {
+    ObjectKey {
+        namespace: leaderboard.namespace().unwrap_or_default(),
+        name: leaderboard.name_any(),
+        uid: uid_of(leaderboard),
+    }
+}

@@ -1,0 +1,241 @@
+//! What is tried for a Leaderboard from time to time: its token, its bucket, its Pod.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use k8s_openapi::api::core::v1::Secret;
+use kube::api::{ApiResource, DynamicObject, PostParams};
+use kube::{Api, ResourceExt};
+use leaderboard_results::metrics;
+
+use super::decide::EvalaiStanding;
+use crate::api::{Evalai, Leaderboard, ResultsFormat, Submission, Token as TokenPlace, effective, reasons};
+use crate::controller::context::{CALL_TIMEOUT, Context};
+use crate::controller::job_spec::{self, JobInput};
+use crate::controller::pod_overlay;
+use crate::services::ObjectKey;
+use crate::services::evalai::Target;
+use crate::services::token::{Token, TokenSource};
+
+/// A token and a bucket are looked at again after this long.
+const AGAIN: SignedDuration = SignedDuration::from_mins(5);
+/// A failed look is repeated sooner.
+const SOON: SignedDuration = SignedDuration::from_secs(15);
+
+/// What was last found.
+#[derive(Clone, Default)]
+pub(super) struct Probe {
+    token: Option<Result<Arc<Token>, String>>,
+    token_at: Option<Timestamp>,
+    bucket: Option<Result<(), String>>,
+    bucket_at: Option<Timestamp>,
+    /// Generation whose Pod was tried, and why it was refused.
+    pod: Option<(i64, Option<String>)>,
+    /// Generation whose policy was applied.
+    policy: Option<i64>,
+}
+
+impl Probe {
+    /// Tries what is due.
+    pub(super) async fn refresh(mut self, context: &Context, leaderboard: &Leaderboard, now: Timestamp) -> Self {
+        let generation = leaderboard.metadata.generation.unwrap_or_default();
+        if self.pod.as_ref().is_none_or(|(tried, _)| *tried != generation) {
+            self.pod = Some((generation, refused_pod(context, leaderboard).await));
+        }
+        if due(self.bucket_at, self.bucket.as_ref().is_some_and(Result::is_ok), now) {
+            self.bucket = Some(try_bucket(context, leaderboard).await);
+            self.bucket_at = Some(now);
+        }
+        if let Some(evalai) = &leaderboard.spec.evalai {
+            let refused = context.sync.hub.token_refused(&super::key_of(leaderboard)).is_some();
+            if due(
+                self.token_at,
+                self.token.as_ref().is_some_and(Result::is_ok) && !refused,
+                now,
+            ) {
+                self.token = Some(read_token(context, leaderboard, &evalai.token).await);
+                self.token_at = Some(now);
+            }
+            if let Some(Ok(token)) = &self.token {
+                serve(context, leaderboard, evalai, token);
+            }
+        }
+        self
+    }
+
+    pub(super) fn invalid_pod(&self) -> Option<String> {
+        self.pod.as_ref().and_then(|(_, why)| why.clone())
+    }
+
+    pub(super) fn unreachable(&self) -> Option<(&'static str, String)> {
+        let why = self.bucket.as_ref()?.as_ref().err()?;
+        Some((reasons::BUCKET_UNREACHABLE, why.clone()))
+    }
+
+    pub(super) fn policy_is_applied(&self, leaderboard: &Leaderboard) -> bool {
+        self.policy.is_some() && self.policy == leaderboard.metadata.generation
+    }
+
+    pub(super) fn with_policy(mut self, leaderboard: &Leaderboard) -> Self {
+        self.policy = leaderboard.metadata.generation;
+        self
+    }
+
+    pub(super) fn evalai_standing(
+        &self,
+        context: &Context,
+        leaderboard: &Leaderboard,
+        key: &ObjectKey,
+        now: Timestamp,
+    ) -> EvalaiStanding {
+        if leaderboard.spec.evalai.is_none() {
+            return EvalaiStanding::NotWanted;
+        }
+        let token = match &self.token {
+            None => return EvalaiStanding::Unchecked(None),
+            Some(Err(why)) => return EvalaiStanding::NoToken(why.clone()),
+            Some(Ok(token)) => token,
+        };
+        if let Some(why) = context.sync.hub.token_refused(key) {
+            return EvalaiStanding::TokenRefused(why);
+        }
+        match context.sync.hub.labels(key) {
+            (None, why) => EvalaiStanding::Unchecked(why),
+            (Some(labels), _) if !labels.ok() => {
+                let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
+                EvalaiStanding::Misfit(problems.join("; "))
+            }
+            (Some(_), _) => EvalaiStanding::Fits {
+                note: ends_soon(token, now),
+            },
+        }
+    }
+}
+
+fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
+    token.ends_soon(now).then(|| {
+        let when = token
+            .expires()
+            .map(|t| t.strftime("%Y-%m-%d").to_string())
+            .unwrap_or_default();
+        format!("EvalAI's token ends on {when}; put a new one into its Secret before.")
+    })
+}
+
+fn due(at: Option<Timestamp>, good: bool, now: Timestamp) -> bool {
+    let wait = if good { AGAIN } else { SOON };
+    // A clock that was set back makes it due as well.
+    at.is_none_or(|at| now.duration_since(at) >= wait || now < at)
+}
+
+async fn try_bucket(context: &Context, leaderboard: &Leaderboard) -> Result<(), String> {
+    let archive = context.archive(&leaderboard.spec.storage, "none");
+    match tokio::time::timeout(Duration::from_secs(10), archive.prefix_is_empty()).await {
+        Ok(Ok(_)) => Ok(()),
+        Ok(Err(error)) => Err(error.to_string()),
+        Err(_) => Err(format!(
+            "the bucket {} does not answer",
+            leaderboard.spec.storage.bucket
+        )),
+    }
+}
+
+async fn read_token(context: &Context, leaderboard: &Leaderboard, place: &TokenPlace) -> Result<Arc<Token>, String> {
+    let source = match (&place.secret_key_ref, &place.secrets_manager) {
+        (Some(key), _) => {
+            let namespace = leaderboard.namespace().unwrap_or_default();
+            let api: Api<Secret> = Api::namespaced(context.client.clone(), &namespace);
+            let secret = tokio::time::timeout(CALL_TIMEOUT, api.get(&key.name))
+                .await
+                .map_err(|_| "the API server did not answer".to_owned())?
+                .map_err(|e| format!("Secret {} cannot be read: {e}", key.name))?;
+            let value = secret.data.as_ref().and_then(|d| d.get(&key.key));
+            let value = value.ok_or_else(|| format!("Secret {} has no key {}", key.name, key.key))?;
+            let text = String::from_utf8(value.0.clone())
+                .map_err(|_| format!("key {} of Secret {} is not text", key.key, key.name))?;
+            TokenSource::Literal(text)
+        }
+        (None, Some(entry)) => TokenSource::SecretsManager {
+            id: entry.id.clone(),
+            key: entry.key.clone(),
+            region: entry.region.clone(),
+            endpoint: entry.endpoint.clone(),
+        },
+        (None, None) => return Err("evalai.token names no place".into()),
+    };
+    source.read(&context.aws).await.map(Arc::new).map_err(|e| e.to_string())
+}
+
+fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) {
+    let format = match leaderboard.spec.results {
+        ResultsFormat::V1 => leaderboard_results::Format::V1,
+        ResultsFormat::V2 => leaderboard_results::Format::V2,
+    };
+    let target = Target {
+        api_server: evalai.api_server.clone(),
+        challenge: evalai.challenge,
+        split: evalai.split.clone(),
+        token: Arc::clone(token),
+        requests_per_minute: evalai.requests_per_minute.unsigned_abs(),
+        sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
+        period: Duration::from_secs(leaderboard.spec.period_seconds.unsigned_abs()),
+        phases: leaderboard.spec.tracks.iter().filter_map(|t| t.phase).collect(),
+        labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
+        since: leaderboard
+            .metadata
+            .creation_timestamp
+            .as_ref()
+            .map(|t| t.0)
+            .unwrap_or_default(),
+    };
+    if let Err(error) = context.sync.hub.serve(&super::key_of(leaderboard), &target) {
+        tracing::error!(leaderboard = %leaderboard.name_any(), %error, "EvalAI cannot be spoken to");
+    }
+    context.sync.set_target(leaderboard, Some(Arc::new(target)));
+}
+
+/// Why a Pod of this Leaderboard would be refused: by our own rules, or by the API server's dry run.
+async fn refused_pod(context: &Context, leaderboard: &Leaderboard) -> Option<String> {
+    if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
+        return Some(error.to_string());
+    }
+    let job = sample_job(context, leaderboard)?;
+    let namespace = leaderboard.namespace().unwrap_or_default();
+    let resource = ApiResource::erase::<k8s_openapi::api::batch::v1::Job>(&());
+    let api: Api<DynamicObject> = Api::namespaced_with(context.client.clone(), &namespace, &resource);
+    let params = PostParams {
+        dry_run: true,
+        ..PostParams::default()
+    };
+    match tokio::time::timeout(CALL_TIMEOUT, api.create(&params, &job)).await {
+        Ok(Err(kube::Error::Api(status))) if status.code == 422 || status.code == 400 => Some(status.message.clone()),
+        _ => None,
+    }
+}
+
+fn sample_job(context: &Context, leaderboard: &Leaderboard) -> Option<DynamicObject> {
+    let track = leaderboard.spec.tracks.first()?;
+    let spec =
+        serde_json::json!({ "leaderboard": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
+    let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
+    sample.metadata.namespace = leaderboard.namespace();
+    sample.metadata.uid = leaderboard.uid();
+    let plan = effective::plan(
+        &leaderboard.spec,
+        track,
+        "sample".into(),
+        "example/agent:1".into(),
+        false,
+    );
+    Some(job_spec::build_object(&JobInput {
+        submission: &sample,
+        leaderboard,
+        plan: &plan,
+        attempt: 1,
+        retry: 0,
+        operator_image: &context.settings.image,
+        image_pull_policy: context.settings.image_pull_policy.as_deref(),
+        region: context.settings.region.as_deref(),
+    }))
+}

@@ -1,0 +1,132 @@
+//! What the leader remembers between passes of one object: the status it last wrote, and what it told.
+//!
+//! Needed because a cache may lag behind our own writes: a pass must never decide on a status older than its own.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use kube::ResourceExt;
+use tokio::time::Instant;
+
+use super::observe::uid_of;
+use crate::api::{Submission, SubmissionStatus};
+
+/// One entry for each Submission, by UID.
+#[derive(Default)]
+pub struct Memory {
+    entries: Mutex<HashMap<String, Entry>>,
+}
+
+#[derive(Clone, Default)]
+struct Entry {
+    written: Option<Written>,
+    partial: Option<(i64, u32)>,
+}
+
+#[derive(Clone)]
+struct Written {
+    version: u64,
+    at: Instant,
+    status: SubmissionStatus,
+}
+
+impl Memory {
+    /// The object with the status that we wrote last, where the cache does not have it yet.
+    pub fn with_own_status(&self, submission: Arc<Submission>) -> Arc<Submission> {
+        let seen = version(&submission);
+        let written = self
+            .lock()
+            .get(&uid_of(submission.as_ref()))
+            .and_then(|e| e.written.clone());
+        match written {
+            Some(written) if seen < written.version => {
+                let mut newer = submission.as_ref().clone();
+                newer.status = Some(written.status);
+                Arc::new(newer)
+            }
+            _ => submission,
+        }
+    }
+
+    /// Remembers what the API server answered to a write of status.
+    pub fn wrote(&self, answer: &Submission) {
+        let Some(status) = answer.status.clone() else { return };
+        let written = Written {
+            version: version(answer),
+            at: Instant::now(),
+            status,
+        };
+        self.lock().entry(uid_of(answer)).or_default().written = Some(written);
+    }
+
+    /// Time since our last write of its status; None if this process has not written it.
+    pub fn since_write(&self, submission: &Submission) -> Option<Duration> {
+        let entries = self.lock();
+        entries
+            .get(&uid_of(submission))
+            .and_then(|e| e.written.as_ref())
+            .map(|w| w.at.elapsed())
+    }
+
+    /// Whether our last status, too, has no Job: a submission that still waits.
+    pub fn is_waiting(&self, submission: &Submission) -> bool {
+        let entries = self.lock();
+        let written = entries.get(&uid_of(submission)).and_then(|e| e.written.as_ref());
+        written.is_none_or(|w| w.status.job.is_none() && w.status.times.finished.is_none())
+    }
+
+    /// Routes of the last partial result of the present attempt.
+    pub fn partial_told(&self, submission: &Submission) -> Option<u32> {
+        let (attempt, done) = self.lock().get(&uid_of(submission))?.partial?;
+        (Some(attempt) == submission.status.as_ref()?.attempt).then_some(done)
+    }
+
+    /// Remembers a partial result.
+    pub fn told_partial(&self, submission: &Submission, attempt: i64, done: u32) {
+        self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
+    }
+
+    /// Drops an object that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.lock().remove(uid);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Resource versions of one kind grow; the API promises that they can be compared as numbers.
+fn version(object: &Submission) -> u64 {
+    object.resource_version().and_then(|v| v.parse().ok()).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn object(version: &str, reason: &str) -> Submission {
+        let mut object = Submission::new(
+            "s",
+            serde_json::from_value(serde_json::json!({"leaderboard": "l", "track": "t", "image": "i"})).unwrap(),
+        );
+        object.metadata.uid = Some("u".into());
+        object.metadata.resource_version = Some(version.into());
+        object.status = Some(SubmissionStatus {
+            reason: Some(reason.into()),
+            ..Default::default()
+        });
+        object
+    }
+
+    #[test]
+    fn an_older_cache_does_not_hide_our_own_write() {
+        let memory = Memory::default();
+        memory.wrote(&object("12", "new"));
+        let seen = memory.with_own_status(Arc::new(object("9", "old")));
+        assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("new"));
+        let seen = memory.with_own_status(Arc::new(object("13", "newer")));
+        assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("newer"));
+    }
+}

@@ -1,0 +1,24 @@
+//! The controller: drives Submissions through their states and keeps everything they own.
+//!
+//! A pass observes (`observe`: caches, memory, one short read from S3), decides (`decide`: pure) and acts (`act`).
+//! `job_spec`, `pod_overlay` and `network_policy` build what is created in the cluster; they know no client and no clock.
+//! `run` wires it all together for the replica that leads.
+
+pub mod act;
+pub mod backoff;
+pub mod context;
+pub mod decide;
+pub mod job_spec;
+pub mod leader;
+pub mod leaderboards;
+pub mod memory;
+pub mod network_policy;
+pub mod observe;
+pub mod pod_overlay;
+mod result_texts;
+pub mod run;
+pub mod significance;
+pub mod sync;
+pub mod turns;
+pub mod view;
+pub mod watches;

@@ -1,0 +1,164 @@
+//! A Pod reduced to what decisions depend on. Pure; reads the runner's verdicts as hostile text.
+
+use k8s_openapi::api::core::v1::{
+    ContainerState, ContainerStateTerminated, ContainerStatus, Pod, PodCondition, PodStatus,
+};
+use kube::ResourceExt;
+use leaderboard_runner::verdict::{Verdict, What};
+
+use crate::api::names;
+use crate::controller::view::{ContainerView, EndView, PodView};
+use crate::pod::run::Stop;
+
+/// Longest text of Kubernetes that is passed on to people.
+const MAX_WORDS: usize = 600;
+
+/// Reduces a Pod.
+pub fn view(pod: &Pod) -> PodView {
+    let status = pod.status.clone().unwrap_or_default();
+    let containers: Vec<ContainerView> = statuses(&status).map(container).collect();
+    let running = |name: &str| containers.iter().any(|c| c.name == name && c.running);
+    PodView {
+        name: pod.name_any(),
+        uid: pod.uid().unwrap_or_default(),
+        node: pod.spec.as_ref().and_then(|s| s.node_name.clone()),
+        scheduled: scheduled(&status),
+        unschedulable: unschedulable(&status),
+        delete_by: pod.metadata.deletion_timestamp.as_ref().map(|t| t.0),
+        agent_started: agent_started(&status),
+        logcopy_running: running(names::CONTAINER_LOGCOPY),
+        ended_by_node: ended_by_node(&status),
+        stop: pod
+            .annotations()
+            .get(names::ANNOTATION_STOP)
+            .and_then(|text| Stop::parse(text)),
+        containers,
+    }
+}
+
+fn statuses(status: &PodStatus) -> impl Iterator<Item = &ContainerStatus> {
+    let init = status.init_container_statuses.iter().flatten();
+    init.chain(status.container_statuses.iter().flatten())
+}
+
+fn condition<'a>(status: &'a PodStatus, type_: &str) -> Option<&'a PodCondition> {
+    status.conditions.iter().flatten().find(|c| c.type_ == type_)
+}
+
+fn scheduled(status: &PodStatus) -> Option<jiff::Timestamp> {
+    condition(status, "PodScheduled")
+        .filter(|c| c.status == "True")?
+        .last_transition_time
+        .as_ref()
+        .map(|t| t.0)
+}
+
+fn unschedulable(status: &PodStatus) -> Option<String> {
+    let found = condition(status, "PodScheduled").filter(|c| c.status == "False")?;
+    Some(short(found.message.as_deref().unwrap_or("no node takes the Pod")))
+}
+
+fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
+    let agents = status
+        .container_statuses
+        .iter()
+        .flatten()
+        .filter(|c| c.name.starts_with("agent-"));
+    agents.flat_map(started_times).min()
+}
+
+fn started_times(status: &ContainerStatus) -> impl Iterator<Item = jiff::Timestamp> {
+    let states = [status.state.as_ref(), status.last_state.as_ref()];
+    states.into_iter().flatten().filter_map(|state| {
+        let running = state.running.as_ref().and_then(|r| r.started_at.as_ref());
+        // A container that could not be started has no start of its own.
+        let ended = state
+            .terminated
+            .as_ref()
+            .filter(|t| t.reason.as_deref() != Some("StartError"));
+        running.or(ended.and_then(|t| t.started_at.as_ref())).map(|t| t.0)
+    })
+}
+
+fn ended_by_node(status: &PodStatus) -> Option<(String, String)> {
+    let reason = status.reason.clone()?;
+    Some((reason, short(status.message.as_deref().unwrap_or_default())))
+}
+
+fn container(status: &ContainerStatus) -> ContainerView {
+    let state = status.state.clone().unwrap_or_default();
+    ContainerView {
+        name: status.name.clone(),
+        restarts: status.restart_count,
+        running: state.running.is_some(),
+        waiting: state.waiting.as_ref().map(|w| {
+            (
+                w.reason.clone().unwrap_or_default(),
+                short(w.message.as_deref().unwrap_or_default()),
+            )
+        }),
+        last: last_end(status, &state),
+    }
+}
+
+fn last_end(status: &ContainerStatus, state: &ContainerState) -> Option<EndView> {
+    let before = status.last_state.as_ref().and_then(|s| s.terminated.as_ref());
+    state.terminated.as_ref().or(before).map(end)
+}
+
+fn end(terminated: &ContainerStateTerminated) -> EndView {
+    let message = terminated.message.as_deref().unwrap_or_default();
+    let verdict = Verdict::parse(message).ok();
+    let out_of_memory = verdict.as_ref().is_some_and(|v| v.out_of_memory);
+    let reason = terminated.reason.clone().unwrap_or_default();
+    EndView {
+        reason: if out_of_memory { "OOMKilled".into() } else { reason },
+        exit_code: terminated.exit_code,
+        at: terminated.finished_at.as_ref().map(|t| t.0),
+        what: verdict
+            .as_ref()
+            .map(|v| word(v.what).to_owned())
+            .or_else(|| foreign_word(message)),
+        why: verdict.map(|v| short(&v.why)).or_else(|| foreign_why(message)),
+    }
+}
+
+/// The runner's words as the failure policy knows them.
+fn word(what: What) -> &'static str {
+    match what {
+        What::Exited => "exited",
+        What::Killed => "killed",
+        What::Idle => "idle",
+        What::PeerCrashed => "peerCrashed",
+        What::Cancelled => "cancelled",
+        What::Stopped => "stopped",
+        What::NotReady => "notReady",
+        What::CannotStart => "cannotStart",
+        What::SilentDeath => "silentDeath",
+        What::Finished => "finished",
+    }
+}
+
+/// `workspace` leaves `{"reason": …, "message": …}`.
+fn foreign_word(message: &str) -> Option<String> {
+    let value: serde_json::Value = serde_json::from_str(message).ok()?;
+    value.get("reason")?.as_str().map(short)
+}
+
+fn foreign_why(message: &str) -> Option<String> {
+    let parsed: Option<serde_json::Value> = serde_json::from_str(message).ok();
+    let told = parsed
+        .as_ref()
+        .and_then(|v| v.get("message"))
+        .and_then(|m| m.as_str())
+        .map(short);
+    told.or_else(|| (!message.trim().is_empty() && parsed.is_none()).then(|| short(message)))
+}
+
+fn short(text: &str) -> String {
+    let text = text.trim();
+    match text.char_indices().nth(MAX_WORDS) {
+        Some((end, _)) => format!("{} …", &text[..end]),
+        None => text.to_owned(),
+    }
+}

@@ -1,0 +1,106 @@
+//! A Leaderboard's `pod`: a partial PodTemplateSpec laid over ours, and what it may not say.
+//!
+//! Pure, and on JSON, so that Pod fields newer than this client survive. Called by `job_spec` (apply) and by the check of a
+//! Leaderboard (validate). The rules, for people too: objects are merged deep; lists by `name`, volumeMounts by
+//! `mountPath`; variables are replaced whole, tolerations added, all other lists replaced; `null` removes;
+//! `simulator` and `agent` stand for the containers of every pair, `agent-2` for one, whichever comes first in the list.
+
+mod rules;
+#[cfg(test)]
+mod tests;
+
+use serde_json::{Map, Value};
+
+pub use rules::{OverlayError, validate, validate_overlay};
+
+/// Names that stand for the containers of all pairs.
+const ALIASES: [&str; 2] = ["simulator", "agent"];
+
+/// Lays `overlay` over a PodTemplateSpec. Only for overlays that [`validate_overlay`] accepts.
+pub(super) fn apply(template: &mut Value, overlay: &Value) {
+    merge(template, overlay);
+}
+
+fn merge(base: &mut Value, overlay: &Value) {
+    match (base, overlay) {
+        (Value::Object(base), Value::Object(overlay)) => merge_objects(base, overlay),
+        (base, overlay) => *base = without_nulls(overlay),
+    }
+}
+
+fn merge_objects(base: &mut Map<String, Value>, overlay: &Map<String, Value>) {
+    for (key, value) in overlay {
+        match (base.get_mut(key), value) {
+            (_, Value::Null) => {
+                base.remove(key);
+            }
+            (Some(Value::Array(known)), Value::Array(added)) => merge_lists(key, known, added),
+            (Some(known), value) => merge(known, value),
+            (None, value) => {
+                base.insert(key.clone(), without_nulls(value));
+            }
+        }
+    }
+}
+
+fn merge_lists(field: &str, base: &mut Vec<Value>, overlay: &[Value]) {
+    let named = |list: &[Value]| list.iter().all(|item| item["name"].is_string());
+    match field {
+        "tolerations" => {
+            let added: Vec<Value> = overlay.iter().filter(|item| !base.contains(item)).cloned().collect();
+            base.extend(added);
+        }
+        "containers" => merge_containers(base, overlay),
+        "volumeMounts" => merge_by("mountPath", base, overlay, merge),
+        // Merged deep, a variable could end up with both a value and a source.
+        "env" => merge_by("name", base, overlay, |known, item| *known = without_nulls(item)),
+        _ if named(base) && named(overlay) => merge_by("name", base, overlay, merge),
+        _ => *base = overlay.iter().map(without_nulls).collect(),
+    }
+}
+
+fn merge_by(key: &str, base: &mut Vec<Value>, overlay: &[Value], join: impl Fn(&mut Value, &Value)) {
+    for item in overlay {
+        match base.iter_mut().find(|known| known[key] == item[key]) {
+            Some(known) => join(known, item),
+            None => base.push(without_nulls(item)),
+        }
+    }
+}
+
+/// Aliases go first, so that what is said of one container wins over what is said of all. A pair that this track does
+/// not have is passed over: the overlay is the same for all tracks.
+fn merge_containers(base: &mut [Value], overlay: &[Value]) {
+    let name = |item: &Value| item["name"].as_str().unwrap_or_default().to_owned();
+    let (aliases, single): (Vec<&Value>, Vec<&Value>) =
+        overlay.iter().partition(|item| ALIASES.contains(&name(item).as_str()));
+    for item in aliases.into_iter().chain(single) {
+        let addressed = name(item);
+        for known in base.iter_mut() {
+            let own = name(known);
+            if addresses(&addressed, &own) {
+                merge(known, item);
+                known["name"] = own.into();
+            }
+        }
+    }
+}
+
+fn addresses(addressed: &str, container: &str) -> bool {
+    addressed == container
+        || (ALIASES.contains(&addressed)
+            && container
+                .strip_prefix(addressed)
+                .is_some_and(|number| number.starts_with('-')))
+}
+
+fn without_nulls(value: &Value) -> Value {
+    match value {
+        Value::Object(object) => {
+            let kept = object.iter().filter(|(_, value)| !value.is_null());
+            Value::Object(kept.map(|(key, value)| (key.clone(), without_nulls(value))).collect())
+        }
+        Value::Array(list) => Value::Array(list.iter().map(without_nulls).collect()),
+        other => other.clone(),
+    }
+}

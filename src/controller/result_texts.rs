@@ -1,0 +1,155 @@
+//! The texts of a result: what EvalAI shows, and the row of the table. Numbers come from the report alone, never printed
+//! again; texts from S3 count only with the digest that the report names.
+
+use leaderboard_results::{Format, metrics, number_text};
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+
+use super::context::Context;
+use super::view::View;
+use crate::api::{FailureClass, ResultsFormat, State, SubmissionStatus};
+use crate::pod::report::Report;
+use crate::services::evalai::Payload;
+use crate::services::table::Row;
+
+/// Largest text that is passed on to EvalAI, in bytes.
+const MAX_TEXT: u64 = 16 << 20;
+/// Where logcopy puts the texts, below the run's prefix.
+const STDOUT_KEY: &str = "evalai/stdout.txt";
+const METADATA_KEY: &str = "evalai/metadata.json";
+
+/// The payload of a partial or final result.
+pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, String> {
+    let stdout = stored(context, view, report, STDOUT_KEY).await?;
+    let metadata = stored(context, view, report, METADATA_KEY).await?;
+    Ok(Payload {
+        phase: phase(view),
+        result: report.results.clone(),
+        stdout,
+        metadata,
+        ..Payload::default()
+    })
+}
+
+/// Phase whose leaderboard gets the result.
+pub(super) fn phase(view: &View) -> i64 {
+    view.submission.spec.evalai.map_or(0, |e| e.phase)
+}
+
+/// What the participant reads of a failure: class, sentence and next step, in our words only.
+pub(super) fn stderr(status: &SubmissionStatus) -> String {
+    let Some(failure) = &status.failure else {
+        return String::new();
+    };
+    let class = match failure.class {
+        FailureClass::Participant => "participant",
+        FailureClass::Infrastructure => "infrastructure, not charged",
+    };
+    format!("{} ({class}): {}", failure.reason, failure.message)
+}
+
+async fn stored(context: &Context, view: &View, report: &Report, key: &str) -> Result<String, String> {
+    let Some(expected) = report.files.get(key) else {
+        return Ok(String::new());
+    };
+    let status = view.submission.status.as_ref();
+    let Some(plan) = status.and_then(|s| s.plan.as_ref()) else {
+        return Ok(String::new());
+    };
+    let archive = context.archive(&plan.storage, &plan.run_id);
+    let object = archive.get(key, MAX_TEXT).await.map_err(|e| e.to_string())?;
+    let bytes = object
+        .ok_or_else(|| format!("{key} is missing although the report names it"))?
+        .bytes;
+    if hex(&Sha256::digest(&bytes)) != expected.sha256 {
+        return Err(format!("{key} is of another round than the report"));
+    }
+    String::from_utf8(bytes).map_err(|_| format!("{key} is not text"))
+}
+
+fn hex(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+/// The row of a submission as it stands; none before it has a team.
+pub(super) fn row(view: &View, status: &SubmissionStatus) -> Option<Row> {
+    let team = status.team.as_ref()?;
+    let plan = status.plan.as_ref()?;
+    let text = |time: Option<&k8s_openapi::apimachinery::pkg::apis::meta::v1::Time>| {
+        time.map_or_else(|| "-".to_owned(), |t| t.0.strftime("%Y-%m-%d %H:%M:%S UTC").to_string())
+    };
+    Some(Row {
+        team_id: team.id.clone()?,
+        run_id: plan.run_id.clone(),
+        attempt: status.attempt.unwrap_or(1),
+        team_name: team.name.clone().unwrap_or_default(),
+        submission_status: table_status(status.state).to_owned(),
+        track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
+        track_name: plan.codename.clone(),
+        submitted_image_uri: plan.image.clone(),
+        submitted_time: text(status.times.submitted.as_ref()),
+        start_time: text(status.times.started.as_ref()),
+        end_time: text(status.times.finished.as_ref()),
+        results: status.results.clone().unwrap_or_default(),
+        progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
+        metrics: view
+            .report
+            .ours()
+            .map(|r| columns(&r.results, plan.results))
+            .unwrap_or_default(),
+    })
+}
+
+fn table_status(state: Option<State>) -> &'static str {
+    match state {
+        None | Some(State::Pending) => "SUBMITTED",
+        Some(State::Running | State::Resumed) => "RUNNING",
+        Some(State::Finished) => "FINISHED",
+        Some(State::Failed) => "FAILED",
+        Some(State::Cancelled) => "CANCELLED",
+    }
+}
+
+/// The metric columns, as text with the digits of results.json.
+fn columns(results: &str, format: ResultsFormat) -> Vec<(String, String)> {
+    let format = match format {
+        ResultsFormat::V1 => Format::V1,
+        ResultsFormat::V2 => Format::V2,
+    };
+    let parsed: Value = serde_json::from_str(results).unwrap_or_default();
+    let accuracies = &parsed[0]["accuracies"];
+    let known = metrics(format).iter().filter_map(|metric| {
+        let value = accuracies.get(metric.name)?;
+        let text = if value.is_f64() {
+            number_text(value.as_f64()?)
+        } else {
+            value.to_string()
+        };
+        Some((metric.column.to_owned(), text))
+    });
+    known.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_keep_the_digits_and_the_names_of_the_original() {
+        let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
+        let found = columns(results, ResultsFormat::V2);
+        let get = |name: &str| found.iter().find(|(n, _)| n == name).map(|(_, v)| v.as_str());
+        assert_eq!(get("driving_score"), Some("43.125"));
+        assert_eq!(get("off_road_infractions"), Some("0.0"));
+        assert_eq!(get("agent_blocked"), Some("0"));
+    }
+
+    #[test]
+    fn a_broken_report_has_no_columns() {
+        assert!(columns("not json", ResultsFormat::V2).is_empty());
+    }
+}

@@ -1,0 +1,108 @@
+//! Whether a changed status is worth a write now: API writes are what a submission costs its cluster.
+//!
+//! Pure. Progress moves all the time and may wait; whatever a decision or a person needs goes out at once.
+
+use std::time::Duration;
+
+use crate::api::{LeaderboardSpec, SubmissionStatus};
+
+/// Longest wait of progress.
+const LONGEST: Duration = Duration::from_secs(30);
+/// Periods that progress waits for, where that is shorter.
+const PERIODS: u32 = 3;
+
+/// What separates two statuses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Change {
+    Nothing,
+    /// Only how far it is, and the words for it.
+    Progress,
+    Real,
+}
+
+/// Compares the status that is stored with the one that is wanted.
+pub fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
+    if old == new {
+        Change::Nothing
+    } else if steady(old) == steady(new) {
+        Change::Progress
+    } else {
+        Change::Real
+    }
+}
+
+/// How long progress may wait since the last write.
+pub fn patience(leaderboard: Option<&LeaderboardSpec>) -> Duration {
+    let period = leaderboard.map_or(10, |l| l.period_seconds).unsigned_abs();
+    LONGEST.min(Duration::from_secs(period) * PERIODS)
+}
+
+/// A status without what moves while a submission waits or runs.
+fn steady(status: &SubmissionStatus) -> SubmissionStatus {
+    let mut steady = SubmissionStatus {
+        progress: None,
+        score: None,
+        message: None,
+        waiting: None,
+        ..status.clone()
+    };
+    for pair in &mut steady.pairs {
+        pair.done = 0;
+        pair.state = String::new();
+    }
+    // A pair that has not crashed carries nothing that would be missed.
+    steady.pairs.retain(|pair| pair.crashes > 0 || pair.last.is_some());
+    for condition in &mut steady.conditions {
+        condition.message = String::new();
+        condition.observed_generation = None;
+    }
+    steady
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::api::{PairStatus, Progress, State};
+
+    fn running(done: i32) -> SubmissionStatus {
+        SubmissionStatus {
+            state: Some(State::Running),
+            progress: Some(Progress::new(done, 20)),
+            message: Some(format!("{done}/20 routes done.")),
+            ..SubmissionStatus::default()
+        }
+    }
+
+    #[test]
+    fn progress_may_wait_and_a_state_may_not() {
+        assert_eq!(change(&running(1), &running(1)), Change::Nothing);
+        assert_eq!(change(&running(1), &running(2)), Change::Progress);
+        let finished = SubmissionStatus {
+            state: Some(State::Finished),
+            ..running(20)
+        };
+        assert_eq!(change(&running(19), &finished), Change::Real);
+    }
+
+    #[test]
+    fn a_crash_is_written_at_once() {
+        let crashed = PairStatus {
+            id: 1,
+            done: 0,
+            total: 5,
+            crashes: 1,
+            state: "Crashed".into(),
+            last: None,
+        };
+        let status = SubmissionStatus {
+            pairs: vec![crashed],
+            ..running(1)
+        };
+        assert_eq!(change(&running(1), &status), Change::Real);
+    }
+
+    #[test]
+    fn progress_waits_no_longer_than_three_periods() {
+        assert_eq!(patience(None), Duration::from_secs(30));
+    }
+}

@@ -1,0 +1,265 @@
+//! The controller's side of EvalAI and DynamoDB: turns views of the services into what `decide` reads, and what `decide`
+//! wants into wishes and rows. Never waits for either; reads S3 for the texts of a result.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use kube::ResourceExt;
+
+use super::context::Context;
+use super::decide::Tell;
+use super::observe::{report, uid_of};
+use super::result_texts;
+use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
+use crate::api::{Leaderboard, Submission, SubmissionStatus, names};
+use crate::services::ObjectKey;
+use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
+use crate::services::table::Recorder;
+
+/// Time the texts of a result may take to be read.
+const TEXTS_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// Doors to both services, and what each Leaderboard needs to go through them.
+pub struct Sync {
+    pub hub: Hub,
+    pub recorder: Recorder,
+    targets: Mutex<HashMap<String, Arc<Target>>>,
+}
+
+impl Sync {
+    pub fn new(hub: Hub, recorder: Recorder) -> Self {
+        Self {
+            hub,
+            recorder,
+            targets: Mutex::default(),
+        }
+    }
+
+    /// A Leaderboard's way to EvalAI, renewed whenever its spec or token changes.
+    pub fn set_target(&self, leaderboard: &Leaderboard, target: Option<Arc<Target>>) {
+        let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        match target {
+            Some(target) => targets.insert(uid_of(leaderboard), target),
+            None => targets.remove(&uid_of(leaderboard)),
+        };
+    }
+
+    fn target(&self, leaderboard: &Leaderboard) -> Option<Arc<Target>> {
+        self.targets
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(&uid_of(leaderboard))
+            .cloned()
+    }
+
+    /// What EvalAI is known to say of a submission.
+    pub fn evalai_view(&self, leaderboard: Option<&Leaderboard>, submission: &Submission) -> Option<EvalaiView> {
+        submission.spec.evalai?;
+        let Some(seen) = self.hub.view(&object_key(submission)) else {
+            let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
+            let error = (!ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned());
+            return Some(EvalaiView {
+                error,
+                ..EvalaiView::default()
+            });
+        };
+        Some(map_view(&seen, submission))
+    }
+
+    /// What is known of a submission's row. None without a table.
+    pub fn record_view(&self, leaderboard: &Leaderboard, submission: &Submission) -> Option<RecordView> {
+        leaderboard.spec.table.as_ref()?;
+        let attempt = submission.status.as_ref().and_then(|s| s.attempt);
+        let seen = self
+            .recorder
+            .view(&object_key(submission))
+            .filter(|seen| Some(seen.attempt) == attempt);
+        Some(seen.map_or_else(RecordView::default, |s| RecordView {
+            end_written: s.end_written,
+            error: s.error,
+        }))
+    }
+
+    /// Asks EvalAI whether a submission wants to run.
+    pub fn ask(&self, view: &View) {
+        let Some(way) = self.way(view) else { return };
+        let wants_image = view.submission.spec.image.is_none();
+        let asked = self.hub.ask(&way.target, &way.key, way.pk, &way.run, wants_image);
+        log_refused(&view.submission, asked);
+    }
+
+    /// Tells EvalAI. Texts that cannot be read now are told by a later pass.
+    pub async fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: Tell) {
+        let Some(way) = self.way(view) else { return };
+        let wish = match tell {
+            Tell::Queued => Some(Wish::Queued),
+            Tell::Running => Some(Wish::Running),
+            Tell::Partial => partial(context, view).await.map(Wish::Partial),
+            Tell::Finished => final_wish(context, view, status, Outcome::Finished).await,
+            Tell::Failed => final_wish(context, view, status, Outcome::Failed).await,
+            Tell::Cancelled => final_wish(context, view, status, Outcome::Cancelled).await,
+        };
+        if matches!(tell, Tell::Queued | Tell::Running) {
+            let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
+            log_refused(
+                &view.submission,
+                self.hub.live(&way.target, &way.key, way.pk, &way.run, since),
+            );
+        }
+        if let Some(wish) = wish {
+            log_refused(
+                &view.submission,
+                self.hub.wish(&way.target, &way.key, way.pk, &way.run, wish),
+            );
+        }
+    }
+
+    /// Nothing more is wanted of EvalAI for this object.
+    pub fn forget(&self, submission: &Submission) {
+        self.hub.forget(&object_key(submission));
+    }
+
+    /// Writes the row, or lets the next write carry it.
+    pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
+        let Some(leaderboard) = &view.leaderboard else { return };
+        let (Some(table), Some(row)) = (&leaderboard.spec.table, result_texts::row(view, status)) else {
+            return;
+        };
+        self.recorder.record(table, &object_key(&view.submission), row, end);
+    }
+
+    /// Drops everything of an object that is gone.
+    pub fn gone(&self, key: &ObjectKey) {
+        self.hub.forget(key);
+        self.recorder.forget(key);
+    }
+
+    fn way(&self, view: &View) -> Option<Way> {
+        let evalai = view.submission.spec.evalai?;
+        let target = self.target(view.leaderboard.as_deref()?)?;
+        let attempt = view.submission.spec.attempt;
+        let job = names::job(&view.submission.name_any(), attempt, 0);
+        Some(Way {
+            target,
+            key: object_key(&view.submission),
+            pk: evalai.submission,
+            run: Run { attempt, job },
+        })
+    }
+}
+
+struct Way {
+    target: Arc<Target>,
+    key: ObjectKey,
+    pk: i64,
+    run: Run,
+}
+
+async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
+    let report = view.report.ours()?;
+    let payload = texts(context, view, report).await?;
+    let attempt = view.submission.spec.attempt;
+    context.memory.told_partial(&view.submission, attempt, report.done);
+    Some(Arc::new(payload))
+}
+
+async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
+    let known = view.report.ours().cloned();
+    let sight = match known {
+        Some(report) => ReportSight::Ours(report),
+        None => report::read_now(context, &view.submission, view.now).await,
+    };
+    let mut payload = match &sight {
+        ReportSight::Ours(report) => texts(context, view, report).await?,
+        ReportSight::Unreadable(why) => {
+            tracing::warn!(submission = %view.submission.name_any(), %why, "the result waits to be published");
+            return None;
+        }
+        _ => Payload {
+            phase: result_texts::phase(view),
+            result: "[]".into(),
+            ..Payload::default()
+        },
+    };
+    payload.stderr = result_texts::stderr(status);
+    Some(Wish::Final(outcome, Arc::new(payload)))
+}
+
+async fn texts(context: &Context, view: &View, report: &crate::pod::report::Report) -> Option<Payload> {
+    match tokio::time::timeout(TEXTS_TIMEOUT, result_texts::payload(context, view, report)).await {
+        Ok(Ok(payload)) => Some(payload),
+        Ok(Err(why)) => {
+            tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of the result wait to be read");
+            None
+        }
+        Err(_) => {
+            tracing::warn!(submission = %view.submission.name_any(), "the bucket does not answer; the result waits");
+            None
+        }
+    }
+}
+
+fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
+    let attempt = submission.spec.attempt;
+    // An image that was asked for is waited for; why there is none is an answer too.
+    let image_known = submission.spec.image.is_some() || seen.image.is_some();
+    let present = seen.attempt == attempt;
+    let ended = seen.ended.filter(|_| present);
+    let answered = seen.answered >= attempt;
+    EvalaiView {
+        info: seen
+            .row
+            .as_ref()
+            .filter(|_| answered && image_known)
+            .map(|row| EvalaiInfo {
+                standing: match (ended, row.status) {
+                    (Some(_), _) => Standing::Ended,
+                    (None, Status::Resuming) => Standing::Resumed,
+                    (None, _) => Standing::Wanted,
+                },
+                status: ended.unwrap_or(row.status).as_str().to_owned(),
+                team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
+                team_name: row.team_name.clone(),
+                submitted_at: row.submitted_at,
+                image: seen.image.as_ref().and_then(|i| i.as_ref().ok().cloned()),
+            }),
+        cancelled: ended.is_some(),
+        end: seen
+            .end
+            .as_ref()
+            .filter(|_| present)
+            .map(|end| map_end(end, seen.read_at)),
+        error: seen.last_error.clone(),
+    }
+}
+
+fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
+    match end {
+        Ended::Published { at, .. } => EvalaiEnd::Published { at: *at },
+        Ended::Agreed(_) => EvalaiEnd::Published {
+            at: read_at.unwrap_or_else(Timestamp::now),
+        },
+        Ended::Otherwise(status) => EvalaiEnd::Ended {
+            status: status.as_str().to_owned(),
+        },
+        Ended::Refused(message) => EvalaiEnd::Refused {
+            message: message.clone(),
+        },
+    }
+}
+
+fn log_refused(submission: &Submission, result: Result<(), evalai::client::ClientError>) {
+    if let Err(error) = result {
+        tracing::error!(submission = %submission.name_any(), %error, "EvalAI cannot be spoken to");
+    }
+}
+
+fn object_key(submission: &Submission) -> ObjectKey {
+    ObjectKey {
+        namespace: submission.namespace().unwrap_or_default(),
+        name: submission.name_any(),
+        uid: uid_of(submission),
+    }
+}

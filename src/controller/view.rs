@@ -1,0 +1,203 @@
+//! The world of one submission, as one pass saw it. `observe` fills it, `decide` reads it; it holds no client and no clock.
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+
+use crate::api::{Leaderboard, Submission};
+use crate::pod::report::Report;
+use crate::pod::run::Stop;
+
+/// Everything a decision may depend on.
+#[derive(Clone, Debug)]
+pub struct View {
+    pub now: Timestamp,
+    pub submission: Arc<Submission>,
+    pub leaderboard: Option<Arc<Leaderboard>>,
+    /// Whether it may start now; only meaningful while it has no Job.
+    pub turn: Turn,
+    pub job: JobSight,
+    pub pod: Option<PodView>,
+    pub report: ReportSight,
+    /// None for a submission that is not EvalAI's.
+    pub evalai: Option<EvalaiView>,
+    /// None if the Leaderboard has no table.
+    pub record: Option<RecordView>,
+    /// Routes that the last partial result told EvalAI of, in this attempt.
+    pub partial_told: Option<u32>,
+}
+
+/// The Job that the present attempt should have.
+#[derive(Clone, Debug, PartialEq)]
+pub enum JobSight {
+    Absent,
+    /// It has the right name but another owner: an older object's, going away.
+    Foreign,
+    Ours(JobView),
+}
+
+impl JobSight {
+    /// The Job, if it is ours.
+    pub fn ours(&self) -> Option<&JobView> {
+        match self {
+            Self::Ours(job) => Some(job),
+            Self::Absent | Self::Foreign => None,
+        }
+    }
+}
+
+/// A Job, reduced to what matters.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JobView {
+    pub name: String,
+    pub uid: String,
+    pub created: Option<Timestamp>,
+    pub end: Option<JobEnd>,
+    pub deleting: bool,
+    pub has_ttl: bool,
+    /// The words of its last FailedCreate event, while it has no Pod.
+    pub failed_create: Option<String>,
+}
+
+/// How a Job ended; both wait for the end of its Pods.
+#[derive(Clone, Debug, PartialEq)]
+pub enum JobEnd {
+    Complete {
+        at: Option<Timestamp>,
+    },
+    Failed {
+        at: Option<Timestamp>,
+        reason: String,
+        message: String,
+    },
+}
+
+/// The newest Pod of the Job.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PodView {
+    pub name: String,
+    pub uid: String,
+    pub node: Option<String>,
+    pub scheduled: Option<Timestamp>,
+    /// The scheduler's words, while no node fits.
+    pub unschedulable: Option<String>,
+    /// When it has to be gone, once it is being deleted (its grace included).
+    pub delete_by: Option<Timestamp>,
+    /// When its first agent started.
+    pub agent_started: Option<Timestamp>,
+    pub logcopy_running: bool,
+    pub containers: Vec<ContainerView>,
+    /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
+    pub ended_by_node: Option<(String, String)>,
+    pub stop: Option<Stop>,
+}
+
+/// One container of the Pod.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ContainerView {
+    pub name: String,
+    pub restarts: i32,
+    pub running: bool,
+    /// Reason and message, while it waits.
+    pub waiting: Option<(String, String)>,
+    pub last: Option<EndView>,
+}
+
+/// How a container last ended.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EndView {
+    /// Kubernetes' reason: `Completed`, `Error`, `OOMKilled`, `StartError`, …
+    pub reason: String,
+    pub exit_code: i32,
+    pub at: Option<Timestamp>,
+    /// The runner's word for it, `exited`, `idle`, `peerCrashed`, …
+    pub what: Option<String>,
+    /// The runner's or Kubernetes' sentence.
+    pub why: Option<String>,
+}
+
+/// The report in S3, as far as it was read.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ReportSight {
+    /// There was no reason to look.
+    NotRead,
+    Absent,
+    /// Another object's or attempt's.
+    Foreign,
+    /// S3 did not answer, or not with a report.
+    Unreadable(String),
+    Ours(Arc<Report>),
+}
+
+impl ReportSight {
+    /// The report, if it is ours.
+    pub fn ours(&self) -> Option<&Arc<Report>> {
+        match self {
+            Self::Ours(report) => Some(report),
+            _ => None,
+        }
+    }
+}
+
+/// Whether a submission may start.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Turn {
+    Go,
+    Wait { position: i32, eta: Option<String> },
+    Paused { position: i32 },
+}
+
+/// What is known of the submission in EvalAI.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EvalaiView {
+    /// What EvalAI last said of it; None until it was asked.
+    pub info: Option<EvalaiInfo>,
+    /// It was cancelled there, after this attempt was announced.
+    pub cancelled: bool,
+    /// What became of the final result of this attempt.
+    pub end: Option<EvalaiEnd>,
+    /// Why the last request failed.
+    pub error: Option<String>,
+}
+
+/// A submission in EvalAI.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EvalaiInfo {
+    pub standing: Standing,
+    pub status: String,
+    pub team_id: String,
+    pub team_name: Option<String>,
+    pub submitted_at: Option<Timestamp>,
+    pub image: Option<String>,
+}
+
+/// What EvalAI's status means for a run of this attempt.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Standing {
+    /// It wants to run.
+    Wanted,
+    /// It was resumed there: its stored results are taken up.
+    Resumed,
+    /// It has come to its end there without us.
+    Ended,
+}
+
+/// What became of a final result.
+#[derive(Clone, Debug, PartialEq)]
+pub enum EvalaiEnd {
+    /// EvalAI has it.
+    Published { at: Timestamp },
+    /// EvalAI had ended it before: cancelled, archived, ignored, or it is gone.
+    Ended { status: String },
+    /// EvalAI will never take it, and why.
+    Refused { message: String },
+}
+
+/// What is known of the row in DynamoDB.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RecordView {
+    /// The end of this attempt is written.
+    pub end_written: bool,
+    /// Why the last write failed.
+    pub error: Option<String>,
+}

@@ -1,0 +1,223 @@
+//! Hands the objects that a watch has touched to whoever subscribed, each to each, the newest state only.
+//!
+//! Filled by a watch's task, read by the controller's queue. Never blocks the watch and loses nothing: what is not read
+//! yet is coalesced by UID, so that it takes no more room than the objects do. A subscriber that comes late gets all
+//! objects that are there.
+
+use std::collections::{HashMap, VecDeque};
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::task::{Context, Poll, Waker};
+
+use futures::Stream;
+use kube::ResourceExt;
+
+/// An object that was added, changed or deleted.
+#[derive(Debug)]
+pub struct Touch<K> {
+    /// As it is, or as it was last.
+    pub object: Arc<K>,
+    /// It no longer exists.
+    pub is_gone: bool,
+}
+
+impl<K> Clone for Touch<K> {
+    fn clone(&self) -> Self {
+        Self {
+            object: self.object.clone(),
+            is_gone: self.is_gone,
+        }
+    }
+}
+
+/// The watch's end. Clones are the same feed.
+pub(super) struct Feed<K>(Arc<Mutex<Lanes<K>>>);
+
+struct Lanes<K> {
+    lanes: Vec<Weak<Mutex<Lane<K>>>>,
+    is_closed: bool,
+}
+
+struct Lane<K> {
+    order: VecDeque<String>,
+    latest: HashMap<String, Touch<K>>,
+    waker: Option<Waker>,
+    is_closed: bool,
+}
+
+/// A subscriber's end: a stream that ends with the watch. Dropping it unsubscribes.
+#[must_use = "a subscription gathers what is not read"]
+pub struct Touches<K>(Arc<Mutex<Lane<K>>>);
+
+impl<K> Clone for Feed<K> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
+    }
+}
+
+impl<K: ResourceExt> Feed<K> {
+    pub(super) fn new() -> Self {
+        Self(Arc::new(Mutex::new(Lanes {
+            lanes: Vec::new(),
+            is_closed: false,
+        })))
+    }
+
+    /// `present` is asked under the feed's lock, so that nothing falls between what is there and what comes.
+    pub(super) fn subscribe(&self, present: impl FnOnce() -> Vec<Arc<K>>) -> Touches<K> {
+        let mut feed = lock(&self.0);
+        let is_closed = feed.is_closed;
+        let mut lane = Lane {
+            order: VecDeque::new(),
+            latest: HashMap::new(),
+            waker: None,
+            is_closed,
+        };
+        for object in present() {
+            lane.push(Touch { object, is_gone: false });
+        }
+        let lane = Arc::new(Mutex::new(lane));
+        feed.lanes.push(Arc::downgrade(&lane));
+        Touches(lane)
+    }
+
+    pub(super) fn push(&self, object: &Arc<K>, is_gone: bool) {
+        self.for_each(|lane| {
+            lane.push(Touch {
+                object: object.clone(),
+                is_gone,
+            });
+        });
+    }
+
+    pub(super) fn close(&self) {
+        lock(&self.0).is_closed = true;
+        self.for_each(|lane| lane.is_closed = true);
+    }
+
+    fn for_each(&self, act: impl Fn(&mut Lane<K>)) {
+        let mut feed = lock(&self.0);
+        feed.lanes.retain(|lane| {
+            let Some(lane) = lane.upgrade() else { return false };
+            let mut lane = lock(&lane);
+            act(&mut lane);
+            if let Some(waker) = lane.waker.take() {
+                waker.wake();
+            }
+            true
+        });
+    }
+}
+
+impl<K: ResourceExt> Lane<K> {
+    fn push(&mut self, touch: Touch<K>) {
+        let object = &touch.object;
+        let key = object
+            .uid()
+            .unwrap_or_else(|| format!("{}/{}", object.namespace().unwrap_or_default(), object.name_any()));
+        if self.latest.insert(key.clone(), touch).is_none() {
+            self.order.push_back(key);
+        }
+    }
+}
+
+impl<K> Stream for Touches<K> {
+    type Item = Touch<K>;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Touch<K>>> {
+        let mut lane = lock(&self.0);
+        let next = lane.order.pop_front();
+        if let Some(touch) = next.and_then(|key| lane.latest.remove(&key)) {
+            return Poll::Ready(Some(touch));
+        }
+        if lane.is_closed {
+            return Poll::Ready(None);
+        }
+        lane.waker = Some(context.waker().clone());
+        Poll::Pending
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use futures::{FutureExt, StreamExt};
+    use k8s_openapi::api::core::v1::ConfigMap;
+
+    fn object(name: &str, uid: &str, version: &str) -> Arc<ConfigMap> {
+        let mut object = ConfigMap::default();
+        object.metadata.name = Some(name.into());
+        object.metadata.uid = Some(uid.into());
+        object.metadata.resource_version = Some(version.into());
+        Arc::new(object)
+    }
+
+    fn told(touches: &mut Touches<ConfigMap>) -> Vec<(String, String, bool)> {
+        std::iter::from_fn(|| touches.next().now_or_never().flatten())
+            .map(|t| (t.object.name_any(), t.object.resource_version().unwrap(), t.is_gone))
+            .collect()
+    }
+
+    fn expected(all: &[(&str, &str, bool)]) -> Vec<(String, String, bool)> {
+        all.iter()
+            .map(|&(name, version, is_gone)| (name.to_owned(), version.to_owned(), is_gone))
+            .collect()
+    }
+
+    #[test]
+    fn what_is_not_read_yet_is_told_once_in_its_newest_state() {
+        let feed = Feed::new();
+        let mut touches = feed.subscribe(|| vec![object("a", "1", "1")]);
+        feed.push(&object("b", "2", "2"), false);
+        feed.push(&object("a", "1", "3"), false);
+        feed.push(&object("b", "2", "4"), true);
+        assert_eq!(told(&mut touches), expected(&[("a", "3", false), ("b", "4", true)]));
+        feed.push(&object("a", "1", "5"), false);
+        assert_eq!(told(&mut touches), expected(&[("a", "5", false)]));
+    }
+
+    #[test]
+    fn the_end_of_an_object_is_not_covered_by_its_namesake() {
+        let feed = Feed::new();
+        let mut touches = feed.subscribe(Vec::new);
+        feed.push(&object("a", "old", "1"), true);
+        feed.push(&object("a", "new", "2"), false);
+        assert_eq!(told(&mut touches), expected(&[("a", "1", true), ("a", "2", false)]));
+    }
+
+    #[tokio::test]
+    async fn each_subscriber_gets_all_and_ends_with_the_watch() {
+        let feed = Feed::<ConfigMap>::new();
+        let (mut one, two) = (feed.subscribe(Vec::new), feed.subscribe(Vec::new));
+        drop(two);
+        let reader = tokio::spawn(async move { one.next().await.map(|t| t.object.name_any()) });
+        tokio::task::yield_now().await;
+        feed.push(&object("a", "1", "1"), false);
+        assert_eq!(reader.await.unwrap().as_deref(), Some("a"));
+        assert_eq!(
+            lock(&feed.0)
+                .lanes
+                .iter()
+                .filter(|lane| lane.strong_count() > 0)
+                .count(),
+            0
+        );
+        let mut three = feed.subscribe(Vec::new);
+        feed.push(&object("b", "2", "2"), false);
+        feed.close();
+        assert_eq!(
+            told(&mut three),
+            expected(&[("b", "2", false)]),
+            "what came before the end is still told"
+        );
+        assert!(three.next().await.is_none());
+        assert!(
+            feed.subscribe(Vec::new).next().await.is_none(),
+            "a watch that has ended tells nothing more"
+        );
+    }
+}

@@ -1,0 +1,307 @@
+//! Watches: one task for each kind, a cache, and a feed of what was touched.
+//!
+//! Started by the controller's wiring. One task each, because a shared back-off would let one sick watch hold up all
+//! others. Errors are logged, counted and mended here; readers only ever see objects. Knows no policy.
+
+mod feed;
+pub mod preflight;
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::HashMap;
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::StreamExt;
+use kube::core::{DeserializeGuard, NamespaceResourceScope};
+use kube::runtime::reflector::{ObjectRef, Store, store::Writer};
+use kube::runtime::watcher::{Config, Error, Event};
+use kube::runtime::{WatchStreamExt, watcher};
+use kube::{Api, Client, Resource, ResourceExt};
+use serde::de::DeserializeOwned;
+
+pub use feed::{Touch, Touches};
+
+use crate::observability::liveness::WatchProbe;
+use crate::observability::metrics::WatchMetrics;
+use crate::observability::readiness::Readiness;
+use crate::observability::shutdown::Stop;
+use crate::observability::{Observability, text};
+
+/// Longer than a watch may be silent: the server ends each after 290 s.
+const READ_TIMEOUT: Duration = Duration::from_mins(5);
+
+/// What can be watched.
+pub trait Watchable:
+    Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
+{
+}
+
+impl<K> Watchable for K where
+    K: Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
+{
+}
+
+/// A client for watches: a list or a watch on a dead connection ends in minutes, not never.
+///
+/// # Errors
+/// If the configuration holds no usable TLS or credentials.
+pub fn watch_client(mut config: kube::Config) -> Result<Client, kube::Error> {
+    config.read_timeout = Some(READ_TIMEOUT);
+    Client::try_from(config)
+}
+
+/// The door to a kind, in one namespace or in all, that lets malformed objects pass as such instead of failing.
+pub fn guarded<K>(client: Client, namespace: Option<&str>) -> Api<DeserializeGuard<K>>
+where
+    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+{
+    match namespace {
+        Some(namespace) => Api::namespaced(client, namespace),
+        None => Api::all(client),
+    }
+}
+
+/// A running watch. Clones are the same one.
+pub struct Watch<K: Watchable> {
+    /// The objects as they were last seen.
+    pub store: Store<K>,
+    feed: feed::Feed<K>,
+}
+
+impl<K: Watchable> Clone for Watch<K> {
+    fn clone(&self) -> Self {
+        Self {
+            store: self.store.clone(),
+            feed: self.feed.clone(),
+        }
+    }
+}
+
+impl<K: Watchable> Watch<K> {
+    /// Everything that is there now, then everything that is touched, deletions included. The store is at least as new
+    /// as what is told.
+    pub fn subscribe(&self) -> Touches<K> {
+        self.feed.subscribe(|| self.store.state())
+    }
+}
+
+/// Starts to watch a kind until the process stops. `trim` drops what nobody reads, before it is cached; managed fields go
+/// anyway. Until the first list is complete, the process is not ready.
+pub fn spawn_watch<K: Watchable>(
+    api: Api<DeserializeGuard<K>>,
+    config: Config,
+    trim: fn(&mut K),
+    seen: &Observability,
+) -> Watch<K> {
+    let writer = Writer::<K>::new(());
+    let watch = Watch {
+        store: writer.as_reader(),
+        feed: feed::Feed::new(),
+    };
+    let kind = K::kind(&()).into_owned();
+    let task = Task {
+        check: format!("{} synced", K::plural(&())),
+        probe: seen.liveness.watch(&kind),
+        metrics: seen.metrics.watch(&kind),
+        readiness: seen.readiness.clone(),
+        kind,
+        trim,
+        store: watch.store.clone(),
+        writer,
+        feed: watch.feed.clone(),
+        is_synced: false,
+    };
+    task.missing("the first list has not come yet");
+    let guard = seen.liveness.task(&format!("watch of {}", K::plural(&())));
+    let stop = seen.stop.clone();
+    tokio::spawn(async move {
+        task.run(api, config, stop).await;
+        guard.finished();
+    });
+    watch
+}
+
+struct Task<K: Watchable> {
+    kind: String,
+    /// Name of the check of readiness.
+    check: String,
+    probe: WatchProbe,
+    metrics: WatchMetrics,
+    readiness: Readiness,
+    trim: fn(&mut K),
+    store: Store<K>,
+    writer: Writer<K>,
+    feed: feed::Feed<K>,
+    is_synced: bool,
+}
+
+impl<K: Watchable> Task<K> {
+    async fn run(mut self, api: Api<DeserializeGuard<K>>, config: Config, stop: Stop) {
+        let mut events = std::pin::pin!(watcher(api, config).default_backoff());
+        loop {
+            let event = tokio::select! {
+                () = stop.wait() => break,
+                event = events.next() => event,
+            };
+            match event {
+                Some(Ok(event)) => self.event(event),
+                Some(Err(error)) => self.error(&error),
+                // The stream has no end; should it find one, the dropped guard tells the probe.
+                None => break,
+            }
+        }
+        self.feed.close();
+    }
+
+    fn event(&mut self, event: Event<DeserializeGuard<K>>) {
+        if matches!(event, Event::Init) {
+            // The beginning of a list is a wish, not an answer.
+            self.probe.listing();
+            return self.writer.apply_watcher_event(&Event::Init);
+        }
+        self.metrics.event();
+        match event {
+            Event::Apply(object) => self.apply(object),
+            Event::Delete(object) => self.delete(object),
+            Event::InitApply(object) => self.listed(object),
+            Event::Init | Event::InitDone => self.list_done(),
+        }
+    }
+
+    fn apply(&mut self, object: DeserializeGuard<K>) {
+        self.probe.running();
+        let Some(object) = self.read(object) else { return };
+        let key = ObjectRef::from_obj(&object);
+        let before = self.store.get(&key);
+        self.writer.apply_watcher_event(&Event::Apply(object));
+        let after = self.store.get(&key);
+        // The end of an object that was replaced by a namesake between two looks.
+        if let Some(before) = before.filter(|b| after.as_ref().is_some_and(|a| a.uid() != b.uid())) {
+            self.feed.push(&before, true);
+        }
+        if let Some(after) = after {
+            self.feed.push(&after, false);
+        }
+    }
+
+    fn delete(&mut self, object: DeserializeGuard<K>) {
+        self.probe.running();
+        let last = match object.0 {
+            Ok(mut object) => {
+                self.trim(&mut object);
+                Arc::new(object)
+            }
+            Err(invalid) => {
+                let mut key = ObjectRef::<K>::new(invalid.metadata.name.as_deref().unwrap_or_default());
+                key.namespace = invalid.metadata.namespace;
+                // An object that never could be read was never told of.
+                let Some(known) = self.store.get(&key) else { return };
+                known
+            }
+        };
+        self.writer.apply_watcher_event(&Event::Delete((*last).clone()));
+        self.feed.push(&last, true);
+    }
+
+    fn listed(&mut self, object: DeserializeGuard<K>) {
+        let namespace = object.namespace();
+        let name = object.name_any();
+        let object = self.read(object).or_else(|| {
+            // One that has become unreadable stays as it was last: it has not been deleted.
+            let mut key = ObjectRef::<K>::new(&name);
+            key.namespace = namespace;
+            self.store.get(&key).map(|known| (*known).clone())
+        });
+        if let Some(object) = object {
+            self.writer.apply_watcher_event(&Event::InitApply(object));
+        }
+    }
+
+    fn list_done(&mut self) {
+        let mut before: HashMap<_, _> = self
+            .store
+            .state()
+            .into_iter()
+            .map(|object| (object.uid(), object))
+            .collect();
+        self.writer.apply_watcher_event(&Event::InitDone);
+        self.probe.listed();
+        let mut changed = 0_usize;
+        for object in self.store.state() {
+            let known = before.remove(&object.uid());
+            if known.is_none_or(|known| known.resource_version() != object.resource_version()) {
+                self.feed.push(&object, false);
+                changed += 1;
+            }
+        }
+        for gone in before.values() {
+            self.feed.push(gone, true);
+        }
+        if !self.is_synced {
+            self.is_synced = true;
+            self.readiness.set(&self.check, Ok(()));
+        }
+        tracing::info!(
+            kind = self.kind,
+            objects = self.store.len(),
+            changed,
+            gone = before.len(),
+            "listed"
+        );
+    }
+
+    /// The object, trimmed; None if it can't be read, which is told by its name.
+    fn read(&self, object: DeserializeGuard<K>) -> Option<K> {
+        match object.0 {
+            Ok(mut object) => {
+                self.trim(&mut object);
+                Some(object)
+            }
+            Err(invalid) => {
+                self.metrics.malformed();
+                let (namespace, name) = (invalid.metadata.namespace.as_deref(), invalid.metadata.name.as_deref());
+                tracing::error!(
+                    kind = self.kind,
+                    namespace,
+                    name,
+                    error = invalid.error,
+                    "left out an object that can't be read"
+                );
+                None
+            }
+        }
+    }
+
+    fn trim(&self, object: &mut K) {
+        object.meta_mut().managed_fields = None;
+        (self.trim)(object);
+    }
+
+    fn error(&self, error: &Error) {
+        self.metrics.failed();
+        match error {
+            // Both come from a watch that had been let in.
+            Error::WatchError(_) | Error::WatchFailed(_) => self.probe.running(),
+            _ => self.probe.failed(),
+        }
+        let told = text::watch(error);
+        if let Error::WatchError(status) = error
+            && status.code == 410
+        {
+            // The server has forgotten where the watch was: usual after an outage.
+            tracing::info!(kind = self.kind, error = told, "listing again");
+        } else {
+            tracing::warn!(kind = self.kind, error = told, "a watch has failed and is tried again");
+        }
+        if !self.is_synced {
+            self.missing(&told);
+        }
+    }
+
+    fn missing(&self, what: &str) {
+        self.readiness.set(&self.check, Err(what.to_owned()));
+    }
+}

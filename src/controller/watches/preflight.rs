@@ -1,0 +1,167 @@
+//! What a process asks of the cluster before it works: that our kinds are served, and that it may do what it has to.
+//!
+//! Called by `main` at the start. Does not give up: CRDs and roles may be applied after the operator. Says what is missing
+//! in the log and in readiness.
+
+use std::fmt;
+use std::time::Duration;
+
+use futures::{StreamExt, stream};
+use k8s_openapi::api::authorization::v1::{ResourceAttributes, SelfSubjectAccessReview, SelfSubjectAccessReviewSpec};
+use kube::api::PostParams;
+use kube::core::GroupVersion;
+use kube::{Api, Client, discovery};
+use tokio::time::{sleep, timeout};
+
+use crate::api::{GROUP, VERSION};
+use crate::observability::{Observability, text};
+
+/// Name of the check for our kinds.
+const KINDS_CHECK: &str = "custom resources";
+/// Name of the check for permissions.
+const ACCESS_CHECK: &str = "permissions";
+/// Any one question.
+const CALL_TIMEOUT: Duration = Duration::from_secs(10);
+/// Between looks for kinds.
+const KINDS_PAUSE: Duration = Duration::from_secs(2);
+/// Between looks for permissions.
+const ACCESS_PAUSE: Duration = Duration::from_secs(30);
+/// Questions at once.
+const AT_ONCE: usize = 8;
+
+/// One thing that the process has to be allowed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Need<'a> {
+    /// Empty for the core group.
+    pub group: &'a str,
+    /// Plural; a sub-resource follows after a slash.
+    pub resource: &'a str,
+    pub verb: &'a str,
+    /// None: in every namespace.
+    pub namespace: Option<&'a str>,
+}
+
+impl fmt::Display for Need<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.verb, self.resource)?;
+        if !self.group.is_empty() {
+            write!(f, " of {}", self.group)?;
+        }
+        match self.namespace {
+            Some(namespace) => write!(f, " in namespace {namespace}"),
+            None => f.write_str(" in all namespaces"),
+        }
+    }
+}
+
+/// Waits until the API server serves our kinds. False: the process was stopped meanwhile.
+pub async fn await_kinds(client: &Client, plurals: &[&str], seen: &Observability) -> bool {
+    let mut last = String::new();
+    loop {
+        let state = kinds_missing(client, plurals).await;
+        let Some(missing) = state else {
+            seen.readiness.set(KINDS_CHECK, Ok(()));
+            seen.liveness.answered();
+            return true;
+        };
+        if missing != last {
+            tracing::warn!(missing, "waiting for the custom resources");
+        }
+        seen.readiness.set(KINDS_CHECK, Err(missing.clone()));
+        last = missing;
+        if !pause(KINDS_PAUSE, seen).await {
+            return false;
+        }
+    }
+}
+
+async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
+    let version = GroupVersion::gv(GROUP, VERSION);
+    let served = match timeout(CALL_TIMEOUT, discovery::pinned_group(client, &version)).await {
+        Ok(Ok(group)) => group.versioned_resources(VERSION),
+        // For an unknown group the server answers plain text, so that only the code says what it means.
+        Ok(Err(kube::Error::Api(status))) if status.code == 404 => Vec::new(),
+        // Discovery tells a group without kinds as an error of its own.
+        Ok(Err(kube::Error::Discovery(_))) => Vec::new(),
+        Ok(Err(error)) => return Some(text::kube(&error)),
+        Err(_) => {
+            return Some(format!(
+                "the API server has not answered within {} s",
+                CALL_TIMEOUT.as_secs()
+            ));
+        }
+    };
+    let is_served = |plural: &str| served.iter().any(|(kind, _)| kind.plural == plural);
+    let missing: Vec<_> = plurals.iter().filter(|plural| !is_served(plural)).copied().collect();
+    (!missing.is_empty()).then(|| {
+        format!(
+            "the API server does not serve {} of {GROUP}/{VERSION}; install the operator's CRDs",
+            missing.join(", ")
+        )
+    })
+}
+
+/// Asks until everything is allowed, and says what is not. Not to be waited for: much may work meanwhile.
+pub async fn watch_access(client: Client, needs: &[Need<'_>], seen: &Observability) {
+    loop {
+        let missing = access_missing(&client, needs).await;
+        if missing.is_empty() {
+            return seen.readiness.set(ACCESS_CHECK, Ok(()));
+        }
+        let told = missing.join("; ");
+        tracing::error!(missing = told, "permissions are missing");
+        seen.readiness.set(ACCESS_CHECK, Err(told));
+        if !pause(ACCESS_PAUSE, seen).await {
+            return;
+        }
+    }
+}
+
+/// A sentence for each need that is not met, in the order of needs.
+pub async fn access_missing(client: &Client, needs: &[Need<'_>]) -> Vec<String> {
+    let reviews: Api<SelfSubjectAccessReview> = Api::all(client.clone());
+    // Collected first: a stream of borrowing closures could not be sent to another thread.
+    let asked: Vec<_> = needs.iter().map(|need| ask(&reviews, need)).collect();
+    let answers = stream::iter(asked).buffered(AT_ONCE);
+    answers.filter_map(|missing| async { missing }).collect().await
+}
+
+async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<String> {
+    let (resource, subresource) = match need.resource.split_once('/') {
+        Some((resource, sub)) => (resource, Some(sub.to_owned())),
+        None => (need.resource, None),
+    };
+    let attributes = ResourceAttributes {
+        group: Some(need.group.to_owned()),
+        resource: Some(resource.to_owned()),
+        subresource,
+        verb: Some(need.verb.to_owned()),
+        namespace: need.namespace.map(str::to_owned),
+        ..ResourceAttributes::default()
+    };
+    let spec = SelfSubjectAccessReviewSpec {
+        resource_attributes: Some(attributes),
+        ..Default::default()
+    };
+    let review = SelfSubjectAccessReview {
+        spec,
+        ..Default::default()
+    };
+    match timeout(CALL_TIMEOUT, reviews.create(&PostParams::default(), &review)).await {
+        Ok(Ok(answer)) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
+        Ok(Ok(_)) => Some(format!("may not {need}; add the verb to the operator's role")),
+        Ok(Err(error)) => Some(format!("can't ask whether it may {need}: {}", text::kube(&error))),
+        Err(_) => Some(format!(
+            "can't ask whether it may {need}: no answer within {} s",
+            CALL_TIMEOUT.as_secs()
+        )),
+    }
+}
+
+/// False: the process was stopped.
+async fn pause(time: Duration, seen: &Observability) -> bool {
+    tokio::select! {
+        () = sleep(time) => true,
+        () = seen.stop.wait() => false,
+    }
+}

@@ -1,0 +1,325 @@
+//! Watches and the preflight on a mock of the API server's client.
+
+use std::time::Duration;
+
+use futures::StreamExt;
+use http::{Request, Response};
+use kube::client::Body;
+use serde_json::{Value, json};
+use tokio::sync::{mpsc, watch};
+use tokio::time::timeout;
+use tower_test::mock::{Handle, pair};
+
+use super::preflight::{Need, access_missing, await_kinds};
+use super::*;
+use crate::api::Leaderboard;
+
+/// Longer than anything here may take.
+const LIMIT: Duration = Duration::from_mins(20);
+
+/// What a request is answered.
+enum Answer {
+    Json(u16, Value),
+    /// The lines of a watch, which then ends.
+    Watch(Vec<Value>),
+}
+
+type Script = mpsc::UnboundedSender<Answer>;
+
+/// A client whose requests are answered in order with what the test sends; until it sends more, they wait.
+fn scripted(answers: Vec<Answer>) -> (Client, Script) {
+    let (service, handle) = pair::<Request<Body>, Response<Body>>();
+    let (script, answered) = mpsc::unbounded_channel();
+    send(&script, answers);
+    tokio::spawn(serve(handle, answered));
+    (Client::new(service, "default"), script)
+}
+
+fn send(script: &Script, answers: Vec<Answer>) {
+    for answer in answers {
+        assert!(script.send(answer).is_ok(), "the server has ended");
+    }
+}
+
+async fn serve(mut handle: Handle<Request<Body>, Response<Body>>, mut answers: mpsc::UnboundedReceiver<Answer>) {
+    while let Some((_, send)) = handle.next_request().await {
+        let Some(answer) = answers.recv().await else { return };
+        let (code, body) = match answer {
+            Answer::Json(code, body) => (code, body.to_string()),
+            Answer::Watch(lines) => (200, lines.iter().map(|line| line.to_string() + "\n").collect()),
+        };
+        let response = Response::builder().status(code).body(Body::from(body.into_bytes()));
+        send.send_response(response.unwrap());
+    }
+}
+
+fn board(name: &str, uid: &str, version: &str) -> Value {
+    json!({"apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
+        "metadata": {"name": name, "namespace": "ns", "uid": uid, "resourceVersion": version, "managedFields": [{}]},
+        "spec": {"results": "V2", "tracks": [{"name": "SENSORS", "codename": "SENSORS"}],
+            "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "storage": {"bucket": "b"}}})
+}
+
+fn malformed(name: &str, uid: &str, version: &str) -> Value {
+    let mut object = board(name, uid, version);
+    object["spec"] = json!({"results": 7});
+    object
+}
+
+fn list(items: &[Value]) -> Answer {
+    Answer::Json(
+        200,
+        json!({"apiVersion": "v1", "kind": "List", "metadata": {"resourceVersion": "10"}, "items": items}),
+    )
+}
+
+fn line(kind: &str, object: &Value) -> Value {
+    json!({"type": kind, "object": object})
+}
+
+fn gone() -> Value {
+    line(
+        "ERROR",
+        &json!({"kind": "Status", "status": "Failure", "reason": "Expired", "code": 410, "message": "too old"}),
+    )
+}
+
+struct Rig {
+    watch: Watch<Leaderboard>,
+    touches: Touches<Leaderboard>,
+    seen: Observability,
+    stop: watch::Sender<bool>,
+    script: Script,
+}
+
+fn rig(answers: Vec<Answer>) -> Rig {
+    let (client, script) = scripted(answers);
+    let (stop, receiver) = Stop::new();
+    let seen = Observability::new(receiver);
+    let trim = |board: &mut Leaderboard| board.metadata.annotations = None;
+    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), trim, &seen);
+    let touches = watch.subscribe();
+    Rig {
+        watch,
+        touches,
+        seen,
+        stop,
+        script,
+    }
+}
+
+impl Rig {
+    fn send(&self, answers: Vec<Answer>) {
+        send(&self.script, answers);
+    }
+
+    async fn next(&mut self) -> (String, String, bool) {
+        let touch = timeout(LIMIT, self.touches.next())
+            .await
+            .expect("an event in time")
+            .expect("a watch that goes on");
+        (
+            touch.object.name_any(),
+            touch.object.resource_version().unwrap_or_default(),
+            touch.is_gone,
+        )
+    }
+
+    fn metric(&self, line: &str) -> bool {
+        self.seen.metrics.text().unwrap().lines().any(|l| l == line)
+    }
+}
+
+fn told(name: &str, version: &str, is_gone: bool) -> (String, String, bool) {
+    (name.to_owned(), version.to_owned(), is_gone)
+}
+
+#[test]
+fn the_test_object_is_one() {
+    assert!(serde_json::from_value::<Leaderboard>(board("a", "1", "1")).is_ok());
+    assert!(serde_json::from_value::<Leaderboard>(malformed("a", "1", "1")).is_err());
+}
+
+#[tokio::test(start_paused = true)]
+async fn objects_come_trimmed_and_deletions_are_told() {
+    let mut rig = rig(vec![list(&[board("a", "1", "5")])]);
+    assert_eq!(
+        rig.seen.readiness.missing(),
+        ["leaderboards synced: the first list has not come yet"]
+    );
+    assert_eq!(rig.next().await, told("a", "5", false));
+    assert!(rig.seen.readiness.missing().is_empty());
+    let first = rig.watch.store.state().remove(0);
+    assert!(first.metadata.managed_fields.is_none());
+    rig.send(vec![Answer::Watch(vec![
+        line("ADDED", &board("b", "2", "11")),
+        line("DELETED", &board("a", "1", "12")),
+    ])]);
+    assert_eq!(rig.next().await, told("b", "11", false));
+    assert_eq!(rig.next().await, told("a", "12", true));
+    assert_eq!(rig.watch.store.len(), 1);
+    assert!(rig.metric("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 0"));
+    rig.stop.send(true).unwrap();
+    assert!(rig.touches.next().await.is_none());
+    assert!(rig.seen.liveness.problems().is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_list_after_an_expired_watch_tells_only_what_changed_and_what_went_away() {
+    let all = [board("a", "1", "5"), board("b", "2", "6"), board("c", "3", "7")];
+    let mut rig = rig(vec![list(&all)]);
+    let mut first = vec![rig.next().await.0, rig.next().await.0, rig.next().await.0];
+    first.sort();
+    assert_eq!(first, ["a", "b", "c"]);
+    let changed = [board("a", "1", "5"), board("b", "2", "20"), board("c", "4", "21")];
+    rig.send(vec![Answer::Watch(vec![gone()]), list(&changed)]);
+    let mut second = vec![rig.next().await, rig.next().await, rig.next().await];
+    second.sort();
+    assert_eq!(
+        second,
+        [told("b", "20", false), told("c", "21", false), told("c", "7", true)]
+    );
+    rig.send(vec![Answer::Watch(vec![line("ADDED", &board("last", "9", "30"))])]);
+    assert_eq!(rig.next().await, told("last", "30", false), "and a was not told again");
+    assert!(rig.metric("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 1"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_malformed_object_is_left_out_and_stops_nothing() {
+    let mut rig = rig(vec![
+        list(&[malformed("bad", "1", "4"), board("a", "2", "5")]),
+        Answer::Watch(vec![
+            line("MODIFIED", &malformed("a", "2", "11")),
+            line("DELETED", &malformed("bad", "1", "12")),
+            line("ADDED", &board("b", "3", "13")),
+            gone(),
+        ]),
+        list(&[malformed("a", "2", "11"), board("b", "3", "13")]),
+    ]);
+    assert_eq!(rig.next().await, told("a", "5", false));
+    assert_eq!(rig.next().await, told("b", "13", false));
+    rig.send(vec![Answer::Watch(vec![line("DELETED", &malformed("a", "2", "31"))])]);
+    assert_eq!(
+        rig.next().await,
+        told("a", "5", true),
+        "kept as it was last until it is deleted"
+    );
+    assert_eq!(rig.watch.store.len(), 1);
+    assert!(rig.metric("leaderboard_watch_malformed_objects_total{kind=\"Leaderboard\"} 3"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_refused_list_is_told_by_readiness_and_tried_again() {
+    let refused = json!({"kind": "Status", "status": "Failure", "reason": "Forbidden", "code": 403,
+        "message": "leaderboards is forbidden"});
+    let mut rig = rig(vec![Answer::Json(403, refused)]);
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert!(rig.metric("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 1"));
+    let missing = rig.seen.readiness.missing().join("");
+    assert!(missing.contains("403: leaderboards is forbidden"), "{missing}");
+    rig.send(vec![list(&[board("a", "1", "5")])]);
+    assert_eq!(rig.next().await, told("a", "5", false));
+    assert!(rig.seen.readiness.missing().is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_list_that_is_never_answered_fails_liveness_while_others_are() {
+    let rig = rig(vec![]);
+    tokio::time::sleep(Duration::from_mins(11)).await;
+    assert!(rig.seen.liveness.problems().is_empty());
+    rig.seen.liveness.answered();
+    let problems = rig.seen.liveness.problems();
+    assert!(
+        problems.len() == 1 && problems[0].contains("watch of Leaderboard"),
+        "{problems:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_late_subscriber_gets_what_is_there() {
+    let mut rig = rig(vec![list(&[board("a", "1", "5")])]);
+    assert_eq!(rig.next().await, told("a", "5", false));
+    let mut late = rig.watch.clone().subscribe();
+    assert_eq!(late.next().await.unwrap().object.name_any(), "a");
+}
+
+fn served(plurals: &[&str]) -> Answer {
+    let resources: Vec<_> = plurals
+        .iter()
+        .map(|p| json!({"name": p, "singularName": "", "namespaced": true, "kind": p, "verbs": ["get", "list"]}))
+        .collect();
+    Answer::Json(
+        200,
+        json!({"kind": "APIResourceList", "apiVersion": "v1",
+        "groupVersion": "leaderboard.carla.org/v1alpha1", "resources": resources}),
+    )
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_preflight_waits_for_the_kinds_and_names_the_missing_one() {
+    let none = json!("404 page not found");
+    let (client, script) = scripted(vec![Answer::Json(404, none), served(&["leaderboards"])]);
+    let (stop, receiver) = Stop::new();
+    let seen = Observability::new(receiver);
+    let waiting = tokio::spawn({
+        let seen = seen.clone();
+        async move { await_kinds(&client, &["leaderboards", "submissions"], &seen).await }
+    });
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    let missing = seen.readiness.missing().join("");
+    assert!(
+        missing.contains("does not serve submissions of leaderboard.carla.org/v1alpha1"),
+        "{missing}"
+    );
+    send(&script, vec![served(&["leaderboards", "submissions"])]);
+    assert!(timeout(LIMIT, waiting).await.unwrap().unwrap());
+    assert!(seen.readiness.missing().is_empty());
+    drop(stop);
+    let (client, _script) = scripted(vec![served(&[])]);
+    assert!(
+        !await_kinds(&client, &["submissions"], &seen).await,
+        "a stopping process waits for nothing"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_preflight_names_each_missing_verb() {
+    let review = |allowed: bool| {
+        Answer::Json(
+            201,
+            json!({"kind": "SelfSubjectAccessReview", "apiVersion": "authorization.k8s.io/v1",
+            "metadata": {}, "spec": {}, "status": {"allowed": allowed}}),
+        )
+    };
+    let (client, _script) = scripted(vec![review(true), review(false)]);
+    let needs = [
+        Need {
+            group: "batch",
+            resource: "jobs",
+            verb: "create",
+            namespace: None,
+        },
+        Need {
+            group: "leaderboard.carla.org",
+            resource: "submissions/status",
+            verb: "patch",
+            namespace: Some("ns"),
+        },
+        Need {
+            group: "",
+            resource: "pods",
+            verb: "list",
+            namespace: None,
+        },
+    ];
+    let missing = access_missing(&client, &needs).await;
+    assert_eq!(
+        missing[0],
+        "may not patch submissions/status of leaderboard.carla.org in namespace ns; add the verb to the operator's role"
+    );
+    assert_eq!(
+        missing[1],
+        "can't ask whether it may list pods in all namespaces: no answer within 10 s"
+    );
+    assert_eq!(missing.len(), 2);
+}

@@ -1,0 +1,192 @@
+//! The CustomResourceDefinitions, as they are installed and as they lie in `crds/`.
+//!
+//! Called by `leaderboard-operator crd` and by the tests. It owns what the derived schema does not say as an API server
+//! wants it; the schema itself is in `api`. Pure.
+
+use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
+use kube::CustomResourceExt;
+use serde_json::Value;
+
+use crate::api::{Leaderboard, Submission};
+
+const HEADER: &str = "# Generated from src/api by `make crds`.\n";
+
+/// Why the definitions could not be printed or written.
+#[derive(thiserror::Error, Debug)]
+pub enum CrdError {
+    /// A definition that is not JSON, or not a definition any more; a mistake in `src/api`.
+    #[error("the definition of {kind} cannot be built: {source}")]
+    Build {
+        /// Kind of the definition.
+        kind: &'static str,
+        /// What serde says.
+        source: serde_json::Error,
+    },
+    /// A definition that is not YAML; a mistake in `src/api`.
+    #[error("the definition of {kind} cannot be printed: {source}")]
+    Print {
+        /// Kind of the definition.
+        kind: &'static str,
+        /// What the printer says.
+        source: serde_saphyr::ser::Error,
+    },
+}
+
+/// One definition and the file it lies in.
+pub struct Definition {
+    /// Its kind.
+    pub kind: &'static str,
+    /// Name of its file in `crds/`.
+    pub file: &'static str,
+    value: Value,
+}
+
+impl Definition {
+    /// As the API server takes it.
+    pub fn object(&self) -> Result<CustomResourceDefinition, CrdError> {
+        serde_json::from_value(self.value.clone()).map_err(|source| CrdError::Build {
+            kind: self.kind,
+            source,
+        })
+    }
+
+    /// As JSON.
+    pub fn json(&self) -> &Value {
+        &self.value
+    }
+
+    /// The text of its file.
+    pub fn yaml(&self) -> Result<String, CrdError> {
+        let text = serde_saphyr::to_string(&self.value).map_err(|source| CrdError::Print {
+            kind: self.kind,
+            source,
+        })?;
+        Ok(format!("{HEADER}{text}"))
+    }
+}
+
+/// Both definitions.
+pub fn definitions() -> Result<[Definition; 2], CrdError> {
+    Ok([
+        definition("Leaderboard", "leaderboards.yaml", &Leaderboard::crd())?,
+        definition("Submission", "submissions.yaml", &Submission::crd())?,
+    ])
+}
+
+/// Both definitions as one YAML stream, for `kubectl apply`.
+pub fn all() -> Result<String, CrdError> {
+    let documents = definitions()?;
+    let documents: Result<Vec<String>, CrdError> = documents.iter().map(Definition::yaml).collect();
+    Ok(documents?.join("---\n"))
+}
+
+fn definition(
+    kind: &'static str,
+    file: &'static str,
+    derived: &CustomResourceDefinition,
+) -> Result<Definition, CrdError> {
+    let mut value = serde_json::to_value(derived).map_err(|source| CrdError::Build { kind, source })?;
+    whole_numbers(&mut value);
+    if let Some(versions) = value.pointer_mut("/spec/versions").and_then(Value::as_array_mut) {
+        for status in versions
+            .iter_mut()
+            .filter_map(|version| version.pointer_mut("/schema/openAPIV3Schema/properties/status"))
+        {
+            without_rules(status);
+        }
+    }
+    Ok(Definition { kind, file, value })
+}
+
+/// The status is the operator's own: a rule there could only keep it from telling what it saw.
+fn without_rules(value: &mut Value) {
+    match value {
+        Value::Array(list) => list.iter_mut().for_each(without_rules),
+        Value::Object(object) => {
+            object.remove("x-kubernetes-validations");
+            object.values_mut().for_each(without_rules);
+        }
+        _ => {}
+    }
+}
+
+/// Writes `1.0` as `1`: bounds are kept as floating-point numbers, but people read them.
+fn whole_numbers(value: &mut Value) {
+    match value {
+        Value::Number(number) if number.is_f64() => {
+            let whole = number.as_f64().map(|float| format!("{float:.0}"));
+            let whole: Option<i64> = whole.and_then(|text| text.parse().ok());
+            #[allow(clippy::cast_precision_loss, reason = "compared with the number it came from")]
+            if let Some(whole) = whole.filter(|whole| number.as_f64() == Some(*whole as f64)) {
+                *value = whole.into();
+            }
+        }
+        Value::Array(list) => list.iter_mut().for_each(whole_numbers),
+        Value::Object(object) => object.values_mut().for_each(whole_numbers),
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    /// `make crds` sets UPDATE_CRDS: the files are then written, not compared.
+    #[test]
+    fn crds_are_up_to_date() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("crds");
+        for definition in definitions().unwrap() {
+            if std::env::var_os("UPDATE_CRDS").is_some() {
+                std::fs::create_dir_all(&folder).unwrap();
+                std::fs::write(folder.join(definition.file), definition.yaml().unwrap()).unwrap();
+            }
+            let committed = std::fs::read_to_string(folder.join(definition.file)).unwrap_or_default();
+            let generated = definition.yaml().unwrap();
+            let differs = committed.lines().zip(generated.lines()).position(|(a, b)| a != b);
+            assert!(
+                committed == generated,
+                "crds/{} differs from src/api at line {}; run `make crds` and commit the result",
+                definition.file,
+                differs.map_or(committed.lines().count().min(generated.lines().count()), |at| at) + 1
+            );
+        }
+    }
+
+    #[test]
+    fn the_files_read_back_as_the_definitions() {
+        for definition in definitions().unwrap() {
+            let read: Value = serde_saphyr::from_str(&definition.yaml().unwrap()).unwrap();
+            assert_eq!(&read, definition.json(), "{}", definition.file);
+            assert_eq!(definition.object().unwrap().spec.names.kind, definition.kind);
+        }
+    }
+
+    #[test]
+    fn no_bound_has_a_point_and_the_status_has_no_rule() {
+        for definition in definitions().unwrap() {
+            let text = definition.yaml().unwrap();
+            let pointed = text.lines().find(|line| {
+                let line = line.trim();
+                (line.starts_with("minimum:") || line.starts_with("maximum:")) && line.contains('.')
+            });
+            assert_eq!(pointed, None, "{}", definition.file);
+            let status = definition
+                .json()
+                .pointer("/spec/versions/0/schema/openAPIV3Schema/properties/status")
+                .unwrap();
+            assert!(!status.to_string().contains("x-kubernetes-validations"));
+        }
+    }
+
+    #[test]
+    fn whole_numbers_lose_their_point_and_others_keep_it() {
+        let mut value = serde_json::json!({"a": [1.0, -3.0, 0.5], "b": {"c": 1e30, "d": 7, "e": "1.0"}});
+        whole_numbers(&mut value);
+        assert_eq!(
+            value,
+            serde_json::json!({"a": [1, -3, 0.5], "b": {"c": 1e30, "d": 7, "e": "1.0"}})
+        );
+    }
+}

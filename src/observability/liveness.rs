@@ -1,0 +1,254 @@
+//! Whether a restart would help: tasks that must not end, and watches that stay broken while the API server answers.
+//!
+//! Told by the tasks themselves, read by the health server. An outage of the API server is no reason to restart, so a
+//! stuck watch counts only while somebody else gets answers.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+/// A watch that is broken for so long is not going to mend itself.
+const STUCK_AFTER: Duration = Duration::from_mins(10);
+/// The API server counts as answering for so long after an answer.
+const ANSWERED_LATELY: Duration = Duration::from_mins(1);
+/// A watch that has failed to start tries again within this time (back-off, and the longest that one try may hang).
+/// Without another failure by then it runs, though it may have nothing to say.
+const FAILS_AGAIN_WITHIN: Duration = Duration::from_mins(7);
+
+/// Clones are the same registry.
+#[derive(Clone, Debug, Default)]
+pub struct Liveness(Arc<Mutex<State>>);
+
+#[derive(Debug, Default)]
+struct State {
+    answered: Option<Instant>,
+    watches: BTreeMap<String, WatchState>,
+    dead: Vec<String>,
+}
+
+#[derive(Debug, Default)]
+struct WatchState {
+    /// Since when the watch wants a complete list and has none.
+    listing: Option<Instant>,
+    /// The first and the last of a row of failures to start.
+    failing: Option<(Instant, Instant)>,
+}
+
+impl WatchState {
+    fn is_stuck(&self, now: Instant) -> bool {
+        let lists_too_long = self.listing.is_some_and(|since| now - since > STUCK_AFTER);
+        let fails_too_long =
+            |(first, last): (Instant, Instant)| now - first > STUCK_AFTER && now - last < FAILS_AGAIN_WITHIN;
+        lists_too_long || self.failing.is_some_and(fails_too_long)
+    }
+}
+
+impl Liveness {
+    /// The API server has answered something.
+    pub fn answered(&self) {
+        self.lock().answered = Some(Instant::now());
+    }
+
+    /// Registers a watch, which starts by listing.
+    pub fn watch(&self, name: &str) -> WatchProbe {
+        let state = WatchState {
+            listing: Some(Instant::now()),
+            failing: None,
+        };
+        self.lock().watches.insert(name.to_owned(), state);
+        WatchProbe {
+            liveness: self.clone(),
+            name: name.to_owned(),
+        }
+    }
+
+    /// Registers a task that must live as long as the process: it counts as dead when the guard is dropped, also by a
+    /// panic, unless `TaskGuard::finished` was called.
+    pub fn task(&self, name: &str) -> TaskGuard {
+        TaskGuard {
+            liveness: self.clone(),
+            name: Some(name.to_owned()),
+        }
+    }
+
+    /// What a restart would cure, one sentence each. Empty: alive.
+    pub fn problems(&self) -> Vec<String> {
+        let (state, now) = (self.lock(), Instant::now());
+        let mut problems: Vec<_> = state
+            .dead
+            .iter()
+            .map(|name| format!("the task {name} has ended"))
+            .collect();
+        if state.answered.is_some_and(|at| now - at < ANSWERED_LATELY) {
+            let stuck = state.watches.iter().filter(|(_, watch)| watch.is_stuck(now));
+            problems.extend(stuck.map(|(name, _)| {
+                format!("the watch of {name} has been broken for 10 minutes while the API server answers other calls")
+            }));
+        }
+        problems
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// How a watch tells what it meets.
+#[derive(Debug)]
+pub struct WatchProbe {
+    liveness: Liveness,
+    name: String,
+}
+
+impl WatchProbe {
+    /// It begins to list: at the start, and after the server forgot where it was.
+    pub fn listing(&self) {
+        self.change(|state, now| state.listing = state.listing.or(Some(now)));
+    }
+
+    /// The list is complete.
+    pub fn listed(&self) {
+        self.change(|state, _| *state = WatchState::default());
+        self.liveness.answered();
+    }
+
+    /// An event has come, or a watch that had started broke: either way it had been let in.
+    pub fn running(&self) {
+        self.change(|state, _| state.failing = None);
+        self.liveness.answered();
+    }
+
+    /// It could not list or start.
+    pub fn failed(&self) {
+        self.change(|state, now| {
+            let first = state
+                .failing
+                .filter(|(_, last)| now - *last < FAILS_AGAIN_WITHIN)
+                .map_or(now, |(first, _)| first);
+            state.failing = Some((first, now));
+        });
+    }
+
+    fn change(&self, change: impl FnOnce(&mut WatchState, Instant)) {
+        let mut state = self.liveness.lock();
+        change(state.watches.entry(self.name.clone()).or_default(), Instant::now());
+    }
+}
+
+impl Drop for WatchProbe {
+    fn drop(&mut self) {
+        self.liveness.lock().watches.remove(&self.name);
+    }
+}
+
+/// See `Liveness::task`.
+#[derive(Debug)]
+pub struct TaskGuard {
+    liveness: Liveness,
+    name: Option<String>,
+}
+
+impl TaskGuard {
+    /// The task has ended as it should.
+    pub fn finished(mut self) {
+        self.name = None;
+    }
+}
+
+impl Drop for TaskGuard {
+    fn drop(&mut self) {
+        if let Some(name) = self.name.take() {
+            self.liveness.lock().dead.push(name);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tokio::time::advance;
+
+    const MINUTE: Duration = Duration::from_mins(1);
+
+    #[tokio::test(start_paused = true)]
+    async fn a_watch_that_never_lists_is_stuck_only_while_the_api_answers() {
+        let liveness = Liveness::default();
+        let _watch = liveness.watch("jobs");
+        advance(11 * MINUTE).await;
+        assert!(liveness.problems().is_empty(), "an outage is no reason to restart");
+        liveness.answered();
+        let problems = liveness.problems();
+        assert!(
+            problems.len() == 1 && problems[0].contains("watch of jobs"),
+            "{problems:?}"
+        );
+        advance(2 * MINUTE).await;
+        assert!(liveness.problems().is_empty(), "the outage is back");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn failing_to_start_for_ten_minutes_is_stuck_and_an_event_mends_it() {
+        let liveness = Liveness::default();
+        let watch = liveness.watch("pods");
+        watch.listed();
+        for _ in 0..12 {
+            watch.failed();
+            advance(MINUTE).await;
+        }
+        liveness.answered();
+        assert_eq!(liveness.problems().len(), 1);
+        watch.running();
+        assert!(liveness.problems().is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn one_failure_and_then_silence_is_a_watch_without_news() {
+        let liveness = Liveness::default();
+        let watch = liveness.watch("pods");
+        watch.listed();
+        watch.failed();
+        advance(60 * MINUTE).await;
+        liveness.answered();
+        assert!(liveness.problems().is_empty());
+        watch.failed();
+        advance(MINUTE / 2).await;
+        assert!(
+            liveness.problems().is_empty(),
+            "an hour later it is another row of failures"
+        );
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_second_list_that_does_not_come_counts_from_its_first_try() {
+        let liveness = Liveness::default();
+        let watch = liveness.watch("pods");
+        watch.listed();
+        for _ in 0..3 {
+            watch.listing();
+            advance(4 * MINUTE).await;
+        }
+        liveness.answered();
+        assert_eq!(liveness.problems().len(), 1);
+        drop(watch);
+        assert!(
+            liveness.problems().is_empty(),
+            "a watch that is given up is not asked for"
+        );
+    }
+
+    #[tokio::test]
+    async fn a_task_that_ends_by_itself_is_told_and_one_that_was_finished_is_not() {
+        let liveness = Liveness::default();
+        let (lease, sweep) = (liveness.task("lease"), liveness.task("sweep"));
+        sweep.finished();
+        assert!(liveness.problems().is_empty());
+        let task = tokio::spawn(async move {
+            let _guard = lease;
+            panic!("on purpose");
+        });
+        assert!(task.await.is_err());
+        assert_eq!(liveness.problems(), ["the task lease has ended"]);
+    }
+}

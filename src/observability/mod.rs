@@ -1,0 +1,40 @@
+//! What must be seen of a running process, and how it is told to stop: metrics, health, logs, the stop signal.
+//!
+//! Called by every program that stays: `controller` and `bridge`. Knows no Kubernetes object and no policy; parts tell
+//! it what they do and what they miss.
+
+pub mod health;
+pub mod liveness;
+pub mod logging;
+pub mod metrics;
+pub mod readiness;
+pub mod shutdown;
+pub mod text;
+
+use std::sync::Arc;
+
+use liveness::Liveness;
+use metrics::Metrics;
+use readiness::Readiness;
+use shutdown::Stop;
+
+/// What every part of a process is handed: where it counts, where it says what it misses, and when it has to end.
+#[derive(Clone, Debug)]
+pub struct Observability {
+    pub metrics: Arc<Metrics>,
+    pub liveness: Liveness,
+    pub readiness: Readiness,
+    pub stop: Stop,
+}
+
+impl Observability {
+    /// Empty registries around a process's stop signal.
+    pub fn new(stop: Stop) -> Self {
+        Self {
+            metrics: Arc::new(Metrics::new()),
+            liveness: Liveness::default(),
+            readiness: Readiness::default(),
+            stop,
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! What a process still misses before it can do its work, by name.
+//!
+//! Set by the parts, read by the health server. Standbys are ready: leading is no check.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Named checks. Clones are the same registry.
+#[derive(Clone, Debug, Default)]
+pub struct Readiness(Arc<Mutex<BTreeMap<String, Result<(), String>>>>);
+
+impl Readiness {
+    /// Says how a named check stands: fine, or the sentence that says what is missing. A check that was never set is
+    /// not asked for, so each part sets its own to an error before it begins.
+    pub fn set(&self, name: &str, state: Result<(), String>) {
+        let mut checks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let before = checks.insert(name.to_owned(), state.clone());
+        drop(checks);
+        match (before, state) {
+            (Some(Err(_)), Ok(())) => tracing::info!(check = name, "ready"),
+            (Some(Ok(())), Err(missing)) => tracing::warn!(check = name, missing, "no longer ready"),
+            _ => {}
+        }
+    }
+
+    /// A check that no longer applies.
+    pub fn remove(&self, name: &str) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(name);
+    }
+
+    /// What is missing, one `name: sentence` each, in the order of names. Empty: ready.
+    pub fn missing(&self) -> Vec<String> {
+        let checks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let failed = checks
+            .iter()
+            .filter_map(|(name, state)| Some((name, state.as_ref().err()?)));
+        failed.map(|(name, missing)| format!("{name}: {missing}")).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_names_what_is_missing_and_only_that() {
+        let readiness = Readiness::default();
+        assert!(readiness.missing().is_empty());
+        readiness.set("submissions synced", Err("the list has not come yet".into()));
+        readiness.set("permissions", Ok(()));
+        let clone = readiness.clone();
+        clone.set("custom resources", Err("submissions are not served".into()));
+        let both = [
+            "custom resources: submissions are not served",
+            "submissions synced: the list has not come yet",
+        ];
+        assert_eq!(readiness.missing(), both);
+        readiness.set("submissions synced", Ok(()));
+        readiness.remove("custom resources");
+        assert!(readiness.missing().is_empty());
+    }
+}

@@ -1,0 +1,96 @@
+//! A run and its checkpoints, for the tests of this room.
+
+use std::fs;
+use std::path::Path;
+
+use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
+
+use super::run::{Run, STATUS_FOLDER};
+use crate::api::{ResultsFormat, RunPlan, Storage, Verify};
+
+/// Two pairs of two routes each, once.
+pub(crate) fn run() -> Run {
+    Run {
+        namespace: "default".to_owned(),
+        submission: "submission-77".to_owned(),
+        uid: "uid-1".to_owned(),
+        attempt: 1,
+        plan: RunPlan {
+            run_id: "77".to_owned(),
+            results: ResultsFormat::V2,
+            track: "sensors".to_owned(),
+            codename: "SENSORS".to_owned(),
+            phase: None,
+            slices: vec!["0-1".to_owned(), "2-3".to_owned()],
+            routes: 4,
+            repetitions: 1,
+            storage: Storage {
+                bucket: "results".to_owned(),
+                prefix: Some("2026/".to_owned()),
+                region: None,
+                endpoint: None,
+                limit: 1 << 30,
+            },
+            image: "image".to_owned(),
+            contents_image: "contents".to_owned(),
+            simulator_image: "simulator".to_owned(),
+            resume: false,
+        },
+        verify: Verify::Off,
+        period_seconds: 1,
+        flush_seconds: 60,
+        cancel_seconds: 20,
+        log_group: None,
+    }
+}
+
+/// A V2 checkpoint with the routes `first..first + done` of `total`.
+pub(crate) fn checkpoint(first: u32, done: u32, total: u32) -> String {
+    let record = |index: u32| {
+        serde_json::json!({
+            "index": index,
+            "route_id": format!("RouteScenario_{}_rep0", first + index),
+            "status": "Completed",
+            "num_infractions": 0,
+            "infractions": {"collisions_pedestrian": [], "collisions_vehicle": [], "collisions_layout": [],
+                "red_light": [], "stop_infraction": [], "outside_route_lanes": [], "min_speed_infractions": [],
+                "yield_emergency_vehicle_infractions": [], "scenario_timeouts": [], "route_dev": [],
+                "vehicle_blocked": [], "route_timeout": []},
+            "scores": {"score_route": 100.0, "score_penalty": 1.0, "score_composed": 100.0},
+            "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
+        })
+    };
+    let global = if done == total {
+        serde_json::json!({"index": -1, "status": "Completed"})
+    } else {
+        serde_json::json!({})
+    };
+    let file = serde_json::json!({
+        "_checkpoint": {
+            "global_record": global,
+            "progress": [done, total],
+            "records": (0..done).map(record).collect::<Vec<_>>(),
+        },
+        "entry_status": if done == total { "Finished" } else { "Started" },
+        "eligible": done == total,
+        "sensors": ["carla_camera", "carla_gnss"],
+        "values": [],
+        "labels": [],
+    });
+    file.to_string()
+}
+
+/// Puts a checkpoint where the agent of a pair would.
+pub(crate) fn put_checkpoint(logs: &Path, pair: usize, text: &str) {
+    let folder = logs.join(format!("agent/agent{pair}"));
+    fs::create_dir_all(&folder).unwrap();
+    fs::write(folder.join("agent_results.json"), text).unwrap();
+}
+
+/// Puts a status file where the container would.
+pub(crate) fn put_status(logs: &Path, side: Side, pair: u16, mark: Mark) {
+    let pair = Pair::new(pair).unwrap();
+    let root = logs.join(STATUS_FOLDER);
+    fs::create_dir_all(&root).unwrap();
+    StatusFile::Of(Member { side, pair }, mark).create(&root).unwrap();
+}

@@ -1,0 +1,351 @@
+//! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
+//!
+//! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes the merged file and EvalAI's texts
+//! there; knows no S3. A checkpoint that is torn, gone or refused leaves the last good one in place.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use leaderboard_results::{Checkpoint, Files, Format, Merged, Plan, Refusal, Slice, Strictness};
+use leaderboard_runner::protocol::{Member, Pair, Progress, Side};
+use sha2::{Digest, Sha256};
+
+use super::report::{ReportPair, StoredFile};
+use super::run::{Run, STATUS_FOLDER};
+use super::tree::{Stamp, Tree, TreeError};
+use super::upload::hex;
+use crate::api::{ResultsFormat, Verify, effective};
+
+/// Largest checkpoint that is read, in bytes.
+const CHECKPOINT_LIMIT: u64 = 64 << 20;
+/// The merged file, below the volume's root.
+pub const MERGED: &str = "agent/agent_results.json";
+
+/// The plan of the results, from the plan of the run.
+pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
+    let bad = |slice: &String| Refusal::Plan {
+        problem: format!("\"{slice}\" is not a slice such as 5-9"),
+    };
+    let slices = run.plan.slices.iter().map(|slice| {
+        let (first, last) = effective::slice_bounds(slice).ok_or_else(|| bad(slice))?;
+        Ok(Slice { first, last })
+    });
+    let pairs: Vec<Slice> = slices.collect::<Result<_, _>>()?;
+    let plan = Plan {
+        format: match run.plan.results {
+            ResultsFormat::V1 => Format::V1,
+            ResultsFormat::V2 => Format::V2,
+        },
+        strictness: Strictness::Pod,
+        routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),
+        pairs,
+        repetitions: u32::try_from(run.plan.repetitions).unwrap_or(0),
+        verify: match run.verify {
+            Verify::Off => leaderboard_results::Verify::Off,
+            Verify::Warn => leaderboard_results::Verify::Warn,
+            Verify::Refuse => leaderboard_results::Verify::Refuse,
+        },
+        as_original: false,
+    };
+    if plan.pairs.is_empty() {
+        let problem = "it has no pair".to_owned();
+        return Err(Refusal::Plan { problem });
+    }
+    plan.check()?;
+    Ok(plan)
+}
+
+/// The checkpoint of a pair, below the volume's root.
+pub fn checkpoint_path(pair: usize) -> String {
+    format!("agent/agent{pair}/agent_results.json")
+}
+
+/// The pairs and the round their status files are in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PairSeen {
+    /// From its agent's folder.
+    pub agent: Progress,
+    /// From its simulator's folder.
+    pub simulator: Progress,
+}
+
+impl PairSeen {
+    fn read(status: &std::path::Path, number: usize) -> Self {
+        let pair = u16::try_from(number).ok().and_then(Pair::new);
+        let of = |side| pair.map_or_else(Progress::default, |pair| Progress::read(status, Member { side, pair }));
+        Self {
+            agent: of(Side::Agent),
+            simulator: of(Side::Simulator),
+        }
+    }
+
+    /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
+    pub fn state(&self) -> &'static str {
+        match self {
+            Self { agent, .. } if agent.done => "Done",
+            Self { agent, simulator } if agent.started || simulator.started => "Running",
+            _ if self.crashes() > 0 => "Crashed",
+            _ => "Waiting",
+        }
+    }
+
+    /// Of the side that had more.
+    pub fn crashes(&self) -> u32 {
+        self.agent.crashes.max(self.simulator.crashes)
+    }
+}
+
+/// What one worker has, over the rounds.
+#[derive(Debug, Default)]
+struct Worker {
+    good: Option<Checkpoint>,
+    seen: Option<Stamp>,
+    refused: Option<String>,
+}
+
+/// What one round found.
+#[derive(Clone, Debug)]
+pub struct Gathered {
+    /// The last good merge, without its text; `None` before the first checkpoint.
+    pub merged: Option<Arc<Merged>>,
+    /// EvalAI's texts, of the same merge.
+    pub files: Arc<Files>,
+    /// Each pair from its status files.
+    pub seen: Vec<PairSeen>,
+    /// Each pair for the report.
+    pub pairs: Vec<ReportPair>,
+    /// Why each pair's checkpoint is refused, if it is.
+    pub refused: Vec<Option<String>>,
+    /// Why the checkpoints can't be merged, if they can't.
+    pub unmerged: Option<String>,
+}
+
+impl Gathered {
+    /// The first reason why something is refused; none once nothing is missing, since what came later changes nothing.
+    pub fn why(&self) -> Option<String> {
+        let first = self.refused.iter().flatten().next().or(self.unmerged.as_ref());
+        first.filter(|_| !self.is_complete()).cloned()
+    }
+
+    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents say.
+    pub fn is_complete(&self) -> bool {
+        self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_final)
+    }
+
+    /// Digests of EvalAI's texts, by key.
+    pub fn digests(&self) -> BTreeMap<String, StoredFile> {
+        let of = |(key, text): (&'static str, &str)| {
+            let stored = StoredFile {
+                size: text.len() as u64,
+                sha256: hex(&Sha256::digest(text)),
+            };
+            (key.to_owned(), stored)
+        };
+        texts(&self.files).into_iter().map(of).collect()
+    }
+}
+
+/// EvalAI's texts by their keys, which are also their paths.
+pub fn texts(files: &Files) -> Vec<(&'static str, &str)> {
+    let mut texts = vec![
+        ("evalai/results.json", files.results_json.as_str()),
+        ("evalai/stdout.txt", files.stdout_txt.as_str()),
+    ];
+    texts.extend(
+        files
+            .metadata_json
+            .as_deref()
+            .map(|text| ("evalai/metadata.json", text)),
+    );
+    texts
+}
+
+/// Reads the volume round by round.
+#[derive(Debug)]
+pub struct Gatherer {
+    plan: Plan,
+    tree: Arc<Tree>,
+    status: PathBuf,
+    workers: Vec<Worker>,
+    merged: Option<Arc<Merged>>,
+    files: Arc<Files>,
+    unmerged: Option<String>,
+    written: BTreeMap<&'static str, Arc<Files>>,
+}
+
+impl Gatherer {
+    /// For a plan that holds.
+    pub fn new(plan: Plan, tree: Arc<Tree>) -> Result<Self, Refusal> {
+        let files = Arc::new(leaderboard_results::render(&plan, None)?);
+        Ok(Self {
+            status: tree.path().join(STATUS_FOLDER),
+            workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
+            plan,
+            tree,
+            merged: None,
+            files,
+            unmerged: None,
+            written: BTreeMap::new(),
+        })
+    }
+
+    /// Routes of the whole run, repetitions counted.
+    pub fn total(&self) -> u32 {
+        self.plan.routes.saturating_mul(self.plan.repetitions)
+    }
+
+    /// Looks at everything once and writes what follows from it. Blocks: not for an asynchronous thread.
+    pub fn round(&mut self) -> Result<Gathered, TreeError> {
+        // The agents' word is read before their results: who is done has written everything.
+        let seen: Vec<PairSeen> = (1..=self.workers.len())
+            .map(|number| PairSeen::read(&self.status, number))
+            .collect();
+        let mut changed = false;
+        for index in 0..self.workers.len() {
+            changed |= self.read(index);
+        }
+        if changed {
+            self.merge();
+        }
+        self.write()?;
+        let pairs = self.pairs(&seen);
+        Ok(Gathered {
+            merged: self.merged.clone(),
+            files: Arc::clone(&self.files),
+            pairs,
+            seen,
+            refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
+            unmerged: self.unmerged.clone(),
+        })
+    }
+
+    /// Reads one worker's checkpoint, if it is not the one of the last round. Returns whether there is something new.
+    fn read(&mut self, index: usize) -> bool {
+        let path = checkpoint_path(index + 1);
+        let worker = &mut self.workers[index];
+        let (file, stamp) = match self.tree.file(&path) {
+            Ok(Some(found)) => found,
+            Ok(None) => return false,
+            Err(error) => return worker.refuse(index, &error),
+        };
+        if worker.seen == Some(stamp) {
+            return false;
+        }
+        drop(file);
+        let (bytes, stamp) = match self.tree.read(&path, CHECKPOINT_LIMIT) {
+            Ok(Some(read)) => read,
+            // The next round finds it whole.
+            Ok(None) | Err(TreeError::Changed) => return false,
+            Err(error) => return worker.refuse(index, &error),
+        };
+        match leaderboard_results::read_worker(&self.plan, index, &bytes) {
+            Ok(None) => false,
+            Ok(Some(checkpoint)) => {
+                worker.seen = Some(stamp);
+                worker.good = Some(checkpoint);
+                if let Some(why) = worker.refused.take() {
+                    tracing::info!(pair = index + 1, "the checkpoint is good again; before: {why}");
+                }
+                true
+            }
+            Err(refusal) => {
+                worker.seen = Some(stamp);
+                worker.refuse_with(words(&refusal))
+            }
+        }
+    }
+
+    fn merge(&mut self) {
+        let workers: Vec<Option<&Checkpoint>> = self.workers.iter().map(|worker| worker.good.as_ref()).collect();
+        if workers.iter().all(Option::is_none) {
+            return;
+        }
+        let merged = leaderboard_results::merge(&self.plan, &workers).and_then(|merged| {
+            let files = leaderboard_results::render(&self.plan, Some(&merged))?;
+            Ok((merged, files))
+        });
+        match merged {
+            Ok((merged, files)) => {
+                self.merged = Some(Arc::new(merged));
+                self.files = Arc::new(files);
+                self.unmerged = None;
+            }
+            Err(refusal) => {
+                let words = words(&refusal);
+                tracing::warn!("the checkpoints are not merged: {words}");
+                self.unmerged = Some(words);
+            }
+        }
+    }
+
+    /// Writes what differs from what was written before.
+    fn write(&mut self) -> Result<(), TreeError> {
+        let files = Arc::clone(&self.files);
+        for (path, text) in texts(&files) {
+            self.write_one(path, text, &files)?;
+        }
+        if let Some(text) = &files.metadata_json {
+            self.write_one(MERGED, text, &files)?;
+        }
+        Ok(())
+    }
+
+    fn write_one(&mut self, path: &'static str, text: &str, files: &Arc<Files>) -> Result<(), TreeError> {
+        if self
+            .written
+            .get(path)
+            .is_some_and(|written| Arc::ptr_eq(written, files))
+        {
+            return Ok(());
+        }
+        // Restored from an earlier Pod, or the same as in the last round.
+        let there = self.tree.read(path, 2 * CHECKPOINT_LIMIT).ok().flatten();
+        if there.is_none_or(|(bytes, _)| bytes != text.as_bytes()) {
+            self.tree.write(path, text.as_bytes())?;
+        }
+        self.written.insert(path, Arc::clone(files));
+        Ok(())
+    }
+
+    fn pairs(&self, seen: &[PairSeen]) -> Vec<ReportPair> {
+        let slices = self.plan.pairs.iter().zip(&self.workers).zip(seen);
+        (1..)
+            .zip(slices)
+            .map(|(id, ((slice, worker), seen))| {
+                let total = slice.routes().saturating_mul(self.plan.repetitions);
+                let done = worker.good.as_ref().map_or(0, Checkpoint::done);
+                ReportPair {
+                    id,
+                    done: done.min(total),
+                    total,
+                    crashes: seen.crashes(),
+                    state: seen.state().to_owned(),
+                }
+            })
+            .collect()
+    }
+}
+
+impl Worker {
+    fn refuse(&mut self, index: usize, error: &TreeError) -> bool {
+        let words = format!(
+            "pair {}: the checkpoint can't be read: {error}. Leave it to the evaluator.",
+            index + 1
+        );
+        self.refuse_with(words)
+    }
+
+    fn refuse_with(&mut self, words: String) -> bool {
+        if self.refused.as_ref() != Some(&words) {
+            tracing::warn!("a checkpoint is refused, the last good one stays: {words}");
+        }
+        self.refused = Some(words);
+        false
+    }
+}
+
+/// Which checkpoint, why, and what to do.
+fn words(refusal: &Refusal) -> String {
+    format!("{refusal}. {}", refusal.next_step())
+}

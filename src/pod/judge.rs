@@ -1,0 +1,167 @@
+//! Whether a run goes on, is wound down, or has ended: a pure function of what a round saw, and the little memory it needs
+//! to say for how long.
+//!
+//! Called by `logcopy`. Knows no clock but the one handed in, no file and no S3.
+
+use std::time::Duration;
+
+use super::gather::Gathered;
+use super::places::Pace;
+use super::run::Stop;
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// The results are complete.
+    Complete,
+    /// It was stopped from outside; the results are what there is.
+    Stopped(Stop),
+    /// A pair has come to its end with results that can't be used: why, in words for the participant.
+    Invalid(String),
+}
+
+impl std::fmt::Display for Ending {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Complete => f.write_str("the results are complete"),
+            Self::Stopped(stop) => write!(f, "the run was stopped ({})", stop.as_str()),
+            Self::Invalid(why) => write!(f, "the results can't be used: {why}"),
+        }
+    }
+}
+
+/// What logcopy does next.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// Nothing out of the ordinary.
+    GoOn,
+    /// Ask everybody to stop, and look again soon.
+    Cancel,
+    /// Store the final report.
+    Finish(Ending),
+}
+
+/// What one round saw, with the times since when.
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
+pub struct Situation {
+    /// The results are complete for this long.
+    pub complete: Option<Duration>,
+    /// All agents say that they are done.
+    pub all_done: bool,
+    /// Some container has begun.
+    pub any_started: bool,
+    /// A stop is wished.
+    pub stop: Option<Stop>,
+    /// A pair has ended badly: why, and for how long.
+    pub spoiled: Option<(String, Duration)>,
+    /// `simulation.cancel` is there for this long.
+    pub cancelled: Option<Duration>,
+    /// The agents' folders have not changed for this long.
+    pub quiet: Duration,
+}
+
+/// What to do next.
+pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
+    let settled = seen.complete.is_some_and(|since| seen.all_done || since >= pace.settle);
+    if let (true, None) = (settled, seen.stop) {
+        return Step::Finish(Ending::Complete);
+    }
+    let spoiled = seen.spoiled.as_ref().filter(|(_, since)| *since >= pace.quiet);
+    let ending = match (seen.stop, spoiled) {
+        (Some(stop), _) => Ending::Stopped(stop),
+        (None, Some((why, _))) => Ending::Invalid(why.clone()),
+        (None, None) => return Step::GoOn,
+    };
+    if settled || seen.all_done {
+        return Step::Finish(ending);
+    }
+    let Some(cancelled) = seen.cancelled else {
+        return Step::Cancel;
+    };
+    // The other half of the time is for storing.
+    let longest = pace.grace.min(cancel / 2);
+    let is_still = cancelled.min(seen.quiet) >= pace.quiet.min(longest);
+    if !seen.any_started || is_still || cancelled >= longest {
+        Step::Finish(ending)
+    } else {
+        Step::GoOn
+    }
+}
+
+/// Remembers since when something is so.
+#[derive(Debug, Default)]
+pub struct Judge {
+    complete: Option<Duration>,
+    spoiled: Option<(String, Duration)>,
+    cancelled: Option<Duration>,
+    quiet: Duration,
+    activity: Option<u64>,
+}
+
+/// What a round hands to [`Judge::see`] besides the results.
+#[derive(Clone, Copy, Debug)]
+pub struct Outside {
+    /// A stop is wished.
+    pub stop: Option<Stop>,
+    /// `simulation.cancel` is there.
+    pub cancelled: bool,
+    /// A digest of the agents' folders: another one means that something was written.
+    pub activity: u64,
+    /// Clock of this process.
+    pub now: Duration,
+}
+
+impl Judge {
+    /// Takes in one round.
+    pub fn see(&mut self, gathered: &Gathered, outside: Outside) -> Situation {
+        let now = outside.now;
+        self.complete = gathered.is_complete().then(|| self.complete.unwrap_or(now));
+        self.spoiled = spoiled(gathered).map(|why| {
+            let since = self.spoiled.as_ref().map_or(now, |(_, since)| *since);
+            (why, since)
+        });
+        self.cancelled = outside.cancelled.then(|| self.cancelled.unwrap_or(now));
+        if self.activity != Some(outside.activity) {
+            self.activity = Some(outside.activity);
+            self.quiet = now;
+        }
+        let since = |then: Duration| now.saturating_sub(then);
+        Situation {
+            complete: self.complete.map(since),
+            all_done: gathered.seen.iter().all(|pair| pair.agent.done),
+            any_started: gathered
+                .seen
+                .iter()
+                .any(|pair| pair.agent.started || pair.simulator.started),
+            stop: outside.stop,
+            spoiled: self.spoiled.clone().map(|(why, then)| (why, since(then))),
+            cancelled: self.cancelled.map(since),
+            quiet: since(self.quiet),
+        }
+    }
+}
+
+/// A pair that says it is done without having complete results will not get them any more. An agent's word alone ends
+/// nothing well: it can only end its own run badly.
+fn spoiled(gathered: &Gathered) -> Option<String> {
+    if gathered.is_complete() {
+        return None;
+    }
+    let ended = gathered.seen.iter().zip(&gathered.pairs).zip(&gathered.refused);
+    let mut short = ended.filter(|((seen, pair), _)| seen.agent.done && pair.done < pair.total);
+    if let Some(((_, pair), refused)) = short.next() {
+        let incomplete = || {
+            format!(
+                "pair {} ended with {} of its {} route runs. Leave the checkpoint to the evaluator.",
+                pair.id, pair.done, pair.total
+            )
+        };
+        return Some(refused.clone().unwrap_or_else(incomplete));
+    }
+    let all_done = gathered.seen.iter().all(|pair| pair.agent.done);
+    gathered.unmerged.clone().filter(|_| all_done)
+}
+
+#[cfg(test)]
+#[path = "judge_tests.rs"]
+mod tests;

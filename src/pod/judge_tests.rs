@@ -1,0 +1,272 @@
+use super::*;
+
+const CANCEL: Duration = Duration::from_mins(2);
+
+fn secs(seconds: u64) -> Duration {
+    Duration::from_secs(seconds)
+}
+
+fn running() -> Situation {
+    Situation {
+        any_started: true,
+        ..Situation::default()
+    }
+}
+
+#[test]
+fn complete_results_end_a_run_as_soon_as_the_agents_are_done_or_after_a_while() {
+    let table = [
+        (None, true, Step::GoOn),
+        (Some(secs(0)), false, Step::GoOn),
+        (Some(secs(29)), false, Step::GoOn),
+        (Some(secs(30)), false, Step::Finish(Ending::Complete)),
+        (Some(secs(0)), true, Step::Finish(Ending::Complete)),
+    ];
+    for (complete, all_done, expected) in table {
+        let seen = Situation {
+            complete,
+            all_done,
+            ..running()
+        };
+        assert_eq!(decide(&seen, &Pace::default(), CANCEL), expected, "{seen:?}");
+    }
+}
+
+#[test]
+fn a_stop_cancels_first_and_ends_when_the_agents_are_still() {
+    let end = Step::Finish(Ending::Stopped(Stop::Retries));
+    let table = [
+        (None, secs(100), Step::Cancel),
+        (Some(secs(0)), secs(100), Step::GoOn),
+        (Some(secs(4)), secs(4), Step::GoOn),
+        (Some(secs(5)), secs(4), Step::GoOn),
+        (Some(secs(5)), secs(5), end.clone()),
+        (Some(secs(24)), secs(0), Step::GoOn),
+        (Some(secs(25)), secs(0), end.clone()),
+    ];
+    for (cancelled, quiet, expected) in table {
+        let seen = Situation {
+            stop: Some(Stop::Retries),
+            cancelled,
+            quiet,
+            ..running()
+        };
+        assert_eq!(decide(&seen, &Pace::default(), CANCEL), expected, "{seen:?}");
+    }
+}
+
+#[test]
+fn half_of_a_short_cancel_is_left_for_storing() {
+    let seen = Situation {
+        stop: Some(Stop::Cancel),
+        cancelled: Some(secs(5)),
+        ..running()
+    };
+    let step = decide(&seen, &Pace::default(), secs(10));
+    assert_eq!(step, Step::Finish(Ending::Stopped(Stop::Cancel)));
+}
+
+#[test]
+fn nothing_is_waited_for_when_nothing_has_begun() {
+    let seen = Situation {
+        stop: Some(Stop::Cancel),
+        cancelled: Some(secs(0)),
+        ..Situation::default()
+    };
+    assert_eq!(
+        decide(&seen, &Pace::default(), CANCEL),
+        Step::Finish(Ending::Stopped(Stop::Cancel))
+    );
+}
+
+#[test]
+fn a_pair_that_ended_badly_ends_the_run() {
+    let why = "pair 2 ended".to_owned();
+    let end = Step::Finish(Ending::Invalid(why.clone()));
+    let table = [
+        (secs(4), None, false, Step::GoOn),
+        (secs(5), None, false, Step::Cancel),
+        (secs(5), None, true, end.clone()),
+        (secs(15), Some(secs(10)), false, end.clone()),
+    ];
+    for (since, cancelled, all_done, expected) in table {
+        let seen = Situation {
+            spoiled: Some((why.clone(), since)),
+            cancelled,
+            all_done,
+            quiet: secs(10),
+            ..running()
+        };
+        assert_eq!(decide(&seen, &Pace::default(), CANCEL), expected, "{seen:?}");
+    }
+}
+
+mod seen_on_a_volume {
+    use std::fs;
+    use std::sync::Arc;
+
+    use leaderboard_runner::protocol::{Mark, Side};
+
+    use super::super::*;
+    use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
+    use crate::pod::gather::{Gatherer, MERGED, results_plan};
+    use crate::pod::tree::Tree;
+
+    struct Volume {
+        folder: tempfile::TempDir,
+        gatherer: Gatherer,
+        judge: Judge,
+        now: u64,
+    }
+
+    impl Volume {
+        fn new() -> Self {
+            let folder = tempfile::tempdir().unwrap();
+            let tree = Arc::new(Tree::open(folder.path()).unwrap());
+            Self {
+                gatherer: Gatherer::new(results_plan(&run()).unwrap(), tree).unwrap(),
+                judge: Judge::default(),
+                folder,
+                now: 0,
+            }
+        }
+
+        fn round(&mut self) -> (Gathered, Situation) {
+            self.now += 10;
+            let gathered = self.gatherer.round().unwrap();
+            let outside = Outside {
+                stop: None,
+                cancelled: false,
+                activity: 0,
+                now: Duration::from_secs(self.now),
+            };
+            let seen = self.judge.see(&gathered, outside);
+            (gathered, seen)
+        }
+
+        fn text(&self, path: &str) -> String {
+            fs::read_to_string(self.folder.path().join(path)).unwrap()
+        }
+    }
+
+    #[test]
+    fn a_run_from_nothing_to_complete() {
+        let mut volume = Volume::new();
+        let (gathered, seen) = volume.round();
+        assert!(gathered.merged.is_none() && seen.complete.is_none() && !seen.any_started);
+        assert!(volume.text("evalai/stdout.txt").starts_with("Initializing"));
+        assert!(!volume.folder.path().join(MERGED).exists());
+
+        put_status(volume.folder.path(), Side::Simulator, 1, Mark::Start(0));
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
+        let (gathered, seen) = volume.round();
+        assert_eq!(
+            (gathered.pairs[0].done, gathered.pairs[0].state.as_str()),
+            (1, "Running")
+        );
+        assert_eq!(
+            (gathered.pairs[1].done, gathered.pairs[1].state.as_str()),
+            (0, "Waiting")
+        );
+        assert!(seen.any_started && seen.complete.is_none());
+        assert!(
+            volume
+                .text("evalai/stdout.txt")
+                .contains("Completed 1 out of the 4 routes")
+        );
+
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
+        let (gathered, seen) = volume.round();
+        assert_eq!((seen.complete, seen.all_done), (Some(Duration::ZERO), false));
+        assert_eq!(gathered.merged.unwrap().score, Some(100.0));
+        assert_eq!(volume.text("evalai/metadata.json"), volume.text(MERGED));
+        let (_, seen) = volume.round();
+        assert_eq!(seen.complete, Some(Duration::from_secs(10)));
+    }
+
+    #[test]
+    fn torn_and_lost_files_leave_the_last_good_one() {
+        let mut volume = Volume::new();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
+        volume.round();
+        for text in ["", "{\"_checkpoint\": {", "null"] {
+            put_checkpoint(volume.folder.path(), 1, text);
+            let (gathered, _) = volume.round();
+            assert_eq!((gathered.pairs[0].done, gathered.why()), (1, None), "{text:?}");
+        }
+        fs::remove_file(volume.folder.path().join("agent/agent1/agent_results.json")).unwrap();
+        assert_eq!(volume.round().0.pairs[0].done, 1);
+    }
+
+    #[test]
+    fn a_refused_checkpoint_says_why_and_spoils_the_run_when_its_agent_is_done() {
+        let mut volume = Volume::new();
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 1, 2));
+        volume.round();
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2).replace("100.0", "1000.0"));
+        let (gathered, seen) = volume.round();
+        let why = gathered.why().unwrap();
+        assert!(
+            why.starts_with("pair 2, route RouteScenario_2_rep0: ") && why.contains("1000"),
+            "{why}"
+        );
+        assert_eq!((gathered.pairs[1].done, seen.spoiled), (1, None));
+        put_status(volume.folder.path(), Side::Agent, 2, Mark::Done);
+        let (_, seen) = volume.round();
+        assert_eq!(seen.spoiled, Some((why.clone(), Duration::ZERO)));
+        let (_, seen) = volume.round();
+        assert_eq!(seen.spoiled, Some((why, Duration::from_secs(10))));
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
+        let (gathered, seen) = volume.round();
+        assert_eq!((gathered.why(), seen.spoiled), (None, None));
+    }
+
+    #[test]
+    fn a_forged_done_ends_nothing_well() {
+        let mut volume = Volume::new();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
+        for pair in [1, 2] {
+            put_status(volume.folder.path(), Side::Agent, pair, Mark::Done);
+        }
+        let (gathered, seen) = volume.round();
+        assert!(!gathered.is_complete() && seen.all_done && seen.complete.is_none());
+        let (why, _) = seen.spoiled.unwrap();
+        assert!(why.starts_with("pair 1 ended with 1 of its 2 route runs."), "{why}");
+    }
+
+    #[test]
+    fn a_link_in_place_of_the_checkpoint_is_refused() {
+        let mut volume = Volume::new();
+        let folder = volume.folder.path().join("agent/agent1");
+        fs::create_dir_all(&folder).unwrap();
+        std::os::unix::fs::symlink("/etc/passwd", folder.join("agent_results.json")).unwrap();
+        let why = volume.round().0.why().unwrap();
+        assert!(why.contains("not a regular file"), "{why}");
+    }
+
+    #[test]
+    fn crashes_count_by_the_side_that_had_more() {
+        let mut volume = Volume::new();
+        let folder = volume.folder.path().to_owned();
+        for (side, mark) in [
+            (Side::Simulator, Mark::Start(0)),
+            (Side::Simulator, Mark::Crash(0)),
+            (Side::Simulator, Mark::Crash(1)),
+            (Side::Agent, Mark::Crash(0)),
+        ] {
+            put_status(&folder, side, 1, mark);
+        }
+        let pair = volume.round().0.pairs[0].clone();
+        assert_eq!((pair.crashes, pair.state.as_str()), (2, "Crashed"));
+    }
+
+    #[test]
+    fn a_plan_that_does_not_hold_is_refused() {
+        for slices in [vec![], vec!["0-2", "2-3"], vec!["x"]] {
+            let mut run = run();
+            run.plan.slices = slices.into_iter().map(str::to_owned).collect();
+            assert!(results_plan(&run).is_err(), "{:?}", run.plan.slices);
+        }
+    }
+}

@@ -1,0 +1,193 @@
+//! The sidecar that stores a run while it runs: merges the pairs' results, stores what changed, and reports.
+//!
+//! Called by `leaderboard-operator logcopy`. Knows S3, CloudWatch and the Pod's volumes. It never ends by itself, since the
+//! kubelet would start it again: after its work it waits for SIGTERM. Results are safe before `logcopy.done` is written,
+//! and the simulators hold the Pod until then.
+
+mod describe;
+mod round;
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use leaderboard_results::Refusal;
+use leaderboard_runner::protocol::StatusFile;
+use tokio::sync::watch;
+
+use super::gather::{Gatherer, results_plan};
+use super::identity;
+use super::places::{Places, Setting};
+use super::run::Stop;
+use super::ship::Shipper;
+use super::tree::{Tree, TreeError};
+use super::upload::send::Uploader;
+use super::watch::Watch;
+use crate::services::archive::{Archive, ArchiveError};
+use crate::services::aws::Aws;
+use crate::services::logs::LogClient;
+use round::{Rounds, Why};
+
+/// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.
+const LAST_FLUSH: Duration = Duration::from_mins(5);
+/// How often the stop file is read where inotify says nothing.
+const STOP_POLL: Duration = Duration::from_secs(2);
+/// Time between two passes over the logs for CloudWatch.
+const SHIP_PERIOD: Duration = Duration::from_secs(5);
+
+/// What logcopy can't work without.
+#[derive(thiserror::Error, Debug)]
+pub enum LogcopyError {
+    /// The plan does not hold; `workspace` has refused it before.
+    #[error("{0}. {next}", next = .0.next_step())]
+    Plan(#[from] Refusal),
+    /// The volume.
+    #[error("the logs volume can't be used: {0}. Look at the node's disk and the Pod's volumes.")]
+    Volume(#[from] TreeError),
+    /// S3, in a round.
+    #[error(transparent)]
+    Storage(#[from] ArchiveError),
+}
+
+impl From<std::io::Error> for LogcopyError {
+    fn from(error: std::io::Error) -> Self {
+        Self::Volume(error.into())
+    }
+}
+
+/// Works until `shutdown` (SIGTERM) comes.
+pub async fn main(setting: Setting, shutdown: impl Future<Output = ()>) -> Result<(), LogcopyError> {
+    let aws = identity::aws(&setting).await;
+    let plan = &setting.run.plan;
+    let archive = Archive::of_run(&aws, &plan.storage, &plan.run_id);
+    work(setting, &aws, archive, shutdown).await
+}
+
+/// The same with ready clients.
+pub async fn work(
+    setting: Setting,
+    aws: &Aws,
+    archive: Archive,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), LogcopyError> {
+    let tree = Arc::new(Tree::open(&setting.places.logs)?);
+    let gatherer = Gatherer::new(results_plan(&setting.run)?, Arc::clone(&tree))?;
+    let limit = u64::try_from(setting.run.plan.storage.limit).unwrap_or(u64::MAX);
+    let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), limit);
+
+    let (shipped, shipping) = ship(&setting, aws, &tree, &uploader);
+    let (stop, stop_watch) = watch_stop(setting.places.clone());
+    let rounds = Rounds::new(setting, archive, tree, gatherer, uploader, stop);
+    let result = keep_going(rounds, shutdown).await;
+
+    stop_watch.abort();
+    // The task has its own bound on its last pass; nothing to do about one that fails.
+    let _ = shipped.send(true);
+    if let Some(shipping) = shipping {
+        let _ = shipping.await;
+    }
+    result
+}
+
+/// Starts the task for CloudWatch, if the run has a log group.
+fn ship(
+    setting: &Setting,
+    aws: &Aws,
+    tree: &Arc<Tree>,
+    uploader: &Uploader,
+) -> (watch::Sender<bool>, Option<tokio::task::JoinHandle<()>>) {
+    let (sender, receiver) = watch::channel(false);
+    let task = setting.run.log_group.as_ref().map(|group| {
+        let plan = &setting.run.plan;
+        let client = LogClient::of_group(aws, group);
+        let pairs = plan.slices.len();
+        let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, uploader.memory());
+        tokio::spawn(shipper.run(SHIP_PERIOD, receiver))
+    });
+    (sender, task)
+}
+
+/// Obeys the stop annotation at once, whatever a round is waiting for: a task reads the downward API's file, writes
+/// `simulation.cancel`, and tells the rounds.
+fn watch_stop(places: Places) -> (watch::Receiver<Option<Stop>>, tokio::task::JoinHandle<()>) {
+    let (sender, receiver) = watch::channel(None);
+    let task = tokio::spawn(async move {
+        let folder = Watch::new(|_| true).ok();
+        let status = places.status();
+        let mut obeyed = false;
+        loop {
+            // A watch on the file itself would die with the first change: the kubelet swaps the folder `..data`.
+            let watched = folder.as_ref().filter(|watch| watch.add(&places.podinfo));
+            let text = tokio::fs::read_to_string(places.stop()).await.unwrap_or_default();
+            if let Some(stop) = Stop::parse(&text) {
+                if !obeyed {
+                    tracing::info!(reason = stop.as_str(), "asked to stop");
+                    obeyed = cancel(&status);
+                }
+                sender.send_if_modified(|known| known.replace(stop) != Some(stop));
+            }
+            let wake = async {
+                match watched {
+                    Some(watch) => watch.changed().await,
+                    None => std::future::pending().await,
+                }
+            };
+            // Either is a reason to look again.
+            let _ = tokio::time::timeout(STOP_POLL, wake).await;
+        }
+    });
+    (receiver, task)
+}
+
+/// Asks every container to stop. Returns whether that is said.
+fn cancel(status: &std::path::Path) -> bool {
+    let created = StatusFile::Cancel.create(status);
+    if let Err(error) = &created {
+        tracing::error!("simulation.cancel can't be written: {error}");
+    }
+    created.is_ok()
+}
+
+/// Rounds until SIGTERM, then what is left.
+async fn keep_going(mut rounds: Rounds, shutdown: impl Future<Output = ()>) -> Result<(), LogcopyError> {
+    tokio::pin!(shutdown);
+    let mut failures: u32 = 0;
+    loop {
+        let outcome = tokio::select! {
+            () = &mut shutdown => break,
+            outcome = rounds.round(Why::Period) => outcome,
+        };
+        let pause = match outcome {
+            Ok(pause) => {
+                if failures > 0 {
+                    tracing::info!("storing works again");
+                }
+                failures = 0;
+                pause
+            }
+            Err(error) => {
+                failures = failures.saturating_add(1);
+                if failures.is_power_of_two() {
+                    tracing::warn!(failures, "{error}");
+                }
+                rounds.after_failures(failures)
+            }
+        };
+        tokio::select! {
+            () = &mut shutdown => break,
+            () = rounds.wake(pause) => {}
+        }
+    }
+    tracing::info!("asked to end; storing what is left");
+    let began = Instant::now();
+    let longest = LAST_FLUSH.min(rounds.flush());
+    match tokio::time::timeout(longest, rounds.round(Why::Shutdown)).await {
+        Ok(Ok(_)) => tracing::info!(milliseconds = began.elapsed().as_millis(), "stored"),
+        Ok(Err(error)) => tracing::error!("the last changes are not stored: {error}"),
+        Err(_) => tracing::error!(
+            "the last changes are not stored: it took more than {} s",
+            longest.as_secs()
+        ),
+    }
+    Ok(())
+}

@@ -1,0 +1,72 @@
+//! What a round's report says. Pure.
+
+use std::collections::BTreeMap;
+
+use crate::pod::gather::Gathered;
+use crate::pod::judge::Ending;
+use crate::pod::places::Setting;
+use crate::pod::report::{MAX_BYTES, Report, SCHEMA};
+
+/// Warnings of the results' check that are reported.
+const WARNINGS: usize = 50;
+/// Characters of a reason or a warning that are reported.
+const REASON: usize = 2000;
+
+/// The report of a round; its number is the caller's.
+pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&Ending>) -> Report {
+    let run = &setting.run;
+    let merged = gathered.merged.as_deref();
+    let score = merged.and_then(|merged| merged.score.or(merged.partial_score));
+    let invalid = match ending {
+        Some(Ending::Invalid(why)) => Some(why.clone()),
+        _ => None,
+    };
+    let stopped = match ending {
+        Some(Ending::Stopped(stop)) => Some(*stop),
+        _ => None,
+    };
+    let counts = invalid.is_none() && gathered.is_complete();
+    let total = gathered
+        .pairs
+        .iter()
+        .map(|pair| pair.total)
+        .fold(0, u32::saturating_add);
+    let warnings = merged.map_or(&[][..], |merged| &merged.warnings);
+    Report {
+        schema: SCHEMA,
+        submission_uid: run.uid.clone(),
+        attempt: run.attempt,
+        pod_uid: setting.pod_uid.clone(),
+        round: 0,
+        done: merged.map_or(0, |merged| merged.done).min(total),
+        total,
+        pairs: gathered.pairs.clone(),
+        score: score.filter(|score| (0.0..=100.0).contains(score)),
+        is_final: ending.is_some(),
+        eligible: counts && merged.is_some_and(|merged| merged.eligible),
+        entry_status: merged.map_or_else(|| "Started".to_owned(), |merged| merged.entry_status.clone()),
+        stopped,
+        why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
+        warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
+        results: gathered.files.results_json.clone(),
+        files: gathered.digests(),
+    }
+}
+
+/// Its JSON, without the long parts if it were larger than what is read.
+pub(super) fn to_bytes(report: &Report) -> Vec<u8> {
+    let bytes = serde_json::to_vec(report).unwrap_or_default();
+    if bytes.len() <= MAX_BYTES {
+        return bytes;
+    }
+    let short = Report {
+        warnings: Vec::new(),
+        files: BTreeMap::new(),
+        ..report.clone()
+    };
+    serde_json::to_vec(&short).unwrap_or_default()
+}
+
+fn shorten(text: &str) -> String {
+    text.chars().take(REASON).collect()
+}

@@ -1,0 +1,387 @@
+//! One round: look, judge, check the fence, store, report.
+//!
+//! Called by the loop of the parent module. What a report says is in [`super::describe`].
+
+use std::collections::BTreeMap;
+use std::collections::hash_map::DefaultHasher;
+use std::ffi::OsStr;
+use std::hash::{Hash, Hasher};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use leaderboard_runner::protocol::{self, Side, StatusFile};
+use tokio::sync::watch;
+
+use super::describe::{describe, to_bytes};
+use super::{LogcopyError, cancel};
+use crate::pod::gather::{Gathered, Gatherer, MERGED, checkpoint_path, texts};
+use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
+use crate::pod::ownlog::OWN_LOG;
+use crate::pod::places::Setting;
+use crate::pod::report::{OWNER_KEY, REPORT_KEY, Report};
+use crate::pod::run::{STATUS_FOLDER, Stop};
+use crate::pod::tree::{Stamp, Tree};
+use crate::pod::upload::Haste;
+use crate::pod::upload::send::{Uploader, Wanted};
+use crate::pod::watch::Watch;
+use crate::services::archive::{Archive, ArchiveError, Fetched};
+
+/// Entries looked at in one agent's folder.
+const AGENT_ENTRIES: usize = 5_000;
+/// Entries looked at in the simulators' folder.
+const SIMULATOR_ENTRIES: usize = 20_000;
+/// Bytes of the owner that are read.
+const OWNER_BYTES: u64 = 1024;
+/// Shortest time that logs get in a round of a running run.
+const LOG_TIME: Duration = Duration::from_secs(10);
+
+/// Why there is a round.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Why {
+    /// Its time has come, or something changed.
+    Period,
+    /// The last one.
+    Shutdown,
+}
+
+/// What has been seen on the volume.
+#[derive(Debug)]
+struct Look {
+    gathered: Gathered,
+    logs: Vec<Wanted>,
+    statuses: Vec<StatusFile>,
+    activity: u64,
+}
+
+/// The rounds of one life.
+pub(super) struct Rounds {
+    setting: Setting,
+    archive: Archive,
+    tree: Arc<Tree>,
+    gatherer: Arc<Mutex<Gatherer>>,
+    uploader: Uploader,
+    stop: watch::Receiver<Option<Stop>>,
+    judge: Judge,
+    folders: Option<Watch>,
+    epoch: Instant,
+    last: Instant,
+    round: u64,
+    reported: Option<Report>,
+    owner_etag: Option<String>,
+    owner_missed: bool,
+    ending: Option<Ending>,
+    /// The final report is stored.
+    finished: bool,
+    /// Another Pod owns the prefix.
+    fenced: bool,
+}
+
+impl Rounds {
+    pub(super) fn new(
+        setting: Setting,
+        archive: Archive,
+        tree: Arc<Tree>,
+        gatherer: Gatherer,
+        uploader: Uploader,
+        stop: watch::Receiver<Option<Stop>>,
+    ) -> Self {
+        // A logcopy before this one may have come to the end already.
+        let finished = StatusFile::Stored.exists(&setting.places.status());
+        Self {
+            setting,
+            archive,
+            tree,
+            gatherer: Arc::new(Mutex::new(gatherer)),
+            uploader,
+            stop,
+            judge: Judge::default(),
+            folders: Watch::new(is_news).ok(),
+            epoch: Instant::now(),
+            last: Instant::now(),
+            round: 0,
+            reported: None,
+            owner_etag: None,
+            owner_missed: false,
+            ending: None,
+            finished,
+            fenced: false,
+        }
+    }
+
+    /// How long storing may take at the end.
+    pub(super) fn flush(&self) -> Duration {
+        Duration::from_secs(self.setting.run.flush_seconds)
+    }
+
+    fn period(&self) -> Duration {
+        Duration::from_secs(self.setting.run.period_seconds).max(self.setting.pace.least)
+    }
+
+    /// The pause after this many failures in a row.
+    pub(super) fn after_failures(&self, failures: u32) -> Duration {
+        let factor = 1 << failures.saturating_sub(1).min(8);
+        (self.setting.pace.least * factor).min(self.setting.pace.backoff)
+    }
+
+    /// Waits for the next round: its time, a stop, or a change that can't wait. There is none after the end.
+    pub(super) async fn wake(&mut self, pause: Duration) {
+        if self.finished || self.fenced {
+            return std::future::pending().await;
+        }
+        self.watch_folders();
+        let folders = self.folders.as_ref();
+        let changed = async {
+            match folders {
+                Some(watch) => watch.changed().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = tokio::time::sleep(pause) => {}
+            () = changed => {}
+            stopped = self.stop.changed() => if stopped.is_err() {
+                tokio::time::sleep(pause).await;
+            },
+        }
+        let spacing = self.setting.pace.least.saturating_sub(self.last.elapsed());
+        tokio::time::sleep(spacing).await;
+    }
+
+    /// The kubelet makes the folders when it makes the containers, so they are looked for again each time.
+    fn watch_folders(&self) {
+        let Some(watch) = &self.folders else { return };
+        let status = self.setting.places.status();
+        watch.add(&status);
+        watch.add(&self.tree.path().join("agent"));
+        for pair in 1..=self.pairs() {
+            watch.add(&self.tree.path().join(format!("agent/agent{pair}")));
+            for side in [Side::Simulator, Side::Agent] {
+                watch.add(&status.join(format!("{side}-{pair}")));
+            }
+        }
+    }
+
+    fn pairs(&self) -> usize {
+        self.setting.run.plan.slices.len()
+    }
+
+    /// One round. Returns how long the next one may wait.
+    pub(super) async fn round(&mut self, why: Why) -> Result<Duration, LogcopyError> {
+        self.last = Instant::now();
+        if self.fenced || (self.finished && why == Why::Period) {
+            return Ok(self.period());
+        }
+        let look = self.look().await?;
+        let pause = self.judge(&look);
+        if !self.owns_prefix().await? {
+            self.give_up();
+            return Ok(self.period());
+        }
+        if self.finished {
+            // Only what has come since: the others' last status files and our own last lines.
+            self.store_statuses(&look.statuses).await?;
+            self.store_logs(look.logs, true).await?;
+            return Ok(self.period());
+        }
+        let at_end = self.ending.is_some() || why == Why::Shutdown;
+        self.store_results(&look.gathered).await?;
+        self.store_statuses(&look.statuses).await?;
+        if at_end {
+            self.store_logs(look.logs, true).await?;
+            self.report(&look.gathered).await?;
+        } else {
+            // A long upload of logs must not keep the progress back.
+            self.report(&look.gathered).await?;
+            self.store_logs(look.logs, false).await?;
+        }
+        if self.ending.is_some() {
+            self.finish(&look.gathered).await?;
+        }
+        Ok(pause)
+    }
+
+    /// Reads the volume, on a thread that may block.
+    async fn look(&self) -> Result<Look, LogcopyError> {
+        let (tree, reader) = (Arc::clone(&self.tree), Arc::clone(&self.gatherer));
+        let status = self.setting.places.status();
+        let pairs = self.pairs();
+        let look = move || {
+            let gathered = reader.lock().unwrap_or_else(PoisonError::into_inner).round()?;
+            let (files, activity) = logs(&tree, pairs);
+            Ok(Look {
+                gathered,
+                logs: files
+                    .iter()
+                    .map(|(path, stamp)| Wanted::new(path, *stamp, Haste::Soon))
+                    .collect(),
+                statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX)),
+                activity,
+            })
+        };
+        tokio::task::spawn_blocking(look).await.map_err(std::io::Error::other)?
+    }
+
+    /// Draws the consequences of what was seen. Returns how long the next look may wait.
+    fn judge(&mut self, look: &Look) -> Duration {
+        let status = self.setting.places.status();
+        let outside = Outside {
+            stop: *self.stop.borrow_and_update(),
+            cancelled: StatusFile::Cancel.exists(&status),
+            activity: look.activity,
+            now: self.epoch.elapsed(),
+        };
+        let seen = self.judge.see(&look.gathered, outside);
+        if self.ending.is_some() {
+            return self.setting.pace.least;
+        }
+        let longest = Duration::from_secs(self.setting.run.cancel_seconds);
+        match decide(&seen, &self.setting.pace, longest) {
+            Step::GoOn => {}
+            Step::Cancel => {
+                cancel(&status);
+            }
+            Step::Finish(ending) => {
+                tracing::info!("{ending}; storing the rest");
+                self.ending = Some(ending);
+            }
+        }
+        let is_ending = seen.stop.is_some() || seen.complete.is_some() || seen.spoiled.is_some();
+        let soon = Duration::from_secs(1).max(self.setting.pace.least);
+        if is_ending {
+            soon.min(self.period())
+        } else {
+            self.period()
+        }
+    }
+
+    /// Whether this Pod's writes still count.
+    async fn owns_prefix(&mut self) -> Result<bool, ArchiveError> {
+        let known = self.owner_etag.as_deref();
+        match self.archive.get_if_none_match(OWNER_KEY, known, OWNER_BYTES).await? {
+            Fetched::NotModified => Ok(true),
+            Fetched::Found(object) => {
+                let ours = object.bytes.trim_ascii() == self.setting.pod_uid.as_bytes();
+                self.owner_etag = object.etag.filter(|_| ours);
+                Ok(ours)
+            }
+            Fetched::Absent => {
+                if !std::mem::replace(&mut self.owner_missed, true) {
+                    tracing::warn!("{OWNER_KEY} is gone from the prefix; nobody else has taken it, so this goes on");
+                }
+                Ok(true)
+            }
+        }
+    }
+
+    /// Another Pod has taken over: this one ends, and nothing of it is stored any more.
+    fn give_up(&mut self) {
+        tracing::warn!("another Pod owns this run's prefix; this one stores nothing more and stops");
+        self.fenced = true;
+        let status = self.setting.places.status();
+        cancel(&status);
+        // Frees the simulators from waiting for a store that will not come.
+        if let Err(error) = StatusFile::Stored.create(&status) {
+            tracing::error!("logcopy.done can't be written: {error}");
+        }
+    }
+
+    /// Checkpoints, the merged file and EvalAI's texts.
+    async fn store_results(&mut self, gathered: &Gathered) -> Result<(), ArchiveError> {
+        let checkpoints = (1..=self.pairs()).map(checkpoint_path);
+        let texts = texts(&gathered.files).into_iter().map(|(path, _)| path.to_owned());
+        let files: Vec<Wanted> = checkpoints
+            .chain([MERGED.to_owned()])
+            .chain(texts)
+            .filter_map(|path| {
+                let (_, stamp) = self.tree.file(&path).ok()??;
+                Some(Wanted::new(&path, stamp, Haste::Now).essential())
+            })
+            .collect();
+        self.uploader.sync(&files, None).await.map(drop)
+    }
+
+    /// The status files, flat, as they have always been stored.
+    async fn store_statuses(&mut self, statuses: &[StatusFile]) -> Result<(), ArchiveError> {
+        let files: Vec<Wanted> = statuses
+            .iter()
+            .map(|file| {
+                let (folder, name) = (file.folder(), file.name());
+                Wanted {
+                    key: format!("{STATUS_FOLDER}/{name}"),
+                    path: format!("{STATUS_FOLDER}/{folder}/{name}"),
+                    // Their name is all they say.
+                    stamp: Stamp::default(),
+                    haste: Haste::Soon,
+                    essential: true,
+                }
+            })
+            .filter(|file| !self.uploader.memory().0.contains_key(&file.key))
+            .collect();
+        self.uploader.sync(&files, None).await.map(drop)
+    }
+
+    /// The logs: all of them at the end, else what is due, and no longer than a period.
+    async fn store_logs(&mut self, mut files: Vec<Wanted>, all: bool) -> Result<(), ArchiveError> {
+        if all {
+            for file in &mut files {
+                file.haste = Haste::Now;
+            }
+        }
+        let until = (!all).then(|| Instant::now() + self.period().max(LOG_TIME));
+        self.uploader.sync(&files, until).await.map(drop)
+    }
+
+    /// Stores the report, if it says something new.
+    async fn report(&mut self, gathered: &Gathered) -> Result<(), ArchiveError> {
+        let mut report = describe(&self.setting, gathered, self.ending.as_ref());
+        report.round = self.round;
+        if self.reported.as_ref() == Some(&report) {
+            return Ok(());
+        }
+        report.round += 1;
+        self.archive.put(REPORT_KEY, to_bytes(&report)).await?;
+        self.round = report.round;
+        self.reported = Some(report);
+        Ok(())
+    }
+
+    /// The final report is stored: says so to the Pod, and ends whoever is still at it.
+    async fn finish(&mut self, gathered: &Gathered) -> Result<(), LogcopyError> {
+        let status = self.setting.places.status();
+        StatusFile::Stored.create(&status)?;
+        self.finished = true;
+        tracing::info!("the final report is stored");
+        if let Err(error) = self.store_statuses(&[StatusFile::Stored]).await {
+            tracing::warn!("logcopy.done is not stored: {error}");
+        }
+        if gathered.seen.iter().any(|pair| !pair.agent.done) {
+            // Nobody needs to run for results that are complete.
+            cancel(&status);
+        }
+        Ok(())
+    }
+}
+
+/// The files of the containers, and a digest that changes when an agent writes something.
+fn logs(tree: &Tree, pairs: usize) -> (BTreeMap<String, Stamp>, u64) {
+    let mut files = BTreeMap::new();
+    for pair in 1..=pairs {
+        files.extend(tree.walk(&format!("agent/agent{pair}"), AGENT_ENTRIES).files);
+    }
+    let mut activity = DefaultHasher::new();
+    files.hash(&mut activity);
+    files.extend(tree.walk("simulator", SIMULATOR_ENTRIES).files);
+    if let Ok(Some((_, stamp))) = tree.file(OWN_LOG) {
+        files.insert(OWN_LOG.to_owned(), stamp);
+    }
+    (files, activity.finish())
+}
+
+/// What can't wait for the period: a container that tells something, or its new folder. A checkpoint can wait: an agent that
+/// writes all the time must not set the pace.
+fn is_news(name: &OsStr) -> bool {
+    let Some(name) = name.to_str() else { return false };
+    let is_mark = [".start", ".crash", ".done"].iter().any(|mark| name.contains(mark));
+    let is_folder = ["agent", "simulator-"].iter().any(|start| name.starts_with(start)) && !name.contains('.');
+    is_mark || is_folder
+}

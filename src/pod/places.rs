@@ -1,0 +1,124 @@
+//! Where things are for the programs in the Pod: the mounts, and the few values the Pod's template puts in the environment.
+//!
+//! Made by the programs' entry points from [`super::run`]'s constants, and by tests from temporary folders.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::run::{
+    ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, RUNNER, RUNNER_IN_IMAGE, Run,
+    STATUS_FOLDER, STOP_FILE, TOOLS,
+};
+
+/// Files and folders.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Places {
+    /// Root of the `logs` volume.
+    pub logs: PathBuf,
+    /// Folder that gets the runner.
+    pub tools: PathBuf,
+    /// The runner as it comes with the operator.
+    pub runner: PathBuf,
+    /// Folder of the downward API.
+    pub podinfo: PathBuf,
+    /// The projected token.
+    pub token: PathBuf,
+    /// What the kubelet copies into the container's status.
+    pub termination_log: PathBuf,
+}
+
+impl Places {
+    /// The mounts of a Pod.
+    pub fn in_pod() -> Self {
+        Self {
+            logs: LOGS.into(),
+            tools: TOOLS.into(),
+            runner: RUNNER_IN_IMAGE.into(),
+            podinfo: PODINFO.into(),
+            token: PathBuf::from(IDENTITY).join(IDENTITY_TOKEN_FILE),
+            termination_log: "/dev/termination-log".into(),
+        }
+    }
+
+    /// Where the containers find the runner.
+    pub fn runner_for_all(&self) -> PathBuf {
+        self.tools.join(RUNNER)
+    }
+
+    /// The file with the stop annotation.
+    pub fn stop(&self) -> PathBuf {
+        self.podinfo.join(STOP_FILE)
+    }
+
+    /// The status files' root.
+    pub fn status(&self) -> PathBuf {
+        self.logs.join(STATUS_FOLDER)
+    }
+}
+
+/// How long logcopy waits for what cannot be seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Pace {
+    /// From complete results to the end, when an agent does not say that it is done.
+    pub settle: Duration,
+    /// Without a change in the agents' folders, they count as stopped.
+    pub quiet: Duration,
+    /// From a cancel to the last look, when they are never quiet: the runner's grace and a margin.
+    pub grace: Duration,
+    /// Smallest time between two rounds.
+    pub least: Duration,
+    /// Longest pause after rounds that failed.
+    pub backoff: Duration,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self {
+            settle: Duration::from_secs(30),
+            quiet: Duration::from_secs(5),
+            grace: Duration::from_secs(25),
+            least: Duration::from_secs(1),
+            backoff: Duration::from_mins(1),
+        }
+    }
+}
+
+/// All that a program in the Pod is given.
+#[derive(Clone, Debug)]
+pub struct Setting {
+    /// The run.
+    pub run: Run,
+    /// UID of the Pod.
+    pub pod_uid: String,
+    /// Role to assume, if the identity is one.
+    pub role_arn: Option<String>,
+    /// Mounts.
+    pub places: Places,
+    /// Waiting times.
+    pub pace: Pace,
+}
+
+/// The Pod's template lacks something.
+#[derive(thiserror::Error, Debug)]
+pub enum SettingError {
+    /// No such variable.
+    #[error("the environment variable {0} is not set: this program runs inside a submission's Pod only")]
+    Missing(&'static str),
+    /// Not what the controller writes.
+    #[error("{ENV_RUN} is not the description of a run: {0}. Operator and Pod must be of the same version")]
+    Malformed(#[from] serde_json::Error),
+}
+
+impl Setting {
+    /// Reads the environment of a Pod.
+    pub fn in_pod() -> Result<Self, SettingError> {
+        let variable = |name| std::env::var(name).map_err(|_| SettingError::Missing(name));
+        Ok(Self {
+            run: serde_json::from_str(&variable(ENV_RUN)?)?,
+            pod_uid: variable(ENV_POD_UID)?,
+            role_arn: std::env::var(ENV_ROLE_ARN).ok().filter(|arn| !arn.is_empty()),
+            places: Places::in_pod(),
+            pace: Pace::default(),
+        })
+    }
+}

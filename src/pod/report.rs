@@ -1,0 +1,140 @@
+//! What a Pod tells the controller: `logcopy/report.json`, written last in each round.
+//!
+//! Written by `logcopy`, read by the controller as hostile text: bounded in size, checked in every number. Pure.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+/// Key of the report below the run's prefix.
+pub const REPORT_KEY: &str = "logcopy/report.json";
+/// Key of the file that names the Pod whose writes count.
+pub const OWNER_KEY: &str = "logcopy/owner";
+/// Largest report that is read or written, in bytes.
+pub const MAX_BYTES: usize = 1 << 20;
+/// Version of the document.
+pub const SCHEMA: u32 = 1;
+
+/// One round of logcopy.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct Report {
+    /// [`SCHEMA`].
+    pub schema: u32,
+    /// UID of the Submission.
+    pub submission_uid: String,
+    /// Attempt it belongs to.
+    pub attempt: i64,
+    /// UID of the Pod that wrote it.
+    pub pod_uid: String,
+    /// Counts the rounds of this Pod.
+    pub round: u64,
+    /// Routes done, over all pairs and repetitions.
+    pub done: u32,
+    /// Routes in all.
+    pub total: u32,
+    /// Each pair, from 1.
+    pub pairs: Vec<ReportPair>,
+    /// Mean driving score: over the finished routes, or of the whole run when final.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub score: Option<f64>,
+    /// True when the merge is complete against the plan and nothing more will come.
+    #[serde(rename = "final")]
+    pub is_final: bool,
+    /// Whether the results count.
+    pub eligible: bool,
+    /// `entry_status` of the merged file.
+    pub entry_status: String,
+    /// Which stop was obeyed, if any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stopped: Option<super::run::Stop>,
+    /// Why a checkpoint was refused, in words a participant understands.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub why: Option<String>,
+    /// What `verify` noticed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
+    /// Text of `evalai/results.json`.
+    pub results: String,
+    /// Files of `evalai/` as stored in this round, by key below the prefix.
+    #[serde(default)]
+    pub files: BTreeMap<String, StoredFile>,
+}
+
+/// One pair as its status files and checkpoint show it.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+pub struct ReportPair {
+    /// From 1.
+    pub id: u32,
+    /// Routes done.
+    pub done: u32,
+    /// Routes of its slice, times repetitions.
+    pub total: u32,
+    /// Crashes of the agent's or simulator's side, whichever is more.
+    pub crashes: u32,
+    /// `Waiting`, `Running`, `Done`, `Crashed`.
+    pub state: String,
+}
+
+/// Size and digest of a stored file.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+pub struct StoredFile {
+    /// Bytes.
+    pub size: u64,
+    /// Hexadecimal SHA-256.
+    pub sha256: String,
+}
+
+/// Why a report is not used.
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
+pub enum ReportError {
+    /// Larger than [`MAX_BYTES`].
+    #[error("the report has {0} bytes, more than the {MAX_BYTES} that are read")]
+    TooLarge(usize),
+    /// Not a report.
+    #[error("the report is not one of ours: {0}")]
+    Malformed(String),
+    /// A number that no run can have.
+    #[error("the report is implausible: {0}")]
+    Implausible(String),
+}
+
+impl Report {
+    /// Reads a report as hostile text.
+    pub fn parse(bytes: &[u8]) -> Result<Self, ReportError> {
+        if bytes.len() > MAX_BYTES {
+            return Err(ReportError::TooLarge(bytes.len()));
+        }
+        let report: Self = serde_json::from_slice(bytes).map_err(|e| ReportError::Malformed(e.to_string()))?;
+        report.check()?;
+        Ok(report)
+    }
+
+    fn check(&self) -> Result<(), ReportError> {
+        let implausible = |what: &str| Err(ReportError::Implausible(what.into()));
+        if self.schema != SCHEMA {
+            return Err(ReportError::Malformed(format!(
+                "schema {} is not {SCHEMA}",
+                self.schema
+            )));
+        }
+        if self.done > self.total {
+            return implausible("more routes done than there are");
+        }
+        if self.is_final && self.stopped.is_none() && self.why.is_none() && self.done != self.total {
+            return implausible("final, but routes are missing");
+        }
+        if self.score.is_some_and(|s| !(0.0..=100.0).contains(&s)) {
+            return implausible("a score outside 0 to 100");
+        }
+        if self.pairs.len() > 64 || self.pairs.iter().any(|p| p.done > p.total) {
+            return implausible("a pair that did more than its slice");
+        }
+        Ok(())
+    }
+
+    /// Whether it speaks of this attempt of this object.
+    pub fn belongs_to(&self, uid: &str, attempt: i64) -> bool {
+        self.submission_uid == uid && self.attempt == attempt
+    }
+}

@@ -1,0 +1,88 @@
+//! What the controller tells a Pod: one JSON document without secrets, and the paths inside the Pod.
+//!
+//! Written by `controller::job_spec`, read by `workspace` and `logcopy`. Pure.
+
+use serde::{Deserialize, Serialize};
+
+use crate::api::{LogGroup, RunPlan, Verify};
+
+/// Environment variable with the JSON of [`Run`].
+pub const ENV_RUN: &str = "LEADERBOARD_RUN";
+/// Environment variable with the Pod's UID, from the downward API.
+pub const ENV_POD_UID: &str = "POD_UID";
+/// The whole `logs` volume, in `workspace` and `logcopy`.
+pub const LOGS: &str = "/logs";
+/// Where `workspace` puts `leaderboard-runner`; mounted read-only in simulators and agents.
+pub const TOOLS: &str = "/leaderboard-tools";
+/// The runner's name in [`TOOLS`].
+pub const RUNNER: &str = "leaderboard-runner";
+/// The runner inside the operator's image.
+pub const RUNNER_IN_IMAGE: &str = "/usr/local/bin/leaderboard-runner";
+/// Folder of the downward-API file with the stop annotation.
+pub const PODINFO: &str = "/podinfo";
+/// The file in it.
+pub const STOP_FILE: &str = "stop";
+/// Folder of the `logs` volume with the status files, one sub-folder a writer.
+pub const STATUS_FOLDER: &str = "containers-status";
+/// Folder of the projected token of `podIdentity.roleArn`.
+pub const IDENTITY: &str = "/var/run/secrets/leaderboard";
+/// The token in it.
+pub const IDENTITY_TOKEN_FILE: &str = "token";
+/// Environment variable with the role of `podIdentity.roleArn`, in `workspace` and `logcopy`.
+pub const ENV_ROLE_ARN: &str = "LEADERBOARD_ROLE_ARN";
+
+/// One attempt of one submission, as its Pod needs to know it.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct Run {
+    /// Namespace of the Submission.
+    pub namespace: String,
+    /// Name of the Submission.
+    pub submission: String,
+    /// UID of the Submission: a report of another one counts for nobody.
+    pub uid: String,
+    /// Attempt.
+    pub attempt: i64,
+    /// Routes, slices, format and storage.
+    pub plan: RunPlan,
+    /// What is done with scores that do not follow from their infractions.
+    pub verify: Verify,
+    /// Seconds between two rounds.
+    pub period_seconds: u64,
+    /// Seconds the last upload may take.
+    pub flush_seconds: u64,
+    /// Seconds from a cancel to the end.
+    pub cancel_seconds: u64,
+    /// CloudWatch log group, if container logs go there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub log_group: Option<LogGroup>,
+}
+
+/// Why a Pod is to stop: the value of the stop annotation.
+#[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stop {
+    /// The participant, a host or a deletion ends it.
+    Cancel,
+    /// A pair has used up its crashes.
+    Retries,
+    /// `deadlines.runSeconds` is over.
+    RunDeadline,
+}
+
+impl Stop {
+    /// The annotation's value.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Cancel => "Cancel",
+            Self::Retries => "Retries",
+            Self::RunDeadline => "RunDeadline",
+        }
+    }
+
+    /// Reads the annotation's value; unknown text is nothing.
+    pub fn parse(text: &str) -> Option<Self> {
+        [Self::Cancel, Self::Retries, Self::RunDeadline]
+            .into_iter()
+            .find(|s| s.as_str() == text.trim())
+    }
+}

@@ -1,0 +1,229 @@
+//! Sends the containers' logs to CloudWatch: each file once, in order, line by line.
+//!
+//! A task of `logcopy` with a pace of its own, so that neither waits for the other. Streams are `<run id>/<container>`. What
+//! was sent is noted beside the files, so that a restarted logcopy goes on where the last one was.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::unix::fs::FileExt;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+use tokio::sync::watch;
+
+use super::ownlog::OWN_LOG;
+use super::tree::{Tree, TreeError};
+use super::upload::Memory;
+use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, cut};
+
+/// Bytes read of one file at once.
+const CHUNK: u64 = 256 << 10;
+/// Batches of one file in one pass.
+const BATCHES: usize = 64;
+/// Where the note lies on the `logs` volume.
+const NOTE: &str = "logcopy/.shipped.json";
+/// Largest note that is read, in bytes.
+const NOTE_LIMIT: u64 = 1 << 20;
+/// Time the last pass may take.
+const LAST_PASS: Duration = Duration::from_secs(20);
+
+/// How far a file was sent.
+#[derive(Serialize, Deserialize, Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Mark {
+    inode: u64,
+    offset: u64,
+}
+
+/// What may have been sent: a batch whose answer never came.
+#[derive(Clone, Debug)]
+struct Doubt {
+    path: String,
+    last: LogEvent,
+    after: Mark,
+}
+
+/// Sends the logs of one run.
+#[derive(Debug)]
+pub struct Shipper {
+    client: LogClient,
+    tree: Arc<Tree>,
+    /// Stream by path.
+    streams: BTreeMap<String, String>,
+    marks: BTreeMap<String, Mark>,
+    made: BTreeSet<String>,
+    doubt: Option<Doubt>,
+    newest: i64,
+}
+
+impl Shipper {
+    /// Goes on where the last one was. What a Pod before this one has stored was also sent by it.
+    pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &str, pairs: usize, restored: &Memory) -> Self {
+        let agents = (1..=pairs).map(|n| (format!("agent/agent{n}/leaderboard.log"), format!("{run_id}/agent-{n}")));
+        let streams: BTreeMap<String, String> = agents
+            .chain([(OWN_LOG.to_owned(), format!("{run_id}/logcopy"))])
+            .collect();
+        let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();
+        let noted = note.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());
+        let marks = noted.unwrap_or_else(|| {
+            let known = streams.keys().filter_map(|path| Some((path, restored.0.get(path)?)));
+            known
+                .map(|(path, stored)| {
+                    let mark = Mark {
+                        inode: stored.stamp.inode,
+                        offset: stored.stamp.size,
+                    };
+                    (path.clone(), mark)
+                })
+                .collect()
+        });
+        Self {
+            client,
+            tree,
+            streams,
+            marks,
+            made: BTreeSet::new(),
+            doubt: None,
+            newest: 0,
+        }
+    }
+
+    /// Passes every `period` until `done` is true, and then once more.
+    pub async fn run(mut self, period: Duration, mut done: watch::Receiver<bool>) {
+        let mut complained = false;
+        while !*done.borrow_and_update() {
+            match self.pass(false).await {
+                Ok(()) => complained = false,
+                Err(error) if !complained => {
+                    complained = true;
+                    tracing::warn!("{error}");
+                }
+                Err(_) => {}
+            }
+            let ended = tokio::time::timeout(period, done.changed()).await;
+            if matches!(ended, Ok(Err(_))) {
+                break;
+            }
+        }
+        match tokio::time::timeout(LAST_PASS, self.pass(true)).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::warn!("{error}"),
+            Err(_) => tracing::warn!("the last lines are not in CloudWatch Logs: it took too long"),
+        }
+    }
+
+    /// Sends what is new in every file; `last`: also a line without an end.
+    pub async fn pass(&mut self, last: bool) -> Result<(), LogsError> {
+        self.resolve().await?;
+        let streams = self.streams.clone();
+        for (path, stream) in &streams {
+            // A flood in one file must not keep the others back.
+            for _ in 0..BATCHES {
+                if !self.send(path, stream, last).await? {
+                    break;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends one batch of a file. Returns whether there may be more.
+    async fn send(&mut self, path: &str, stream: &str, last: bool) -> Result<bool, LogsError> {
+        let mark = self.marks.get(path).copied().unwrap_or_default();
+        // A file that can't be read is the uploader's to complain about.
+        let Ok(Some((bytes, mark))) = self.next(path, mark) else {
+            return Ok(false);
+        };
+        let is_full = bytes.len() as u64 == CHUNK;
+        self.newest = self.newest.max(milliseconds());
+        let endless = is_full && !bytes.contains(&b'\n');
+        let (events, consumed) = cut(&bytes, (last && !is_full) || endless, self.newest);
+        if consumed == 0 {
+            return Ok(false);
+        }
+        let after = Mark {
+            offset: mark.offset + consumed as u64,
+            ..mark
+        };
+        let sent = Instant::now();
+        self.put(path, stream, &events, after).await?;
+        self.note(path, after);
+        let more = is_full || consumed < bytes.len();
+        if more {
+            tokio::time::sleep(BETWEEN_BATCHES.saturating_sub(sent.elapsed())).await;
+        }
+        Ok(more)
+    }
+
+    /// The next piece of a file, and where it begins: at 0 if it is another file than before.
+    fn next(&self, path: &str, mark: Mark) -> Result<Option<(Vec<u8>, Mark)>, TreeError> {
+        let Some((file, stamp)) = self.tree.file(path)? else {
+            return Ok(None);
+        };
+        let goes_on = stamp.inode == mark.inode && stamp.size >= mark.offset;
+        let offset = if goes_on { mark.offset } else { 0 };
+        let len = (stamp.size - offset).min(CHUNK);
+        let mut bytes = vec![0; usize::try_from(len).unwrap_or(0)];
+        file.read_exact_at(&mut bytes, offset)?;
+        let inode = stamp.inode;
+        Ok((len > 0).then_some((bytes, Mark { inode, offset })))
+    }
+
+    async fn put(&mut self, path: &str, stream: &str, events: &[LogEvent], after: Mark) -> Result<(), LogsError> {
+        let Some(last) = events.last() else {
+            return Ok(());
+        };
+        if !self.made.contains(stream) {
+            self.client.create_stream(stream).await?;
+            self.made.insert(stream.to_owned());
+        }
+        let result = self.client.put(stream, events).await;
+        match &result {
+            Err(LogsError::Refused { missing: true, .. }) => {
+                self.made.remove(stream);
+            }
+            Err(LogsError::Unanswered { .. }) => {
+                self.doubt = Some(Doubt {
+                    path: path.to_owned(),
+                    last: last.clone(),
+                    after,
+                });
+            }
+            _ => {}
+        }
+        result
+    }
+
+    /// Finds out whether the batch without an answer arrived, before anything is sent again.
+    async fn resolve(&mut self) -> Result<(), LogsError> {
+        let Some(doubt) = self.doubt.clone() else {
+            return Ok(());
+        };
+        let stream = self.streams.get(&doubt.path).cloned().unwrap_or_default();
+        let arrived = match self.client.last(&stream).await {
+            Ok(last) => last.as_ref() == Some(&doubt.last),
+            Err(LogsError::Refused { missing: true, .. }) => false,
+            Err(error) => return Err(error),
+        };
+        if arrived {
+            self.note(&doubt.path, doubt.after);
+        }
+        self.doubt = None;
+        Ok(())
+    }
+
+    fn note(&mut self, path: &str, mark: Mark) {
+        self.marks.insert(path.to_owned(), mark);
+        let noted = serde_json::to_vec(&self.marks).map_err(std::io::Error::other);
+        if let Err(error) = noted
+            .map_err(TreeError::from)
+            .and_then(|bytes| self.tree.write(NOTE, &bytes))
+        {
+            tracing::warn!("how far logs were sent can't be noted down: {error}");
+        }
+    }
+}
+
+fn milliseconds() -> i64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(since.as_millis()).unwrap_or(i64::MAX)
+}

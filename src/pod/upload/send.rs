@@ -1,0 +1,298 @@
+//! Stores files by the rules of the parent module: a few at a time, at most one part of each in memory.
+//!
+//! Called by `logcopy`. A file that can't be read is left out and named; only S3's own failures end a round.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use futures::StreamExt;
+
+use super::{Decision, Haste, Memory, Stored, decide_upload, fingerprint};
+use crate::pod::tree::{Stamp, Tree, TreeError};
+use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART};
+
+/// Files in the air at once.
+const AT_ONCE: usize = 4;
+
+/// A file that is to be stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    /// Its key below the run's prefix.
+    pub key: String,
+    /// Its path below the volume's root.
+    pub path: String,
+    /// As it was found.
+    pub stamp: Stamp,
+    /// How soon.
+    pub haste: Haste,
+    /// Stored even beyond the limit: what a run is about is bounded in other ways.
+    pub essential: bool,
+}
+
+impl Wanted {
+    /// A file whose key is its path.
+    pub fn new(path: &str, stamp: Stamp, haste: Haste) -> Self {
+        Self {
+            key: path.to_owned(),
+            path: path.to_owned(),
+            stamp,
+            haste,
+            essential: false,
+        }
+    }
+
+    /// The same, stored even beyond the limit.
+    #[must_use]
+    pub fn essential(self) -> Self {
+        Self {
+            essential: true,
+            ..self
+        }
+    }
+}
+
+/// What became of one round of files.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sent {
+    /// Objects written.
+    pub objects: usize,
+    /// Files that were due when the time was over.
+    pub late: usize,
+    /// Files that could not be read, or did not fit into the limit.
+    pub left_out: usize,
+}
+
+/// Stores the files of one run.
+#[derive(Debug)]
+pub struct Uploader {
+    archive: Archive,
+    tree: Arc<Tree>,
+    memory: Memory,
+    limit: u64,
+    epoch: Instant,
+    complained: BTreeSet<String>,
+}
+
+/// One file's end.
+enum Fate {
+    Stored(Box<Stored>, bool),
+    LeftOut(String),
+    Failed(ArchiveError),
+    Late,
+}
+
+impl Uploader {
+    /// With the memory of what an earlier program of this Pod stored. `limit`: bytes the run may store.
+    pub fn new(archive: Archive, tree: Arc<Tree>, limit: u64) -> Self {
+        Self {
+            memory: Memory::load(&tree),
+            archive,
+            tree,
+            limit,
+            epoch: Instant::now(),
+            complained: BTreeSet::new(),
+        }
+    }
+
+    /// What is stored.
+    pub fn memory(&self) -> &Memory {
+        &self.memory
+    }
+
+    /// Stores what is due, in the order given as far as several at once allow. After `until` no file is begun. The first
+    /// failure of S3 ends it; what was stored until then is remembered.
+    pub async fn sync(&mut self, files: &[Wanted], until: Option<Instant>) -> Result<Sent, ArchiveError> {
+        let (jobs, left_out) = self.due(files);
+        let mut sent = Sent {
+            left_out: left_out.len(),
+            ..Sent::default()
+        };
+        self.complain(&left_out);
+        // What is in the air comes to its end, so that it is remembered; nothing new is begun.
+        let broken = Arc::new(AtomicBool::new(false));
+        let work = jobs.into_iter().map(|job| {
+            let broken = Arc::clone(&broken);
+            async move {
+                if broken.load(Ordering::Relaxed) || until.is_some_and(|until| Instant::now() >= until) {
+                    return (job.wanted.key, Fate::Late);
+                }
+                let fate = job.store().await;
+                if matches!(fate, Fate::Failed(_)) {
+                    broken.store(true, Ordering::Relaxed);
+                }
+                (job.wanted.key, fate)
+            }
+        });
+        let fates: Vec<(String, Fate)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        let failed = self.settle(fates, &mut sent);
+        if sent.objects > 0 || failed.is_some() {
+            self.remember();
+        }
+        failed.map_or(Ok(sent), Err)
+    }
+
+    /// Takes in what became of the files. Returns S3's failure, if there was one.
+    fn settle(&mut self, fates: Vec<(String, Fate)>, sent: &mut Sent) -> Option<ArchiveError> {
+        let (mut complaints, mut failed) = (BTreeMap::new(), None);
+        for (key, fate) in fates {
+            match fate {
+                Fate::Stored(stored, written) => {
+                    sent.objects += usize::from(written);
+                    self.memory.0.insert(key, *stored);
+                }
+                Fate::LeftOut(why) => {
+                    sent.left_out += 1;
+                    complaints.insert(key, why);
+                }
+                Fate::Late => sent.late += 1,
+                Fate::Failed(error) => {
+                    if matches!(error.cause, Cause::Changed) {
+                        // Somebody else's object: it is written whole the next time.
+                        self.memory.0.remove(&key);
+                    }
+                    failed = Some(error);
+                }
+            }
+        }
+        self.complain(&complaints);
+        failed
+    }
+
+    /// The files that are due and fit, and why the others don't.
+    fn due(&self, files: &[Wanted]) -> (Vec<Job>, BTreeMap<String, String>) {
+        let now = self.epoch.elapsed();
+        let mut used = self.memory.bytes();
+        let (mut jobs, mut left_out) = (Vec::new(), BTreeMap::new());
+        for file in files {
+            let known = self.memory.0.get(&file.key);
+            let decision = decide_upload(&file.stamp, known, now, file.haste);
+            if decision == Decision::Keep {
+                continue;
+            }
+            let after = used - known.map_or(0, |known| known.stamp.size) + file.stamp.size;
+            if after > self.limit && after > used && !file.essential {
+                let why = format!("storage.limit of {} bytes is reached", self.limit);
+                left_out.insert(file.key.clone(), why);
+                continue;
+            }
+            used = after;
+            jobs.push(Job {
+                archive: self.archive.clone(),
+                tree: Arc::clone(&self.tree),
+                wanted: file.clone(),
+                decision,
+                known: known.cloned(),
+                now,
+            });
+        }
+        (jobs, left_out)
+    }
+
+    /// Says once per file why it is left out.
+    fn complain(&mut self, left_out: &BTreeMap<String, String>) {
+        for (key, why) in left_out {
+            if self.complained.len() < 1000 && self.complained.insert(key.clone()) {
+                tracing::warn!(file = %key, "not stored: {why}");
+            }
+        }
+    }
+
+    fn remember(&self) {
+        if let Err(error) = self.memory.save(&self.tree) {
+            tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
+        }
+    }
+}
+
+/// One file on its way.
+struct Job {
+    archive: Archive,
+    tree: Arc<Tree>,
+    wanted: Wanted,
+    decision: Decision,
+    known: Option<Stored>,
+    now: Duration,
+}
+
+enum Problem {
+    Local(TreeError),
+    Archive(ArchiveError),
+}
+
+impl From<std::io::Error> for Problem {
+    fn from(error: std::io::Error) -> Self {
+        Self::Local(error.into())
+    }
+}
+
+impl From<ArchiveError> for Problem {
+    fn from(error: ArchiveError) -> Self {
+        Self::Archive(error)
+    }
+}
+
+impl Job {
+    async fn store(&self) -> Fate {
+        let opened = match self.tree.file(&self.wanted.path) {
+            Ok(Some(opened)) => opened,
+            Ok(None) => return Fate::LeftOut("it is gone".to_owned()),
+            Err(error) => return Fate::LeftOut(error.to_string()),
+        };
+        match self.send(opened).await {
+            Ok(fate) => fate,
+            Err(Problem::Local(error)) => Fate::LeftOut(error.to_string()),
+            Err(Problem::Archive(error)) => match error.cause {
+                // The file shrank under our hands; the next round sees what it became.
+                Cause::Local(_) | Cause::Parts(_) => Fate::LeftOut(error.cause.to_string()),
+                _ => Fate::Failed(error),
+            },
+        }
+    }
+
+    /// Sends the first bytes of the file, as many as it had when it was opened.
+    async fn send(&self, (file, stamp): (File, Stamp)) -> Result<Fate, Problem> {
+        let file = Arc::new(file);
+        let known_size = self.known.as_ref().map_or(0, |known| known.stamp.size);
+        let marks = {
+            let file = Arc::clone(&file);
+            let marks = move || {
+                let of_known = fingerprint(&file, known_size.min(stamp.size))?;
+                Ok::<_, std::io::Error>((fingerprint(&file, stamp.size)?, of_known))
+            };
+            tokio::task::spawn_blocking(marks)
+        };
+        let (fingerprint, of_known) = marks.await.map_err(std::io::Error::other)??;
+        let stored = |etag| {
+            Box::new(Stored {
+                stamp,
+                etag,
+                fingerprint: fingerprint.clone(),
+                at: self.now,
+            })
+        };
+        let prefix = self.known.as_ref();
+        let prefix = prefix.filter(|known| known_size <= stamp.size && known.fingerprint == of_known);
+        if let Some(known) = prefix.filter(|_| known_size == stamp.size && stamp.size < MIN_PART) {
+            // Touched, or written again with the same content.
+            return Ok(Fate::Stored(stored(known.etag.clone()), false));
+        }
+        let etag = prefix.and_then(|known| known.etag.as_deref());
+        let kept = match self.decision {
+            Decision::Append { from } if from == known_size => etag.map(|etag| Kept { etag, size: from }),
+            _ => None,
+        };
+        let key = &self.wanted.key;
+        let etag = if kept.is_none() && stamp.size <= PART {
+            let mut bytes = vec![0; usize::try_from(stamp.size).map_err(std::io::Error::other)?];
+            file.read_exact_at(&mut bytes, 0)?;
+            self.archive.put(key, bytes).await?
+        } else {
+            self.archive.upload(key, &file, kept, stamp.size).await?
+        };
+        Ok(Fate::Stored(stored(etag), true))
+    }
+}

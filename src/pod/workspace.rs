@@ -1,0 +1,311 @@
+//! The init container that prepares a Pod: the runner for all containers, the folders, what earlier Pods stored, and at last
+//! the fence that makes this Pod the one whose writes count.
+//!
+//! Called by `leaderboard-operator workspace`. Knows S3 and the volumes. Everything it does may be done again: the kubelet
+//! restarts it when it fails.
+
+pub mod restore;
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use leaderboard_results::Refusal;
+use serde::{Deserialize, Serialize};
+
+use super::gather::results_plan;
+use super::identity;
+use super::places::{Places, Setting};
+use super::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
+use super::run::{Run, STATUS_FOLDER};
+use super::tree::{Tree, TreeError};
+use crate::services::archive::{Archive, ArchiveError};
+
+/// Folders that no mount makes. The others are the kubelet's.
+const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "evalai", "logcopy"];
+/// Names the Pod whose volume this is, once it is prepared.
+const PREPARED: &str = "logcopy/.prepared";
+/// Tries while S3 does not answer, before the kubelet is left to start this again.
+const TRIES: u32 = 6;
+/// Most bytes of a verdict: eleven containers share 12 KiB.
+const VERDICT_BYTES: usize = 1000;
+
+/// Why the workspace could not be prepared, as the controller needs to know it.
+#[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WorkspaceReason {
+    /// The prefix holds another submission's results.
+    PrefixInUse,
+    /// The plan of the run contradicts itself.
+    PlanInvalid,
+    /// S3 can't be used.
+    StorageFailed,
+    /// A volume of the Pod can't be used.
+    VolumeFailed,
+}
+
+/// What the container says in its termination message.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+pub struct WorkspaceVerdict {
+    /// For the controller.
+    pub reason: WorkspaceReason,
+    /// For people, with the next step.
+    pub message: String,
+}
+
+impl WorkspaceVerdict {
+    /// Its JSON, cut to what a termination message may have.
+    pub fn to_json(&self) -> String {
+        let mut verdict = self.clone();
+        loop {
+            let json = serde_json::to_string(&verdict).unwrap_or_default();
+            if json.len() <= VERDICT_BYTES || verdict.message.is_empty() {
+                return json;
+            }
+            let keep = verdict.message.chars().count() * 3 / 4;
+            verdict.message = verdict.message.chars().take(keep).collect();
+        }
+    }
+
+    /// Reads a container's termination message; `None` if it is not one of these.
+    pub fn parse(message: &str) -> Option<Self> {
+        (message.len() <= VERDICT_BYTES).then(|| serde_json::from_str(message).ok())?
+    }
+}
+
+/// Why the workspace could not be prepared.
+#[derive(thiserror::Error, Debug)]
+pub enum WorkspaceError {
+    /// Somebody else's results are there.
+    #[error(
+        "s3://{0} already holds results of something else. Apply the submission with attempt: 2 to take them up, or \
+         empty the prefix."
+    )]
+    PrefixInUse(String),
+    /// The plan does not hold.
+    #[error("{0}. {next}", next = .0.next_step())]
+    Plan(#[from] Refusal),
+    /// S3.
+    #[error(transparent)]
+    Storage(#[from] ArchiveError),
+    /// A file below the volume's root.
+    #[error("{path} on the logs volume can't be used: {error}. Look at the node's disk and the Pod's volumes.")]
+    Volume {
+        /// Which.
+        path: String,
+        /// The system's own words.
+        error: TreeError,
+    },
+    /// The runner.
+    #[error("the runner can't be copied to {path}: {error}. Use the operator's own image for this container.")]
+    Runner {
+        /// Where to.
+        path: String,
+        /// The system's own words.
+        error: io::Error,
+    },
+}
+
+impl WorkspaceError {
+    /// For the termination message.
+    pub fn verdict(&self) -> WorkspaceVerdict {
+        let reason = match self {
+            Self::PrefixInUse(_) => WorkspaceReason::PrefixInUse,
+            Self::Plan(_) => WorkspaceReason::PlanInvalid,
+            Self::Storage(_) => WorkspaceReason::StorageFailed,
+            Self::Volume { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
+        };
+        WorkspaceVerdict {
+            reason,
+            message: self.to_string(),
+        }
+    }
+}
+
+/// Prepares the Pod. A failure is also written to the termination log.
+pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
+    let result = prepare_with_own_identity(&setting).await;
+    if let Err(error) = &result {
+        tracing::error!("{error}");
+        let verdict = error.verdict().to_json();
+        if let Err(error) = fs::write(&setting.places.termination_log, verdict) {
+            tracing::warn!("the termination log can't be written: {error}");
+        }
+    }
+    result
+}
+
+async fn prepare_with_own_identity(setting: &Setting) -> Result<(), WorkspaceError> {
+    let plan = &setting.run.plan;
+    results_plan(&setting.run)?;
+    let aws = identity::aws(setting).await;
+    prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await
+}
+
+/// Does the work, again and again while S3 does not answer.
+pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), WorkspaceError> {
+    results_plan(&setting.run)?;
+    copy_runner(&setting.places)?;
+    let tree = folders(&setting.places.logs)?;
+    if is_prepared(&tree, &setting.pod_uid) {
+        // The node was restarted under the Pod: the volume is newer than what is stored, and the fence may be another's.
+        tracing::info!("this Pod's volume is prepared already");
+        return Ok(());
+    }
+    let mut pause = Duration::from_secs(1);
+    for _ in 1..TRIES {
+        match take(setting, archive, &tree).await {
+            Err(WorkspaceError::Storage(error)) if error.cause.is_transient() => tracing::warn!("{error}"),
+            other => return other,
+        }
+        tokio::time::sleep(pause.min(setting.pace.backoff)).await;
+        pause *= 2;
+    }
+    take(setting, archive, &tree).await
+}
+
+/// Takes the prefix for this Pod.
+async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
+    let run = &setting.run;
+    match claim(run, archive).await? {
+        Claim::Fresh => {
+            // Says whose prefix it is before anything else is in it, so that a Pod that is lost early can be replaced.
+            let report = first_report(run, &setting.pod_uid)?;
+            let bytes = serde_json::to_vec(&report).unwrap_or_default();
+            archive.put(REPORT_KEY, bytes).await?;
+        }
+        Claim::TakeUp => {
+            let restored = restore::restore(run, archive, tree).await?;
+            tracing::info!(
+                files = restored.files,
+                bytes = restored.bytes,
+                "restored what was stored"
+            );
+        }
+    }
+    archive.put(OWNER_KEY, setting.pod_uid.clone().into_bytes()).await?;
+    let noted = tree.write(PREPARED, setting.pod_uid.as_bytes());
+    noted.map_err(|error| WorkspaceError::Volume {
+        path: PREPARED.to_owned(),
+        error,
+    })
+}
+
+fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
+    let noted = tree.read(PREPARED, 1024).ok().flatten();
+    noted.is_some_and(|(bytes, _)| bytes == pod_uid.as_bytes())
+}
+
+/// What becomes of what is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Claim {
+    /// There is nothing.
+    Fresh,
+    /// It is ours, or we are told to go on with it.
+    TakeUp,
+}
+
+async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
+    if run.plan.resume || run.attempt > 1 {
+        return Ok(Claim::TakeUp);
+    }
+    let stored = archive.get(REPORT_KEY, MAX_BYTES as u64).await?;
+    let stored = stored.and_then(|object| Report::parse(&object.bytes).ok());
+    if stored.is_some_and(|report| report.submission_uid == run.uid) {
+        return Ok(Claim::TakeUp);
+    }
+    // The controller may have taken the fence from a Pod that never came this far.
+    let there = archive.list("", 2).await?.objects;
+    if there.iter().all(|object| object.key == OWNER_KEY) {
+        return Ok(Claim::Fresh);
+    }
+    let plan = &run.plan;
+    let prefix = crate::api::effective::key_prefix(&plan.storage, &plan.run_id);
+    Err(WorkspaceError::PrefixInUse(format!("{}/{prefix}", plan.storage.bucket)))
+}
+
+/// The report of a run in which nothing has happened.
+fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
+    let plan = results_plan(run)?;
+    let pairs = (1..).zip(&plan.pairs).map(|(id, slice)| ReportPair {
+        id,
+        done: 0,
+        total: slice.routes().saturating_mul(plan.repetitions),
+        crashes: 0,
+        state: "Waiting".to_owned(),
+    });
+    Ok(Report {
+        schema: SCHEMA,
+        submission_uid: run.uid.clone(),
+        attempt: run.attempt,
+        pod_uid: pod_uid.to_owned(),
+        round: 0,
+        done: 0,
+        total: plan.routes.saturating_mul(plan.repetitions),
+        pairs: pairs.collect(),
+        score: None,
+        is_final: false,
+        eligible: false,
+        entry_status: "Started".to_owned(),
+        stopped: None,
+        why: None,
+        warnings: Vec::new(),
+        results: leaderboard_results::render(&plan, None)?.results_json,
+        files: std::collections::BTreeMap::new(),
+    })
+}
+
+/// Puts the runner where every container finds it, executable for every user.
+fn copy_runner(places: &Places) -> Result<(), WorkspaceError> {
+    let target = places.runner_for_all();
+    let copy = |target: &Path| {
+        let temporary = target.with_extension("tmp");
+        fs::copy(&places.runner, &temporary)?;
+        fs::set_permissions(&temporary, fs::Permissions::from_mode(0o755))?;
+        fs::rename(&temporary, target)
+    };
+    copy(&target).map_err(|error| WorkspaceError::Runner {
+        path: target.display().to_string(),
+        error,
+    })
+}
+
+fn folders(logs: &Path) -> Result<Arc<Tree>, WorkspaceError> {
+    let volume = |path: &str, error| WorkspaceError::Volume {
+        path: path.to_owned(),
+        error,
+    };
+    let tree = Tree::open(logs).map_err(|error| volume("/", error.into()))?;
+    for folder in FOLDERS {
+        tree.folder(folder).map_err(|error| volume(folder, error))?;
+    }
+    Ok(Arc::new(tree))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pod::fixtures;
+
+    #[test]
+    fn the_first_report_is_one_the_controller_takes() {
+        let run = fixtures::run();
+        let report = first_report(&run, "pod-1").unwrap();
+        let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
+        assert!(read.belongs_to("uid-1", 1) && !read.is_final);
+        assert_eq!((read.total, read.pairs.len(), read.pairs[1].total), (4, 2, 2));
+    }
+
+    #[test]
+    fn verdicts_are_short_and_read_back() {
+        let verdict = WorkspaceError::PrefixInUse("bucket/77/".to_owned()).verdict();
+        assert_eq!(verdict.reason, WorkspaceReason::PrefixInUse);
+        assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
+        let long = WorkspaceError::PrefixInUse("é\"".repeat(3000)).verdict();
+        assert!(long.to_json().len() <= VERDICT_BYTES);
+        assert!(WorkspaceVerdict::parse(&long.to_json()).is_some());
+        assert_eq!(WorkspaceVerdict::parse("Error"), None);
+    }
+}

@@ -1,0 +1,219 @@
+//! Brings back what earlier Pods of a run have stored, so that the agents go on where they were.
+//!
+//! Called by `workspace`. What is stored came from strangers' containers: keys are checked like paths, sizes against the
+//! run's limit. Status files speak of containers that are gone; they are dropped on both sides.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use futures::{StreamExt, TryStreamExt};
+
+use super::WorkspaceError;
+use crate::pod::report::{OWNER_KEY, REPORT_KEY};
+use crate::pod::run::{Run, STATUS_FOLDER};
+use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
+use crate::pod::upload::{Memory, Stored, fingerprint};
+use crate::services::archive::{Archive, Listed};
+
+/// Most objects of a run.
+const MAX_OBJECTS: usize = 100_000;
+/// Downloads at once.
+const AT_ONCE: usize = 4;
+
+/// What was brought back.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Restored {
+    /// Files.
+    pub files: usize,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Objects with impossible keys or beyond the limit.
+    pub left_out: usize,
+}
+
+/// Downloads what the run goes on with, and removes the stored status files.
+pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<Restored, WorkspaceError> {
+    let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
+    let keys: Vec<String> = statuses.objects.into_iter().map(|object| object.key).collect();
+    archive.delete(&keys).await?;
+
+    let listing = archive.list("", MAX_OBJECTS).await?;
+    if !listing.complete {
+        tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
+    }
+    let limit = u64::try_from(run.plan.storage.limit).unwrap_or(0);
+    let chosen = choose(listing.objects, run.plan.slices.len(), limit);
+    let stored: Vec<Option<(String, Stored)>> = futures::stream::iter(chosen.objects)
+        .map(|object| download(archive, tree, object))
+        .buffer_unordered(AT_ONCE)
+        .try_collect()
+        .await?;
+    let memory = Memory(stored.into_iter().flatten().collect());
+    let restored = Restored {
+        files: memory.0.len(),
+        bytes: memory.bytes(),
+        left_out: chosen.left_out,
+    };
+    memory.save(tree).map_err(|error| volume("logcopy", error))?;
+    if restored.left_out > 0 {
+        tracing::warn!(
+            objects = restored.left_out,
+            "not restored: impossible keys, or beyond storage.limit"
+        );
+    }
+    Ok(restored)
+}
+
+#[derive(Debug, PartialEq, Eq)]
+struct Chosen {
+    objects: Vec<Listed>,
+    left_out: usize,
+}
+
+/// What is restored: the smallest first, so that a huge log never keeps a checkpoint out.
+fn choose(mut objects: Vec<Listed>, pairs: usize, limit: u64) -> Chosen {
+    let ours = [OWNER_KEY, REPORT_KEY];
+    objects.retain(|object| {
+        !ours.contains(&object.key.as_str())
+            && !object.key.starts_with(&format!("{STATUS_FOLDER}/"))
+            && !object.key.starts_with("logcopy/.")
+            && !is_foreign_agent(&object.key, pairs)
+    });
+    let all = objects.len();
+    objects.retain(|object| object.key.contains('/') && is_plain(&object.key));
+    drop_shadowed(&mut objects);
+    objects.sort_by(|a, b| (a.size, &a.key).cmp(&(b.size, &b.key)));
+    let mut room = limit;
+    objects.retain(|object| {
+        let fits = object.size <= room;
+        room -= if fits { object.size } else { 0 };
+        fits
+    });
+    Chosen {
+        left_out: all - objects.len(),
+        objects,
+    }
+}
+
+/// S3 can hold `a` beside `a/b`; a volume can't.
+fn drop_shadowed(objects: &mut Vec<Listed>) {
+    let keys: BTreeSet<String> = objects.iter().map(|object| object.key.clone()).collect();
+    objects.retain(|object| {
+        let folder = format!("{}/", object.key);
+        !keys
+            .range(folder.clone()..)
+            .next()
+            .is_some_and(|next| next.starts_with(&folder))
+    });
+}
+
+/// `agent/agent<n>/…` of a pair this run does not have.
+fn is_foreign_agent(key: &str, pairs: usize) -> bool {
+    let number = key.strip_prefix("agent/agent").and_then(|rest| rest.split_once('/'));
+    number.is_some_and(|(number, _)| !(1..=pairs).any(|pair| pair.to_string() == number))
+}
+
+async fn download(archive: &Archive, tree: &Tree, object: Listed) -> Result<Option<(String, Stored)>, WorkspaceError> {
+    let file = tree.create(&object.key).map_err(|error| volume(&object.key, error))?;
+    let mut file = tokio::fs::File::from_std(file);
+    // A little more than the list said, for an object that was replaced since.
+    let limit = object.size.saturating_mul(2).max(1 << 20);
+    let Some(size) = archive.download(&object.key, &mut file, limit).await? else {
+        return Ok(None);
+    };
+    drop(file);
+    let local = |error: std::io::Error| volume(&object.key, error.into());
+    let Some((file, stamp)) = tree.file(&object.key).map_err(|error| volume(&object.key, error))? else {
+        return Ok(None);
+    };
+    // Known as stored only if it is what the list told the tag of.
+    let etag = object.etag.filter(|_| size == object.size);
+    let stored = Stored {
+        fingerprint: fingerprint(&file, stamp.size).map_err(local)?,
+        stamp: Stamp { size, ..stamp },
+        etag,
+        at: std::time::Duration::ZERO,
+    };
+    Ok(Some((object.key, stored)))
+}
+
+fn volume(path: &str, error: TreeError) -> WorkspaceError {
+    WorkspaceError::Volume {
+        path: path.to_owned(),
+        error,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn listed(key: &str, size: u64) -> Listed {
+        Listed {
+            key: key.to_owned(),
+            size,
+            etag: None,
+        }
+    }
+
+    fn keys(chosen: &Chosen) -> Vec<&str> {
+        chosen.objects.iter().map(|object| object.key.as_str()).collect()
+    }
+
+    #[test]
+    fn what_belongs_to_the_run_is_restored_and_nothing_else() {
+        let objects = vec![
+            listed("agent/agent1/agent_results.json", 10),
+            listed("agent/agent2/leaderboard.log", 20),
+            listed("agent/agent3/agent_results.json", 10),
+            listed("agent/agent10/agent_results.json", 10),
+            listed("agent/agent01/agent_results.json", 10),
+            listed("agent/agent_results.json", 30),
+            listed("containers-status/agent-1.done", 0),
+            listed("logcopy/report.json", 5),
+            listed("logcopy/owner", 5),
+            listed("logcopy/.stored.json", 5),
+            listed("logcopy/logcopy.log", 40),
+        ];
+        let chosen = choose(objects, 2, 1000);
+        let expected = [
+            "agent/agent1/agent_results.json",
+            "agent/agent2/leaderboard.log",
+            "agent/agent_results.json",
+            "logcopy/logcopy.log",
+        ];
+        assert_eq!((keys(&chosen), chosen.left_out), (expected.to_vec(), 0));
+    }
+
+    #[test]
+    fn keys_that_lead_elsewhere_are_left_out() {
+        let objects = [
+            "../x",
+            "/etc/x",
+            "simulator/../../x",
+            "simulator//x",
+            "plain",
+            "simulator/",
+            "simulator/x",
+        ];
+        let chosen = choose(objects.iter().map(|key| listed(key, 1)).collect(), 2, 1000);
+        assert_eq!((keys(&chosen), chosen.left_out), (vec!["simulator/x"], 6));
+    }
+
+    #[test]
+    fn a_key_that_is_also_a_folder_is_left_out() {
+        let objects = vec![
+            listed("simulator/a", 1),
+            listed("simulator/a/b", 1),
+            listed("simulator/a-b", 1),
+        ];
+        assert_eq!(keys(&choose(objects, 1, 10)), ["simulator/a-b", "simulator/a/b"]);
+    }
+
+    #[test]
+    fn the_limit_leaves_out_the_largest() {
+        let objects = vec![listed("a/large", 90), listed("a/x", 6), listed("a/y", 5)];
+        let chosen = choose(objects, 1, 100);
+        assert_eq!((keys(&chosen), chosen.left_out), (vec!["a/y", "a/x"], 1));
+    }
+}

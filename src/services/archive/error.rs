@@ -1,0 +1,123 @@
+//! What goes wrong with S3, in words for the person who runs the bucket.
+
+use std::error::Error as _;
+
+use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
+
+use super::parts::PartsError;
+
+type HttpResponse = aws_sdk_s3::config::http::HttpResponse;
+
+/// A request to S3 that did not do what it was for.
+#[derive(thiserror::Error, Debug)]
+#[error("{op} s3://{object}: {cause}. {}", .cause.next_step())]
+pub struct ArchiveError {
+    /// What was done.
+    pub op: &'static str,
+    /// Bucket and key.
+    pub object: String,
+    /// Why not.
+    pub cause: Cause,
+}
+
+/// Why a request to S3 failed.
+#[derive(thiserror::Error, Debug)]
+pub enum Cause {
+    /// The credentials do not allow it, or there are none.
+    #[error("S3 denies access ({0})")]
+    Denied(String),
+    /// No such bucket.
+    #[error("the bucket does not exist")]
+    NoBucket,
+    /// The object is not the one that was asked for, or is gone.
+    #[error("the object was changed by somebody else")]
+    Changed,
+    /// More than is read.
+    #[error("the object has more than the {0} bytes that are read")]
+    TooLarge(u64),
+    /// No answer, or one that says to try again.
+    #[error("S3 does not answer ({0})")]
+    Away(String),
+    /// Any other refusal.
+    #[error("S3 refuses the request ({0})")]
+    Refused(String),
+    /// The file on this side.
+    #[error("the local file can't be used ({0})")]
+    Local(#[from] std::io::Error),
+    /// S3 would not take the parts.
+    #[error(transparent)]
+    Parts(#[from] PartsError),
+}
+
+impl Cause {
+    /// What to do about it, as one sentence.
+    pub fn next_step(&self) -> &'static str {
+        match self {
+            Self::Denied(_) => {
+                "Give the identity s3:GetObject, s3:PutObject, s3:DeleteObject, s3:AbortMultipartUpload and \
+                 s3:ListBucket for the prefix."
+            }
+            Self::NoBucket => "Create the bucket, or correct storage.bucket and storage.region of the leaderboard.",
+            Self::Changed => "Let nobody else write below this prefix.",
+            Self::TooLarge(_) => "Look at the object: nothing of ours is that large.",
+            Self::Away(_) => "It is tried again; check storage.endpoint and the network rules if this stays.",
+            Self::Refused(_) => "Check storage.bucket, storage.region and storage.endpoint of the leaderboard.",
+            Self::Local(_) => "Check the volume of the Pod.",
+            Self::Parts(_) => "The file is stored whole instead.",
+        }
+    }
+
+    /// Whether the same request may succeed later.
+    pub fn is_transient(&self) -> bool {
+        matches!(self, Self::Away(_))
+    }
+
+    /// What the SDK's error means.
+    pub(super) fn of<E>(error: &SdkError<E, HttpResponse>) -> Self
+    where
+        E: ProvideErrorMetadata + std::error::Error + 'static,
+    {
+        let SdkError::ServiceError(service) = error else {
+            return Self::unanswered(error);
+        };
+        let status = service.raw().status().as_u16();
+        let code = service.err().code().unwrap_or_default();
+        let text = match (code, service.err().message()) {
+            ("", None) => format!("status {status}"),
+            (code, None) => format!("status {status}, {code}"),
+            (code, Some(message)) => format!("status {status}, {code}: {message}"),
+        };
+        match (status, code) {
+            (_, "NoSuchBucket") => Self::NoBucket,
+            (404 | 412, _) | (_, "PreconditionFailed" | "ConditionalRequestConflict") => Self::Changed,
+            (401 | 403, _) => Self::Denied(text),
+            (408 | 429 | 500..=599, _) | (_, "SlowDown" | "RequestTimeout" | "RequestTimeTooSkewed") => {
+                Self::Away(text)
+            }
+            _ => Self::Refused(text),
+        }
+    }
+
+    /// No answer of S3. Missing credentials look the same to the SDK, and are worth their own words.
+    fn unanswered<E>(error: &SdkError<E, HttpResponse>) -> Self
+    where
+        E: std::error::Error + 'static,
+    {
+        let mut text = error.to_string();
+        let mut source = error.source();
+        while let Some(inner) = source {
+            text = format!("{text}: {inner}");
+            source = inner.source();
+        }
+        if text.contains("credentials") {
+            Self::Denied(text)
+        } else {
+            Self::Away(text)
+        }
+    }
+}
+
+/// The status of an answer that the SDK takes for an error.
+pub(super) fn status<E>(error: &SdkError<E, HttpResponse>) -> Option<u16> {
+    error.raw_response().map(|response| response.status().as_u16())
+}

@@ -1,0 +1,146 @@
+//! How an object is cut into the parts of a multipart upload. Pure; called by the archive alone.
+//!
+//! S3 refuses parts under 5 MiB unless they are the last, but only when the upload is completed, and stand-ins do not
+//! refuse them at all. So the rule is enforced here.
+
+/// Smallest part that may be followed by another.
+pub const MIN_PART: u64 = 5 << 20;
+/// Most parts of one upload.
+const MAX_PARTS: u64 = 10_000;
+/// Bytes of an ordinary part, which is also what is held in memory of one file.
+pub const PART: u64 = 8 << 20;
+/// Bytes copied by one request. S3 takes 5 GiB, but answers only when it is done.
+const COPY: u64 = 1 << 30;
+
+/// One part.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Bytes the stored object has already.
+    Copy {
+        /// First byte.
+        from: u64,
+        /// How many.
+        len: u64,
+    },
+    /// Bytes of the file.
+    Send {
+        /// First byte.
+        from: u64,
+        /// How many.
+        len: u64,
+    },
+}
+
+impl Part {
+    fn len(self) -> u64 {
+        match self {
+            Self::Copy { len, .. } | Self::Send { len, .. } => len,
+        }
+    }
+}
+
+/// Parts that S3 would refuse.
+#[derive(thiserror::Error, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PartsError {
+    /// One of them is too small.
+    #[error("part {number} would have {len} bytes, and S3 takes parts under {MIN_PART} bytes only as the last")]
+    TooSmall {
+        /// Which, from 1.
+        number: usize,
+        /// Its bytes.
+        len: u64,
+    },
+    /// There are too many.
+    #[error("it would need {0} parts, and S3 takes {MAX_PARTS}")]
+    TooMany(usize),
+    /// More is kept than the file has.
+    #[error("the file is shorter than what is stored of it")]
+    Shrunk,
+}
+
+/// The parts of an object of `size` bytes whose first `kept` bytes are stored already.
+pub fn plan(kept: u64, size: u64) -> Result<Vec<Part>, PartsError> {
+    let new = size.checked_sub(kept).ok_or(PartsError::Shrunk)?;
+    let mut parts = Vec::new();
+    let pieces = kept.div_ceil(COPY);
+    for piece in 0..pieces {
+        let (from, end) = (kept / pieces * piece, kept / pieces * (piece + 1));
+        let end = if piece + 1 == pieces { kept } else { end };
+        parts.push(Part::Copy { from, len: end - from });
+    }
+    let room = MAX_PARTS.saturating_sub(pieces).max(1);
+    let step = PART.max(new.div_ceil(room).next_multiple_of(1 << 20));
+    let mut from = kept;
+    while from < size {
+        let len = step.min(size - from);
+        parts.push(Part::Send { from, len });
+        from += len;
+    }
+    check(&parts)?;
+    Ok(parts)
+}
+
+/// Refuses what S3 would refuse.
+fn check(parts: &[Part]) -> Result<(), PartsError> {
+    if parts.len() as u64 > MAX_PARTS {
+        return Err(PartsError::TooMany(parts.len()));
+    }
+    let followed = parts.len().saturating_sub(1);
+    match parts.iter().take(followed).position(|part| part.len() < MIN_PART) {
+        Some(index) => Err(PartsError::TooSmall {
+            number: index + 1,
+            len: parts[index].len(),
+        }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    #[test]
+    fn a_part_under_the_minimum_is_refused_unless_it_is_the_last() {
+        let small = PartsError::TooSmall {
+            number: 1,
+            len: MIN_PART - 1,
+        };
+        assert_eq!(plan(MIN_PART - 1, 20 * MIB), Err(small));
+        assert!(plan(MIN_PART, MIN_PART + 1).is_ok());
+        assert!(plan(0, 1).is_ok());
+    }
+
+    #[test]
+    fn the_parts_cover_the_object_once_and_in_order() {
+        let sizes = [
+            (0, 1),
+            (0, PART),
+            (0, PART + 1),
+            (MIN_PART, MIN_PART + 3),
+            (50 * MIB, 67 * MIB + 5),
+            (3 * COPY + 17, 3 * COPY + 17 + PART * 2),
+            (0, 200_000 * MIB),
+        ];
+        for (kept, size) in sizes {
+            let parts = plan(kept, size).unwrap();
+            let mut at = 0;
+            for part in &parts {
+                let (from, len, copied) = match *part {
+                    Part::Copy { from, len } => (from, len, true),
+                    Part::Send { from, len } => (from, len, false),
+                };
+                assert_eq!((from, copied), (at, at < kept), "{kept} of {size}");
+                at += len;
+            }
+            assert_eq!(at, size);
+            assert!(parts.len() as u64 <= MAX_PARTS);
+        }
+    }
+
+    #[test]
+    fn a_shrunk_file_is_not_appended_to() {
+        assert_eq!(plan(10, 9), Err(PartsError::Shrunk));
+    }
+}

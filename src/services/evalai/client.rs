@@ -1,0 +1,276 @@
+//! EvalAI over HTTP: one method a request, every answer classified.
+//!
+//! Called by `task` only. Knows no policy: it sends what it is told, once, and follows no redirect of the API (the server
+//! drops the body of a redirected write).
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use reqwest::header::{AUTHORIZATION, CONTENT_TYPE, RETRY_AFTER};
+use reqwest::{Method, RequestBuilder, Response};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::answer::{About, Answer, Refusal, Silence, classify};
+use super::request::{Reply, Request, Subject};
+use super::row::image;
+use super::types::Payload;
+use crate::services::token::Token;
+
+/// Largest answer that is read, a list of many thousand rows, in bytes.
+const LARGEST: usize = 64 << 20;
+/// Largest uploaded file that is read, in bytes.
+const LARGEST_UPLOAD: usize = 64 << 10;
+
+/// How long an answer is waited for.
+#[derive(Clone, Copy, Debug)]
+pub struct Timeouts {
+    pub connect: Duration,
+    pub read: Duration,
+    /// Longer than the server itself may work on a request.
+    pub write: Duration,
+}
+
+impl Default for Timeouts {
+    fn default() -> Self {
+        Self {
+            connect: Duration::from_secs(5),
+            read: Duration::from_secs(30),
+            write: Duration::from_secs(65),
+        }
+    }
+}
+
+/// Why there is no client.
+#[derive(thiserror::Error, Debug)]
+#[error("no HTTP client could be made: {0}; check the machine's trusted certificates")]
+pub struct ClientError(String);
+
+/// A server of EvalAI.
+#[derive(Clone, Debug)]
+pub struct Client {
+    api: reqwest::Client,
+    files: reqwest::Client,
+    base: String,
+    timeouts: Timeouts,
+}
+
+/// The body of a PUT, as the server wants it: `result` and `metadata` are texts that hold JSON.
+#[derive(Serialize)]
+struct Put<'a> {
+    submission: i64,
+    submission_status: &'a str,
+    challenge_phase: i64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    result: Option<&'a str>,
+    stdout: &'a str,
+    stderr: &'a str,
+    metadata: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    environment_log: Option<&'a str>,
+}
+
+#[derive(Serialize)]
+struct Patch<'a> {
+    submission: i64,
+    submission_status: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    job_name: Option<&'a str>,
+}
+
+impl Client {
+    /// A client of one server, named by its root.
+    pub fn new(api_server: &str, timeouts: Timeouts) -> Result<Self, ClientError> {
+        // A program that has installed one already keeps it.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let builder = || {
+            reqwest::Client::builder()
+                .connect_timeout(timeouts.connect)
+                .user_agent(concat!("leaderboard-operator/", env!("CARGO_PKG_VERSION")))
+                .retry(reqwest::retry::never())
+        };
+        let made = |builder: reqwest::ClientBuilder| builder.build().map_err(|e| ClientError(chain(&e)));
+        Ok(Self {
+            api: made(builder().redirect(reqwest::redirect::Policy::none()))?,
+            files: made(builder().redirect(reqwest::redirect::Policy::limited(5)))?,
+            base: format!("{}/api/", api_server.trim_end_matches('/')),
+            timeouts,
+        })
+    }
+
+    /// Sends a request and reads its answer.
+    pub async fn send(&self, token: &Token, request: &Request) -> Reply {
+        match request {
+            Request::Get(s) => Reply::Row(self.get(token, &format!("jobs/submission/{}", s.pk)).await),
+            Request::Image(_, url) => Reply::Image(self.upload(url).await),
+            Request::Progress(s, progress, job) => {
+                let body = Patch {
+                    submission: s.pk,
+                    submission_status: progress.as_str(),
+                    job_name: job.as_deref(),
+                };
+                Reply::Written(self.write(token, Method::PATCH, &update(s), &body).await)
+            }
+            Request::Partial(s, payload) => {
+                let path = format!("jobs/challenges/{}/update_partially_evaluated_submission/", s.challenge);
+                let body = put(s, "partially_evaluated", true, payload);
+                let body = Put {
+                    environment_log: None,
+                    ..body
+                };
+                Reply::Written(self.write(token, Method::PUT, &path, &body).await)
+            }
+            Request::Final(s, outcome, payload) => {
+                let body = put(s, outcome.as_str(), *outcome == super::Outcome::Finished, payload);
+                Reply::Written(self.write(token, Method::PUT, &update(s), &body).await)
+            }
+            Request::List {
+                challenge,
+                purpose,
+                after,
+            } => Reply::Rows(self.get(token, &list(*challenge, purpose.status(), *after)).await),
+            Request::Phases(challenge) => {
+                Reply::Phases(self.get(token, &format!("challenges/{challenge}/phases/")).await)
+            }
+            Request::Splits(challenge) => {
+                let path = format!("challenges/{challenge}/challenge_phase_split");
+                Reply::Splits(self.get(token, &path).await)
+            }
+            Request::DatasetSplit(_, id) => {
+                let path = format!("challenges/challenge/create/dataset_split/{id}/");
+                Reply::DatasetSplit(self.get(token, &path).await)
+            }
+        }
+    }
+
+    async fn get<T: DeserializeOwned>(&self, token: &Token, path: &str) -> Answer<T> {
+        let request = self.api.get(format!("{}{path}", self.base)).timeout(self.timeouts.read);
+        let answer = answer(request.header(AUTHORIZATION, token.header()), LARGEST, Need::Body).await;
+        answer.and_then(|(status, body)| match serde_json::from_slice(&body) {
+            Ok(content) => Answer::Done(content),
+            Err(_) => Answer::unusable(status, "something that is not EvalAI's"),
+        })
+    }
+
+    async fn write<B: Serialize>(&self, token: &Token, method: Method, path: &str, body: &B) -> Answer<()> {
+        let body = match serde_json::to_vec(body) {
+            Ok(body) => body,
+            Err(error) => return Answer::unusable(0, &format!("nothing: the request could not be written ({error})")),
+        };
+        let request = self
+            .api
+            .request(method, format!("{}{path}", self.base))
+            .timeout(self.timeouts.write)
+            .header(AUTHORIZATION, token.header())
+            .header(CONTENT_TYPE, "application/json")
+            .body(body);
+        answer(request, LARGEST, Need::Status)
+            .await
+            .and_then(|_| Answer::Done(()))
+    }
+
+    /// Downloads the participant's uploaded file, without the token: it may lie with a storage provider.
+    async fn upload(&self, url: &str) -> Answer<String> {
+        if !url.starts_with("https://") && !url.starts_with("http://") {
+            return no_image("its address is neither http nor https");
+        }
+        let request = self.files.get(url).timeout(self.timeouts.read);
+        let answer = answer(request, LARGEST_UPLOAD, Need::Body).await;
+        answer.and_then(|(_, body)| image(&body).map_or_else(|why| no_image(&why), Answer::Done))
+    }
+}
+
+/// What of an answer is worth something.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Need {
+    /// A read is nothing without its body.
+    Body,
+    /// The status line says that a write was done, whatever becomes of the rest.
+    Status,
+}
+
+async fn answer(request: RequestBuilder, largest: usize, need: Need) -> Answer<(u16, Vec<u8>)> {
+    let response = match request.send().await {
+        Ok(response) => response,
+        Err(error) => return Answer::Unanswered(silence(error)),
+    };
+    let status = response.status();
+    let code = status.as_u16();
+    let retry_after = response
+        .headers()
+        .get(RETRY_AFTER)
+        .and_then(|value| value.to_str().ok())
+        .map(str::to_owned);
+    let body = match body(response, largest).await {
+        Ok(body) => body,
+        Err(_) if need == Need::Status && status.is_success() => Vec::new(),
+        Err(Unread::TooLarge) => return Answer::unusable(code, "more than is read of an answer"),
+        Err(Unread::Broken(error)) => return Answer::Unanswered(silence(error)),
+    };
+    classify(code, retry_after.as_deref(), &body).and_then(|()| Answer::Done((code, body)))
+}
+
+enum Unread {
+    TooLarge,
+    Broken(reqwest::Error),
+}
+
+async fn body(mut response: Response, largest: usize) -> Result<Vec<u8>, Unread> {
+    let mut body = Vec::new();
+    while let Some(chunk) = response.chunk().await.map_err(Unread::Broken)? {
+        if body.len() + chunk.len() > largest {
+            return Err(Unread::TooLarge);
+        }
+        body.extend_from_slice(&chunk);
+    }
+    Ok(body)
+}
+
+fn no_image(why: &str) -> Answer<String> {
+    Answer::Refused(Refusal {
+        about: About::Request,
+        status: 200,
+        message: format!("the uploaded file names no image ({why}); set spec.image, or have it submitted again"),
+    })
+}
+
+fn silence(error: reqwest::Error) -> Silence {
+    let error = error.without_url();
+    let what = match () {
+        () if error.is_timeout() => "EvalAI did not answer in time",
+        () if error.is_connect() => "EvalAI could not be reached",
+        () => "EvalAI's answer broke off",
+    };
+    Silence {
+        sent: !error.is_connect() && !error.is_builder(),
+        why: format!("{what} ({})", chain(&error)),
+    }
+}
+
+/// An error with its causes, which reqwest leaves to the reader.
+fn chain(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(Some(error), |error| error.source());
+    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
+}
+
+fn update(subject: &Subject) -> String {
+    format!("jobs/challenge/{}/update_submission/", subject.challenge)
+}
+
+fn list(challenge: i64, status: &str, after: Timestamp) -> String {
+    let after = after.strftime("%Y-%m-%dT%H:%M:%SZ");
+    format!("jobs/challenge/{challenge}/submission/?status={status}&submitted_after={after}")
+}
+
+fn put<'a>(subject: &Subject, status: &'a str, results: bool, payload: &'a Payload) -> Put<'a> {
+    Put {
+        submission: subject.pk,
+        submission_status: status,
+        challenge_phase: payload.phase,
+        result: results.then_some(payload.result.as_str()),
+        stdout: &payload.stdout,
+        stderr: &payload.stderr,
+        metadata: &payload.metadata,
+        environment_log: Some(&payload.environment_log),
+    }
+}

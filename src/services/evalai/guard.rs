@@ -1,0 +1,255 @@
+//! What may be started, written or ended, given what EvalAI says: the server itself enforces nothing.
+//!
+//! Called by `queue` with each read. Pure: words in, words out.
+//!
+//! `begun` says that the end of an earlier attempt no longer stands: this attempt's Job is in the row's `job_name`, or the
+//! read was requested after EvalAI had answered this attempt's `queued`, or after another read had shown the submission as
+//! live. Only then does `cancelled` or `failed` speak of this attempt.
+
+use super::status::{Outcome, Progress, Status};
+
+/// Whether an attempt may run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// It may.
+    Run,
+    /// EvalAI has ended it: nothing runs, nothing is written.
+    Drop(Status),
+    /// EvalAI's word is not known: neither start nor end on it.
+    Unclear,
+}
+
+/// What becomes of a wish to write `queued`, `running` or partial results.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Write.
+    Send,
+    /// EvalAI says so already: a repeated PATCH would reset the execution time.
+    There,
+    /// Not now.
+    Wait,
+    /// EvalAI has ended the run.
+    Ended(Status),
+}
+
+/// What becomes of a wish to write the end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum End {
+    /// Write.
+    Put,
+    /// EvalAI says so already.
+    Done(Status),
+    /// EvalAI has ended it otherwise: the outcome becomes Cancelled, nothing is written.
+    Amend(Status),
+    /// EvalAI's word is not known: read again later.
+    Wait,
+}
+
+/// Whether this attempt may run.
+pub fn start(status: Status, attempt: i64, begun: bool) -> Start {
+    match standing(status, attempt, begun) {
+        Status::Submitted
+        | Status::Submitting
+        | Status::Resuming
+        | Status::Queued
+        | Status::Running
+        | Status::PartiallyEvaluated => Start::Run,
+        Status::Finished
+        | Status::Failed
+        | Status::Cancelled
+        | Status::Archived
+        | Status::Ignored
+        | Status::Missing => Start::Drop(status),
+        Status::Unknown => Start::Unclear,
+    }
+}
+
+/// Whether `queued` or `running` is written. `told` says that EvalAI has been told of this attempt: before, a later attempt
+/// writes even over `running`, which is an earlier one's word.
+pub fn progress(status: Status, attempt: i64, begun: bool, told: bool, wanted: Progress) -> Verdict {
+    match start(status, attempt, begun) {
+        Start::Drop(status) => Verdict::Ended(status),
+        Start::Unclear => Verdict::Wait,
+        Start::Run if (attempt == 1 || told) && reached(status, wanted) => Verdict::There,
+        Start::Run => Verdict::Send,
+    }
+}
+
+/// Whether partial results are written. An earlier attempt's end is first overwritten by `queued` or `running`.
+pub fn partial(status: Status, attempt: i64, begun: bool) -> Verdict {
+    match start(status, attempt, begun) {
+        Start::Drop(status) => Verdict::Ended(status),
+        Start::Unclear => Verdict::Wait,
+        Start::Run if standing(status, attempt, begun) != status => Verdict::Wait,
+        Start::Run => Verdict::Send,
+    }
+}
+
+/// Whether the end is written.
+pub fn end(status: Status, attempt: i64, begun: bool, wanted: Outcome) -> End {
+    match (standing(status, attempt, begun), wanted) {
+        (Status::Unknown, _) => End::Wait,
+        (Status::Failed, Outcome::Failed | Outcome::Cancelled)
+        | (Status::Cancelled | Status::Archived | Status::Ignored | Status::Missing, Outcome::Cancelled) => {
+            End::Done(status)
+        }
+        (Status::Cancelled | Status::Archived | Status::Ignored | Status::Missing, _) => End::Amend(status),
+        _ => End::Put,
+    }
+}
+
+/// The status as it speaks of this attempt: the end of an earlier attempt is a beginning.
+fn standing(status: Status, attempt: i64, begun: bool) -> Status {
+    match status {
+        Status::Failed | Status::Cancelled if attempt > 1 && !begun => Status::Resuming,
+        other => other,
+    }
+}
+
+fn reached(status: Status, wanted: Progress) -> bool {
+    match wanted {
+        Progress::Queued => matches!(status, Status::Queued | Status::Running | Status::PartiallyEvaluated),
+        Progress::Running => matches!(status, Status::Running | Status::PartiallyEvaluated),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Status as S;
+    use super::*;
+
+    const LIVE: [S; 6] = [
+        S::Submitted,
+        S::Submitting,
+        S::Resuming,
+        S::Queued,
+        S::Running,
+        S::PartiallyEvaluated,
+    ];
+    const GONE: [S; 3] = [S::Archived, S::Ignored, S::Missing];
+
+    #[test]
+    fn what_starts_and_what_drops() {
+        for begun in [false, true] {
+            for attempt in [1, 2, 7] {
+                for status in LIVE {
+                    assert_eq!(start(status, attempt, begun), Start::Run, "{status} {attempt} {begun}");
+                }
+                for status in GONE.into_iter().chain([S::Finished]) {
+                    assert_eq!(
+                        start(status, attempt, begun),
+                        Start::Drop(status),
+                        "{status} {attempt} {begun}"
+                    );
+                }
+                assert_eq!(start(S::Unknown, attempt, begun), Start::Unclear);
+            }
+        }
+        for status in [S::Failed, S::Cancelled] {
+            assert_eq!(start(status, 1, false), Start::Drop(status), "attempt 1");
+            assert_eq!(start(status, 1, true), Start::Drop(status), "attempt 1");
+            assert_eq!(
+                start(status, 2, false),
+                Start::Run,
+                "the end of attempt 1 does not end attempt 2"
+            );
+            assert_eq!(
+                start(status, 2, true),
+                Start::Drop(status),
+                "attempt 2 itself was ended"
+            );
+        }
+    }
+
+    #[test]
+    fn the_table_of_finals() {
+        use Outcome::{Cancelled, Failed, Finished};
+        for status in LIVE.into_iter().chain([S::Finished]) {
+            for wanted in [Finished, Failed, Cancelled] {
+                for (attempt, begun) in [(1, false), (1, true), (2, false), (2, true)] {
+                    assert_eq!(end(status, attempt, begun, wanted), End::Put, "{status} {wanted:?}");
+                }
+            }
+        }
+        assert_eq!(end(S::Failed, 1, true, Finished), End::Put);
+        assert_eq!(end(S::Failed, 1, true, Failed), End::Done(S::Failed));
+        assert_eq!(end(S::Failed, 1, true, Cancelled), End::Done(S::Failed));
+        for status in GONE.into_iter().chain([S::Cancelled]) {
+            assert_eq!(end(status, 1, true, Finished), End::Amend(status));
+            assert_eq!(end(status, 1, true, Failed), End::Amend(status));
+            assert_eq!(end(status, 1, true, Cancelled), End::Done(status));
+            assert_eq!(end(status, 2, true, Finished), End::Amend(status));
+        }
+        assert_eq!(end(S::Unknown, 1, true, Finished), End::Wait);
+    }
+
+    #[test]
+    fn a_short_later_attempt_is_published_over_the_end_of_the_earlier_one() {
+        for wanted in [Outcome::Finished, Outcome::Failed, Outcome::Cancelled] {
+            assert_eq!(end(S::Cancelled, 2, false, wanted), End::Put);
+            assert_eq!(end(S::Failed, 2, false, wanted), End::Put);
+        }
+        assert_eq!(end(S::Archived, 2, false, Outcome::Finished), End::Amend(S::Archived));
+    }
+
+    #[test]
+    fn progress_is_written_once() {
+        use Progress::{Queued, Running};
+        for (status, wanted, first, later) in [
+            (S::Submitted, Queued, Verdict::Send, Verdict::Send),
+            (S::Resuming, Running, Verdict::Send, Verdict::Send),
+            (S::Queued, Queued, Verdict::There, Verdict::Send),
+            (S::Queued, Running, Verdict::Send, Verdict::Send),
+            (S::Running, Queued, Verdict::There, Verdict::Send),
+            (S::Running, Running, Verdict::There, Verdict::Send),
+            (S::PartiallyEvaluated, Running, Verdict::There, Verdict::Send),
+            (S::Cancelled, Queued, Verdict::Ended(S::Cancelled), Verdict::Send),
+            (S::Failed, Running, Verdict::Ended(S::Failed), Verdict::Send),
+            (
+                S::Finished,
+                Running,
+                Verdict::Ended(S::Finished),
+                Verdict::Ended(S::Finished),
+            ),
+            (S::Unknown, Queued, Verdict::Wait, Verdict::Wait),
+        ] {
+            assert_eq!(
+                progress(status, 1, false, false, wanted),
+                first,
+                "{status} {wanted:?}, attempt 1"
+            );
+            assert_eq!(
+                progress(status, 2, false, false, wanted),
+                later,
+                "{status} {wanted:?}, attempt 2 before it has begun"
+            );
+            assert_eq!(
+                progress(status, 2, true, true, wanted),
+                first,
+                "{status} {wanted:?}, attempt 2 after it has begun"
+            );
+        }
+    }
+
+    #[test]
+    fn a_later_attempt_is_told_once_even_where_the_earlier_one_left_its_words() {
+        assert_eq!(progress(S::Running, 2, true, false, Progress::Queued), Verdict::Send);
+        assert_eq!(
+            progress(S::Cancelled, 2, true, false, Progress::Queued),
+            Verdict::Ended(S::Cancelled)
+        );
+    }
+
+    #[test]
+    fn partials_follow_only_a_run_that_evalai_knows() {
+        for status in LIVE {
+            assert_eq!(partial(status, 1, false), Verdict::Send);
+        }
+        for status in GONE.into_iter().chain([S::Cancelled, S::Failed, S::Finished]) {
+            assert_eq!(partial(status, 1, true), Verdict::Ended(status));
+        }
+        assert_eq!(partial(S::Cancelled, 2, false), Verdict::Wait);
+        assert_eq!(partial(S::Cancelled, 2, true), Verdict::Ended(S::Cancelled));
+        assert_eq!(partial(S::Unknown, 1, true), Verdict::Wait);
+    }
+}

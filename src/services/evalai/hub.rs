@@ -1,0 +1,280 @@
+//! The controller's door to EvalAI: wishes in, what is known out, nothing waits.
+//!
+//! Called by the controller's passes. Sorts what it is told to the queue of the right server and token, and starts a task
+//! for each. Knows no policy.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use jiff::Timestamp;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
+use super::client::{Client, ClientError, Timeouts};
+use super::labels::Labels;
+use super::queue::{Queue, Timing};
+use super::task::{Outlets, Shared, now, run};
+use super::types::{Changed, Key, Run, SweepRow, Target, View, Wish};
+
+/// Says, right before each write, whether this process still leads.
+pub trait Fence: Send + Sync + 'static {
+    /// True while the lease was renewed less than 10 s ago, by a clock that counts pauses of the machine.
+    fn may_write(&self) -> bool;
+}
+
+impl<F: Fn() -> bool + Send + Sync + 'static> Fence for F {
+    fn may_write(&self) -> bool {
+        self()
+    }
+}
+
+/// What a hub needs.
+pub struct Options {
+    pub fence: Arc<dyn Fence>,
+    /// No write before: after a takeover, what the process before has sent may still be worked on.
+    pub not_before: Instant,
+    /// Told what has changed.
+    pub changed: mpsc::UnboundedSender<Changed>,
+    /// Told of submissions whose message was lost.
+    pub sweep: mpsc::UnboundedSender<SweepRow>,
+    pub timing: Timing,
+    pub timeouts: Timeouts,
+}
+
+/// See the module's text. Clones are the same hub.
+#[derive(Clone)]
+pub struct Hub(Arc<Inner>);
+
+struct Inner {
+    options: Options,
+    /// All queues count time from here, so that a moment means the same in each.
+    start: Instant,
+    outlets: Outlets,
+    closing: watch::Sender<bool>,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    tokens: BTreeMap<Account, Entry>,
+    /// Which queue an object is in.
+    places: BTreeMap<Key, Account>,
+}
+
+/// A server and whose requests are counted there.
+type Account = (String, String);
+
+struct Entry {
+    shared: Arc<Shared>,
+    /// None once its end is waited for.
+    task: Option<JoinHandle<bool>>,
+}
+
+impl Hub {
+    /// A hub without any task yet.
+    pub fn new(options: Options) -> Self {
+        let outlets = Outlets {
+            changed: options.changed.clone(),
+            sweep: options.sweep.clone(),
+        };
+        Self(Arc::new(Inner {
+            options,
+            start: Instant::now(),
+            outlets,
+            closing: watch::Sender::new(false),
+            state: Mutex::default(),
+        }))
+    }
+
+    /// A Leaderboard serves its challenge: it is swept, checked, and its token is renewed by calling this again.
+    pub fn serve(&self, leaderboard: &Key, target: &Target) -> Result<(), ClientError> {
+        self.with(leaderboard, None, target, |queue, now| {
+            queue.serve(leaderboard, target, now)
+        })
+    }
+
+    /// A Leaderboard is gone.
+    pub fn retire(&self, leaderboard: &Key) {
+        if let Some(shared) = self.place(leaderboard) {
+            shared.queue().retire(leaderboard, shared.now());
+        }
+        self.state().places.remove(leaderboard);
+    }
+
+    /// Wants to know whether an attempt may run; with `image`, also which image it is. The answer is in the view:
+    /// `answered` reaches the attempt, `ended` says whether it may run.
+    pub fn ask(&self, target: &Target, key: &Key, pk: i64, run: &Run, image: bool) -> Result<(), ClientError> {
+        self.with(key, Some(pk), target, |queue, now| {
+            queue.ask(target, key, pk, run, image, now)
+        })
+    }
+
+    /// From now on, until its end or [`Hub::forget`], a cancellation of this attempt is looked for each period.
+    /// `submitted_at` is EvalAI's own time of the submission.
+    pub fn live(
+        &self,
+        target: &Target,
+        key: &Key,
+        pk: i64,
+        run: &Run,
+        submitted_at: Timestamp,
+    ) -> Result<(), ClientError> {
+        self.with(key, Some(pk), target, |queue, _| {
+            queue.live(target, key, pk, run, submitted_at)
+        })
+    }
+
+    /// Wants EvalAI to say something. May be called in each pass: what is already said or wished changes nothing.
+    pub fn wish(&self, target: &Target, key: &Key, pk: i64, run: &Run, wish: Wish) -> Result<(), ClientError> {
+        self.with(key, Some(pk), target, |queue, now| {
+            queue.wish(target, key, pk, run, wish, now)
+        })
+    }
+
+    /// The object is gone, or nothing more is to be said of it. What is on its way is still waited for.
+    pub fn forget(&self, key: &Key) {
+        if let Some(shared) = self.place(key) {
+            shared.queue().forget(key, shared.now());
+        }
+        self.state().places.remove(key);
+    }
+
+    /// What is known of a submission.
+    pub fn view(&self, key: &Key) -> Option<View> {
+        self.place(key)?.queue().view(key)
+    }
+
+    /// How a Leaderboard fits its challenge, checked at its start and hourly, and why there is no newer check.
+    pub fn labels(&self, leaderboard: &Key) -> (Option<Labels>, Option<String>) {
+        self.place(leaderboard)
+            .map_or((None, None), |shared| shared.queue().labels(leaderboard))
+    }
+
+    /// Requests that a Leaderboard's token has made in the last minute, and its limit.
+    pub fn budget_used(&self, leaderboard: &Key) -> Option<(u32, u32)> {
+        let shared = self.place(leaderboard)?;
+        let used = shared.queue().budget_used(shared.now());
+        Some(used)
+    }
+
+    /// What EvalAI says of a Leaderboard's token, while it refuses it.
+    pub fn token_refused(&self, leaderboard: &Key) -> Option<String> {
+        self.place(leaderboard)?.queue().token_refused().map(str::to_owned)
+    }
+
+    /// Takes nothing new and waits for what is on its way, at most 70 s. True if every write is answered, so that the next
+    /// leader may write at once.
+    pub async fn drain(&self) -> bool {
+        self.0.closing.send_replace(true);
+        let tasks: Vec<_> = self
+            .state()
+            .tokens
+            .values_mut()
+            .filter_map(|entry| entry.task.take())
+            .collect();
+        let mut drained = true;
+        for task in tasks {
+            drained &= task.await.unwrap_or(false);
+        }
+        drained
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn place(&self, key: &Key) -> Option<Arc<Shared>> {
+        let state = self.state();
+        let account = state.places.get(key)?;
+        state.tokens.get(account).map(|entry| entry.shared.clone())
+    }
+
+    /// Does something with the queue that an object belongs to, and wakes its task.
+    fn with(
+        &self,
+        key: &Key,
+        pk: Option<i64>,
+        target: &Target,
+        act: impl FnOnce(&mut Queue, super::queue::Now) -> bool,
+    ) -> Result<(), ClientError> {
+        if *self.0.closing.borrow() {
+            return Ok(());
+        }
+        let shared = self.shared(key, pk, target)?;
+        let renewed = shared.renew(&target.token);
+        if renewed {
+            shared.queue().renew_token();
+        }
+        let news = act(&mut shared.queue(), shared.now());
+        if news || renewed {
+            shared.publish(&self.0.outlets);
+            shared.notify.notify_one();
+        }
+        Ok(())
+    }
+
+    fn shared(&self, key: &Key, pk: Option<i64>, target: &Target) -> Result<Arc<Shared>, ClientError> {
+        let account = (
+            target.api_server.trim_end_matches('/').to_owned(),
+            target.token.identity(),
+        );
+        let mut state = self.state();
+        let shared = if let Some(entry) = state.tokens.get(&account) {
+            entry.shared.clone()
+        } else {
+            let entry = self.start(target)?;
+            let shared = entry.shared.clone();
+            state.tokens.insert(account.clone(), entry);
+            shared
+        };
+        let before = state
+            .places
+            .insert(key.clone(), account.clone())
+            .filter(|before| *before != account);
+        let old = before.and_then(|before| state.tokens.get(&before).map(|entry| entry.shared.clone()));
+        drop(state);
+        if let Some(old) = old {
+            self.move_over(key, pk, &old, &shared);
+        }
+        Ok(shared)
+    }
+
+    /// An object whose token now is another user's: what the old queue has on its way is waited out.
+    fn move_over(&self, key: &Key, pk: Option<i64>, old: &Shared, new: &Shared) {
+        let now = now(self.0.start);
+        let mut queue = old.queue();
+        queue.retire(key, now);
+        queue.forget(key, now);
+        let unsettled = pk.filter(|pk| queue.is_unsettled(*pk));
+        drop(queue);
+        if let Some(pk) = unsettled {
+            new.queue()
+                .hold(pk, now.at + self.0.options.timing.hold + self.0.options.timeouts.write);
+        }
+    }
+
+    fn start(&self, target: &Target) -> Result<Entry, ClientError> {
+        let inner = &self.0;
+        let client = Client::new(&target.api_server, inner.options.timeouts)?;
+        let not_before = inner.options.not_before.saturating_duration_since(inner.start);
+        let queue = Queue::new(
+            inner.options.timing,
+            target.requests_per_minute,
+            not_before,
+            now(inner.start),
+        );
+        let shared = Arc::new(Shared::new(queue, target.token.clone(), inner.start));
+        let task = tokio::spawn(run(
+            shared.clone(),
+            client,
+            inner.options.fence.clone(),
+            inner.outlets.clone(),
+            inner.closing.subscribe(),
+        ));
+        Ok(Entry {
+            shared,
+            task: Some(task),
+        })
+    }
+}

@@ -1,0 +1,242 @@
+//! What an answer about one submission changes.
+//!
+//! Owned by `queue`; what concerns a whole challenge is in `lists`. Pure.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::SignedDuration;
+
+use super::poll::pause;
+use super::sub::Sub;
+use super::{Busy, Now, Queue, Ticket};
+use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
+use crate::services::evalai::payload::digest;
+use crate::services::evalai::request::{Reply, Request, Subject};
+use crate::services::evalai::row::Row;
+use crate::services::evalai::status::Status;
+use crate::services::evalai::types::{Changed, Ended};
+
+/// After a refused token nothing is asked for so long, unless it is renewed.
+const TOKEN_PAUSE: Duration = Duration::from_mins(1);
+
+impl Queue {
+    /// Takes an answer in.
+    pub fn answered(&mut self, ticket: &Ticket, reply: Reply, now: Now) {
+        if ticket.request.counts() {
+            self.note(&reply.answer(), &now);
+        }
+        match (&ticket.request, reply) {
+            (Request::Get(subject), Reply::Row(answer)) => self.took_row(subject, ticket.requested, answer, &now),
+            (Request::Image(subject, _), Reply::Image(answer)) => self.took_image(subject, answer, &now),
+            (request, Reply::Written(answer)) => self.wrote(request, answer, &now),
+            (request, reply) => self.took_of_challenge(request, ticket.requested, reply, &now),
+        }
+    }
+
+    /// A request was not sent after all; it is chosen again.
+    pub fn not_sent(&mut self, ticket: &Ticket) {
+        if let Some(lane) = ticket
+            .request
+            .subject()
+            .and_then(|subject| self.lanes.get_mut(&subject.pk))
+        {
+            lane.busy = None;
+        }
+    }
+
+    /// What every answer says of the token.
+    fn note(&mut self, answer: &Answer<()>, now: &Now) {
+        match answer {
+            Answer::Throttled(wait) => self.budget.close_until(now.at + *wait),
+            Answer::Refused(refusal) if refusal.about == About::Token => {
+                let news = self.token_refused.is_none();
+                self.token_refused = Some((refusal.message.clone(), now.at + TOKEN_PAUSE));
+                if news {
+                    self.changes
+                        .extend(self.served.keys().cloned().map(Changed::Leaderboard));
+                }
+            }
+            Answer::Done(()) if self.token_refused.take().is_some() => {
+                self.changes
+                    .extend(self.served.keys().cloned().map(Changed::Leaderboard));
+            }
+            _ => {}
+        }
+    }
+
+    fn took_row(&mut self, subject: &Subject, requested: Duration, answer: Answer<Row>, now: &Now) {
+        let lane = self.lanes.entry(subject.pk).or_default();
+        lane.busy = None;
+        let row = match answer {
+            Answer::Done(row) if row.id == subject.pk => row,
+            Answer::Refused(Refusal {
+                about: About::Missing, ..
+            }) => Row::missing(subject.pk),
+            Answer::Done(_) => return self.went_wrong(subject, "EvalAI answered with another submission".into(), now),
+            other => return self.read_failed(subject, &other, now),
+        };
+        if lane.unsure && requested >= lane.hold_until {
+            lane.unsure = false;
+        }
+        let sure = !lane.unsure;
+        self.spread(&Arc::new(row), requested, now, |sub| {
+            if sure {
+                sub.view.unanswered_until = None;
+            }
+            sub.read_done();
+        });
+    }
+
+    /// Gives a row to every object of that submission.
+    pub(super) fn spread(&mut self, row: &Arc<Row>, requested: Duration, now: &Now, mut also: impl FnMut(&mut Sub)) {
+        let lane = self.lanes.get(&row.id);
+        let calm = lane.is_none_or(|lane| lane.busy != Some(Busy::Write) && !lane.unsure);
+        for key in self.pks.get(&row.id).cloned().unwrap_or_default() {
+            let Some(sub) = self.subs.get_mut(&key) else { continue };
+            let before = (sub.view.last_error.clone(), sub.view.unanswered_until);
+            also(sub);
+            let mut changed = before != (sub.view.last_error.clone(), sub.view.unanswered_until);
+            changed |= sub.take_row(row, requested, calm, now);
+            if changed {
+                self.changes.insert(Changed::Submission(key));
+            }
+        }
+    }
+
+    fn took_image(&mut self, subject: &Subject, answer: Answer<String>, now: &Now) {
+        self.lanes.entry(subject.pk).or_default().busy = None;
+        self.change(subject, |sub| {
+            let error = answer.error();
+            sub.view.image = match answer {
+                Answer::Done(image) => Some(Ok(image)),
+                other => {
+                    let why = other.error().unwrap_or_default();
+                    sub.read_failed(why.clone(), now);
+                    Some(Err(why))
+                }
+            };
+            sub.view.last_error = error;
+        });
+    }
+
+    fn read_failed(&mut self, subject: &Subject, answer: &Answer<Row>, now: &Now) {
+        let everybodys = matches!(answer, Answer::Throttled(_))
+            || matches!(answer, Answer::Refused(refusal) if refusal.about == About::Token);
+        match answer.error() {
+            Some(why) if !everybodys => self.went_wrong(subject, why, now),
+            _ => {}
+        }
+    }
+
+    fn went_wrong(&mut self, subject: &Subject, why: String, now: &Now) {
+        self.change(subject, |sub| sub.read_failed(why, now));
+    }
+
+    fn wrote(&mut self, request: &Request, answer: Answer<()>, now: &Now) {
+        let Some(subject) = request.subject() else { return };
+        self.lanes.entry(subject.pk).or_default().busy = None;
+        match answer {
+            Answer::Done(()) => self.change(subject, |sub| done(sub, request, now)),
+            Answer::Throttled(_) => {}
+            Answer::Refused(refusal) => self.refused(subject, request, refusal, now),
+            Answer::Broken(why) => {
+                let retry = self.timing.retry_end;
+                self.change(subject, |sub| {
+                    // Part of it may have been done.
+                    (sub.outdated, sub.wrote_at) = (true, now.at);
+                    drop_partial(sub, request);
+                    let wait = (pause(sub.write_failures) * 6).min(retry);
+                    sub.write_failed(why, wait, now);
+                });
+            }
+            Answer::Unanswered(silence) => self.unanswered(subject, silence, now),
+        }
+    }
+
+    fn refused(&mut self, subject: &Subject, request: &Request, refusal: Refusal, now: &Now) {
+        let retry = self.timing.retry_end;
+        self.change(subject, |sub| match (refusal.about, request) {
+            (About::Token, _) => {}
+            (About::Missing, _) => sub.outdated = true,
+            (About::Request, Request::Final(..)) => {
+                sub.view.end = Some(Ended::Refused(refusal.message.clone()));
+                sub.write_failed(refusal.message, retry, now);
+            }
+            (About::Request, _) => {
+                drop_partial(sub, request);
+                sub.write_failed(refusal.message, pause(sub.write_failures), now);
+            }
+        });
+    }
+
+    fn unanswered(&mut self, subject: &Subject, silence: Silence, now: &Now) {
+        if !silence.sent {
+            return self.change(subject, |sub| {
+                sub.write_failed(silence.why, pause(sub.write_failures), now);
+            });
+        }
+        let hold = self.timing.hold;
+        let lane = self.lanes.entry(subject.pk).or_default();
+        lane.hold_until = now.at + hold;
+        lane.unsure = true;
+        let until = SignedDuration::try_from(hold)
+            .ok()
+            .and_then(|hold| now.wall.checked_add(hold).ok());
+        self.change(subject, |sub| {
+            (sub.outdated, sub.wrote_at) = (true, now.at);
+            sub.view.unanswered_until = until;
+            sub.view.last_error = Some(silence.why);
+        });
+    }
+
+    /// Changes the object a request was about, if it is still at that attempt.
+    fn change(&mut self, subject: &Subject, change: impl FnOnce(&mut Sub)) {
+        let Some(sub) = self.subs.get_mut(&subject.key) else {
+            return;
+        };
+        if sub.run.attempt != subject.attempt || sub.pk != subject.pk {
+            // The write happened all the same.
+            sub.outdated = true;
+            return;
+        }
+        let before = sub.view.clone();
+        change(sub);
+        if sub.view != before {
+            self.changes.insert(Changed::Submission(subject.key.clone()));
+        }
+    }
+}
+
+fn done(sub: &mut Sub, request: &Request, now: &Now) {
+    match request {
+        Request::Progress(_, progress, _) => {
+            sub.wrote(progress.status(), now);
+            sub.view.progress = sub.view.progress.max(Some(*progress));
+            if sub.progress.as_ref().is_some_and(|wanted| wanted.what <= *progress) {
+                sub.progress = None;
+            }
+        }
+        Request::Partial(..) => {
+            sub.wrote(Status::PartiallyEvaluated, now);
+            sub.view.partial_at = Some(now.wall);
+            drop_partial(sub, request);
+        }
+        Request::Final(_, outcome, _) => {
+            let (outcome, at) = (*outcome, now.wall);
+            sub.wrote(Status::parse(outcome.as_str()), now);
+            // A newer wish that came meanwhile is too late: what EvalAI has taken stands.
+            sub.close(Ended::Published { outcome, at });
+        }
+        _ => {}
+    }
+}
+
+/// Partial results that were answered are not sent again, whatever the answer: newer ones come.
+fn drop_partial(sub: &mut Sub, request: &Request) {
+    let Request::Partial(_, payload) = request else { return };
+    sub.partial_sent = Some(digest(payload));
+    if sub.partial.as_ref().is_some_and(|wanted| wanted.what == *payload) {
+        sub.partial = None;
+    }
+}

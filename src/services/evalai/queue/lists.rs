@@ -1,0 +1,180 @@
+//! What an answer about a whole challenge changes: lists of submissions, and what its leaderboards look like.
+//!
+//! Owned by `queue`. Pure.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::sub::Sub;
+use super::{Now, Queue};
+use crate::services::evalai::answer::{About, Answer};
+use crate::services::evalai::request::{Purpose, Reply, Request};
+use crate::services::evalai::row::{Row, Split};
+use crate::services::evalai::types::{Changed, SweepRow};
+
+/// What the sweep has found is not handed out again for so long.
+const SWEPT_FOR: Duration = Duration::from_mins(10);
+/// Before a failed check is tried again.
+const RETRY_LOOK: Duration = Duration::from_mins(1);
+
+impl Queue {
+    /// Takes in what is not about one submission.
+    pub(super) fn took_of_challenge(&mut self, request: &Request, requested: Duration, reply: Reply, now: &Now) {
+        match (request, reply) {
+            (
+                Request::List {
+                    challenge,
+                    purpose,
+                    after,
+                },
+                Reply::Rows(answer),
+            ) => self.took_list(*challenge, *purpose, *after, requested, answer, now),
+            (Request::Phases(id), Reply::Phases(answer)) => {
+                self.looked(*id, answer, now, |look, phases| {
+                    look.phases = Some(phases.iter().map(|phase| phase.id).collect());
+                });
+            }
+            (Request::Splits(id), Reply::Splits(answer)) => {
+                self.looked(*id, answer, now, |look, splits: Vec<Split>| look.splits = Some(splits));
+            }
+            (Request::DatasetSplit(id, split), Reply::DatasetSplit(answer)) => {
+                // Not every host may read it: the phase's only leaderboard is taken then.
+                let answer = match answer {
+                    Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),
+                    other => other.and_then(|split| Answer::Done(Some(split.codename))),
+                };
+                self.looked(*id, answer, now, |look, codename| {
+                    look.codenames.insert(*split, codename);
+                });
+            }
+            _ => {}
+        }
+    }
+
+    fn took_list(
+        &mut self,
+        id: i64,
+        purpose: Purpose,
+        after: Timestamp,
+        requested: Duration,
+        answer: Answer<Vec<Row>>,
+        now: &Now,
+    ) {
+        let accept = self.timing.accept;
+        let Some(challenge) = self.challenges.get_mut(&id) else {
+            return;
+        };
+        let every = match purpose {
+            Purpose::Cancel => challenge.period,
+            Purpose::Accept => accept,
+            Purpose::SweepSubmitted | Purpose::SweepResuming => challenge.sweep.map_or(accept, |(every, _)| every),
+        };
+        let rows = match answer {
+            Answer::Done(rows) => rows,
+            // Throttling is the whole token's: the budget waits.
+            Answer::Throttled(_) => {
+                challenge.poll(purpose).busy = false;
+                return;
+            }
+            other => {
+                challenge.poll(purpose).failed(now.at, every);
+                if matches!(other, Answer::Refused(_)) {
+                    self.listed(id, purpose, now.at);
+                }
+                return;
+            }
+        };
+        challenge.poll(purpose).done(now.at, every);
+        let mut cancelled = std::collections::BTreeSet::new();
+        for row in rows {
+            cancelled.insert(row.id);
+            if matches!(purpose, Purpose::SweepSubmitted | Purpose::SweepResuming) {
+                self.sweep_row(id, &row, now);
+            }
+            self.spread(&Arc::new(row), requested, now, |_| {});
+        }
+        if purpose == Purpose::Cancel {
+            let covered = |sub: &&mut Sub| sub.challenge == id && sub.submitted_at().is_some_and(|at| at > after);
+            for sub in self
+                .subs
+                .values_mut()
+                .filter(covered)
+                .filter(|sub| !cancelled.contains(&sub.pk))
+            {
+                sub.not_cancelled(requested, now);
+            }
+        }
+        self.listed(id, purpose, requested);
+    }
+
+    /// Whoever is still waiting after a list of new submissions is asked for alone.
+    fn listed(&mut self, id: i64, purpose: Purpose, requested: Duration) {
+        if purpose != Purpose::Accept {
+            return;
+        }
+        let asked = self
+            .subs
+            .values_mut()
+            .filter(|sub| sub.challenge == id)
+            .filter_map(|sub| sub.asked.as_mut());
+        for asked in asked.filter(|asked| asked.since <= requested) {
+            asked.listed = true;
+        }
+    }
+
+    /// A row that asks to be run, long enough ago for its message to be lost, and that nobody here knows.
+    fn sweep_row(&mut self, id: i64, row: &Row, now: &Now) {
+        let lost = SignedDuration::try_from(self.timing.lost).unwrap_or(SignedDuration::MAX);
+        let Some(challenge) = self.challenges.get_mut(&id) else {
+            return;
+        };
+        let (Some((_, since)), Some(time), Some(phase)) = (challenge.sweep, row.wanted_at(), row.phase) else {
+            return;
+        };
+        let age = now.wall.duration_since(time);
+        challenge.swept.retain(|_, (_, said)| *said + SWEPT_FOR > now.at);
+        let said = challenge.swept.get(&row.id).is_some_and(|(at, _)| *at == time);
+        if age < lost || time < since || said || self.pks.contains_key(&row.id) {
+            return;
+        }
+        challenge.swept.insert(row.id, (time, now.at));
+        self.sweep.push(SweepRow {
+            challenge: id,
+            phase,
+            submission: row.id,
+            time,
+        });
+    }
+
+    fn looked<T>(&mut self, id: i64, answer: Answer<T>, now: &Now, take: impl FnOnce(&mut super::poll::Look, T)) {
+        let every = self.timing.check;
+        let Some(challenge) = self.challenges.get_mut(&id) else {
+            return;
+        };
+        let look = &mut challenge.look;
+        let before = (look.catalog.clone(), look.error.clone());
+        match answer {
+            Answer::Done(content) => {
+                take(look, content);
+                look.poll.done(now.at, Duration::ZERO);
+                if look.request(id).is_none() {
+                    look.poll.done(now.at, every);
+                    look.close(now.wall);
+                }
+            }
+            Answer::Throttled(_) => look.poll.busy = false,
+            other => {
+                look.error = other.error();
+                look.restart();
+                look.poll.failed(now.at, RETRY_LOOK);
+            }
+        }
+        if before != (look.catalog.clone(), look.error.clone()) {
+            let of = self.served.iter().filter(|(_, target)| target.challenge == id);
+            self.changes
+                .extend(of.map(|(key, _)| Changed::Leaderboard(key.clone())));
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! What one token is to ask and to write, and in which order: all of it as a state machine without network and clock.
+//!
+//! `hub` puts wishes in, `task` takes requests out ([`Queue::next`]) and brings their answers back ([`Queue::answered`]).
+//! What holds for every request:
+//!
+//! - the budget of the token, priorities by [`choose`], oldest first within one;
+//! - one request in flight for a submission, whatever it is, and [`MAX_IN_FLIGHT`] in all;
+//! - after a write without an answer nothing for that submission until the server must have given up, then a read;
+//! - each write follows a read (or a list of cancelled ones) that is only moments old, judged by [`super::guard`].
+
+mod answers;
+mod choose;
+mod lists;
+mod poll;
+mod sub;
+
+#[cfg(test)]
+mod simulation;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use self::poll::Challenge;
+use self::sub::{Asked, Sub, Wanted};
+use super::budget::Budget;
+use super::labels::{Labels, compare};
+use super::payload::{check, digest};
+use super::request::Request;
+use super::status::{Outcome, Progress};
+use super::types::{Changed, Ended, Key, Payload, Run, SweepRow, Target, View, Wish};
+
+/// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
+const MAX_IN_FLIGHT: usize = 4;
+
+/// The moment, on both clocks.
+#[derive(Clone, Copy, Debug)]
+pub struct Now {
+    /// Since any fixed moment; never goes back.
+    pub at: Duration,
+    /// For people and for EvalAI.
+    pub wall: Timestamp,
+}
+
+/// How long what holds.
+#[derive(Clone, Copy, Debug)]
+pub struct Timing {
+    /// Nothing for a submission after a write without an answer: the server's own limit of 60 s, and a margin.
+    pub hold: Duration,
+    /// Partial results follow a list or read by no more.
+    pub window: Duration,
+    /// An end and progress follow a read by no more, plus what two requests cost.
+    pub fresh: Duration,
+    /// Between two lists of new submissions.
+    pub accept: Duration,
+    /// A message that has not come for so long is lost.
+    pub lost: Duration,
+    /// A live submission is read again, in case somebody else has ended it.
+    pub refresh: Duration,
+    /// Between two checks of a challenge's leaderboards.
+    pub check: Duration,
+    /// Before a refused or broken end is tried again.
+    pub retry_end: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            hold: Duration::from_secs(75),
+            window: Duration::from_secs(2),
+            fresh: Duration::from_secs(5),
+            accept: Duration::from_secs(5),
+            lost: Duration::from_mins(2),
+            refresh: Duration::from_mins(10),
+            check: Duration::from_hours(1),
+            retry_end: Duration::from_mins(10),
+        }
+    }
+}
+
+/// What to do next.
+#[derive(Debug)]
+pub enum Next {
+    /// Send this, and hand it back with its answer.
+    Send(Ticket),
+    /// Nothing before that moment, unless something is wished or answered; none is never.
+    Wait(Option<Duration>),
+}
+
+/// A request on its way.
+#[derive(Clone, Debug)]
+pub struct Ticket {
+    pub request: Request,
+    /// When it was sent.
+    pub requested: Duration,
+}
+
+/// A submission's place on the wire, kept while its object comes and goes.
+#[derive(Debug, Default)]
+struct Lane {
+    busy: Option<Busy>,
+    hold_until: Duration,
+    /// A write was not answered: read before anything is written.
+    unsure: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Busy {
+    Read,
+    ReadForEnd,
+    Write,
+}
+
+/// See the module's text.
+#[derive(Debug)]
+pub struct Queue {
+    timing: Timing,
+    budget: Budget,
+    /// No write before.
+    not_before: Duration,
+    subs: BTreeMap<Key, Sub>,
+    pks: BTreeMap<i64, BTreeSet<Key>>,
+    lanes: BTreeMap<i64, Lane>,
+    challenges: BTreeMap<i64, Challenge>,
+    served: BTreeMap<Key, Target>,
+    /// What EvalAI said of the token, and until when nothing is asked with it.
+    token_refused: Option<(String, Duration)>,
+    changes: BTreeSet<Changed>,
+    sweep: Vec<SweepRow>,
+}
+
+impl Queue {
+    /// An empty queue of one token. Writes start at `not_before`.
+    pub fn new(timing: Timing, requests_per_minute: u32, not_before: Duration, now: Now) -> Self {
+        Self {
+            timing,
+            budget: Budget::new(requests_per_minute, now.at),
+            not_before,
+            subs: BTreeMap::new(),
+            pks: BTreeMap::new(),
+            lanes: BTreeMap::new(),
+            challenges: BTreeMap::new(),
+            served: BTreeMap::new(),
+            token_refused: None,
+            changes: BTreeSet::new(),
+            sweep: Vec::new(),
+        }
+    }
+
+    /// A Leaderboard serves its challenge from now on: sweep and check it.
+    pub fn serve(&mut self, leaderboard: &Key, target: &Target, now: Now) -> bool {
+        if self.served.get(leaderboard) == Some(target) {
+            return false;
+        }
+        self.served.insert(leaderboard.clone(), target.clone());
+        self.challenges
+            .entry(target.challenge)
+            .or_insert_with(|| Challenge::new(target.period));
+        self.arrange(now);
+        if let Some(challenge) = self.challenges.get_mut(&target.challenge) {
+            challenge.look.poll.due = now.at;
+            challenge.look.restart();
+        }
+        true
+    }
+
+    /// A Leaderboard is gone.
+    pub fn retire(&mut self, leaderboard: &Key, now: Now) {
+        if self.served.remove(leaderboard).is_some() {
+            self.arrange(now);
+        }
+    }
+
+    /// The token was renewed: what EvalAI said of the old one is void.
+    pub fn renew_token(&mut self) {
+        self.token_refused = None;
+    }
+
+    /// Nothing is written for a submission before that moment: its requests are another queue's.
+    pub fn hold(&mut self, pk: i64, until: Duration) {
+        let lane = self.lanes.entry(pk).or_default();
+        lane.hold_until = lane.hold_until.max(until);
+        lane.unsure = true;
+    }
+
+    /// Whether a submission has a request on its way, or one without an answer.
+    pub fn is_unsettled(&self, pk: i64) -> bool {
+        self.lanes
+            .get(&pk)
+            .is_some_and(|lane| lane.busy.is_some() || lane.unsure)
+    }
+
+    /// Whether a write was not answered and the server may still be working on it.
+    pub fn is_unsure(&self, now: Now) -> bool {
+        self.lanes.values().any(|lane| lane.hold_until > now.at)
+    }
+
+    /// Wants to know whether an attempt may run, and its image where the object has none. This and the two below say
+    /// whether they brought anything new.
+    pub fn ask(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, image: bool, now: Now) -> bool {
+        let Some(sub) = self.enter(target, key, pk, run) else {
+            return false;
+        };
+        let mut news = image && !sub.image;
+        sub.image |= image;
+        if sub.view.answered < run.attempt && sub.asked.is_none() {
+            news = true;
+            sub.asked = Some(Asked {
+                since: now.at,
+                listed: false,
+            });
+        }
+        news
+    }
+
+    /// From now on a cancellation of this attempt is looked for. `submitted_at` is EvalAI's own time.
+    pub fn live(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, submitted_at: Timestamp) -> bool {
+        let Some(sub) = self.enter(target, key, pk, run) else {
+            return false;
+        };
+        let news = !sub.is_over() && sub.live != Some(submitted_at);
+        if news {
+            sub.live = Some(submitted_at);
+        }
+        news
+    }
+
+    /// Wants EvalAI to say something; a newer wish replaces an older one, an end all others.
+    pub fn wish(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, wish: Wish, now: Now) -> bool {
+        let Some(sub) = self.enter(target, key, pk, run) else {
+            return false;
+        };
+        let before = sub.view.clone();
+        let news = match wish {
+            Wish::Queued => wish_progress(sub, Progress::Queued, now),
+            Wish::Running => wish_progress(sub, Progress::Running, now),
+            Wish::Partial(payload) => wish_partial(sub, target, payload, now),
+            Wish::Final(outcome, payload) => wish_end(sub, target, outcome, payload, now),
+        };
+        if sub.view != before {
+            self.changes.insert(Changed::Submission(key.clone()));
+        }
+        news
+    }
+
+    /// The object is gone, or nothing more is to be said of it.
+    pub fn forget(&mut self, key: &Key, now: Now) {
+        let Some(sub) = self.subs.remove(key) else { return };
+        if let Some(keys) = self.pks.get_mut(&sub.pk) {
+            keys.remove(key);
+            if keys.is_empty() {
+                self.pks.remove(&sub.pk);
+            }
+        }
+        let pks = &self.pks;
+        self.lanes
+            .retain(|pk, lane| lane.busy.is_some() || lane.hold_until > now.at || pks.contains_key(pk));
+    }
+
+    /// What is known of a submission.
+    pub fn view(&self, key: &Key) -> Option<View> {
+        self.subs.get(key).map(|sub| sub.view.clone())
+    }
+
+    /// How a Leaderboard fits its challenge; none before the first check. The error is why there was no newer check.
+    pub fn labels(&self, leaderboard: &Key) -> (Option<Labels>, Option<String>) {
+        let Some(target) = self.served.get(leaderboard) else {
+            return (None, None);
+        };
+        let Some(challenge) = self.challenges.get(&target.challenge) else {
+            return (None, None);
+        };
+        let labels = challenge.look.catalog.as_ref().map(|catalog| compare(target, catalog));
+        (labels, challenge.look.error.clone())
+    }
+
+    /// Requests of the last minute, and the limit.
+    pub fn budget_used(&self, now: Now) -> (u32, u32) {
+        (self.budget.used(now.at), self.budget.limit())
+    }
+
+    /// What EvalAI last said of the token, if it refused it.
+    pub fn token_refused(&self) -> Option<&str> {
+        self.token_refused.as_ref().map(|(why, _)| why.as_str())
+    }
+
+    /// Objects to wake.
+    pub fn take_changes(&mut self) -> BTreeSet<Changed> {
+        std::mem::take(&mut self.changes)
+    }
+
+    /// What the sweep has found.
+    pub fn take_sweep(&mut self) -> Vec<SweepRow> {
+        std::mem::take(&mut self.sweep)
+    }
+
+    /// The submission's place, at this attempt; none if it is already further.
+    fn enter(&mut self, target: &Target, key: &Key, pk: i64, run: &Run) -> Option<&mut Sub> {
+        self.challenges
+            .entry(target.challenge)
+            .or_insert_with(|| Challenge::new(target.period));
+        let sub = self.subs.entry(key.clone()).or_insert_with(|| {
+            self.pks.entry(pk).or_default().insert(key.clone());
+            Sub::new(pk, target.challenge, run.clone())
+        });
+        if run.attempt > sub.run.attempt {
+            sub.begin(run.clone());
+        }
+        // An object's submission is immutable.
+        (run.attempt == sub.run.attempt && pk == sub.pk).then_some(sub)
+    }
+
+    /// Computes what depends on all Leaderboards served.
+    fn arrange(&mut self, now: Now) {
+        if let Some(limit) = self.served.values().map(|target| target.requests_per_minute).min() {
+            self.budget.set_limit(limit, now.at);
+        }
+        for (id, challenge) in &mut self.challenges {
+            let of = || self.served.values().filter(|target| target.challenge == *id);
+            challenge.period = of().map(|target| target.period).min().unwrap_or(challenge.period);
+            let since = of().map(|target| target.since).min();
+            challenge.sweep = of().map(|target| target.sweep).min().zip(since);
+            challenge.look.wanted = of().flat_map(|target| target.phases.iter().copied()).collect();
+        }
+    }
+}
+
+fn wish_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
+    let further = sub.view.progress >= Some(wanted) || sub.progress.as_ref().is_some_and(|p| p.what >= wanted);
+    if further || has_end(sub) {
+        return false;
+    }
+    sub.progress = Some(Wanted {
+        what: wanted,
+        since: now.at,
+    });
+    sub.settle(&now);
+    true
+}
+
+fn wish_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
+    let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == payload);
+    if has_end(sub) || pending || sub.partial_sent == Some(digest(&payload)) {
+        return false;
+    }
+    if let Err(why) = check(&payload, &target.split, &target.labels) {
+        sub.view.last_error = Some(why);
+        return false;
+    }
+    // The oldest unsent goes first, however often it was replaced.
+    let since = sub.partial.as_ref().map_or(now.at, |partial| partial.since);
+    sub.partial = Some(Wanted { what: payload, since });
+    true
+}
+
+fn wish_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Payload>, now: Now) -> bool {
+    let closed = sub
+        .view
+        .end
+        .as_ref()
+        .is_some_and(|end| !matches!(end, Ended::Refused(_)));
+    let refused = outcome == Outcome::Finished && sub.end_refused == Some(digest(&payload));
+    let want = (outcome, payload);
+    if closed || refused || sub.end.as_ref().is_some_and(|end| end.what == want) {
+        return false;
+    }
+    let whole = match outcome {
+        Outcome::Finished => check(&want.1, &target.split, &target.labels),
+        Outcome::Failed | Outcome::Cancelled => Ok(()),
+    };
+    let since = now.at;
+    sub.end = Some(Wanted { what: want, since });
+    (sub.progress, sub.partial, sub.view.end, sub.end_refused) = (None, None, None, None);
+    sub.retry_at = sub.retry_at.min(now.at);
+    if let Err(why) = whole {
+        sub.refuse_end(why);
+    }
+    true
+}
+
+fn has_end(sub: &Sub) -> bool {
+    sub.end.is_some() || sub.view.end.is_some() || sub.is_over()
+}

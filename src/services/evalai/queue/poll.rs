@@ -1,0 +1,148 @@
+//! What is asked again and again for a whole challenge: lists, and what its leaderboards look like.
+//!
+//! Owned by `queue`. Pure.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use crate::services::evalai::labels::Catalog;
+use crate::services::evalai::request::{Purpose, Request};
+use crate::services::evalai::row::Split;
+
+/// Longest wait after failures.
+const LONGEST_PAUSE: Duration = Duration::from_mins(1);
+/// Wait after the first failure.
+const FIRST_PAUSE: Duration = Duration::from_secs(5);
+
+/// Something asked again and again, one request at a time.
+#[derive(Debug, Default)]
+pub(super) struct Poll {
+    pub busy: bool,
+    pub due: Duration,
+    failures: u32,
+}
+
+impl Poll {
+    /// It went well: next time after `every`.
+    pub fn done(&mut self, now: Duration, every: Duration) {
+        *self = Self {
+            busy: false,
+            due: now + every,
+            failures: 0,
+        };
+    }
+
+    /// Whether it went wrong last time.
+    pub fn is_failing(&self) -> bool {
+        self.failures > 0
+    }
+
+    /// It went wrong: again later, and later each time.
+    pub fn failed(&mut self, now: Duration, every: Duration) {
+        self.busy = false;
+        self.due = now + pause(self.failures).max(every);
+        self.failures = self.failures.saturating_add(1);
+    }
+}
+
+/// The wait after the n-th failure in a row.
+pub(super) fn pause(failures: u32) -> Duration {
+    (FIRST_PAUSE * 2_u32.saturating_pow(failures.min(10))).min(LONGEST_PAUSE)
+}
+
+/// A challenge, as far as it is asked about as a whole.
+#[derive(Debug)]
+pub(super) struct Challenge {
+    /// Time between two lists of cancelled submissions.
+    pub period: Duration,
+    /// Time between two sweeps, and since when what they find counts; none while no Leaderboard serves it.
+    pub sweep: Option<(Duration, Timestamp)>,
+    pub cancel: Poll,
+    pub accept: Poll,
+    pub submitted: Poll,
+    pub resuming: Poll,
+    pub look: Look,
+    /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when we said so.
+    pub swept: BTreeMap<i64, (Timestamp, Duration)>,
+}
+
+impl Challenge {
+    pub fn new(period: Duration) -> Self {
+        Self {
+            period,
+            sweep: None,
+            cancel: Poll::default(),
+            accept: Poll::default(),
+            submitted: Poll::default(),
+            resuming: Poll::default(),
+            look: Look::default(),
+            swept: BTreeMap::new(),
+        }
+    }
+
+    pub fn poll(&mut self, purpose: Purpose) -> &mut Poll {
+        match purpose {
+            Purpose::Cancel => &mut self.cancel,
+            Purpose::Accept => &mut self.accept,
+            Purpose::SweepSubmitted => &mut self.submitted,
+            Purpose::SweepResuming => &mut self.resuming,
+        }
+    }
+}
+
+/// Reading what a challenge's leaderboards look like, request by request.
+#[derive(Debug, Default)]
+pub(super) struct Look {
+    pub poll: Poll,
+    /// Phases whose splits are of interest.
+    pub wanted: Vec<i64>,
+    pub phases: Option<Vec<i64>>,
+    pub splits: Option<Vec<Split>>,
+    pub codenames: BTreeMap<i64, Option<String>>,
+    /// The last whole reading.
+    pub catalog: Option<Catalog>,
+    /// Why there is no newer one.
+    pub error: Option<String>,
+}
+
+impl Look {
+    /// Starts anew.
+    pub fn restart(&mut self) {
+        (self.phases, self.splits) = (None, None);
+        self.codenames.clear();
+    }
+
+    /// The next request of a reading; none when it is whole.
+    pub fn request(&self, challenge: i64) -> Option<Request> {
+        if self.phases.is_none() {
+            return Some(Request::Phases(challenge));
+        }
+        let Some(splits) = &self.splits else {
+            return Some(Request::Splits(challenge));
+        };
+        let open = splits
+            .iter()
+            .filter(|split| self.wanted.contains(&split.phase))
+            .map(|split| split.dataset_split);
+        open.into_iter()
+            .find(|id| !self.codenames.contains_key(id))
+            .map(|id| Request::DatasetSplit(challenge, id))
+    }
+
+    /// Closes a whole reading.
+    pub fn close(&mut self, at: Timestamp) {
+        let (Some(phases), Some(splits)) = (self.phases.take(), self.splits.take()) else {
+            return;
+        };
+        let codenames = std::mem::take(&mut self.codenames);
+        self.error = None;
+        self.catalog = Some(Catalog {
+            at,
+            phases,
+            splits,
+            codenames,
+        });
+    }
+}

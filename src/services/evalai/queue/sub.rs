@@ -1,0 +1,350 @@
+//! One submission in the queue: what is wished, what is known, and what follows from both.
+//!
+//! Owned by `queue`. Pure: the guard is asked here, nothing is sent.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::Now;
+use super::poll::pause;
+use crate::services::evalai::guard::{self, End, Start, Verdict};
+use crate::services::evalai::payload::digest;
+use crate::services::evalai::row::Row;
+use crate::services::evalai::status::{Outcome, Progress, Status};
+use crate::services::evalai::types::{Ended, Payload, Run, View};
+
+/// Wait before an unknown word of EvalAI is read again.
+const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
+
+/// A wish and since when it is wished.
+#[derive(Debug, Clone)]
+pub(super) struct Wanted<T> {
+    pub what: T,
+    pub since: Duration,
+}
+
+/// A question whether an attempt may run.
+#[derive(Debug, Clone)]
+pub(super) struct Asked {
+    pub since: Duration,
+    /// A list was asked and did not hold it.
+    pub listed: bool,
+}
+
+/// The last read of the row.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Read {
+    pub requested: Duration,
+    pub answered: Duration,
+}
+
+#[derive(Debug)]
+pub(super) struct Sub {
+    pub pk: i64,
+    pub challenge: i64,
+    pub run: Run,
+    /// When it was submitted, while its run may be cancelled.
+    pub live: Option<Timestamp>,
+    pub asked: Option<Asked>,
+    pub image: bool,
+    pub progress: Option<Wanted<Progress>>,
+    pub partial: Option<Wanted<Arc<Payload>>>,
+    pub end: Option<Wanted<(Outcome, Arc<Payload>)>>,
+    /// Digest of the partial results that were last answered.
+    pub partial_sent: Option<u64>,
+    /// Digest of the end that was last refused here, before it was sent.
+    pub end_refused: Option<u64>,
+    pub read: Option<Read>,
+    /// Answer of the last read of it, or of the last list that would have held it, had it been cancelled.
+    pub fresh_at: Option<Duration>,
+    /// The same, if it said that it is not cancelled, by whatever attempt.
+    pub clear_at: Option<Duration>,
+    /// The row is known to be outdated.
+    pub outdated: bool,
+    /// From when on EvalAI knows of this attempt.
+    pub known_at: Option<Duration>,
+    /// A read that showed it as live, since this attempt began: whatever ends it later, ends this attempt.
+    pub live_at: Option<Duration>,
+    /// Answer of the last write: reads requested before show what was before it.
+    pub wrote_at: Duration,
+    pub retry_at: Duration,
+    /// Failed reads in a row.
+    pub failures: u32,
+    /// Failed writes in a row: a read that goes well between two of them repairs nothing.
+    pub write_failures: u32,
+    pub view: View,
+}
+
+impl Sub {
+    pub fn new(pk: i64, challenge: i64, run: Run) -> Self {
+        let view = View {
+            attempt: run.attempt,
+            ..View::default()
+        };
+        Self {
+            pk,
+            challenge,
+            run,
+            live: None,
+            asked: None,
+            image: false,
+            progress: None,
+            partial: None,
+            end: None,
+            partial_sent: None,
+            end_refused: None,
+            read: None,
+            fresh_at: None,
+            clear_at: None,
+            outdated: false,
+            known_at: None,
+            live_at: None,
+            wrote_at: Duration::ZERO,
+            retry_at: Duration::ZERO,
+            failures: 0,
+            write_failures: 0,
+            view,
+        }
+    }
+
+    /// Begins a later attempt: every wish of the earlier one is void, what was read stays.
+    pub fn begin(&mut self, run: Run) {
+        let old = std::mem::take(&mut self.view);
+        let fresh = Self::new(self.pk, self.challenge, run);
+        *self = Self {
+            read: self.read,
+            fresh_at: self.fresh_at,
+            clear_at: self.clear_at,
+            outdated: self.outdated,
+            wrote_at: self.wrote_at,
+            view: View {
+                row: old.row,
+                read_at: old.read_at,
+                answered: old.answered,
+                image: old.image,
+                unanswered_until: old.unanswered_until,
+                ..fresh.view.clone()
+            },
+            ..fresh
+        };
+    }
+
+    /// Whether nothing more is to be said of this attempt.
+    pub fn is_over(&self) -> bool {
+        self.view.ended.is_some()
+            || self
+                .view
+                .end
+                .as_ref()
+                .is_some_and(|end| !matches!(end, Ended::Refused(_)))
+    }
+
+    /// When it was submitted, EvalAI's own word first.
+    pub fn submitted_at(&self) -> Option<Timestamp> {
+        self.view.row.as_ref().and_then(|row| row.submitted_at).or(self.live)
+    }
+
+    /// Whether EvalAI had been told of this attempt when a read was made.
+    fn told(&self, row: &Row, requested: Duration) -> bool {
+        row.names(&self.run.job) || self.known_at.is_some_and(|known| requested > known)
+    }
+
+    /// Whether the end of an earlier attempt could no longer stand when a read was made.
+    fn begun(&self, row: &Row, requested: Duration) -> bool {
+        self.told(row, requested) || self.live_at.is_some_and(|live| requested > live)
+    }
+
+    /// Takes a row in; `calm` if no write of ours can still change it. Returns whether anything changed that the object
+    /// should know.
+    pub fn take_row(&mut self, row: &Arc<Row>, requested: Duration, calm: bool, now: &Now) -> bool {
+        let before = self.view.clone();
+        let begun = self.begun(row, requested);
+        let start = guard::start(row.status, self.run.attempt, begun);
+        let outdated = requested < self.wrote_at || self.read.is_some_and(|read| requested < read.requested);
+        if outdated {
+            // A cancel may since have been overwritten by one of our writes: it still was one.
+            if let Start::Drop(status @ (Status::Cancelled | Status::Archived | Status::Ignored)) = start {
+                self.stop(status);
+            }
+            return self.view != before;
+        }
+        self.view.row = Some(row.clone());
+        self.view.read_at = Some(now.wall);
+        self.read = Some(Read {
+            requested,
+            answered: now.at,
+        });
+        self.fresh_at = Some(now.at);
+        if row.status != Status::Cancelled {
+            self.clear_at = Some(now.at);
+        }
+        self.outdated = false;
+        match start {
+            Start::Unclear => {
+                self.retry_at = now.at + UNCLEAR_PAUSE;
+                self.view.last_error =
+                    Some("EvalAI gives the submission a status that this version does not know".into());
+            }
+            Start::Run => {
+                if calm && !matches!(row.status, Status::Failed | Status::Cancelled) {
+                    self.live_at = self.live_at.or(Some(requested));
+                }
+                self.answer(requested);
+            }
+            Start::Drop(status) => {
+                self.answer(requested);
+                self.stop(status);
+            }
+        }
+        self.settle(now);
+        // That it was read again is no news.
+        let before = View {
+            read_at: self.view.read_at,
+            ..before
+        };
+        self.view != before
+    }
+
+    /// A list that would hold it if it were cancelled does not.
+    pub fn not_cancelled(&mut self, requested: Duration, now: &Now) {
+        let cancelled = self
+            .view
+            .row
+            .as_ref()
+            .is_some_and(|row| row.status == Status::Cancelled);
+        if !cancelled {
+            (self.fresh_at, self.clear_at) = (Some(now.at), Some(now.at));
+        } else if self.read.is_none_or(|read| requested >= read.requested) {
+            self.outdated = true;
+        }
+    }
+
+    fn answer(&mut self, requested: Duration) {
+        if self.asked.as_ref().is_some_and(|asked| requested >= asked.since) {
+            self.asked = None;
+            self.view.answered = self.run.attempt;
+        }
+    }
+
+    fn stop(&mut self, status: Status) {
+        if self.end.is_none() && !self.is_over() {
+            self.view.ended = Some(status);
+        }
+        (self.live, self.progress, self.partial) = (None, None, None);
+    }
+
+    /// Grants wishes that EvalAI grants already.
+    pub fn settle(&mut self, now: &Now) {
+        if let Some((Verdict::There, wanted)) = self.progress_verdict().zip(self.progress.clone()) {
+            let known = self.read.map_or(now.at, |read| read.requested);
+            self.known_at = Some(self.known_at.unwrap_or(known));
+            self.view.progress = self.view.progress.max(Some(wanted.what));
+            self.progress = None;
+        }
+        match self.end_verdict() {
+            Some(End::Done(status)) => self.close(Ended::Agreed(status)),
+            Some(End::Amend(status)) => self.close(Ended::Otherwise(status)),
+            Some(End::Wait) => self.retry_at = now.at + UNCLEAR_PAUSE,
+            Some(End::Put) => {
+                if let Some(why) = self.foreign_phase() {
+                    self.refuse_end(why);
+                }
+            }
+            None => {}
+        }
+    }
+
+    /// The end is settled.
+    pub fn close(&mut self, end: Ended) {
+        self.view.end = Some(end);
+        self.view.last_error = None;
+        (self.end, self.live, self.progress, self.partial) = (None, None, None, None);
+    }
+
+    /// The end can't be had with these texts.
+    pub fn refuse_end(&mut self, why: String) {
+        self.end_refused = self.end.as_ref().map(|want| digest(&want.what.1));
+        self.view.end = Some(Ended::Refused(why.clone()));
+        self.view.last_error = Some(why);
+        self.end = None;
+    }
+
+    /// What becomes of the wish for progress; none without one, or without a row.
+    pub fn progress_verdict(&self) -> Option<Verdict> {
+        let (row, read) = (self.view.row.as_ref()?, self.read?);
+        let wanted = self.progress.as_ref()?.what;
+        let (begun, told) = (self.begun(row, read.requested), self.told(row, read.requested));
+        Some(guard::progress(row.status, self.run.attempt, begun, told, wanted))
+    }
+
+    /// What becomes of partial results; none without some, or without a row.
+    pub fn partial_verdict(&self) -> Option<Verdict> {
+        let (row, read) = (self.view.row.as_ref()?, self.read?);
+        self.partial.as_ref()?;
+        Some(guard::partial(
+            row.status,
+            self.run.attempt,
+            self.begun(row, read.requested),
+        ))
+    }
+
+    /// What becomes of the wish for an end; none without one, or without a read since.
+    pub fn end_verdict(&self) -> Option<End> {
+        let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
+        let since = !self.outdated && read.requested >= want.since && read.requested >= self.wrote_at;
+        let begun = self.begun(row, read.requested);
+        since.then(|| guard::end(row.status, self.run.attempt, begun, want.what.0))
+    }
+
+    /// EvalAI would put the results on another phase's leaderboard without a word.
+    fn foreign_phase(&self) -> Option<String> {
+        let (outcome, payload) = &self.end.as_ref()?.what;
+        let phase = self.view.row.as_ref()?.phase?;
+        (*outcome == Outcome::Finished && phase != payload.phase).then(|| {
+            let (pk, ours) = (self.pk, payload.phase);
+            format!(
+                "EvalAI says that submission {pk} belongs to phase {phase}, not {ours}; apply it with the right phase"
+            )
+        })
+    }
+
+    /// EvalAI has taken a status of ours.
+    pub fn wrote(&mut self, status: Status, now: &Now) {
+        self.wrote_at = now.at;
+        self.known_at = Some(self.known_at.unwrap_or(now.at));
+        (self.failures, self.write_failures) = (0, 0);
+        self.view.last_error = None;
+        if let Some(row) = &self.view.row {
+            let mut row = Row::clone(row);
+            row.status = status;
+            if !row.names(&self.run.job) {
+                row.jobs.push(self.run.job.to_lowercase());
+            }
+            self.view.row = Some(Arc::new(row));
+        }
+    }
+
+    /// A read went wrong: the next one is later each time.
+    pub fn read_failed(&mut self, why: String, now: &Now) {
+        self.retry_at = now.at + pause(self.failures);
+        self.failures = self.failures.saturating_add(1);
+        self.view.last_error = Some(why);
+    }
+
+    /// A read went well.
+    pub fn read_done(&mut self) {
+        self.failures = 0;
+        if self.write_failures == 0 {
+            self.view.last_error = None;
+        }
+    }
+
+    /// A write went wrong: the next try is that much later.
+    pub fn write_failed(&mut self, why: String, pause: Duration, now: &Now) {
+        self.retry_at = now.at + pause;
+        self.write_failures = self.write_failures.saturating_add(1);
+        self.view.last_error = Some(why);
+    }
+}

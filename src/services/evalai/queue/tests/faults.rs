@@ -1,0 +1,149 @@
+//! Answers that are none, refusals, a broken server, no lease, no token.
+
+use super::*;
+
+#[test]
+fn an_unanswered_end_is_read_again_only_when_the_server_must_have_given_up() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("finished 7");
+    bench.wait(65.0);
+    bench.answer(&put, unanswered());
+    let until = bench.view(7).unanswered_until.unwrap();
+    assert_eq!(until, now(bench.at).wall + SignedDuration::from_secs(75));
+    assert!(bench.is_unsure());
+    bench.forget(7);
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.wait(74.9);
+    bench.expect_nothing();
+    bench.wait(0.1);
+    bench.get(7, row(7, Status::Finished));
+    bench.write("finished 7");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+    assert!(!bench.is_unsure());
+}
+
+#[test]
+fn an_unanswered_write_is_followed_by_a_read_before_any_other_write() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    let put = bench.expect("partial 7");
+    bench.answer(&put, unanswered());
+    bench.wait(74.0);
+    let list = bench.expect("list of cancelled");
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
+    bench.expect_nothing();
+    bench.wait(1.5);
+    bench.get(7, row(7, Status::PartiallyEvaluated));
+    bench.write("partial 7");
+    assert_eq!((bench.view(7).unanswered_until, bench.view(7).last_error), (None, None));
+}
+
+#[test]
+fn a_request_that_never_left_is_tried_again_soon() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Queued);
+    bench.get(7, row(7, Status::Submitted));
+    let patch = bench.expect("queued 7");
+    let silence = Silence {
+        sent: false,
+        why: "EvalAI could not be reached".into(),
+    };
+    bench.answer(&patch, Reply::Written(Answer::Unanswered(silence)));
+    assert_eq!(bench.view(7).last_error.as_deref(), Some("EvalAI could not be reached"));
+    bench.expect_nothing();
+    bench.wait(5.0);
+    bench.write("queued 7");
+}
+
+#[test]
+fn throttling_stops_everything_for_as_long_as_asked() {
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    let get = bench.expect("submission 7");
+    bench.answer(&get, Reply::Row(Answer::Throttled(Duration::from_secs(56))));
+    bench.ask(8, 1);
+    bench.wait(55.9);
+    bench.expect_nothing();
+    bench.wait(0.1);
+    bench.get(7, row(7, Status::Submitted));
+    assert_eq!(bench.view(7).last_error, None, "that is nobody's fault");
+}
+
+#[test]
+fn a_refused_end_is_told_tried_again_later_and_at_once_with_other_texts() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("finished 7");
+    bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Request, 400))));
+    assert_eq!(bench.view(7).end, Some(Ended::Refused("EvalAI answered 400".into())));
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.wait(10.0);
+    bench.list("list of cancelled", vec![]);
+    bench.expect_nothing();
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(44.0)));
+    assert_eq!(bench.view(7).end, None);
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("finished 7");
+    bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Request, 400))));
+    bench.wait(600.0);
+    bench.get(7, row(7, Status::Running));
+    bench.write("finished 7");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+#[test]
+fn a_broken_server_is_left_alone_longer_each_time() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    for wait in [30.0, 60.0, 120.0, 240.0, 360.0, 360.0] {
+        bench.get(7, row(7, Status::Finished));
+        let put = bench.expect("finished 7");
+        bench.answer(&put, Reply::Written(Answer::Broken("EvalAI answered 500".into())));
+        bench.wait(wait - 0.1);
+        bench.expect_nothing();
+        bench.wait(0.1);
+    }
+}
+
+#[test]
+fn without_the_lease_and_after_a_takeover_only_reads_are_sent() {
+    let mut bench = Bench::with_writes_after(75);
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Submitted));
+    bench.live(7, 1);
+    bench.wish(7, 1, Wish::Queued);
+    bench.list("list of cancelled", vec![]);
+    bench.wish(8, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.expect_nothing();
+    bench.wait(15.0);
+    let now = bench.now();
+    assert!(matches!(bench.queue.next(now, false), Next::Send(t) if matches!(t.request, Request::List { .. })));
+    let Next::Wait(Some(again)) = bench.queue.next(now, false) else {
+        panic!("a write is sent without the lease")
+    };
+    assert_eq!(again, now.at + Duration::from_secs(1));
+    let names: Vec<_> = std::iter::from_fn(|| bench.next()).map(|(name, _)| name).collect();
+    assert_eq!(names[0], "submission 8", "{names:?}");
+}
+
+#[test]
+fn a_refused_token_is_told_and_asked_again_after_a_minute_or_its_renewal() {
+    let mut bench = Bench::new();
+    bench.serve();
+    let ticket = bench.expect("sweep of submitted");
+    bench.answer(&ticket, Reply::Rows(Answer::Refused(refusal(About::Token, 401))));
+    assert_eq!(bench.queue.token_refused(), Some("EvalAI answered 401"));
+    assert_eq!(bench.queue.take_changes(), [Changed::Leaderboard(key(100))].into());
+    bench.ask(7, 1);
+    bench.wait(59.0);
+    bench.expect_nothing();
+    bench.queue.renew_token();
+    bench.get(7, row(7, Status::Submitted));
+    assert_eq!(bench.queue.token_refused(), None);
+}

@@ -1,0 +1,200 @@
+//! What a submission is told, and when it is not.
+
+use super::*;
+
+#[test]
+fn a_whole_life() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    assert_eq!(bench.view(7).progress, Some(Progress::Running));
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.write("partial 7");
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.expect_nothing();
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.get(7, row(7, Status::PartiallyEvaluated));
+    bench.write("finished 7");
+    let at = now(bench.at).wall;
+    let outcome = Outcome::Finished;
+    assert_eq!(bench.view(7).end, Some(Ended::Published { outcome, at }));
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(44.0)));
+    bench.live(7, 1);
+    bench.wait(100.0);
+    bench.expect_nothing();
+    bench.forget(7);
+    assert!(bench.queue.view(&key(7)).is_none() && bench.queue.lanes.is_empty() && bench.queue.pks.is_empty());
+}
+
+#[test]
+fn every_change_wakes_its_object_once_and_repeats_wake_nobody() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    let woken = [Changed::Submission(key(7))].into();
+    assert_eq!(bench.queue.take_changes(), woken);
+    bench.wait(10.0);
+    bench.list("list of cancelled", vec![]);
+    bench.wait(600.0);
+    bench.list("list of cancelled", vec![]);
+    let read = Row {
+        jobs: vec!["submission-7-1".into()],
+        ..row(7, Status::Running)
+    };
+    bench.get(7, read.clone());
+    assert_eq!(bench.queue.take_changes(), [].into(), "a read that says what is known");
+    let now = bench.now();
+    assert!(!bench.queue.wish(&target(), &key(7), 7, &run(7, 1), Wish::Running, now));
+    assert!(!bench.queue.live(&target(), &key(7), 7, &run(7, 1), wall(-60)));
+}
+
+#[test]
+fn progress_names_the_job_once() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Queued);
+    bench.get(7, row(7, Status::Submitted));
+    let ticket = bench.write("queued 7");
+    assert!(matches!(&ticket.request, Request::Progress(_, _, Some(job)) if job == "submission-7-1"));
+    bench.wish(7, 1, Wish::Running);
+    let ticket = bench.write("running 7");
+    assert!(matches!(&ticket.request, Request::Progress(_, _, None)));
+}
+
+#[test]
+fn what_evalai_says_already_is_not_written_again() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Running);
+    bench.get(7, row(7, Status::Running));
+    bench.expect_nothing();
+    assert_eq!(bench.view(7).progress, Some(Progress::Running));
+}
+
+#[test]
+fn a_submission_that_evalai_has_ended_does_not_run() {
+    for status in [
+        Status::Cancelled,
+        Status::Archived,
+        Status::Ignored,
+        Status::Finished,
+        Status::Failed,
+    ] {
+        let mut bench = Bench::new();
+        bench.ask(7, 1);
+        bench.get(7, row(7, status));
+        assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, Some(status)));
+        bench.wish(7, 1, Wish::Queued);
+        bench.wait(100.0);
+        bench.expect_nothing();
+    }
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    let ticket = bench.expect("submission 7");
+    bench.answer(&ticket, Reply::Row(Answer::Refused(refusal(About::Missing, 404))));
+    assert_eq!(bench.view(7).ended, Some(Status::Missing));
+}
+
+#[test]
+fn an_unknown_status_starts_nothing_and_ends_nothing() {
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Unknown));
+    let view = bench.view(7);
+    assert_eq!((view.answered, view.ended), (0, None));
+    assert!(view.last_error.is_some_and(|why| why.contains("does not know")));
+    bench.wait(59.0);
+    bench.expect_nothing();
+    bench.wait(1.0);
+    bench.get(7, row(7, Status::Submitted));
+    assert_eq!((bench.view(7).answered, bench.view(7).last_error), (1, None));
+}
+
+#[test]
+fn results_that_cannot_be_right_are_not_sent() {
+    let mut bench = Bench::new();
+    let empty = Arc::new(Payload {
+        phase: 1,
+        result: "[]".into(),
+        ..Payload::default()
+    });
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
+    assert!(matches!(bench.view(7).end, Some(Ended::Refused(_))));
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
+    bench.expect_nothing();
+    bench.wish(7, 1, Wish::Final(Outcome::Failed, empty));
+    bench.get(7, row(7, Status::Running));
+    bench.write("failed 7");
+    let foreign = Arc::new(Payload {
+        phase: 2,
+        ..Payload::clone(&results(1.0))
+    });
+    bench.wish(8, 1, Wish::Final(Outcome::Finished, foreign));
+    bench.get(8, row(8, Status::Running));
+    bench.expect_nothing();
+    assert!(matches!(bench.view(8).end, Some(Ended::Refused(why)) if why.contains("phase 1, not 2")));
+}
+
+#[test]
+fn an_end_waits_for_its_own_read() {
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Running));
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.wait(0.1);
+    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(43.0)));
+    let get = bench.expect("submission 7");
+    bench.answer(&get, Reply::Row(Answer::Done(row(7, Status::Cancelled))));
+    bench.expect_nothing();
+    assert_eq!(bench.view(7).end, Some(Ended::Otherwise(Status::Cancelled)));
+}
+
+#[test]
+fn an_end_replaces_what_was_wished_before() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Queued);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.wish(7, 1, Wish::Running);
+    bench.wish(7, 1, Wish::Partial(results(42.0)));
+    bench.get(7, row(7, Status::Submitted));
+    bench.write("finished 7");
+    bench.wait(100.0);
+    bench.expect_nothing();
+}
+
+#[test]
+fn a_later_attempt_makes_the_wishes_of_the_earlier_one_void() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("failed 7");
+    bench.ask(7, 2);
+    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(2.0)));
+    bench.expect_nothing();
+    bench.answer(&put, Reply::Written(Answer::Done(())));
+    assert_eq!((bench.view(7).attempt, bench.view(7).end), (2, None));
+    bench.get(7, row(7, Status::Failed));
+    assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, None));
+}
+
+#[test]
+fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
+    let mut bench = Bench::new();
+    let now = bench.now();
+    bench.queue.ask(&target(), &key(7), 7, &run(7, 1), true, now);
+    let found = Row {
+        input_file: Some("http://files/x.json".into()),
+        ..row(7, Status::Submitted)
+    };
+    bench.get(7, found);
+    let used = bench.queue.budget_used(now);
+    let ticket = bench.expect("image 7");
+    bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
+    assert!(matches!(bench.view(7).image, Some(Err(_))));
+    bench.wait(5.0);
+    let ticket = bench.expect("image 7");
+    bench.answer(&ticket, Reply::Image(Answer::Done("registry.example/a:1".into())));
+    assert_eq!(bench.view(7).image, Some(Ok("registry.example/a:1".into())));
+    assert_eq!(bench.queue.budget_used(now), used);
+    bench.wait(100.0);
+    bench.expect_nothing();
+}

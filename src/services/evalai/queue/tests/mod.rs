@@ -1,0 +1,241 @@
+//! The queue, one rule a test: wishes in, requests out, answers in.
+
+mod cancels;
+mod faults;
+mod life;
+mod order;
+
+use jiff::SignedDuration;
+
+use super::*;
+use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
+use crate::services::evalai::request::{Purpose, Reply};
+use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
+use crate::services::evalai::status::Status;
+use crate::services::token::Token;
+
+/// A queue whose time is ours.
+struct Bench {
+    queue: Queue,
+    at: Duration,
+}
+
+fn target() -> Target {
+    Target {
+        api_server: "http://evalai".into(),
+        challenge: 1,
+        split: "leaderboard".into(),
+        token: Arc::new(Token::parse("x").unwrap()),
+        requests_per_minute: 54,
+        sweep: Duration::from_mins(1),
+        period: Duration::from_secs(10),
+        phases: [1].into(),
+        labels: ["Driving score".to_owned()].into(),
+        since: wall(-3600),
+    }
+}
+
+fn wall(seconds: i64) -> Timestamp {
+    Timestamp::from_second(1_800_000_000 + seconds).unwrap()
+}
+
+fn key(pk: i64) -> Key {
+    Key {
+        namespace: "carla".into(),
+        name: format!("submission-{pk}"),
+        uid: format!("uid-{pk}"),
+    }
+}
+
+fn run(pk: i64, attempt: i64) -> Run {
+    Run {
+        attempt,
+        job: format!("submission-{pk}-{attempt}"),
+    }
+}
+
+fn row(pk: i64, status: Status) -> Row {
+    Row {
+        phase: Some(1),
+        submitted_at: Some(wall(-60)),
+        status,
+        ..Row::missing(pk)
+    }
+}
+
+fn results(score: f64) -> Arc<Payload> {
+    Arc::new(Payload {
+        phase: 1,
+        result: format!(r#"[{{"split":"leaderboard","accuracies":{{"Driving score":{score}}}}}]"#),
+        ..Payload::default()
+    })
+}
+
+fn unanswered() -> Reply {
+    Reply::Written(Answer::Unanswered(Silence {
+        sent: true,
+        why: "EvalAI did not answer in time".into(),
+    }))
+}
+
+fn refusal(about: About, status: u16) -> Refusal {
+    Refusal {
+        about,
+        status,
+        message: format!("EvalAI answered {status}"),
+    }
+}
+
+impl Bench {
+    /// A minute after its start: the budget has earned its burst.
+    fn new() -> Self {
+        Self::with_writes_after(0)
+    }
+
+    fn with_writes_after(seconds: u64) -> Self {
+        let mut bench = Self {
+            queue: Queue::new(Timing::default(), 54, Duration::from_secs(seconds), now(Duration::ZERO)),
+            at: Duration::ZERO,
+        };
+        bench.wait(60.0);
+        bench
+    }
+
+    /// No two moments are the same.
+    fn now(&mut self) -> Now {
+        self.at += Duration::from_micros(1);
+        now(self.at)
+    }
+
+    fn wait(&mut self, seconds: f64) {
+        self.at += Duration::from_secs_f64(seconds);
+    }
+
+    fn ask(&mut self, pk: i64, attempt: i64) {
+        let now = self.now();
+        self.queue.ask(&target(), &key(pk), pk, &run(pk, attempt), false, now);
+    }
+
+    fn live(&mut self, pk: i64, attempt: i64) {
+        self.queue.live(&target(), &key(pk), pk, &run(pk, attempt), wall(-60));
+    }
+
+    fn wish(&mut self, pk: i64, attempt: i64, wish: Wish) {
+        let now = self.now();
+        self.queue.wish(&target(), &key(pk), pk, &run(pk, attempt), wish, now);
+    }
+
+    fn forget(&mut self, pk: i64) {
+        let now = self.now();
+        self.queue.forget(&key(pk), now);
+    }
+
+    fn serve(&mut self) {
+        let now = self.now();
+        self.queue.serve(&key(100), &target(), now);
+    }
+
+    fn is_unsure(&mut self) -> bool {
+        let now = self.now();
+        self.queue.is_unsure(now)
+    }
+
+    fn view(&self, pk: i64) -> View {
+        self.queue.view(&key(pk)).unwrap()
+    }
+
+    /// The next request as text, and its ticket.
+    fn next(&mut self) -> Option<(String, Ticket)> {
+        let now = self.now();
+        match self.queue.next(now, true) {
+            Next::Send(ticket) => {
+                let pk = ticket
+                    .request
+                    .subject()
+                    .map(|subject| format!(" {}", subject.pk))
+                    .unwrap_or_default();
+                Some((format!("{}{pk}", ticket.request.name()), ticket))
+            }
+            Next::Wait(_) => None,
+        }
+    }
+
+    /// The next request has to be this one.
+    fn expect(&mut self, name: &str) -> Ticket {
+        let (found, ticket) = self
+            .next()
+            .unwrap_or_else(|| panic!("nothing is sent, expected {name}"));
+        assert_eq!(found, name);
+        ticket
+    }
+
+    fn expect_nothing(&mut self) {
+        if let Some((found, _)) = self.next() {
+            panic!("{found} is sent, expected nothing");
+        }
+    }
+
+    fn answer(&mut self, ticket: &Ticket, reply: Reply) {
+        let now = self.now();
+        self.queue.answered(ticket, reply, now);
+    }
+
+    /// The next request has to be a read of this submission, which EvalAI answers so.
+    fn get(&mut self, pk: i64, answer: Row) {
+        let ticket = self.expect(&format!("submission {pk}"));
+        self.answer(&ticket, Reply::Row(Answer::Done(answer)));
+    }
+
+    /// The next request has to be this write, which EvalAI takes.
+    fn write(&mut self, name: &str) -> Ticket {
+        let ticket = self.expect(name);
+        self.answer(&ticket, Reply::Written(Answer::Done(())));
+        ticket
+    }
+
+    fn list(&mut self, name: &str, rows: Vec<Row>) -> Ticket {
+        let ticket = self.expect(name);
+        self.answer(&ticket, Reply::Rows(Answer::Done(rows)));
+        ticket
+    }
+
+    /// Several submissions that run, with the budget at rest after it.
+    fn all_running(&mut self, pks: &[i64]) {
+        for pk in pks {
+            self.live(*pk, 1);
+            self.wish(*pk, 1, Wish::Running);
+            while let Some((_, ticket)) = self.next() {
+                let reply = match ticket.request {
+                    Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
+                    Request::Get(_) => Reply::Row(Answer::Done(row(*pk, Status::Submitted))),
+                    _ => Reply::Written(Answer::Done(())),
+                };
+                self.answer(&ticket, reply);
+            }
+            self.wait(5.0);
+        }
+        self.wait(60.0);
+        self.list("list of cancelled", vec![]);
+        self.expect_nothing();
+    }
+
+    /// A submission of attempt 1 that runs in EvalAI's eyes too, after the first list.
+    fn running(&mut self, pk: i64) {
+        self.ask(pk, 1);
+        self.get(pk, row(pk, Status::Submitted));
+        self.live(pk, 1);
+        self.list("list of cancelled", vec![]);
+        self.wish(pk, 1, Wish::Queued);
+        self.write(&format!("queued {pk}"));
+        self.wish(pk, 1, Wish::Running);
+        self.write(&format!("running {pk}"));
+        self.expect_nothing();
+    }
+}
+
+fn now(at: Duration) -> Now {
+    Now {
+        at,
+        wall: wall(0) + SignedDuration::try_from(at).unwrap(),
+    }
+}

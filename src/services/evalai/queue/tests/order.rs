@@ -1,0 +1,185 @@
+//! What comes first, how much at once, and what is asked for a whole challenge.
+
+use super::*;
+
+#[test]
+fn priorities() {
+    let mut bench = Bench::new();
+    bench.all_running(&[1, 2, 3]);
+    bench.serve();
+    bench.wish(1, 1, Wish::Partial(results(1.0)));
+    bench.wish(2, 1, Wish::Final(Outcome::Cancelled, results(1.0)));
+    bench.wish(10, 1, Wish::Queued);
+    bench.ask(11, 1);
+    bench.wish(3, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.wait(10.0);
+    let mut sent = Vec::new();
+    let mut tickets = Vec::new();
+    for _ in 0..12 {
+        let Some((name, ticket)) = bench.next() else { break };
+        match &ticket.request {
+            Request::List { .. } => bench.answer(&ticket, Reply::Rows(Answer::Done(vec![]))),
+            Request::Phases(_) => bench.answer(&ticket, Reply::Phases(Answer::Refused(refusal(About::Request, 401)))),
+            _ => tickets.push(ticket),
+        }
+        sent.push(name);
+    }
+    // The read for the cancelled end has to leave room in the budget for two writes; the rest waits for a place.
+    let expected = [
+        "submission 3",
+        "list of cancelled",
+        "submission 11",
+        "sweep of submitted",
+        "sweep of resuming",
+        "phases",
+        "submission 10",
+    ];
+    assert_eq!(sent, expected, "{sent:?}");
+    bench.answer(&tickets[0], Reply::Row(Answer::Done(row(3, Status::Running))));
+    bench.write("failed 3");
+    bench.wait(0.5);
+    bench.expect_nothing();
+    bench.wait(1.4);
+    let ticket = bench.expect("submission 2");
+    bench.answer(&ticket, Reply::Row(Answer::Done(row(2, Status::Running))));
+    bench.write("cancelled 2");
+}
+
+#[test]
+fn one_request_a_submission_and_four_in_all() {
+    let mut bench = Bench::new();
+    for pk in 1..=5 {
+        bench.ask(pk, 1);
+        bench.wish(pk, 1, Wish::Queued);
+    }
+    let tickets: Vec<_> = std::iter::from_fn(|| bench.next()).collect();
+    assert_eq!(tickets.len(), 4, "{tickets:?}");
+    bench.answer(&tickets[0].1, Reply::Row(Answer::Done(row(1, Status::Submitted))));
+    let names: Vec<_> = std::iter::from_fn(|| bench.next()).map(|(name, _)| name).collect();
+    assert_eq!(names.len(), 1);
+    // An object applied anew under another uid is the same submission.
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    bench.expect("submission 7");
+    bench.forget(7);
+    let again = Key {
+        uid: "another".into(),
+        ..key(7)
+    };
+    let now = bench.now();
+    bench.queue.ask(&target(), &again, 7, &run(7, 1), false, now);
+    bench.expect_nothing();
+}
+
+#[test]
+fn many_waiting_submissions_are_asked_for_by_one_list() {
+    let mut bench = Bench::new();
+    for pk in 1..=8 {
+        bench.ask(pk, 1);
+    }
+    let rows = (1..=7).map(|pk| row(pk, Status::Submitted)).collect();
+    bench.list("list of submitted", rows);
+    assert!((1..=7).all(|pk| bench.view(pk).answered == 1));
+    bench.get(8, row(8, Status::Resuming));
+    bench.expect_nothing();
+    for pk in 11..=16 {
+        bench.ask(pk, 1);
+    }
+    bench.expect_nothing();
+    bench.wait(5.0);
+    let ticket = bench.expect("list of submitted");
+    bench.answer(&ticket, Reply::Rows(Answer::Refused(refusal(About::Request, 400))));
+    bench.get(11, row(11, Status::Submitted));
+}
+
+#[test]
+fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
+    let mut bench = Bench::new();
+    bench.serve();
+    bench.ask(7, 1);
+    let at = |pk, seconds| Row {
+        submitted_at: Some(wall(seconds)),
+        ..row(pk, Status::Submitted)
+    };
+    let resumed = Row {
+        resumed_at: Some(wall(-200)),
+        ..at(5, -1_000_000)
+    };
+    bench.get(7, at(7, -1000));
+    // Known, lost, too young, from before the Leaderboard.
+    bench.list(
+        "sweep of submitted",
+        vec![at(7, -1000), at(1, -1000), at(2, -30), at(3, -7200)],
+    );
+    let ticket = bench.list("sweep of resuming", vec![resumed]);
+    assert!(matches!(ticket.request, Request::List { after, .. } if after < wall(-100 * 86_400)));
+    let swept: Vec<_> = bench
+        .queue
+        .take_sweep()
+        .into_iter()
+        .map(|row| (row.submission, row.time))
+        .collect();
+    assert_eq!(swept, [(1, wall(-1000)), (5, wall(-200))]);
+    let mut again = 0;
+    for _ in 0..11 {
+        bench.wait(60.0);
+        while let Some((name, ticket)) = bench.next() {
+            let rows = if name == "sweep of submitted" {
+                vec![at(1, -1000)]
+            } else {
+                vec![]
+            };
+            match ticket.request {
+                Request::Phases(_) => bench.answer(&ticket, Reply::Phases(Answer::Done(vec![]))),
+                Request::Splits(_) => bench.answer(&ticket, Reply::Splits(Answer::Done(vec![]))),
+                _ => bench.answer(&ticket, Reply::Rows(Answer::Done(rows))),
+            }
+        }
+        again += bench.queue.take_sweep().len();
+    }
+    assert_eq!(again, 1, "once more after ten minutes");
+}
+
+#[test]
+fn a_leaderboard_is_checked_at_its_start_and_hourly() {
+    let mut bench = Bench::new();
+    bench.serve();
+    bench.list("sweep of submitted", vec![]);
+    bench.list("sweep of resuming", vec![]);
+    let split = Split {
+        phase: 1,
+        dataset_split: 5,
+        schema: Schema {
+            labels: vec!["Driving score".into()],
+        },
+    };
+    for round in 0..2 {
+        let ticket = bench.expect("phases");
+        bench.answer(&ticket, Reply::Phases(Answer::Done(vec![Phase { id: 1 }])));
+        let ticket = bench.expect("splits");
+        bench.answer(&ticket, Reply::Splits(Answer::Done(vec![split.clone()])));
+        let ticket = bench.expect("dataset split");
+        let codename = if round == 0 { "leaderboard" } else { "other" };
+        let answer = DatasetSplit {
+            codename: codename.into(),
+        };
+        bench.answer(&ticket, Reply::DatasetSplit(Answer::Done(answer)));
+        let (labels, error) = bench.queue.labels(&key(100));
+        assert_eq!((labels.unwrap().ok(), error), (round == 0, None));
+        assert_eq!(bench.queue.take_changes(), [Changed::Leaderboard(key(100))].into());
+        bench.wait(3600.0);
+        bench.list("sweep of submitted", vec![]);
+        bench.list("sweep of resuming", vec![]);
+    }
+    let ticket = bench.expect("phases");
+    bench.answer(&ticket, Reply::Phases(Answer::Refused(refusal(About::Request, 401))));
+    let (labels, error) = bench.queue.labels(&key(100));
+    assert!(
+        labels.is_some() && error.is_some(),
+        "the old check stands, and why there is no newer one"
+    );
+    let now = bench.now();
+    bench.queue.retire(&key(100), now);
+    bench.wait(3600.0);
+    bench.expect_nothing();
+}

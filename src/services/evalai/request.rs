@@ -1,0 +1,144 @@
+//! Every request this room can make, and the form of its answer. `queue` chooses them, `client` sends them.
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+
+use super::answer::Answer;
+use super::row::{DatasetSplit, Phase, Row, Split};
+use super::status::{Outcome, Progress};
+use super::types::{Key, Payload};
+
+/// Whom a request is about.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Subject {
+    pub key: Key,
+    pub challenge: i64,
+    /// Id of the submission.
+    pub pk: i64,
+    pub attempt: i64,
+}
+
+/// What a list is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Purpose {
+    /// `cancelled`: whose runs are to stop.
+    Cancel,
+    /// `submitted`: many new submissions at once.
+    Accept,
+    /// `submitted`: whose message was lost.
+    SweepSubmitted,
+    /// `resuming`: whose message was lost.
+    SweepResuming,
+}
+
+impl Purpose {
+    /// The status that is listed.
+    pub fn status(self) -> &'static str {
+        match self {
+            Self::Cancel => "cancelled",
+            Self::Accept | Self::SweepSubmitted => "submitted",
+            Self::SweepResuming => "resuming",
+        }
+    }
+}
+
+/// One request.
+#[derive(Clone, Debug)]
+pub enum Request {
+    Get(Subject),
+    /// The uploaded file: not of the API, and not counted by it.
+    Image(Subject, String),
+    Progress(Subject, Progress, Option<String>),
+    Partial(Subject, Arc<Payload>),
+    Final(Subject, Outcome, Arc<Payload>),
+    List {
+        challenge: i64,
+        purpose: Purpose,
+        after: Timestamp,
+    },
+    Phases(i64),
+    Splits(i64),
+    DatasetSplit(i64, i64),
+}
+
+impl Request {
+    /// Whether it changes anything.
+    pub fn is_write(&self) -> bool {
+        matches!(self, Self::Progress(..) | Self::Partial(..) | Self::Final(..))
+    }
+
+    /// Whether the server counts it.
+    pub fn counts(&self) -> bool {
+        !matches!(self, Self::Image(..))
+    }
+
+    /// Whom it is about, if a submission.
+    pub fn subject(&self) -> Option<&Subject> {
+        match self {
+            Self::Get(subject)
+            | Self::Image(subject, _)
+            | Self::Progress(subject, ..)
+            | Self::Partial(subject, _)
+            | Self::Final(subject, ..) => Some(subject),
+            Self::List { .. } | Self::Phases(_) | Self::Splits(_) | Self::DatasetSplit(..) => None,
+        }
+    }
+
+    /// For logs.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Get(_) => "submission",
+            Self::Image(..) => "image",
+            Self::Progress(_, Progress::Queued, _) => "queued",
+            Self::Progress(_, Progress::Running, _) => "running",
+            Self::Partial(..) => "partial",
+            Self::Final(_, outcome, _) => outcome.as_str(),
+            Self::List { purpose, .. } => match purpose {
+                Purpose::Cancel => "list of cancelled",
+                Purpose::Accept => "list of submitted",
+                Purpose::SweepSubmitted => "sweep of submitted",
+                Purpose::SweepResuming => "sweep of resuming",
+            },
+            Self::Phases(_) => "phases",
+            Self::Splits(_) => "splits",
+            Self::DatasetSplit(..) => "dataset split",
+        }
+    }
+}
+
+/// An answer, in the form its request asks for.
+#[derive(Clone, Debug)]
+pub enum Reply {
+    Row(Answer<Row>),
+    Rows(Answer<Vec<Row>>),
+    Written(Answer<()>),
+    Image(Answer<String>),
+    Phases(Answer<Vec<Phase>>),
+    Splits(Answer<Vec<Split>>),
+    DatasetSplit(Answer<DatasetSplit>),
+}
+
+impl Reply {
+    /// The end without its content.
+    pub fn answer(&self) -> Answer<()> {
+        fn bare<T>(answer: &Answer<T>) -> Answer<()> {
+            match answer {
+                Answer::Done(_) => Answer::Done(()),
+                Answer::Refused(refusal) => Answer::Refused(refusal.clone()),
+                Answer::Broken(message) => Answer::Broken(message.clone()),
+                Answer::Throttled(wait) => Answer::Throttled(*wait),
+                Answer::Unanswered(silence) => Answer::Unanswered(silence.clone()),
+            }
+        }
+        match self {
+            Self::Row(answer) => bare(answer),
+            Self::Rows(answer) => bare(answer),
+            Self::Written(answer) => bare(answer),
+            Self::Image(answer) => bare(answer),
+            Self::Phases(answer) => bare(answer),
+            Self::Splits(answer) => bare(answer),
+            Self::DatasetSplit(answer) => bare(answer),
+        }
+    }
+}

@@ -1,0 +1,216 @@
+//! What EvalAI tells of a submission, a phase and a split, parsed at the edge.
+//!
+//! Called by `client`. Pure. Only an id and a status are required: a field that changes its form must not blind us to
+//! a cancellation.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Deserializer};
+use serde_json::Value;
+
+use super::status::Status;
+
+/// A submission as EvalAI shows it to a host.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Row {
+    /// Its id.
+    pub id: i64,
+    /// Where it stands; [`Status::Ignored`] if it was deleted.
+    pub status: Status,
+    /// Id of its phase.
+    pub phase: Option<i64>,
+    /// Id of the team.
+    pub team_id: Option<i64>,
+    /// Name of the team.
+    pub team_name: Option<String>,
+    /// When it was submitted; a re-run keeps the time of the old row.
+    pub submitted_at: Option<Timestamp>,
+    /// When it was last re-run or resumed.
+    pub resumed_at: Option<Timestamp>,
+    /// Where the uploaded file is.
+    pub input_file: Option<String>,
+    /// Every `job_name` ever sent, in lower case.
+    pub jobs: Vec<String>,
+}
+
+impl Row {
+    /// The row of a submission that EvalAI does not have.
+    pub fn missing(id: i64) -> Self {
+        Self {
+            id,
+            status: Status::Missing,
+            phase: None,
+            team_id: None,
+            team_name: None,
+            submitted_at: None,
+            resumed_at: None,
+            input_file: None,
+            jobs: Vec::new(),
+        }
+    }
+
+    /// When it last asked to be run.
+    pub fn wanted_at(&self) -> Option<Timestamp> {
+        self.resumed_at.or(self.submitted_at)
+    }
+
+    /// Whether this Job was ever named to EvalAI.
+    pub fn names(&self, job: &str) -> bool {
+        let job = job.to_lowercase();
+        self.jobs.contains(&job)
+    }
+}
+
+impl<'de> Deserialize<'de> for Row {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        struct Raw {
+            id: i64,
+            status: String,
+            #[serde(default)]
+            ignore_submission: Value,
+            #[serde(default)]
+            challenge_phase: Value,
+            #[serde(default)]
+            participant_team: Value,
+            #[serde(default)]
+            participant_team_name: Value,
+            #[serde(default)]
+            submitted_at: Value,
+            #[serde(default)]
+            rerun_resumed_at: Value,
+            #[serde(default)]
+            input_file: Value,
+            #[serde(default)]
+            job_name: Value,
+        }
+        let raw = Raw::deserialize(deserializer)?;
+        let text = |value: &Value| value.as_str().map(str::to_owned);
+        let time = |value: &Value| value.as_str().and_then(|text| text.parse().ok());
+        let ignored = raw.ignore_submission.as_bool() == Some(true);
+        let jobs = raw.job_name.as_array().into_iter().flatten();
+        Ok(Self {
+            id: raw.id,
+            status: if ignored {
+                Status::Ignored
+            } else {
+                Status::parse(&raw.status)
+            },
+            phase: raw.challenge_phase.as_i64(),
+            team_id: raw.participant_team.as_i64(),
+            team_name: text(&raw.participant_team_name),
+            submitted_at: time(&raw.submitted_at),
+            resumed_at: time(&raw.rerun_resumed_at),
+            input_file: text(&raw.input_file),
+            jobs: jobs.filter_map(Value::as_str).map(str::to_lowercase).collect(),
+        })
+    }
+}
+
+/// A phase of a challenge.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+pub struct Phase {
+    /// Its id.
+    pub id: i64,
+}
+
+/// A leaderboard of a phase. The codename of its dataset split stands elsewhere.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+pub struct Split {
+    /// Id of the phase.
+    #[serde(rename = "challenge_phase")]
+    pub phase: i64,
+    /// Id of the dataset split.
+    pub dataset_split: i64,
+    /// The leaderboard's columns.
+    #[serde(rename = "leaderboard_schema")]
+    pub schema: Schema,
+}
+
+/// A leaderboard's columns.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+pub struct Schema {
+    /// The metrics it knows.
+    pub labels: Vec<String>,
+}
+
+/// A dataset split.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+pub struct DatasetSplit {
+    /// Its name in results.
+    pub codename: String,
+}
+
+/// The image that an uploaded file names, or why there is none.
+pub fn image(file: &[u8]) -> Result<String, String> {
+    let parsed: Value = serde_json::from_slice(file).map_err(|_| "the uploaded file is no JSON".to_owned())?;
+    let image = parsed.get("submitted_image_uri").and_then(Value::as_str);
+    let image = image
+        .ok_or_else(|| "the uploaded file has no submitted_image_uri".to_owned())?
+        .trim();
+    let plausible = !image.is_empty() && image.len() <= 512 && image.bytes().all(|byte| byte.is_ascii_graphic());
+    if plausible {
+        Ok(image.to_owned())
+    } else {
+        Err("submitted_image_uri in the uploaded file is no image".to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn a_row_is_read() {
+        let row: Row = serde_json::from_value(json!({
+            "id": 7, "status": "queued", "ignore_submission": false, "challenge_phase": 1, "participant_team": 3,
+            "participant_team_name": "team-a", "submitted_at": "2026-11-21T10:09:08.123456Z",
+            "rerun_resumed_at": null, "input_file": "http://e/media/x.json", "job_name": ["Submission-7-1"], "is_public": true,
+        }))
+        .unwrap();
+        assert_eq!(
+            (row.id, row.status, row.phase, row.team_id),
+            (7, Status::Queued, Some(1), Some(3))
+        );
+        assert_eq!(row.wanted_at(), row.submitted_at);
+        assert!(row.names("submission-7-1") && row.names("SUBMISSION-7-1") && !row.names("submission-7-2"));
+    }
+
+    #[test]
+    fn odd_fields_hide_no_status() {
+        let row: Row = serde_json::from_value(json!({
+            "id": 7, "status": "cancelled", "challenge_phase": "one", "submitted_at": "yesterday", "job_name": "x",
+        }))
+        .unwrap();
+        assert_eq!(
+            (row.status, row.phase, row.submitted_at, row.jobs.len()),
+            (Status::Cancelled, None, None, 0)
+        );
+        assert!(serde_json::from_value::<Row>(json!({"id": 7})).is_err());
+    }
+
+    #[test]
+    fn a_deleted_submission_keeps_its_status_and_is_ignored() {
+        let row: Row =
+            serde_json::from_value(json!({"id": 7, "status": "running", "ignore_submission": true})).unwrap();
+        assert_eq!(row.status, Status::Ignored);
+    }
+
+    #[test]
+    fn an_uploaded_file_names_an_image_or_says_why_not() {
+        let of = |value: Value| image(value.to_string().as_bytes());
+        assert_eq!(
+            of(json!({"submitted_image_uri": "registry.example/a:1"})),
+            Ok("registry.example/a:1".into())
+        );
+        for (value, part) in [
+            (json!({}), "no submitted_image_uri"),
+            (json!({"submitted_image_uri": 1}), "no submitted_image_uri"),
+            (json!({"submitted_image_uri": "two words"}), "no image"),
+            (json!({"submitted_image_uri": ""}), "no image"),
+        ] {
+            assert!(of(value).unwrap_err().contains(part));
+        }
+        assert!(image(b"<html>").unwrap_err().contains("no JSON"));
+    }
+}

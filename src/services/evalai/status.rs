@@ -1,0 +1,132 @@
+//! EvalAI's words for where a submission stands, and ours for what we want it to say.
+//!
+//! Pure. Used by every module of this room and by the controller.
+
+use std::fmt;
+
+/// Where a submission stands in EvalAI.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Status {
+    Submitted,
+    Submitting,
+    Resuming,
+    Queued,
+    Running,
+    PartiallyEvaluated,
+    Finished,
+    Failed,
+    Cancelled,
+    Archived,
+    /// Deleted by its participant: EvalAI keeps the row and its status, and sets `ignore_submission`.
+    Ignored,
+    /// EvalAI has no such submission.
+    Missing,
+    /// A word this program does not know.
+    Unknown,
+}
+
+impl Status {
+    /// All of them.
+    pub const ALL: [Self; 13] = [
+        Self::Submitted,
+        Self::Submitting,
+        Self::Resuming,
+        Self::Queued,
+        Self::Running,
+        Self::PartiallyEvaluated,
+        Self::Finished,
+        Self::Failed,
+        Self::Cancelled,
+        Self::Archived,
+        Self::Ignored,
+        Self::Missing,
+        Self::Unknown,
+    ];
+
+    /// Reads EvalAI's word.
+    pub fn parse(word: &str) -> Self {
+        let word = word.to_ascii_lowercase();
+        let ours = |status: &Self| matches!(status, Self::Ignored | Self::Missing | Self::Unknown);
+        let found = Self::ALL
+            .into_iter()
+            .find(|status| !ours(status) && status.as_str() == word);
+        found.unwrap_or(Self::Unknown)
+    }
+
+    /// The word, EvalAI's where it has one.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Submitted => "submitted",
+            Self::Submitting => "submitting",
+            Self::Resuming => "resuming",
+            Self::Queued => "queued",
+            Self::Running => "running",
+            Self::PartiallyEvaluated => "partially_evaluated",
+            Self::Finished => "finished",
+            Self::Failed => "failed",
+            Self::Cancelled => "cancelled",
+            Self::Archived => "archived",
+            Self::Ignored => "ignored",
+            Self::Missing => "missing",
+            Self::Unknown => "unknown",
+        }
+    }
+}
+
+impl fmt::Display for Status {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// How far a run is said to be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Progress {
+    Queued,
+    Running,
+}
+
+impl Progress {
+    /// EvalAI's word.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Queued => "queued",
+            Self::Running => "running",
+        }
+    }
+}
+
+/// How a run is said to have ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Outcome {
+    Finished,
+    Failed,
+    Cancelled,
+}
+
+impl Outcome {
+    /// EvalAI's word.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Finished => "finished",
+            Self::Failed => "failed",
+            Self::Cancelled => "cancelled",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn evalais_words_are_read_and_ours_are_not() {
+        for status in Status::ALL {
+            let ours = matches!(status, Status::Ignored | Status::Missing | Status::Unknown);
+            let expected = if ours { Status::Unknown } else { status };
+            assert_eq!(Status::parse(status.as_str()), expected);
+        }
+        assert_eq!(Status::parse("Finished"), Status::Finished);
+        assert_eq!(Status::parse("evaluating"), Status::Unknown);
+    }
+}

@@ -1,0 +1,180 @@
+//! Carries out what one token's queue decides: takes requests out, sends them, brings the answers back.
+//!
+//! Started by `hub`, one for each server and token. Holds the queue's lock only for moments, never while it waits.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use futures::stream::{FuturesUnordered, StreamExt};
+use jiff::Timestamp;
+use tokio::sync::{Notify, mpsc, watch};
+use tokio::time::Instant;
+
+use super::answer::{Answer, Silence};
+use super::client::Client;
+use super::hub::Fence;
+use super::queue::{Next, Now, Queue, Ticket};
+use super::request::Reply;
+use super::types::{Changed, SweepRow};
+use crate::services::token::Token;
+
+/// How long answers are waited for at the end: longer than a write may take.
+const DRAIN: Duration = Duration::from_secs(70);
+
+/// What the hub and the task of one token share.
+pub(super) struct Shared {
+    queue: Mutex<Queue>,
+    token: Mutex<Arc<Token>>,
+    /// Told when something new is wished.
+    pub notify: Notify,
+    /// The queue's time counts from here.
+    start: Instant,
+}
+
+/// Where changes go.
+#[derive(Clone)]
+pub(super) struct Outlets {
+    pub changed: mpsc::UnboundedSender<Changed>,
+    pub sweep: mpsc::UnboundedSender<SweepRow>,
+}
+
+impl Shared {
+    pub fn new(queue: Queue, token: Arc<Token>, start: Instant) -> Self {
+        Self {
+            queue: Mutex::new(queue),
+            token: Mutex::new(token),
+            notify: Notify::new(),
+            start,
+        }
+    }
+
+    /// The moment on the queue's clock.
+    pub fn now(&self) -> Now {
+        now(self.start)
+    }
+
+    /// The queue. A panic elsewhere leaves it whole: every change of it is one call.
+    pub fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes a renewed token. Returns whether it is another one.
+    pub fn renew(&self, token: &Arc<Token>) -> bool {
+        let mut kept = self.token.lock().unwrap_or_else(PoisonError::into_inner);
+        let other = *kept != *token;
+        if other {
+            *kept = token.clone();
+        }
+        other
+    }
+
+    fn token(&self) -> Arc<Token> {
+        self.token.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Tells what has changed.
+    pub fn publish(&self, outlets: &Outlets) {
+        let (changes, sweep) = {
+            let mut queue = self.queue();
+            (queue.take_changes(), queue.take_sweep())
+        };
+        // A listener that is gone has no use for it.
+        for change in changes {
+            let _ = outlets.changed.send(change);
+        }
+        for row in sweep {
+            let _ = outlets.sweep.send(row);
+        }
+    }
+}
+
+/// The moment on a clock that began at `start`.
+pub(super) fn now(start: Instant) -> Now {
+    Now {
+        at: start.elapsed(),
+        wall: Timestamp::now(),
+    }
+}
+
+/// Runs until `closing` turns true. Returns whether every write is answered: only then may another process write at once.
+pub(super) async fn run(
+    shared: Arc<Shared>,
+    client: Client,
+    fence: Arc<dyn Fence>,
+    outlets: Outlets,
+    mut closing: watch::Receiver<bool>,
+) -> bool {
+    let mut in_flight = FuturesUnordered::new();
+    while !*closing.borrow() {
+        let wait = loop {
+            let next = shared.queue().next(shared.now(), fence.may_write());
+            match next {
+                Next::Send(ticket) => in_flight.push(send(&shared, &client, &*fence, ticket)),
+                Next::Wait(until) => break until,
+            }
+        };
+        let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
+        tokio::select! {
+            Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &outlets, &ticket, reply),
+            () = shared.notify.notified() => {}
+            () = tokio::time::sleep_until(until) => {}
+            _ = closing.changed() => {}
+        }
+    }
+    let answers = async {
+        while let Some((ticket, reply)) = in_flight.next().await {
+            take(&shared, &outlets, &ticket, reply);
+        }
+    };
+    let all = tokio::time::timeout(DRAIN, answers).await.is_ok();
+    all && !shared.queue().is_unsure(shared.now())
+}
+
+/// Sends one request, unless the fence has fallen since it was chosen. None as reply: it was not sent.
+async fn send(shared: &Shared, client: &Client, fence: &dyn Fence, ticket: Ticket) -> (Ticket, Option<Reply>) {
+    let write = ticket.request.is_write();
+    if write && !fence.may_write() {
+        return (ticket, None);
+    }
+    let started = Instant::now();
+    let reply = client.send(&shared.token(), &ticket.request).await;
+    log(&ticket, &reply.answer(), started.elapsed());
+    (ticket, Some(reply))
+}
+
+fn take(shared: &Shared, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
+    match reply {
+        Some(reply) => shared.queue().answered(ticket, reply, shared.now()),
+        None => shared.queue().not_sent(ticket),
+    }
+    shared.publish(outlets);
+}
+
+fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
+    let request = ticket.request.name();
+    let submission = ticket
+        .request
+        .subject()
+        .map(|subject| subject.key.to_string())
+        .unwrap_or_default();
+    let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);
+    match answer {
+        Answer::Done(()) if ticket.request.is_write() => {
+            tracing::info!(request, submission, milliseconds, "EvalAI has taken it");
+        }
+        Answer::Done(()) => tracing::debug!(request, submission, milliseconds, "EvalAI has answered"),
+        Answer::Unanswered(Silence { sent: true, why }) if ticket.request.is_write() => {
+            tracing::warn!(
+                request,
+                submission,
+                milliseconds,
+                why,
+                "EvalAI has not answered a write; nothing more is written for a while"
+            );
+        }
+        other => {
+            let why = other.error().unwrap_or_default();
+            tracing::warn!(request, submission, milliseconds, why, "EvalAI has not done it");
+        }
+    }
+}

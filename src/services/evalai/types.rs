@@ -1,0 +1,137 @@
+//! What the controller says to this room, and what it gets back.
+//!
+//! Pure. A [`Key`] names the object that is woken, a [`Run`] the attempt that a wish speaks of.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::row::Row;
+use super::status::{Outcome, Progress, Status};
+pub use crate::services::ObjectKey as Key;
+use crate::services::token::Token;
+
+/// The challenge of a Leaderboard and how it is spoken to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Target {
+    /// Root of the server.
+    pub api_server: String,
+    /// Id of the challenge.
+    pub challenge: i64,
+    /// Codename of the dataset split.
+    pub split: String,
+    /// A host's token.
+    pub token: Arc<Token>,
+    /// Requests per minute; the smallest of all Leaderboards with this token holds.
+    pub requests_per_minute: u32,
+    /// Time between two sweeps.
+    pub sweep: Duration,
+    /// Time between two lists of cancelled submissions.
+    pub period: Duration,
+    /// Phases of the Leaderboard's tracks.
+    pub phases: Arc<[i64]>,
+    /// The metrics that its results hold.
+    pub labels: Arc<[String]>,
+    /// When the Leaderboard was created: the sweep leaves alone what asked to be run before.
+    pub since: Timestamp,
+}
+
+/// One attempt of a submission.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Run {
+    /// From 1.
+    pub attempt: i64,
+    /// Name of the attempt's first Job, told to EvalAI with `queued`: found there again, it says that EvalAI knows of the
+    /// attempt.
+    pub job: String,
+}
+
+/// What EvalAI is to say.
+#[derive(Clone, Debug)]
+pub enum Wish {
+    /// The run waits for its Pod.
+    Queued,
+    /// An agent runs.
+    Running,
+    /// Results so far.
+    Partial(Arc<Payload>),
+    /// The end.
+    Final(Outcome, Arc<Payload>),
+}
+
+/// Texts of an evaluation.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
+pub struct Payload {
+    /// Phase whose leaderboard gets the results.
+    pub phase: i64,
+    /// JSON text of the list of results; not sent with `failed` and `cancelled`.
+    pub result: String,
+    /// Shown to the participant.
+    pub stdout: String,
+    /// Shown to the participant.
+    pub stderr: String,
+    /// JSON text, shown to the hosts.
+    pub metadata: String,
+    /// Shown to the hosts; only with an end.
+    pub environment_log: String,
+}
+
+/// What is known of a submission in EvalAI. Memory only.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct View {
+    /// Its row, as last read.
+    pub row: Option<Arc<Row>>,
+    /// When the row was read.
+    pub read_at: Option<Timestamp>,
+    /// The newest attempt whose `ask` the row answers; 0 is none.
+    pub answered: i64,
+    /// The image of the uploaded file, if it was asked for; or why there is none.
+    pub image: Option<Result<String, String>>,
+    /// The attempt that all below speaks of.
+    pub attempt: i64,
+    /// How far EvalAI knows this attempt to be.
+    pub progress: Option<Progress>,
+    /// EvalAI has ended this attempt, by somebody else's hand.
+    pub ended: Option<Status>,
+    /// What became of the wish for an end.
+    pub end: Option<Ended>,
+    /// When partial results were last taken.
+    pub partial_at: Option<Timestamp>,
+    /// The last thing that went wrong; none after the next thing that went well.
+    pub last_error: Option<String>,
+    /// Nothing is written until then, because a write was not answered.
+    pub unanswered_until: Option<Timestamp>,
+}
+
+/// What became of a wish for an end.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// EvalAI has taken it.
+    Published { outcome: Outcome, at: Timestamp },
+    /// EvalAI said as much already; nothing was written.
+    Agreed(Status),
+    /// EvalAI has ended the run itself: the outcome becomes Cancelled, nothing was written.
+    Otherwise(Status),
+    /// EvalAI refuses it. It is tried again from time to time, and at once with other texts.
+    Refused(String),
+}
+
+/// What has changed, to wake its object.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Changed {
+    /// The view of a Submission.
+    Submission(Key),
+    /// Labels or token of a Leaderboard.
+    Leaderboard(Key),
+}
+
+/// A submission that asks to be run and that nobody here knows: its message may be lost.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SweepRow {
+    pub challenge: i64,
+    pub phase: i64,
+    pub submission: i64,
+    /// When it asked to be run: its re-run or resume, else its submission.
+    pub time: Timestamp,
+}

@@ -1,0 +1,447 @@
+//! The DynamoDB table of submissions: finds out its keys, writes rows so that an older one never wins.
+//!
+//! Called through `Recorder` by the controller's leader, which alone writes. Knows no Kubernetes objects; what a
+//! column holds is the caller's.
+
+mod ledger;
+mod recorder;
+
+use std::collections::{BTreeMap, HashMap};
+
+use aws_sdk_dynamodb::Client;
+use aws_sdk_dynamodb::config::http::HttpResponse;
+use aws_sdk_dynamodb::error::{ProvideErrorMetadata, SdkError};
+use aws_sdk_dynamodb::operation::update_item::UpdateItemError;
+use aws_sdk_dynamodb::types::{
+    AttributeValue, KeyType, ReturnValuesOnConditionCheckFailure, ScalarAttributeType, TableDescription,
+};
+use thiserror::Error;
+
+pub use ledger::View;
+pub use recorder::Recorder;
+
+use crate::api;
+use crate::services::aws::Aws;
+use crate::services::fault::{self, Fault};
+
+/// Column with the attempt, a number.
+const ATTEMPT: &str = "attempt";
+/// Column with the status, in upper case.
+const STATUS: &str = "submission_status";
+/// Statuses after which a row of the same attempt is not written again.
+const ENDS: [&str; 3] = ["FINISHED", "FAILED", "CANCELLED"];
+/// A row is written only over an older attempt, or over the same one before its end.
+const CONDITION: &str = "attribute_not_exists(#attempt) OR #attempt < :attempt \
+     OR (#attempt = :attempt AND NOT (#status IN (:end0, :end1, :end2)))";
+
+/// One row, all columns as text. An empty text is unknown: its column stays as it is.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Row {
+    /// Partition key: id of the team.
+    pub team_id: String,
+    /// Sort key: id of the run.
+    pub run_id: String,
+    /// Attempt, from 1.
+    pub attempt: i64,
+    /// Name of the team.
+    pub team_name: String,
+    /// `PENDING`, `RUNNING`, `FINISHED` and so on.
+    pub submission_status: String,
+    /// Id of the phase.
+    pub track_id: String,
+    /// Codename of the track.
+    pub track_name: String,
+    /// The participant's image.
+    pub submitted_image_uri: String,
+    /// When it was submitted, as `time_text` writes it.
+    pub submitted_time: String,
+    /// When the attempt started.
+    pub start_time: String,
+    /// When the attempt ended.
+    pub end_time: String,
+    /// Where the results are, `s3://bucket/id`.
+    pub results: String,
+    /// `12/20`.
+    pub progress: String,
+    /// Metric columns and their values.
+    pub metrics: Vec<(String, String)>,
+}
+
+impl Row {
+    /// The columns that are known, but for the keys and the attempt.
+    fn columns(&self) -> BTreeMap<&str, &str> {
+        let fixed = [
+            ("team_name", &self.team_name),
+            (STATUS, &self.submission_status),
+            ("track_id", &self.track_id),
+            ("track_name", &self.track_name),
+            ("submitted_image_uri", &self.submitted_image_uri),
+            ("submitted_time", &self.submitted_time),
+            ("start_time", &self.start_time),
+            ("end_time", &self.end_time),
+            ("results", &self.results),
+            ("progress", &self.progress),
+        ];
+        let metrics = self
+            .metrics
+            .iter()
+            .map(|(column, value)| (column.as_str(), value.as_str()));
+        // What a metric may be called is the phase's; our own columns come last and win.
+        metrics
+            .chain(fixed.iter().map(|(column, value)| (*column, value.as_str())))
+            .filter(|(column, value)| !value.is_empty() && *column != ATTEMPT)
+            .collect()
+    }
+}
+
+/// A time as the columns hold it: `2026-11-20 10:00:00 UTC`.
+pub fn time_text(time: jiff::Timestamp) -> String {
+    time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string()
+}
+
+/// What became of a write.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Written {
+    /// The row is stored, now or by an earlier try.
+    Stored,
+    /// The table holds the end of this attempt, or a later attempt, with other values.
+    Stale,
+}
+
+/// Why a row is not stored.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+pub enum TableError {
+    /// The operator may not do this.
+    #[error("table {table}: {action} is not allowed: {text}; give the operator's AWS identity dynamodb:{action}")]
+    Denied {
+        table: String,
+        action: &'static str,
+        text: String,
+    },
+    /// There is no such table.
+    #[error("table {table} does not exist: {text}; check table.name, table.region and table.endpoint")]
+    Missing { table: String, text: String },
+    /// DynamoDB may take it later.
+    #[error("table {table}: {action} failed: {text}; it is tried again")]
+    Passing {
+        table: String,
+        action: &'static str,
+        text: String,
+    },
+    /// DynamoDB won't take it.
+    #[error("table {table}: {action} was refused: {text}")]
+    Refused {
+        table: String,
+        action: &'static str,
+        text: String,
+    },
+    /// The table has one key only: the rows of a team would overwrite each other.
+    #[error("table {table} has no sort key; it needs a partition key for the team and a sort key for the submission")]
+    NoSortKey { table: String },
+    /// The keys that are set are not the table's.
+    #[error("table {table} has the keys {found} but table.partitionKey and table.sortKey say {set}; leave both out")]
+    OtherKeys { table: String, found: String, set: String },
+    /// A key's value is not of the type that the table wants.
+    #[error("table {table}: key {key} {problem}")]
+    Key {
+        table: String,
+        key: String,
+        problem: String,
+    },
+    /// The table holds a later state of the submission.
+    #[error(
+        "table {table} already holds a later attempt or another end of submission {run_id}; the row is left as it is"
+    )]
+    Stale { table: String, run_id: String },
+}
+
+impl TableError {
+    /// True if other rows of this table would meet the same error, and the same row may be taken later.
+    pub fn is_of_the_table(&self) -> bool {
+        !matches!(self, Self::Refused { .. } | Self::Key { .. } | Self::Stale { .. })
+    }
+}
+
+/// A table whose keys are known.
+#[derive(Clone, Debug)]
+pub struct Table {
+    client: Client,
+    name: String,
+    partition: Key,
+    sort: Key,
+}
+
+/// A key of a table.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Key {
+    name: String,
+    kind: ScalarAttributeType,
+}
+
+impl Table {
+    /// Asks the table for the names and types of its keys. Where that is not allowed, keys that are set are taken
+    /// for strings.
+    pub async fn describe(aws: &Aws, table: &api::Table) -> Result<Self, TableError> {
+        let client = aws.dynamodb(table.region.as_deref(), table.endpoint.as_deref());
+        let name = table.name.clone();
+        let set = table.partition_key.clone().zip(table.sort_key.clone());
+        let answer = client.describe_table().table_name(&name).send().await;
+        let (partition, sort) = match answer.map_err(|error| failed(&name, "DescribeTable", &error)) {
+            Ok(output) => keys(&name, output.table.as_ref(), set)?,
+            Err(TableError::Denied { .. }) if set.is_some() => {
+                let (partition, sort) = set.unwrap_or_default();
+                (text_key(partition), text_key(sort))
+            }
+            Err(error) => return Err(error),
+        };
+        Ok(Self {
+            client,
+            name,
+            partition,
+            sort,
+        })
+    }
+
+    /// Names of partition and sort key.
+    pub fn key_names(&self) -> (&str, &str) {
+        (&self.partition.name, &self.sort.name)
+    }
+
+    /// Writes a row, unless the table holds a later one. Safe twice.
+    pub async fn write(&self, row: &Row) -> Result<Written, TableError> {
+        let mut request = self
+            .client
+            .update_item()
+            .table_name(&self.name)
+            .key(
+                &self.partition.name,
+                self.key_value(&self.partition, &row.team_id, "team")?,
+            )
+            .key(&self.sort.name, self.key_value(&self.sort, &row.run_id, "submission")?)
+            .condition_expression(CONDITION)
+            .expression_attribute_names("#attempt", ATTEMPT)
+            .expression_attribute_names("#status", STATUS)
+            .expression_attribute_values(":attempt", AttributeValue::N(row.attempt.to_string()))
+            .return_values_on_condition_check_failure(ReturnValuesOnConditionCheckFailure::AllOld);
+        for (index, end) in ENDS.into_iter().enumerate() {
+            request = request.expression_attribute_values(format!(":end{index}"), AttributeValue::S(end.into()));
+        }
+        let columns = self.columns(row);
+        let mut update = vec!["SET #attempt = :attempt".to_owned()];
+        for (index, (column, value)) in columns.iter().enumerate() {
+            // A name may have one placeholder only, and the status has one already.
+            let name = if *column == STATUS {
+                "#status".to_owned()
+            } else {
+                format!("#c{index}")
+            };
+            update.push(format!("{name} = :v{index}"));
+            request = request
+                .expression_attribute_names(name, *column)
+                .expression_attribute_values(format!(":v{index}"), AttributeValue::S((*value).into()));
+        }
+        match request.update_expression(update.join(", ")).send().await {
+            Ok(_) => Ok(Written::Stored),
+            Err(error) => match error.as_service_error() {
+                Some(UpdateItemError::ConditionalCheckFailedException(lost)) => {
+                    let same = lost.item().is_some_and(|old| is_same(old, row.attempt, &columns));
+                    Ok(if same { Written::Stored } else { Written::Stale })
+                }
+                _ => Err(failed(&self.name, "UpdateItem", &error)),
+            },
+        }
+    }
+
+    /// Keys can't be set; a table may have given one the name of a column.
+    fn columns<'a>(&self, row: &'a Row) -> BTreeMap<&'a str, &'a str> {
+        let mut columns = row.columns();
+        columns.retain(|column, _| *column != self.partition.name && *column != self.sort.name);
+        columns
+    }
+
+    fn key_value(&self, key: &Key, text: &str, what: &str) -> Result<AttributeValue, TableError> {
+        let problem = if text.is_empty() {
+            format!("is empty: the {what} is not known")
+        } else {
+            match key.kind {
+                ScalarAttributeType::S => return Ok(AttributeValue::S(text.to_owned())),
+                ScalarAttributeType::N if text.parse::<i64>().is_ok() => return Ok(AttributeValue::N(text.to_owned())),
+                ScalarAttributeType::N => format!("is a number in this table, but the {what} is called {text}"),
+                _ => "is neither a string nor a number in this table".to_owned(),
+            }
+        };
+        Err(TableError::Key {
+            table: self.name.clone(),
+            key: key.name.clone(),
+            problem,
+        })
+    }
+}
+
+/// True if the stored item holds what we were about to write.
+fn is_same(old: &HashMap<String, AttributeValue>, attempt: i64, columns: &BTreeMap<&str, &str>) -> bool {
+    let stored = old.get(ATTEMPT).and_then(|value| value.as_n().ok());
+    let same_attempt = stored.and_then(|text| text.parse::<i64>().ok()) == Some(attempt);
+    same_attempt
+        && columns.iter().all(|(column, value)| {
+            old.get(*column)
+                .and_then(|v| v.as_s().ok())
+                .is_some_and(|text| text == value)
+        })
+}
+
+/// The keys as the table describes them.
+fn keys(
+    table: &str,
+    described: Option<&TableDescription>,
+    set: Option<(String, String)>,
+) -> Result<(Key, Key), TableError> {
+    let find = |kind: KeyType| {
+        let schema = described.map(TableDescription::key_schema).unwrap_or_default();
+        let name = schema
+            .iter()
+            .find(|element| *element.key_type() == kind)?
+            .attribute_name();
+        let types = described
+            .map(TableDescription::attribute_definitions)
+            .unwrap_or_default();
+        let definition = types.iter().find(|definition| definition.attribute_name() == name);
+        Some(Key {
+            name: name.to_owned(),
+            kind: definition.map_or(ScalarAttributeType::S, |d| d.attribute_type().clone()),
+        })
+    };
+    let found = find(KeyType::Hash).zip(find(KeyType::Range));
+    let (partition, sort) = found.ok_or_else(|| TableError::NoSortKey {
+        table: table.to_owned(),
+    })?;
+    match set {
+        Some((first, second)) if (&first, &second) != (&partition.name, &sort.name) => Err(TableError::OtherKeys {
+            table: table.to_owned(),
+            found: format!("{} and {}", partition.name, sort.name),
+            set: format!("{first} and {second}"),
+        }),
+        _ => Ok((partition, sort)),
+    }
+}
+
+fn text_key(name: String) -> Key {
+    Key {
+        name,
+        kind: ScalarAttributeType::S,
+    }
+}
+
+fn failed<E>(table: &str, action: &'static str, error: &SdkError<E, HttpResponse>) -> TableError
+where
+    E: ProvideErrorMetadata + std::error::Error + 'static,
+{
+    let (table, text) = (table.to_owned(), fault::sentence(error));
+    match fault::of(error) {
+        Fault::Denied => TableError::Denied { table, action, text },
+        Fault::Missing => TableError::Missing { table, text },
+        Fault::Throttled | Fault::Unavailable | Fault::Conflict => TableError::Passing { table, action, text },
+        Fault::Refused => TableError::Refused { table, action, text },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use aws_sdk_dynamodb::types::{AttributeDefinition, KeySchemaElement};
+
+    use super::*;
+
+    fn described(all: &[(&str, KeyType, ScalarAttributeType)]) -> TableDescription {
+        let mut builder = TableDescription::builder();
+        for (name, role, kind) in all {
+            builder = builder
+                .key_schema(
+                    KeySchemaElement::builder()
+                        .attribute_name(*name)
+                        .key_type(role.clone())
+                        .build()
+                        .unwrap(),
+                )
+                .attribute_definitions(
+                    AttributeDefinition::builder()
+                        .attribute_name(*name)
+                        .attribute_type(kind.clone())
+                        .build()
+                        .unwrap(),
+                );
+        }
+        builder.build()
+    }
+
+    #[test]
+    fn keys_are_what_the_table_says() {
+        use {KeyType::Hash, KeyType::Range, ScalarAttributeType as Kind};
+        for (team, submission, kind) in [
+            ("team_id", "submission_id", Kind::S),
+            ("team-id", "submission-id", Kind::N),
+        ] {
+            // Definitions come in any order and may hold keys of indexes.
+            let table = described(&[(submission, Range, kind.clone()), (team, Hash, Kind::S)]);
+            let key = |name: &str, kind| Key {
+                name: name.into(),
+                kind,
+            };
+            let want = (key(team, Kind::S), key(submission, kind));
+            assert_eq!(keys("t", Some(&table), None), Ok(want.clone()));
+            assert_eq!(
+                keys("t", Some(&table), Some((team.into(), submission.into()))),
+                Ok(want)
+            );
+        }
+        let single = described(&[("team_id", Hash, Kind::S)]);
+        assert_eq!(
+            keys("t", Some(&single), None),
+            Err(TableError::NoSortKey { table: "t".into() })
+        );
+        let table = described(&[("team_id", Hash, Kind::S), ("submission_id", Range, Kind::S)]);
+        let other = keys("t", Some(&table), Some(("team-id".into(), "submission-id".into()))).unwrap_err();
+        assert_eq!(
+            other.to_string(),
+            "table t has the keys team_id and submission_id but table.partitionKey and table.sortKey say team-id and submission-id; leave both out"
+        );
+    }
+
+    #[test]
+    fn unknown_columns_are_left_alone_and_metrics_hide_none_of_ours() {
+        let row = Row {
+            team_name: "t".into(),
+            submission_status: "RUNNING".into(),
+            metrics: vec![
+                ("score".into(), "1.5".into()),
+                ("team_name".into(), "x".into()),
+                ("attempt".into(), "9".into()),
+            ],
+            ..Row::default()
+        };
+        let want = BTreeMap::from([("score", "1.5"), (STATUS, "RUNNING"), ("team_name", "t")]);
+        assert_eq!(row.columns(), want);
+    }
+
+    #[test]
+    fn what_is_stored_already_is_known_again() {
+        let columns = BTreeMap::from([("a", "1"), (STATUS, "FAILED")]);
+        let text = |text: &str| AttributeValue::S(text.into());
+        let old = |attempt: &str, status: &str| {
+            HashMap::from([
+                (ATTEMPT.to_owned(), AttributeValue::N(attempt.into())),
+                (STATUS.to_owned(), text(status)),
+                ("a".to_owned(), text("1")),
+                ("of an earlier attempt".to_owned(), text("z")),
+            ])
+        };
+        assert!(is_same(&old("2", "FAILED"), 2, &columns));
+        assert!(!is_same(&old("2", "FINISHED"), 2, &columns));
+        assert!(!is_same(&old("3", "FAILED"), 2, &columns));
+    }
+
+    #[test]
+    fn times_are_written_as_the_pipeline_did() {
+        let time: jiff::Timestamp = "2026-11-20T10:00:07.9Z".parse().unwrap();
+        assert_eq!(time_text(time), "2026-11-20 10:00:07 UTC");
+    }
+}

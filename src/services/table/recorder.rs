@@ -1,0 +1,222 @@
+//! Writes rows in the background: one task for each table, at most one write in 2 s, each behind the leader's fence.
+//!
+//! The controller hands rows in and reads views, both from memory; changes wake the object. What is written next is
+//! the ledger's to say.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use futures::FutureExt;
+use futures::future::BoxFuture;
+use tokio::sync::{Notify, mpsc, watch};
+use tokio::time::Instant;
+
+use super::ledger::{Ledger, TableId, View, Wish};
+use super::{Row, Table, TableError, Written};
+use crate::api;
+use crate::services::ObjectKey;
+use crate::services::aws::Aws;
+
+/// Time between the starts of two writes to one table: the stock table has one write unit.
+const SPACING: Duration = Duration::from_secs(2);
+/// Longest pause after failures.
+const LONGEST_PAUSE: Duration = Duration::from_mins(5);
+/// How often a fence that is down is looked at.
+const FENCE_PAUSE: Duration = Duration::from_secs(1);
+
+/// Writes one row; a seam for tests.
+trait Store: Send + Sync + 'static {
+    fn write(&self, table: &api::Table, row: Arc<Row>) -> BoxFuture<'static, Result<Written, TableError>>;
+}
+
+/// Records submissions in their tables.
+#[derive(Clone)]
+pub struct Recorder {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    ledger: Mutex<Ledger>,
+    tables: Mutex<HashMap<TableId, Arc<Notify>>>,
+    store: Box<dyn Store>,
+    may_write: Box<dyn Fn() -> bool + Send + Sync>,
+    wake: mpsc::UnboundedSender<ObjectKey>,
+    shutdown: watch::Receiver<bool>,
+    runtime: tokio::runtime::Handle,
+}
+
+impl Recorder {
+    /// A recorder whose tasks run on the present runtime until `shutdown` becomes true. `may_write` is asked right
+    /// before each write; `wake` is told of each object whose view has changed.
+    pub fn new(
+        aws: Aws,
+        may_write: impl Fn() -> bool + Send + Sync + 'static,
+        wake: mpsc::UnboundedSender<ObjectKey>,
+        shutdown: watch::Receiver<bool>,
+    ) -> Self {
+        let store = Dynamo {
+            aws,
+            known: Arc::default(),
+        };
+        Self::with_store(Box::new(store), may_write, wake, shutdown)
+    }
+
+    fn with_store(
+        store: Box<dyn Store>,
+        may_write: impl Fn() -> bool + Send + Sync + 'static,
+        wake: mpsc::UnboundedSender<ObjectKey>,
+        shutdown: watch::Receiver<bool>,
+    ) -> Self {
+        let shared = Shared {
+            ledger: Mutex::default(),
+            tables: Mutex::default(),
+            store,
+            may_write: Box::new(may_write),
+            wake,
+            shutdown,
+            runtime: tokio::runtime::Handle::current(),
+        };
+        Self { shared: shared.into() }
+    }
+
+    /// Hands in the newest row of an object; `end` says that it is the last of its attempt. Cheap, and safe to call
+    /// in each pass: what is written or waiting already is not written again.
+    pub fn record(&self, table: &api::Table, key: &ObjectKey, row: Row, end: bool) {
+        let id = TableId::from(table);
+        let wish = Wish { row: row.into(), end };
+        if !self.shared.ledger().record(id.clone(), key, wish, Instant::now()) {
+            return;
+        }
+        let mut tables = lock(&self.shared.tables);
+        let notify = tables.entry(id.clone()).or_insert_with(|| {
+            let notify = Arc::new(Notify::new());
+            let worker = Worker {
+                shared: self.shared.clone(),
+                table: table.clone(),
+                id,
+                notify: notify.clone(),
+            };
+            self.shared.runtime.spawn(worker.run());
+            notify
+        });
+        notify.notify_one();
+    }
+
+    /// What is known of an object's newest row; None if none was handed in.
+    pub fn view(&self, key: &ObjectKey) -> Option<View> {
+        self.shared.ledger().view(key)
+    }
+
+    /// Forgets an object; a row of it that waits is not written any more.
+    pub fn forget(&self, key: &ObjectKey) {
+        self.shared.ledger().forget(key);
+    }
+}
+
+impl Shared {
+    fn ledger(&self) -> MutexGuard<'_, Ledger> {
+        lock(&self.ledger)
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Writes the rows of one table.
+struct Worker {
+    shared: Arc<Shared>,
+    table: api::Table,
+    id: TableId,
+    notify: Arc<Notify>,
+}
+
+impl Worker {
+    /// Ends between two writes: one that has begun is finished.
+    async fn run(self) {
+        let mut stop = self.shared.shutdown.clone();
+        let mut failures: u32 = 0;
+        while !*stop.borrow() {
+            let next = self.shared.ledger().next(&self.id);
+            let pause = match next {
+                None => None,
+                Some(_) if !(self.shared.may_write)() => Some(Instant::now() + FENCE_PAUSE),
+                Some((key, wish)) => {
+                    let begun = Instant::now();
+                    let is_sick = self.write(key, wish).await;
+                    failures = if is_sick { failures.saturating_add(1) } else { 0 };
+                    Some(begun + pause(failures, fastrand::f64()))
+                }
+            };
+            let wait = async {
+                match pause {
+                    Some(until) => tokio::time::sleep_until(until).await,
+                    None => self.notify.notified().await,
+                }
+            };
+            tokio::select! {
+                _ = stop.wait_for(|stop| *stop) => {}
+                () = wait => {}
+            }
+        }
+    }
+
+    /// Writes one row. True if the table could not be written.
+    async fn write(&self, key: ObjectKey, wish: Wish) -> bool {
+        let result = self.shared.store.write(&self.table, wish.row.clone()).await;
+        let is_sick = result.as_ref().is_err_and(TableError::is_of_the_table);
+        if let Err(error) = &result {
+            tracing::warn!(submission = %key, %error, "the row is not in the table");
+        }
+        if self.shared.ledger().report(&key, &wish, result, Instant::now()) {
+            // Nobody listens any more once the controller has ended.
+            let _ = self.shared.wake.send(key);
+        }
+        is_sick
+    }
+}
+
+/// The spacing; after failures it doubles up to five minutes, between half of it and all.
+fn pause(failures: u32, chance: f64) -> Duration {
+    let whole = SPACING.saturating_mul(1 << failures.min(10)).min(LONGEST_PAUSE);
+    if failures == 0 {
+        SPACING
+    } else {
+        whole.mul_f64(0.5 + chance / 2.0).max(SPACING)
+    }
+}
+
+/// DynamoDB, with the tables that have been described.
+struct Dynamo {
+    aws: Aws,
+    known: Arc<Mutex<HashMap<TableId, Table>>>,
+}
+
+impl Store for Dynamo {
+    fn write(&self, table: &api::Table, row: Arc<Row>) -> BoxFuture<'static, Result<Written, TableError>> {
+        let (aws, table, known) = (self.aws.clone(), table.clone(), self.known.clone());
+        async move {
+            let id = TableId::from(&table);
+            let found = lock(&known).get(&id).cloned();
+            let described = if let Some(described) = found {
+                described
+            } else {
+                let described = Table::describe(&aws, &table).await?;
+                lock(&known).insert(id.clone(), described.clone());
+                described
+            };
+            let written = described.write(&row).await;
+            if matches!(written, Err(TableError::Missing { .. } | TableError::Refused { .. })) {
+                // It may have been made again with other keys.
+                lock(&known).remove(&id);
+            }
+            written
+        }
+        .boxed()
+    }
+}
+
+#[cfg(test)]
+#[path = "recorder_tests.rs"]
+mod tests;

@@ -1,0 +1,316 @@
+//! Tokens of EvalAI: where they are kept, what kind they are, when they end.
+//!
+//! Called by the controller, which hands a [`Token`] to `services::evalai`. Knows Secrets Manager and the text of a
+//! token; it reads no Kubernetes Secret itself and never shows a token's value.
+
+use std::fmt;
+
+use base64::Engine;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use jiff::{SignedDuration, Timestamp};
+use serde_json::{Map, Value};
+use sha2::{Digest, Sha256};
+
+use super::aws::Aws;
+
+/// How long before its end a token's renewal is asked for.
+pub const WARN_BEFORE: SignedDuration = SignedDuration::from_hours(30 * 24);
+
+/// Where a token comes from.
+#[derive(Clone, PartialEq, Eq)]
+pub enum TokenSource {
+    /// The text of a key of a Kubernetes Secret, already read.
+    Literal(String),
+    /// A key of a JSON object in AWS Secrets Manager.
+    SecretsManager {
+        id: String,
+        key: String,
+        region: Option<String>,
+        endpoint: Option<String>,
+    },
+}
+
+/// Which word stands before the token in the `Authorization` header.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scheme {
+    /// A JWT refresh token, as EvalAI's profile page gives it.
+    Bearer,
+    /// A key of 40 hexadecimal digits, as EvalAI's login gives it.
+    Token,
+}
+
+/// A token that can be sent. Its value appears in no `Debug` and no message.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Token {
+    scheme: Scheme,
+    value: String,
+    expires: Option<Timestamp>,
+    user: Option<String>,
+}
+
+/// Why there is no token.
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
+pub enum TokenError {
+    /// Nothing but white space.
+    #[error("the token is empty; put a host's refresh token there")]
+    Empty,
+    /// Characters no token has.
+    #[error("the token holds spaces, line breaks or other characters that no token has; store it again")]
+    Characters,
+    /// An access token, which EvalAI refuses.
+    #[error("the token is an access token, which EvalAI refuses; use the refresh token of the profile page")]
+    Access,
+    /// Secrets Manager did not give the entry.
+    #[error(
+        "the entry {id} of Secrets Manager could not be read ({why}); check its name, region and the permission to read it"
+    )]
+    Unreadable { id: String, why: String },
+    /// The entry holds no such key.
+    #[error("the entry {id} of Secrets Manager has no text under the key {key}; check token.secretsManager.key")]
+    NoKey { id: String, key: String },
+}
+
+impl TokenSource {
+    /// Reads the token. Only Secrets Manager needs the network.
+    pub async fn read(&self, aws: &Aws) -> Result<Token, TokenError> {
+        match self {
+            Self::Literal(text) => Token::parse(text),
+            Self::SecretsManager {
+                id,
+                key,
+                region,
+                endpoint,
+            } => {
+                let client = aws.secrets(region.as_deref(), endpoint.as_deref());
+                let answer = client.get_secret_value().secret_id(id).send().await;
+                let answer = answer.map_err(|e| TokenError::Unreadable {
+                    id: id.clone(),
+                    why: reason(&e),
+                })?;
+                Token::parse(&entry(id, key, answer.secret_string().unwrap_or_default())?)
+            }
+        }
+    }
+}
+
+impl fmt::Debug for TokenSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Literal(_) => f.write_str("Literal(…)"),
+            Self::SecretsManager { id, key, .. } => write!(f, "SecretsManager({id}, {key})"),
+        }
+    }
+}
+
+/// The service's own words where it gave some: its answers hold no secret, unlike a `Debug` of the whole.
+fn reason<R>(
+    error: &aws_sdk_secretsmanager::error::SdkError<
+        aws_sdk_secretsmanager::operation::get_secret_value::GetSecretValueError,
+        R,
+    >,
+) -> String {
+    use aws_sdk_secretsmanager::error::ProvideErrorMetadata;
+    match (error.code(), error.message()) {
+        (Some(code), Some(message)) => format!("{code}: {message}"),
+        (Some(code), None) => code.to_owned(),
+        _ => error.to_string(),
+    }
+}
+
+/// The text under a key of the entry's JSON object.
+fn entry(id: &str, key: &str, text: &str) -> Result<String, TokenError> {
+    let fields: Map<String, Value> = serde_json::from_str(text).unwrap_or_default();
+    let found = fields.get(key).and_then(Value::as_str).map(str::to_owned);
+    found.ok_or_else(|| TokenError::NoKey {
+        id: id.into(),
+        key: key.into(),
+    })
+}
+
+impl Token {
+    /// Reads a token as people store it: with or without the scheme's word and white space around it.
+    pub fn parse(text: &str) -> Result<Self, TokenError> {
+        let text = text.trim();
+        let value = match text.split_once(char::is_whitespace) {
+            Some(("Bearer" | "Token", value)) => value.trim(),
+            _ => text,
+        };
+        if value.is_empty() || matches!(value, "Bearer" | "Token") {
+            return Err(TokenError::Empty);
+        }
+        if !value.bytes().all(|byte| byte.is_ascii_graphic()) {
+            return Err(TokenError::Characters);
+        }
+        let is_key = value.len() == 40 && value.bytes().all(|byte| byte.is_ascii_hexdigit());
+        let claims = claims(value).unwrap_or_default();
+        if claims.get("token_type").and_then(Value::as_str) == Some("access") {
+            return Err(TokenError::Access);
+        }
+        let expires = claims
+            .get("exp")
+            .and_then(Value::as_i64)
+            .and_then(|at| Timestamp::from_second(at).ok());
+        let user = match claims.get("user_id") {
+            Some(Value::Number(id)) => Some(id.to_string()),
+            Some(Value::String(id)) => Some(id.clone()),
+            _ => None,
+        };
+        Ok(Self {
+            scheme: if is_key { Scheme::Token } else { Scheme::Bearer },
+            value: value.into(),
+            expires,
+            user,
+        })
+    }
+
+    /// Which word stands before it.
+    pub fn scheme(&self) -> Scheme {
+        self.scheme
+    }
+
+    /// The value of the `Authorization` header.
+    pub(crate) fn header(&self) -> String {
+        match self.scheme {
+            Scheme::Bearer => format!("Bearer {}", self.value),
+            Scheme::Token => format!("Token {}", self.value),
+        }
+    }
+
+    /// When it ends, if it says so.
+    pub fn expires(&self) -> Option<Timestamp> {
+        self.expires
+    }
+
+    /// Whether it ends within [`WARN_BEFORE`], or has ended.
+    pub fn ends_soon(&self, now: Timestamp) -> bool {
+        self.expires.is_some_and(|at| at.duration_since(now) <= WARN_BEFORE)
+    }
+
+    /// Whose requests it makes, without its value. EvalAI counts by user, so a renewed token of the same user keeps the
+    /// identity; a key that names no user is its own.
+    pub fn identity(&self) -> String {
+        if let Some(user) = &self.user {
+            return format!("user-{user}");
+        }
+        let digest = Sha256::digest(self.value.as_bytes());
+        let start: [u8; 8] = std::array::from_fn(|index| digest[index]);
+        format!("token-{:016x}", u64::from_be_bytes(start))
+    }
+}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Token")
+            .field("scheme", &self.scheme)
+            .field("expires", &self.expires)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The claims of a JWT, unverified: only EvalAI can tell whether they are true.
+fn claims(value: &str) -> Option<Map<String, Value>> {
+    let mut parts = value.split('.');
+    let (_, claims, _, None) = (parts.next()?, parts.next()?, parts.next()?, parts.next()) else {
+        return None;
+    };
+    let bytes = URL_SAFE_NO_PAD.decode(claims.trim_end_matches('=')).ok()?;
+    serde_json::from_slice(&bytes).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn jwt(claims: &Value) -> String {
+        let part = |value: &Value| URL_SAFE_NO_PAD.encode(value.to_string());
+        format!("{}.{}.c2lnbmF0dXJl", part(&json!({"alg": "HS256"})), part(claims))
+    }
+
+    #[test]
+    fn the_scheme_follows_from_the_value() {
+        let key = "0123456789abcdef0123456789ABCDEF01234567";
+        for (text, scheme, header) in [
+            (key.to_owned(), Scheme::Token, format!("Token {key}")),
+            (format!("Token {key}\n"), Scheme::Token, format!("Token {key}")),
+            (
+                "local-host-token".to_owned(),
+                Scheme::Bearer,
+                "Bearer local-host-token".to_owned(),
+            ),
+            (
+                " Bearer local-host-token ".to_owned(),
+                Scheme::Bearer,
+                "Bearer local-host-token".to_owned(),
+            ),
+            (key[1..].to_owned(), Scheme::Bearer, format!("Bearer {}", &key[1..])),
+        ] {
+            let token = Token::parse(&text).unwrap();
+            assert_eq!((token.scheme(), token.header()), (scheme, header), "{text:?}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_a_token_is_refused_with_the_next_step() {
+        let access = jwt(&json!({"token_type": "access", "exp": 1}));
+        for (text, error) in [
+            ("  \n", TokenError::Empty),
+            ("Bearer ", TokenError::Empty),
+            ("two words", TokenError::Characters),
+            ("a\nb", TokenError::Characters),
+            (access.as_str(), TokenError::Access),
+        ] {
+            assert_eq!(Token::parse(text), Err(error), "{text:?}");
+        }
+    }
+
+    #[test]
+    fn the_end_of_a_jwt_is_read_without_verifying_it() {
+        let end = Timestamp::from_second(2_000_000_000).unwrap();
+        let token = Token::parse(&jwt(
+            &json!({"token_type": "refresh", "exp": 2_000_000_000, "user_id": 7}),
+        ))
+        .unwrap();
+        assert_eq!(token.expires(), Some(end));
+        assert!(!token.ends_soon(end - SignedDuration::from_hours(31 * 24)));
+        assert!(token.ends_soon(end - SignedDuration::from_hours(29 * 24)));
+        assert!(token.ends_soon(end + SignedDuration::from_hours(1)));
+        let plain = Token::parse("local-host-token").unwrap();
+        assert_eq!((plain.expires(), plain.ends_soon(end)), (None, false));
+    }
+
+    #[test]
+    fn a_renewed_token_of_the_same_user_keeps_its_identity() {
+        let of = |claims: Value| Token::parse(&jwt(&claims)).unwrap().identity();
+        assert_eq!(
+            of(json!({"user_id": 7, "exp": 1})),
+            of(json!({"user_id": "7", "exp": 2}))
+        );
+        assert_ne!(of(json!({"user_id": 7})), of(json!({"user_id": 8})));
+        let plain = |text: &str| Token::parse(text).unwrap().identity();
+        assert_ne!(plain("one"), plain("other"));
+        assert!(!plain("local-host-token").contains("local"));
+    }
+
+    #[test]
+    fn the_value_is_in_no_debug() {
+        let token = Token::parse("local-host-token").unwrap();
+        assert_eq!(format!("{token:?}"), "Token { scheme: Bearer, expires: None, .. }");
+        assert_eq!(
+            format!("{:?}", TokenSource::Literal("local-host-token".into())),
+            "Literal(…)"
+        );
+    }
+
+    #[test]
+    fn a_key_of_the_entry_is_found_or_named() {
+        assert_eq!(
+            entry("evalai", "auth_token", r#"{"auth_token": "x", "other": 1}"#),
+            Ok("x".into())
+        );
+        for text in ["", "x", "[]", "{}", r#"{"auth_token": 1}"#] {
+            let error = entry("evalai", "auth_token", text).unwrap_err().to_string();
+            assert!(error.contains("evalai") && error.contains("auth_token"), "{error}");
+        }
+    }
+}

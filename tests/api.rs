@@ -1,0 +1,26 @@
+//! What only a real API server can tell: whether it takes the definitions, and what it then refuses, fills in and shows.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "clippy knows a test by its attribute; what tests call is a test too"
+)]
+
+mod support;
+
+mod api {
+    mod bridge;
+    mod columns;
+    mod definitions;
+    mod evalai;
+    mod examples;
+    mod leader;
+    mod objects;
+    mod pod;
+    mod queue;
+    mod rule_cases;
+    mod rules;
+    mod table;
+    mod watches;
+}

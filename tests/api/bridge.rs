@@ -1,0 +1,444 @@
+//! The bridge against a real API server and the AWS stand-in.
+#![cfg(test)]
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use aws_sdk_sqs::types::QueueAttributeName;
+use k8s_openapi::api::events::v1::Event;
+use kube::api::{Api, ApiResource, DynamicObject, ListParams, Patch, PatchParams, PostParams};
+use kube::runtime::wait::await_condition;
+use kube::{Client, ResourceExt};
+use leaderboard_operator::api::{Leaderboard, Submission, names};
+use leaderboard_operator::bridge::{self, Health, Observer, Settings};
+use leaderboard_operator::services::aws::Aws;
+use serde_json::{Value, json};
+use tokio::sync::watch;
+
+use crate::support::{apiserver, ministack};
+
+/// Far longer than anything here takes, so that a busy machine fails no test.
+pub(super) const LIMIT: Duration = Duration::from_mins(2);
+const POLL: Duration = Duration::from_millis(100);
+
+/// The AWS stand-in, shared by all tests; queues and tables have names of their own.
+pub(super) struct StandIn {
+    pub(super) aws: Aws,
+    pub(super) endpoint: String,
+    number: u32,
+}
+
+impl StandIn {
+    pub(super) async fn start() -> Self {
+        static NUMBER: AtomicU32 = AtomicU32::new(1);
+        let server = ministack::server().await;
+        Self {
+            aws: server.aws().await,
+            endpoint: server.endpoint(),
+            number: NUMBER.fetch_add(1, Ordering::Relaxed),
+        }
+    }
+
+    /// A name that no other test uses.
+    pub(super) fn name(&self, name: &str) -> String {
+        format!("test-{}-{name}", self.number)
+    }
+
+    pub(super) fn sqs(&self) -> aws_sdk_sqs::Client {
+        self.aws.sqs(None, Some(&self.endpoint))
+    }
+
+    pub(super) async fn queue(&self, name: &str) -> String {
+        let mut request = self.sqs().create_queue().queue_name(self.name(name));
+        if name.rsplit('.').next() == Some("fifo") {
+            request = request.attributes(QueueAttributeName::FifoQueue, "true");
+        }
+        request.send().await.unwrap().queue_url.unwrap()
+    }
+
+    pub(super) async fn set_visibility(&self, url: &str, seconds: u32) {
+        let set = self.sqs().set_queue_attributes().queue_url(url);
+        let set = set.attributes(QueueAttributeName::VisibilityTimeout, seconds.to_string());
+        set.send().await.unwrap();
+    }
+
+    pub(super) async fn send(&self, url: &str, body: &str) {
+        self.sqs()
+            .send_message()
+            .queue_url(url)
+            .message_body(body)
+            .send()
+            .await
+            .unwrap();
+    }
+
+    /// Waits until nothing is left in a queue, seen or unseen.
+    pub(super) async fn drained(&self, url: &str) {
+        eventually("the queue is empty", async || self.depth(url).await == (0, 0)).await;
+    }
+
+    /// Messages that can be received, and that are in somebody's hands.
+    pub(super) async fn depth(&self, url: &str) -> (u32, u32) {
+        let all = self
+            .sqs()
+            .get_queue_attributes()
+            .queue_url(url)
+            .attribute_names(QueueAttributeName::All);
+        let all = all.send().await.unwrap().attributes.unwrap();
+        let number = |name: QueueAttributeName| all[&name].parse().unwrap();
+        (
+            number(QueueAttributeName::ApproximateNumberOfMessages),
+            number(QueueAttributeName::ApproximateNumberOfMessagesNotVisible),
+        )
+    }
+
+    /// Takes so many dead letters and gives their bodies and attributes.
+    async fn dead_letters(&self, url: &str, count: usize) -> Vec<(String, BTreeMap<String, String>)> {
+        let mut letters = Vec::new();
+        let take = async {
+            while letters.len() < count {
+                let receive = self
+                    .sqs()
+                    .receive_message()
+                    .queue_url(url)
+                    .max_number_of_messages(10)
+                    .wait_time_seconds(20);
+                let receive = receive.message_attribute_names("All");
+                for message in receive.send().await.unwrap().messages.unwrap_or_default() {
+                    let attributes = message.message_attributes.unwrap_or_default().into_iter();
+                    let attributes = attributes.map(|(name, value)| (name, value.string_value.unwrap()));
+                    letters.push((message.body.unwrap(), attributes.collect()));
+                }
+            }
+        };
+        tokio::time::timeout(LIMIT, take).await.expect("dead letters arrive");
+        letters.sort();
+        letters
+    }
+}
+
+async fn eventually(what: &str, mut holds: impl AsyncFnMut() -> bool) {
+    let wait = async {
+        while !holds().await {
+            tokio::time::sleep(POLL).await;
+        }
+    };
+    assert!(tokio::time::timeout(LIMIT, wait).await.is_ok(), "{what}");
+}
+
+/// Counts fates.
+#[derive(Default)]
+struct Counter(Mutex<BTreeMap<&'static str, u64>>);
+
+impl Observer for Counter {
+    fn messages(&self, fate: &'static str, count: u64) {
+        *self.0.lock().unwrap().entry(fate).or_default() += count;
+    }
+}
+
+/// A bridge of one namespace that runs until it is dropped.
+struct Bridge {
+    health: Arc<Health>,
+    counter: Arc<Counter>,
+    stop: watch::Sender<bool>,
+    task: tokio::task::JoinHandle<()>,
+}
+
+impl Bridge {
+    fn start(client: Client, stand_in: &StandIn, namespace: &str) -> Self {
+        let (stop, stopped) = watch::channel(false);
+        let (health, counter) = (Arc::new(Health::default()), Arc::new(Counter::default()));
+        let settings = Settings {
+            namespace: Some(namespace.to_owned()),
+            health: health.clone(),
+            observer: counter.clone(),
+        };
+        let task = tokio::spawn(bridge::run(client, stand_in.aws.clone(), stopped, settings));
+        Self {
+            health,
+            counter,
+            stop,
+            task,
+        }
+    }
+
+    fn count(&self, fate: &str) -> u64 {
+        self.counter.0.lock().unwrap().get(fate).copied().unwrap_or_default()
+    }
+
+    async fn stop(self) {
+        self.stop.send_replace(true);
+        tokio::time::timeout(LIMIT, self.task)
+            .await
+            .expect("the bridge ends")
+            .unwrap();
+    }
+}
+
+/// A namespace of the API server, and a stand-in of AWS.
+struct World {
+    client: Client,
+    namespace: String,
+    stand_in: StandIn,
+}
+
+impl World {
+    async fn new(name: &str) -> Self {
+        let server = apiserver::server().await;
+        Self {
+            client: server.client(),
+            namespace: server.namespace(name).await,
+            stand_in: StandIn::start().await,
+        }
+    }
+
+    fn bridge(&self) -> Bridge {
+        Bridge::start(self.client.clone(), &self.stand_in, &self.namespace)
+    }
+
+    fn submissions(&self) -> Api<Submission> {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    /// A Leaderboard of challenge 1 with this phase, and its queue.
+    async fn leaderboard(&self, name: &str, phase: i64, mut queue: Value) {
+        if queue["endpoint"].is_null() {
+            queue["endpoint"] = json!(self.stand_in.endpoint);
+        }
+        let leaderboard = serde_json::from_value(json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1",
+            "kind": "Leaderboard",
+            "metadata": {"name": name},
+            "spec": {
+                "evalai": {
+                    "apiServer": "https://evalai.example",
+                    "challenge": 1,
+                    "token": {"secretKeyRef": {"name": "evalai", "key": "token"}}
+                },
+                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+                "results": "V2",
+                "contents": {"image": "contents:1"},
+                "simulator": {"image": "simulator:1"},
+                "storage": {"bucket": "results"},
+                "queue": queue
+            }
+        }));
+        // As a person writes it: the API server fills in the rest.
+        let kind = ApiResource::erase::<Leaderboard>(&());
+        let api: Api<DynamicObject> = Api::namespaced_with(self.client.clone(), &self.namespace, &kind);
+        api.create(&PostParams::default(), &leaderboard.unwrap()).await.unwrap();
+    }
+
+    async fn submission(&self, name: &str, holds: impl Fn(&Submission) -> bool + Send) -> Submission {
+        let found = await_condition(self.submissions(), name, |object: Option<&Submission>| {
+            object.is_some_and(&holds)
+        });
+        let found = tokio::time::timeout(LIMIT, found).await;
+        found.unwrap_or_else(|_| panic!("{name} gets there")).unwrap().unwrap()
+    }
+
+    /// Ends the present attempt, as the controller would.
+    async fn end(&self, name: &str, state: &str) {
+        let attempt = self.submissions().get(name).await.unwrap().spec.attempt;
+        let condition = json!({
+            "type": "Finished", "status": "True", "reason": "Test", "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"
+        });
+        let status = json!({"status": {"state": state, "attempt": attempt, "conditions": [condition]}});
+        let patched = self
+            .submissions()
+            .patch_status(name, &PatchParams::default(), &Patch::Merge(status))
+            .await;
+        patched.unwrap();
+    }
+}
+
+fn body(phase: i64, submission: i64) -> String {
+    json!({"challenge_pk": "1", "phase_pk": phase.to_string(), "submission_pk": submission, "submitted_image_uri": "registry.example/a:1"})
+        .to_string()
+}
+
+#[tokio::test]
+async fn two_bridges_make_each_submission_once() {
+    let world = World::new("bridge-twice").await;
+    let url = world.stand_in.queue("q").await;
+    for round in 0..3 {
+        for id in 1..=20 {
+            world.stand_in.send(&url, &body(2, 100 + (id + round) % 20)).await;
+        }
+    }
+    world.leaderboard("lb", 2, json!({"url": url})).await;
+    let bridges = [world.bridge(), world.bridge()];
+    world.stand_in.drained(&url).await;
+    let made = world.submissions().list(&ListParams::default()).await.unwrap().items;
+    assert_eq!(made.len(), 20);
+    assert!(made.iter().all(|submission| submission.spec.attempt == 1));
+    let one = world.submissions().get("submission-107").await.unwrap();
+    assert_eq!(one.labels()[names::LABEL_LEADERBOARD], "lb");
+    assert_eq!(one.labels()[names::LABEL_PHASE], "2");
+    assert_eq!(one.finalizers(), [names::FINALIZER_SUBMISSION]);
+    let count = |fate| bridges.iter().map(|bridge| bridge.count(fate)).sum::<u64>();
+    assert_eq!((count("created"), count("repeat")), (20, 40));
+    for bridge in bridges {
+        assert!(bridge.health.readiness().ready);
+        bridge.stop().await;
+    }
+}
+
+#[tokio::test]
+async fn a_resume_bumps_once_and_undoes_a_cancel() {
+    let world = World::new("bridge-resume").await;
+    let url = world.stand_in.queue("q").await;
+    world.leaderboard("lb", 2, json!({"url": url})).await;
+    let bridge = world.bridge();
+    world.stand_in.send(&url, &body(2, 7)).await;
+    world.submission("submission-7", |_| true).await;
+    world.stand_in.send(&url, &body(2, 7)).await;
+    eventually("the repeat is seen", async || bridge.count("repeat") == 1).await;
+    let cancel = Patch::Merge(json!({"spec": {"cancel": true}}));
+    world
+        .submissions()
+        .patch("submission-7", &PatchParams::default(), &cancel)
+        .await
+        .unwrap();
+    world.end("submission-7", "Cancelled").await;
+    world.stand_in.send(&url, &body(2, 7)).await;
+    let resumed = world
+        .submission("submission-7", |submission| submission.spec.attempt == 2)
+        .await;
+    assert!(!resumed.spec.cancel);
+    world.stand_in.send(&url, &body(2, 7)).await;
+    eventually("the next is a repeat", async || bridge.count("repeat") == 2).await;
+    world.end("submission-7", "Finished").await;
+    world.stand_in.send(&url, &body(2, 7)).await;
+    eventually("a finished one is not resumed", async || bridge.count("repeat") == 3).await;
+    assert_eq!(world.submissions().get("submission-7").await.unwrap().spec.attempt, 2);
+    world.stand_in.drained(&url).await;
+    bridge.stop().await;
+}
+
+#[tokio::test]
+async fn what_cannot_be_used_becomes_a_dead_letter_with_its_reason() {
+    let world = World::new("bridge-dead").await;
+    let (url, dead) = (world.stand_in.queue("q").await, world.stand_in.queue("dead").await);
+    let queue = json!({"url": url, "deadLetterUrl": dead, "unknownAfterSeconds": 0});
+    world.leaderboard("a", 2, queue.clone()).await;
+    world.leaderboard("b", 3, queue).await;
+    let bridge = world.bridge();
+    world.stand_in.send(&url, &body(2, 7)).await;
+    world.submission("submission-7", |_| true).await;
+    let bodies = [body(3, 7), body(9, 8), "no json".to_owned()];
+    for body in &bodies {
+        world.stand_in.send(&url, body).await;
+    }
+    let letters = world.stand_in.dead_letters(&dead, 3).await;
+    let reason = |body: &str| letters.iter().find(|(text, _)| text == body).unwrap().1["reason"].clone();
+    assert_eq!(
+        bodies.each_ref().map(|body| reason(body)),
+        ["IdTaken", "UnknownPhase", "Malformed"]
+    );
+    let (_, taken) = letters.iter().find(|(text, _)| *text == bodies[0]).unwrap();
+    assert_eq!(
+        taken["detail"],
+        "submission-7 belongs to leaderboard a, challenge 1, phase 2, submission 7"
+    );
+    world.stand_in.drained(&url).await;
+    bridge.stop().await;
+}
+
+#[tokio::test]
+async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_says_so() {
+    let world = World::new("bridge-blocked").await;
+    let url = world.stand_in.queue("q").await;
+    world.leaderboard("lb", 2, json!({"url": url})).await;
+    let bridge = world.bridge();
+    world.stand_in.send(&url, "no json").await;
+    let events: Api<Event> = Api::namespaced(world.client.clone(), &world.namespace);
+    let mut note = None;
+    eventually("an event is written", async || {
+        let all = events.list(&ListParams::default()).await.unwrap().items;
+        note = all
+            .into_iter()
+            .find(|event| event.reason.as_deref() == Some("QueueBlocked"))
+            .and_then(|event| event.note);
+        note.is_some()
+    })
+    .await;
+    let note = note.unwrap();
+    assert!(
+        note.contains("(Malformed): the body is not JSON (line 1, column 2)"),
+        "{note}"
+    );
+    assert!(
+        note.ends_with("no Leaderboard of this queue has queue.deadLetterUrl"),
+        "{note}"
+    );
+    eventually("it is counted", async || bridge.count("blocked") == 1).await;
+    assert_eq!(world.stand_in.depth(&url).await, (0, 1));
+    bridge.stop().await;
+}
+
+#[tokio::test]
+async fn one_bad_queue_among_several_is_named_and_the_others_are_read() {
+    let world = World::new("bridge-bad-queue").await;
+    let url = world.stand_in.queue("q").await;
+    let missing = format!("{}/000000000000/nowhere", world.stand_in.endpoint);
+    world.leaderboard("bad", 3, json!({"url": missing})).await;
+    let bridge = world.bridge();
+    let (health, named) = (
+        bridge.health.clone(),
+        format!("queue {missing}: GetQueueAttributes failed"),
+    );
+    eventually("a bridge that can read nothing is not ready", async || {
+        let told = health.readiness();
+        !told.ready && told.text.contains(&named)
+    })
+    .await;
+    // Its poller is started when the Leaderboard is applied.
+    world.leaderboard("good", 2, json!({"url": url})).await;
+    world.stand_in.send(&url, &body(2, 7)).await;
+    world.submission("submission-7", |_| true).await;
+    eventually("the other one makes it ready", async || health.readiness().ready).await;
+    assert!(health.readiness().text.contains(&named), "{}", health.readiness().text);
+    // And ended when it is deleted.
+    let api: Api<Leaderboard> = Api::namespaced(world.client.clone(), &world.namespace);
+    api.delete("bad", &kube::api::DeleteParams::default()).await.unwrap();
+    eventually("a queue that nobody names is forgotten", async || {
+        health.readiness().text.is_empty()
+    })
+    .await;
+    bridge.stop().await;
+}
+
+#[tokio::test]
+async fn a_queue_that_goes_away_for_a_while_loses_no_message() {
+    let world = World::new("bridge-away").await;
+    let url = world.stand_in.queue("q").await;
+    // What the broken receive may have taken comes back soon.
+    world.stand_in.set_visibility(&url, 2).await;
+    let proxy = ministack::server().await.proxy().await;
+    let queue = json!({"url": url, "endpoint": proxy.endpoint()});
+    world.leaderboard("lb", 2, queue).await;
+    let bridge = world.bridge();
+    world.stand_in.send(&url, &body(2, 7)).await;
+    world.submission("submission-7", |_| true).await;
+    proxy.set_away(true);
+    let health = bridge.health.clone();
+    eventually("it is not ready", async || !health.readiness().ready).await;
+    assert!(
+        health.readiness().text.ends_with("it is tried again"),
+        "{}",
+        health.readiness().text
+    );
+    for id in 8..=20 {
+        world.stand_in.send(&url, &body(2, id)).await;
+    }
+    proxy.set_away(false);
+    for id in 8..=20 {
+        world.submission(&names::submission(id), |_| true).await;
+    }
+    eventually("it is ready again", async || health.readiness().ready).await;
+    world.stand_in.drained(&url).await;
+    bridge.stop().await;
+}

@@ -1,0 +1,185 @@
+//! What `kubectl get` shows, from the table that the API server sends.
+
+use std::fmt::Write as _;
+
+use kube::Client;
+use kube::api::{Patch, PatchParams};
+use serde_json::{Value, json};
+
+use super::objects::{Kind, create, plural};
+use crate::support::apiserver::server;
+
+const AS_TABLE: &str = "application/json;as=Table;g=meta.k8s.io;v=v1";
+
+/// A status with every field.
+pub fn full_status() -> Value {
+    let time = "2026-11-01T10:00:00Z";
+    json!({
+        "state": "Running",
+        "observedGeneration": 1,
+        "attempt": 2,
+        "retry": 1,
+        "recreated": 1,
+        "nextTry": time,
+        "reason": "Resumed",
+        "message": "The second attempt runs.",
+        "team": {"id": "7", "name": "Team Seven"},
+        "track": "sensors",
+        "plan": {
+            "runId": "42",
+            "results": "V2",
+            "track": "sensors",
+            "codename": "SENSORS",
+            "phase": 7,
+            "slices": ["0-9", "10-19"],
+            "routes": 20,
+            "repetitions": 1,
+            "storage": {"bucket": "results", "prefix": "a/", "limit": 21_474_836_480_i64},
+            "image": "agent:1",
+            "contentsImage": "contents:1",
+            "simulatorImage": "simulator:1",
+            "resume": true,
+        },
+        "progress": {"done": 12, "total": 20, "text": "12/20"},
+        "pairs": [{
+            "id": 1,
+            "done": 6,
+            "total": 10,
+            "crashes": 1,
+            "state": "Running",
+            "last": {"reason": "idle", "exitCode": 1, "time": time},
+        }],
+        "score": "~41.20",
+        "waiting": {"position": 1, "eta": "20m-40m"},
+        "times": {
+            "submitted": time, "accepted": time, "scheduled": time, "started": time, "stopping": time, "finished": time,
+            "published": time,
+        },
+        "job": "a-2",
+        "node": "node-1",
+        "results": "s3://results/a/42",
+        "failure": {"class": "infrastructure", "reason": "NodeLost", "message": "The node is gone.", "charged": false},
+        "conditions": [{
+            "type": "Running",
+            "status": "True",
+            "reason": "Resumed",
+            "message": "",
+            "lastTransitionTime": time,
+        }],
+    })
+}
+
+/// The table as kubectl prints it, with the age, which moves, as `<age>`.
+async fn table(client: &Client, kind: Kind, namespace: &str, wide: bool) -> String {
+    let path = format!(
+        "/apis/leaderboard.carla.org/v1alpha1/namespaces/{namespace}/{}",
+        plural(kind)
+    );
+    let request = http::Request::get(path).header(http::header::ACCEPT, AS_TABLE);
+    let table: Value = client.request(request.body(Vec::new()).unwrap()).await.unwrap();
+    let columns = table["columnDefinitions"].as_array().unwrap();
+    let shown: Vec<usize> = (0..columns.len())
+        .filter(|at| wide || columns[*at]["priority"] == 0)
+        .collect();
+    let name = |at: usize| columns[at]["name"].as_str().unwrap();
+    let mut lines = vec![shown.iter().map(|at| name(*at).to_uppercase()).collect::<Vec<_>>()];
+    for row in table["rows"].as_array().unwrap() {
+        lines.push(shown.iter().map(|at| cell(name(*at), &row["cells"][*at])).collect());
+    }
+    layout(&lines)
+}
+
+fn cell(column: &str, value: &Value) -> String {
+    match value {
+        Value::Null => "<none>".into(),
+        Value::String(_) if column == "Age" => "<age>".into(),
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    }
+}
+
+fn layout(lines: &[Vec<String>]) -> String {
+    let width = |column: usize| lines.iter().map(|line| line[column].len()).max().unwrap_or(0) + 3;
+    let mut text = String::new();
+    for line in lines {
+        for (column, cell) in line.iter().enumerate() {
+            let last = column + 1 == line.len();
+            _ = write!(text, "{cell:<0$}", if last { 0 } else { width(column) });
+        }
+        text.push('\n');
+    }
+    text
+}
+
+#[tokio::test]
+async fn submissions_in_the_table() {
+    let server = server().await;
+    let (client, namespace) = (server.client(), server.namespace("columns").await);
+    let api = Kind::Submission.api(&client, &namespace);
+    create(&api, Kind::Submission.object("new", &[]), false).await.unwrap();
+    create(&api, Kind::Submission.object("submission-42", &[]), false)
+        .await
+        .unwrap();
+    let status = Patch::Merge(json!({"status": full_status()}));
+    api.patch_status("submission-42", &PatchParams::default(), &status)
+        .await
+        .unwrap();
+    assert_eq!(
+        table(&client, Kind::Submission, &namespace, false).await,
+        "\
+NAME            LEADERBOARD   TRACK     STATE     PROGRESS   SCORE    AGE
+new             local         <none>    <none>    <none>     <none>   <age>
+submission-42   local         sensors   Running   12/20      ~41.20   <age>
+"
+    );
+    assert_eq!(
+        table(&client, Kind::Submission, &namespace, true).await,
+        "\
+NAME            LEADERBOARD   TRACK     STATE     PROGRESS   SCORE    AGE     TEAM         ATTEMPT   REASON    NODE     RESULTS
+new             local         <none>    <none>    <none>     <none>   <age>   <none>       <none>    <none>    <none>   <none>
+submission-42   local         sensors   Running   12/20      ~41.20   <age>   Team Seven   2         Resumed   node-1   s3://results/a/42
+"
+    );
+}
+
+#[tokio::test]
+async fn leaderboards_in_the_table() {
+    let server = server().await;
+    let (client, namespace) = (server.client(), server.namespace("columns").await);
+    let api = Kind::Leaderboard.api(&client, &namespace);
+    create(&api, Kind::Leaderboard.object("carla-20", &[]), false)
+        .await
+        .unwrap();
+    create(&api, Kind::Leaderboard.object("new", &[]), false).await.unwrap();
+    let condition = |kind: &str, reason: &str| {
+        let time = "2026-11-01T10:00:00Z";
+        json!({"type": kind, "status": "False", "reason": reason, "message": "", "lastTransitionTime": time})
+    };
+    let status = json!({
+        "observedGeneration": 1,
+        "counts": {"pending": 3, "running": 2, "finished": 40, "failed": 1, "cancelled": 0},
+        "budget": "12/54",
+        "tracks": {"sensors": "4 x 20 x 1"},
+        "conditions": [condition("Terminating", "InUse"), condition("Ready", "TokenRefused")],
+    });
+    let patch = Patch::Merge(json!({ "status": status }));
+    let read = api
+        .patch_status("carla-20", &PatchParams::default(), &patch)
+        .await
+        .unwrap();
+    assert_eq!(read.data["status"], status);
+    assert_eq!(
+        table(&client, Kind::Leaderboard, &namespace, false).await,
+        "\
+NAME       READY    REASON         PENDING   RUNNING   FINISHED   FAILED   AGE
+carla-20   False    TokenRefused   3         2         40         1        <age>
+new        <none>   <none>         <none>    <none>    <none>     <none>   <age>
+"
+    );
+    let wide = table(&client, Kind::Leaderboard, &namespace, true).await;
+    assert!(
+        wide.starts_with("NAME       READY    REASON         PENDING   RUNNING   FINISHED   FAILED   BUDGET   AGE\n"),
+        "{wide}"
+    );
+    assert!(wide.contains("   12/54    <age>\n"), "{wide}");
+}

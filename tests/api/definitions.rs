@@ -1,0 +1,394 @@
+//! The definitions as the API server serves them: names, defaults, `null`, raw fields, selectors, the status.
+
+use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
+use kube::Client;
+use kube::api::{Api, ListParams, Patch, PatchParams};
+use leaderboard_operator::api::{Leaderboard, Submission};
+use leaderboard_operator::crds;
+use serde_json::{Value, json};
+
+use super::objects::{Kind, causes, create};
+use crate::support::apiserver::server;
+
+#[tokio::test]
+async fn both_definitions_are_established_and_structural() {
+    let api: Api<CustomResourceDefinition> = Api::all(server().await.client());
+    for definition in crds::definitions().unwrap() {
+        let name = definition.object().unwrap().metadata.name.unwrap();
+        let read = serde_json::to_value(api.get(&name).await.unwrap()).unwrap();
+        let conditions: Vec<String> = read["status"]["conditions"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|c| format!("{}={}", c["type"].as_str().unwrap(), c["status"].as_str().unwrap()))
+            .collect();
+        assert_eq!(conditions, ["NamesAccepted=True", "Established=True"], "{name}");
+        assert_eq!(read["spec"]["versions"][0]["subresources"], json!({"status": {}}));
+    }
+}
+
+#[tokio::test]
+async fn short_names_and_the_category_are_served() {
+    let client = server().await.client();
+    let list = client
+        .list_api_group_resources("leaderboard.carla.org/v1alpha1")
+        .await
+        .unwrap();
+    let mut served: Vec<String> = list
+        .resources
+        .iter()
+        .map(|resource| {
+            let (short, categories) = (resource.short_names.as_deref(), resource.categories.as_deref());
+            format!(
+                "{} {:?} {:?}",
+                resource.name,
+                short.unwrap_or_default(),
+                categories.unwrap_or_default()
+            )
+        })
+        .collect();
+    served.sort();
+    assert_eq!(
+        served,
+        [
+            r#"leaderboards ["lb"] ["challenges"]"#,
+            "leaderboards/status [] []",
+            r#"submissions ["sub"] ["challenges"]"#,
+            "submissions/status [] []",
+        ]
+    );
+}
+
+#[tokio::test]
+async fn a_minimal_leaderboard_reads_back_whole() {
+    let server = server().await;
+    let api = Kind::Leaderboard.api(&server.client(), &server.namespace("minimal").await);
+    let read = create(&api, Kind::Leaderboard.object("a", &[]), false).await.unwrap();
+    assert_eq!(
+        read.data["spec"],
+        json!({
+            "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+            "results": "V2",
+            "contents": {"image": "contents:1"},
+            "simulator": {"image": "simulator:1"},
+            "agent": {"logLimit": 2_147_483_648_i64},
+            "pairs": 4,
+            "routes": 20,
+            "retries": {"pair": 4, "infrastructure": 2},
+            "deadlines": {
+                "scheduleSeconds": 0,
+                "startSeconds": 1800,
+                "readySeconds": 3600,
+                "idleSeconds": 800,
+                "runSeconds": 86400,
+                "cancelSeconds": 120,
+                "flushSeconds": 1800,
+            },
+            "storage": {"bucket": "results", "limit": 21_474_836_480_i64},
+            "network": {"dns": true},
+            "running": {},
+            "paused": false,
+            "verify": "Warn",
+            "periodSeconds": 10,
+            "ttlSecondsAfterFinished": 86400,
+            "finalizeSeconds": 900,
+        })
+    );
+}
+
+#[tokio::test]
+async fn a_minimal_submission_reads_back_whole() {
+    let server = server().await;
+    let api = Kind::Submission.api(&server.client(), &server.namespace("minimal").await);
+    let read = create(&api, Kind::Submission.object("a", &[]), false).await.unwrap();
+    assert_eq!(
+        read.data["spec"],
+        json!({
+            "leaderboard": "local",
+            "track": "sensors",
+            "image": "agent:1",
+            "priority": 0,
+            "attempt": 1,
+            "cancel": false,
+        })
+    );
+}
+
+/// A field of a Leaderboard, what is sent there, and what is read back.
+type HalfFilled = (&'static str, Value, Value);
+
+fn half_filled_runs() -> Vec<HalfFilled> {
+    vec![
+        (
+            "agent",
+            json!({"command": ["a"]}),
+            json!({"command": ["a"], "logLimit": 2_147_483_648_i64}),
+        ),
+        ("agent", json!({}), json!({"logLimit": 2_147_483_648_i64})),
+        ("retries", json!({"pair": 0}), json!({"pair": 0, "infrastructure": 2})),
+        (
+            "retries",
+            json!({"infrastructure": 0}),
+            json!({"pair": 4, "infrastructure": 0}),
+        ),
+        (
+            "deadlines",
+            json!({"startSeconds": 5, "runSeconds": 7200}),
+            json!({
+                "scheduleSeconds": 0,
+                "startSeconds": 5,
+                "readySeconds": 3600,
+                "idleSeconds": 800,
+                "runSeconds": 7200,
+                "cancelSeconds": 120,
+                "flushSeconds": 1800,
+            }),
+        ),
+        (
+            "network",
+            json!({"egress": [{"cidr": "10.0.0.0/16"}]}),
+            json!({"egress": [{"cidr": "10.0.0.0/16"}], "dns": true}),
+        ),
+        ("network", json!({"dns": false}), json!({"dns": false})),
+        ("running", json!({"total": 3}), json!({"total": 3})),
+    ]
+}
+
+fn half_filled_services() -> Vec<HalfFilled> {
+    let evalai = |token: Value, log_tail: &str| {
+        json!({
+            "apiServer": "https://eval.ai",
+            "challenge": 1,
+            "split": "leaderboard",
+            "token": token,
+            "requestsPerMinute": 54,
+            "sweepSeconds": 60,
+            "logTail": log_tail,
+        })
+    };
+    let sent = |token: Value| json!({"apiServer": "https://eval.ai", "challenge": 1, "token": token});
+    let secret = json!({"secretKeyRef": {"name": "evalai", "key": "token"}});
+    let in_manager = |manager: Value| json!({ "secretsManager": manager });
+    vec![
+        (
+            "storage",
+            json!({"bucket": "results", "prefix": "a/"}),
+            json!({"bucket": "results", "prefix": "a/", "limit": 21_474_836_480_i64}),
+        ),
+        ("evalai", sent(secret.clone()), evalai(secret, "Hosts")),
+        (
+            "evalai",
+            sent(in_manager(json!({"id": "evalai"}))),
+            evalai(in_manager(json!({"id": "evalai", "key": "auth_token"})), "Hosts"),
+        ),
+        (
+            "queue",
+            json!({"url": "https://sqs.example.org/1/a"}),
+            json!({"url": "https://sqs.example.org/1/a", "unknownAfterSeconds": 900, "foreign": "DeadLetter"}),
+        ),
+        ("podIdentity", json!({"secretRef": "aws"}), json!({"secretRef": "aws"})),
+        ("table", json!({"name": "results"}), json!({"name": "results"})),
+        ("logGroup", json!({"name": "results"}), json!({"name": "results"})),
+    ]
+}
+
+#[tokio::test]
+async fn every_half_filled_object_reads_back_whole() {
+    let server = server().await;
+    let api = Kind::Leaderboard.api(&server.client(), &server.namespace("half").await);
+    for (field, sent, expected) in half_filled_runs().into_iter().chain(half_filled_services()) {
+        let mut object = Kind::Leaderboard.object("a", &[&json!({"spec": {field: sent}})]);
+        if ["evalai", "queue"].contains(&field) {
+            serve_evalai(&mut object);
+        }
+        let read = create(&api, object.clone(), true).await;
+        let read = read.unwrap_or_else(|error| panic!("{field} {sent}: {:?}", causes(&error)));
+        assert_eq!(read.data["spec"][field], expected, "{field} {sent}");
+        // The types fill in the same as the schema: programs without a cluster see what the operator sees.
+        let ours: Leaderboard = serde_json::from_value(object).unwrap();
+        let theirs = typed(&read);
+        assert_eq!(ours.spec, theirs.spec, "{field} {sent}");
+    }
+}
+
+fn typed(object: &kube::core::DynamicObject) -> Leaderboard {
+    serde_json::from_value(serde_json::to_value(object).unwrap()).unwrap()
+}
+
+fn serve_evalai(object: &mut Value) {
+    object["spec"]["tracks"][0]["phase"] = json!(7);
+    if object["spec"]["evalai"].is_null() {
+        let token = json!({"secretKeyRef": {"name": "evalai", "key": "token"}});
+        object["spec"]["evalai"] = json!({"apiServer": "https://eval.ai", "challenge": 1, "token": token});
+    }
+}
+
+#[tokio::test]
+async fn a_null_is_as_good_as_a_field_left_out() {
+    let server = server().await;
+    let client = server.client();
+    let api = Kind::Leaderboard.api(&client, &server.namespace("null").await);
+    let plain = create(&api, Kind::Leaderboard.object("plain", &[]), false)
+        .await
+        .unwrap();
+    let nulls = [
+        json!({
+            "evalai": null, "repetitions": null, "queue": null, "table": null, "logGroup": null, "podIdentity": null,
+            "runtimeClassName": null, "pod": null, "agent": null, "retries": null, "deadlines": null, "network": null,
+            "running": null, "paused": null, "verify": null, "periodSeconds": null, "pairs": null,
+        }),
+        json!({
+            "tracks": [{
+                "name": "sensors", "codename": "SENSORS", "phase": null, "pairs": null, "routeSubsets": null,
+                "routesFile": null,
+            }],
+            "storage": {"bucket": "results", "prefix": null, "region": null, "endpoint": null, "limit": null},
+            "deadlines": {"runSeconds": null},
+            "running": {"total": null, "perTeam": null},
+            "agent": {"command": null, "args": null, "resources": null, "logLimit": null},
+            "contents": {"image": "contents:1", "command": null, "args": null, "securityContext": null},
+        }),
+    ];
+    for (number, spec) in nulls.iter().enumerate() {
+        let mut object = Kind::Leaderboard.object("null", &[]);
+        // Not a merge patch: the nulls are meant to arrive.
+        for (field, value) in spec.as_object().unwrap() {
+            object["spec"][field] = value.clone();
+        }
+        let created = create(&api, object.clone(), true).await;
+        let created = created.unwrap_or_else(|error| panic!("{number}: {:?}", causes(&error)));
+        assert_eq!(typed(&created).spec, typed(&plain).spec, "created with nulls {number}");
+        let params = PatchParams::apply("tests").force();
+        object["metadata"]["name"] = json!(format!("applied-{number}"));
+        let applied = api
+            .patch(&format!("applied-{number}"), &params, &Patch::Apply(object))
+            .await;
+        let applied = applied.unwrap_or_else(|error| panic!("{number}: {:?}", causes(&error)));
+        assert_eq!(typed(&applied).spec, typed(&plain).spec, "applied with nulls {number}");
+    }
+}
+
+#[tokio::test]
+async fn a_null_does_not_get_around_a_rule() {
+    let server = server().await;
+    let api = Kind::Submission.api(&server.client(), &server.namespace("null").await);
+    let mut neither = Kind::Submission.object("a", &[]);
+    neither["spec"]["track"] = Value::Null;
+    neither["spec"]["evalai"] = Value::Null;
+    let causes_of = causes(&create(&api, neither, true).await.unwrap_err());
+    assert!(
+        matches!(causes_of.as_slice(), [only] if only.contains("not both and not neither")),
+        "{causes_of:?}"
+    );
+    let mut object = Kind::Submission.object("a", &[]);
+    object["spec"]["evalai"] = Value::Null;
+    object["spec"]["team"] = Value::Null;
+    create(&api, object, false).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_lies_in_pod_is_kept_as_it_is() {
+    let server = server().await;
+    let api = Kind::Leaderboard.api(&server.client(), &server.namespace("pod").await);
+    let pod = json!({
+        "metadata": {"annotations": {"a": "b"}},
+        "spec": {
+            "fieldOfANewerKubernetes": {"deep": [1, "two", {"three": null}]},
+            "priorityClassName": null,
+            "containers": [{"name": "agent", "resizePolicy": [{"resourceName": "cpu", "unheardOf": true}]}],
+        },
+    });
+    let object = {
+        let mut object = Kind::Leaderboard.object("a", &[]);
+        object["spec"]["pod"] = pod.clone();
+        object
+    };
+    create(&api, object, false).await.unwrap();
+    assert_eq!(typed(&api.get("a").await.unwrap()).spec.pod, Some(pod));
+}
+
+#[tokio::test]
+async fn submissions_are_found_by_leaderboard_id_and_state() {
+    let server = server().await;
+    let (client, namespace) = (server.client(), server.namespace("select").await);
+    let api = Kind::Submission.api(&client, &namespace);
+    let evalai = |id: i64| {
+        let ids = json!({"challenge": 1, "phase": 7, "submission": id});
+        json!({"spec": {"track": null, "evalai": ids, "leaderboard": "carla"}})
+    };
+    for (name, patch) in [("a", json!({})), ("b", evalai(1)), ("c", evalai(2))] {
+        create(&api, Kind::Submission.object(name, &[&patch]), false)
+            .await
+            .unwrap();
+    }
+    let running = Patch::Merge(json!({"status": {"state": "Running"}}));
+    api.patch_status("c", &PatchParams::default(), &running).await.unwrap();
+    for (selector, expected) in [
+        ("spec.leaderboard=carla", vec!["b", "c"]),
+        ("spec.leaderboard!=carla", vec!["a"]),
+        ("spec.evalai.submission=2", vec!["c"]),
+        ("status.state=Running", vec!["c"]),
+        ("status.state=Running,spec.evalai.submission=1", vec![]),
+    ] {
+        assert_eq!(
+            names(&client, &namespace, selector).await.unwrap(),
+            expected,
+            "{selector}"
+        );
+    }
+    let unknown = names(&client, &namespace, "spec.image=agent:1").await.unwrap_err();
+    assert!(causes(&unknown)[0].contains("field label not supported"), "{unknown}");
+}
+
+async fn names(client: &Client, namespace: &str, selector: &str) -> kube::Result<Vec<String>> {
+    let api: Api<Submission> = Api::namespaced(client.clone(), namespace);
+    let list = api.list(&ListParams::default().fields(selector)).await?;
+    Ok(list.items.into_iter().filter_map(|found| found.metadata.name).collect())
+}
+
+#[tokio::test]
+async fn spec_and_status_are_written_apart() {
+    let server = server().await;
+    let api = Kind::Submission.api(&server.client(), &server.namespace("status").await);
+    let born = Kind::Submission.object("a", &[&json!({"status": {"state": "Finished"}})]);
+    let first = create(&api, born, false).await.unwrap();
+    assert_eq!(
+        first.data.get("status"),
+        None,
+        "a status given at birth counts for nothing"
+    );
+    let both =
+        |priority: i64, state: &str| Patch::Merge(json!({"spec": {"priority": priority}, "status": {"state": state}}));
+    let params = PatchParams::default();
+    let second = api.patch_status("a", &params, &both(1, "Running")).await.unwrap();
+    assert_eq!(
+        (&second.data["spec"]["priority"], &second.data["status"]["state"]),
+        (&json!(0), &json!("Running"))
+    );
+    assert_eq!(second.metadata.generation, first.metadata.generation);
+    let third = api.patch("a", &params, &both(2, "Failed")).await.unwrap();
+    assert_eq!(
+        (&third.data["spec"]["priority"], &third.data["status"]["state"]),
+        (&json!(2), &json!("Running"))
+    );
+    assert_eq!(
+        third.metadata.generation,
+        first.metadata.generation.map(|generation| generation + 1)
+    );
+}
+
+#[tokio::test]
+async fn a_full_status_of_our_types_is_kept_whole() {
+    let server = server().await;
+    let namespace = server.namespace("status").await;
+    let api: Api<Submission> = Api::namespaced(server.client(), &namespace);
+    let raw = Kind::Submission.api(&server.client(), &namespace);
+    create(&raw, Kind::Submission.object("a", &[]), false).await.unwrap();
+    let status = super::columns::full_status();
+    let params = PatchParams::default();
+    let read = api
+        .patch_status("a", &params, &Patch::Merge(json!({"status": status})))
+        .await
+        .unwrap();
+    assert_eq!(serde_json::to_value(read.status).unwrap(), status);
+}

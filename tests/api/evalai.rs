@@ -1,0 +1,486 @@
+//! `services::evalai` against the stand-in of EvalAI's server, over loopback.
+//!
+//! The stand-in holds the facts: the texts of its errors, writes that are read early and saved late, faults on purpose.
+
+mod faults;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use evalai_stand_in::faults::{Failure, Fault, When};
+use evalai_stand_in::log::Entry;
+use evalai_stand_in::model::{FileState, Status as Stored};
+use evalai_stand_in::submissions::{NewSubmission, create};
+use evalai_stand_in::{Config, Handle, Knobs};
+use jiff::{SignedDuration, Timestamp};
+use leaderboard_operator::services::evalai::{
+    Changed, Ended, Hub, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target, Timeouts,
+    Timing, View, Wish,
+};
+use leaderboard_operator::services::token::Token;
+use serde_json::{Map, json};
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+
+/// A stand-in, a hub that speaks to it, and what the controller would hold.
+struct World {
+    server: Handle,
+    hub: Hub,
+    target: Target,
+    changed: mpsc::UnboundedReceiver<Changed>,
+    sweep: mpsc::UnboundedReceiver<SweepRow>,
+    leads: Arc<AtomicBool>,
+}
+
+fn timing() -> Timing {
+    Timing {
+        hold: Duration::from_millis(1500),
+        accept: Duration::from_millis(50),
+        lost: Duration::ZERO,
+        ..Timing::default()
+    }
+}
+
+fn timeouts() -> Timeouts {
+    Timeouts {
+        connect: Duration::from_secs(5),
+        read: Duration::from_secs(2),
+        write: Duration::from_secs(10),
+    }
+}
+
+fn target(api_server: &str, token: &str) -> Target {
+    let seed = evalai_stand_in::Seed::built_in().unwrap();
+    Target {
+        api_server: api_server.to_owned(),
+        challenge: 1,
+        split: "leaderboard".into(),
+        token: Arc::new(Token::parse(token).unwrap()),
+        requests_per_minute: 6000,
+        sweep: Duration::from_millis(200),
+        period: Duration::from_millis(200),
+        phases: [1, 2].into(),
+        labels: seed.challenges[0].phases[0].splits[0].schema.labels.clone().into(),
+        since: Timestamp::now() - SignedDuration::from_hours(1),
+    }
+}
+
+impl World {
+    async fn new() -> Self {
+        Self::with(timing(), timeouts()).await
+    }
+
+    async fn with(timing: Timing, timeouts: Timeouts) -> Self {
+        let (config, _) = Config::in_memory().unwrap();
+        let config = Config { throttle: 0, ..config };
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let server = evalai_stand_in::serve(config, vec![listener]);
+        let (wake, changed) = mpsc::unbounded_channel();
+        let (found, sweep) = mpsc::unbounded_channel();
+        let leads = Arc::new(AtomicBool::new(true));
+        let fence = leads.clone();
+        let hub = Hub::new(Options {
+            fence: Arc::new(move || fence.load(Ordering::SeqCst)),
+            not_before: Instant::now(),
+            changed: wake,
+            sweep: found,
+            timing,
+            timeouts,
+        });
+        let target = target(&server.url(), "local-host-token");
+        Self {
+            server,
+            hub,
+            target,
+            changed,
+            sweep,
+            leads,
+        }
+    }
+
+    fn submit(&self) -> i64 {
+        self.submit_with(FileState::Stored, Timestamp::now())
+    }
+
+    fn submit_with(&self, file: FileState, at: Timestamp) -> i64 {
+        let input = json!({"submitted_image_uri": "registry.example/team-a:1"}).to_string();
+        let new = NewSubmission {
+            team: 1,
+            phase: 1,
+            user: 11,
+            input: input.into_bytes(),
+            fields: Map::new(),
+        };
+        let pk = self.server.with_state(|state| create(state, new, file, at));
+        i64::try_from(pk).unwrap()
+    }
+
+    fn set(&self, pk: i64, status: Stored) {
+        let pk = u64::try_from(pk).unwrap();
+        self.server
+            .with_state(|state| state.submissions.get_mut(&pk).unwrap().status = status);
+    }
+
+    fn stored(&self, pk: i64) -> Stored {
+        self.server.state().submissions[&u64::try_from(pk).unwrap()].status
+    }
+
+    fn rows(&self, pk: i64) -> usize {
+        let pk = u64::try_from(pk).unwrap();
+        self.server
+            .state()
+            .rows
+            .values()
+            .filter(|row| row.submission == pk)
+            .count()
+    }
+
+    fn ask(&self, pk: i64, image: bool) {
+        self.hub.ask(&self.target, &key(pk), pk, &run(pk, 1), image).unwrap();
+    }
+
+    fn live(&self, pk: i64) {
+        let at = self.server.state().submissions[&u64::try_from(pk).unwrap()].submitted_at;
+        self.hub.live(&self.target, &key(pk), pk, &run(pk, 1), at).unwrap();
+    }
+
+    fn wish(&self, pk: i64, wish: Wish) {
+        self.hub.wish(&self.target, &key(pk), pk, &run(pk, 1), wish).unwrap();
+    }
+
+    fn fail(&self, method: &str, part: &str, answer: Failure, when: When) {
+        let fault = Fault {
+            method: Some(method.into()),
+            path_prefix: Some(part.into()),
+            answer,
+            times: 1,
+            when,
+        };
+        self.server.set_knobs(Knobs {
+            fail_next: vec![fault],
+            ..Knobs::default()
+        });
+    }
+
+    /// Waits until the view of a submission is as wanted.
+    async fn until(&mut self, pk: i64, wanted: impl Fn(&View) -> bool) -> View {
+        loop {
+            if let Some(view) = self.hub.view(&key(pk)).filter(|view| wanted(view)) {
+                return view;
+            }
+            let news = tokio::time::timeout(Duration::from_mins(1), self.changed.recv()).await;
+            assert!(news.is_ok(), "nothing changes: {:?}", self.hub.view(&key(pk)));
+        }
+    }
+
+    async fn ended(&mut self, pk: i64) -> Ended {
+        self.until(pk, |view| view.end.is_some()).await.end.unwrap()
+    }
+
+    fn sent(&self, method: &str) -> Vec<Entry> {
+        self.server
+            .requests()
+            .into_iter()
+            .filter(|entry| entry.method == method)
+            .collect()
+    }
+}
+
+fn key(pk: i64) -> Key {
+    Key {
+        namespace: "carla".into(),
+        name: format!("submission-{pk}"),
+        uid: pk.to_string(),
+    }
+}
+
+fn leaderboard() -> Key {
+    Key {
+        namespace: "carla".into(),
+        name: "carla-2".into(),
+        uid: "leaderboard".into(),
+    }
+}
+
+fn run(pk: i64, attempt: i64) -> Run {
+    Run {
+        attempt,
+        job: format!("submission-{pk}-{attempt}"),
+    }
+}
+
+fn results(target: &Target, score: f64) -> Arc<Payload> {
+    let accuracies: BTreeMap<_, _> = target.labels.iter().map(|label| (label.clone(), score)).collect();
+    let result = json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]);
+    Arc::new(Payload {
+        phase: 1,
+        result: result.to_string(),
+        stdout: "12/20 routes".into(),
+        stderr: String::new(),
+        metadata: "{}".into(),
+        environment_log: "for hosts".into(),
+    })
+}
+
+#[tokio::test]
+async fn a_submission_lives_through_all_of_it() {
+    let mut world = World::new().await;
+    let pk = world.submit();
+    world.ask(pk, true);
+    let view = world.until(pk, |view| view.answered == 1 && view.image.is_some()).await;
+    let row = view.row.unwrap();
+    assert_eq!(
+        (row.status, row.team_id, row.team_name.as_deref()),
+        (Status::Submitted, Some(1), Some("team-a"))
+    );
+    assert_eq!(
+        (view.image, view.ended),
+        (Some(Ok("registry.example/team-a:1".into())), None)
+    );
+    world.live(pk);
+    world.wish(pk, Wish::Queued);
+    world.until(pk, |view| view.progress == Some(Progress::Queued)).await;
+    world.wish(pk, Wish::Running);
+    world.until(pk, |view| view.progress == Some(Progress::Running)).await;
+    world.wish(pk, Wish::Partial(results(&world.target, 41.0)));
+    world.until(pk, |view| view.partial_at.is_some()).await;
+    assert_eq!(world.stored(pk), Stored::PartiallyEvaluated);
+    world.wish(pk, Wish::Final(Outcome::Finished, results(&world.target, 43.0)));
+    assert!(matches!(
+        world.ended(pk).await,
+        Ended::Published {
+            outcome: Outcome::Finished,
+            ..
+        }
+    ));
+    let state = world.server.state();
+    let stored = &state.submissions[&u64::try_from(pk).unwrap()];
+    assert_eq!((stored.status, world.rows(pk)), (Stored::Finished, 1));
+    assert_eq!(stored.job_name, [format!("submission-{pk}-1")]);
+    let text = |file: &Option<String>| String::from_utf8(state.files[file.as_ref().unwrap()].clone()).unwrap();
+    assert_eq!(text(&stored.environment_log_file), "for hosts");
+    assert_eq!(text(&stored.stdout_file), "12/20 routes");
+    let score = state.rows.values().next().unwrap().result["Driving score"].as_f64();
+    assert_eq!(score, Some(43.0));
+    assert!(world.hub.drain().await);
+}
+
+#[tokio::test]
+async fn the_table_of_ends() {
+    use Outcome::{Cancelled, Failed, Finished};
+    let mut world = World::new().await;
+    let mut cases = Vec::new();
+    for wanted in [Finished, Failed, Cancelled] {
+        for status in Stored::ALL {
+            let pk = world.submit();
+            world.set(pk, status);
+            cases.push((pk, Status::parse(status.as_str()), wanted));
+        }
+        let pk = world.submit();
+        let id = u64::try_from(pk).unwrap();
+        world
+            .server
+            .with_state(|state| state.submissions.get_mut(&id).unwrap().ignore_submission = true);
+        cases.push((pk, Status::Ignored, wanted));
+        cases.push((90_000 + pk, Status::Missing, wanted));
+    }
+    for (pk, _, wanted) in &cases {
+        world.wish(*pk, Wish::Final(*wanted, results(&world.target, 43.0)));
+    }
+    for (pk, status, wanted) in cases {
+        let before = world
+            .server
+            .state()
+            .submissions
+            .get(&u64::try_from(pk).unwrap())
+            .map(|row| row.status);
+        let end = world.ended(pk).await;
+        let gone = matches!(
+            status,
+            Status::Cancelled | Status::Archived | Status::Ignored | Status::Missing
+        );
+        match (status, wanted) {
+            (Status::Failed, Failed | Cancelled) => assert_eq!(end, Ended::Agreed(status), "{status} {wanted:?}"),
+            _ if gone && wanted == Cancelled => assert_eq!(end, Ended::Agreed(status), "{status} {wanted:?}"),
+            _ if gone => assert_eq!(end, Ended::Otherwise(status), "{status} {wanted:?}"),
+            _ => {
+                assert!(
+                    matches!(end, Ended::Published { outcome, .. } if outcome == wanted),
+                    "{status} {wanted:?}: {end:?}"
+                );
+                assert_eq!(world.stored(pk).as_str(), wanted.as_str(), "{status} {wanted:?}");
+                continue;
+            }
+        }
+        let puts = world
+            .sent("PUT")
+            .into_iter()
+            .filter(|entry| entry.body["submission"] == json!(pk))
+            .count();
+        assert_eq!(puts, 0, "{status} {wanted:?} was {before:?}");
+    }
+}
+
+#[tokio::test]
+async fn cancels_during_partial_traffic_are_lost_only_inside_a_request() {
+    let world = World::new().await;
+    world.server.set_knobs(Knobs {
+        put_delay_ms: 20,
+        ..Knobs::default()
+    });
+    let pks: Vec<_> = (0..40).map(|_| world.submit()).collect();
+    for pk in &pks {
+        world.set(*pk, Stored::Running);
+        world.live(*pk);
+    }
+    let mut cancelled: BTreeMap<i64, Timestamp> = BTreeMap::new();
+    for (round, pk) in pks.iter().enumerate() {
+        for other in &pks {
+            let score = f64::from(u32::try_from(round).unwrap());
+            world.wish(*other, Wish::Partial(results(&world.target, score)));
+        }
+        let written = world.sent("PUT").len();
+        world
+            .server
+            .wait_until(|_, log| log.entries().filter(|entry| entry.method == "PUT").count() > written + 4)
+            .await;
+        cancelled.insert(*pk, Timestamp::now());
+        world.set(*pk, Stored::Cancelled);
+    }
+    // Everything that was on its way is answered, and no more is begun.
+    assert!(world.hub.drain().await);
+    let log = world.server.requests();
+    let puts: Vec<_> = log.iter().filter(|entry| entry.method == "PUT").collect();
+    assert!(puts.len() > 100, "{} partials", puts.len());
+    let mut lost = 0;
+    for (pk, at) in &cancelled {
+        let lists: Vec<_> = log
+            .iter()
+            .filter(|e| e.path.contains("status=cancelled") && e.time > *at)
+            .collect();
+        // Sent although a list that was asked for after the cancel had been answered, long enough ago to have arrived.
+        let arrived = |put: &Entry| put.time - SignedDuration::from_secs(1);
+        let knowingly = |put: &Entry| {
+            lists
+                .iter()
+                .any(|list| list.answered.is_some_and(|at| at < arrived(put)))
+        };
+        let mut after = puts
+            .iter()
+            .filter(|put| put.body["submission"] == json!(pk) && put.answered > Some(*at));
+        if world.stored(*pk) == Stored::Cancelled {
+            assert!(
+                !after.any(|put| knowingly(put)),
+                "submission {pk} was written after a list that held it"
+            );
+        } else {
+            // Whoever was overwritten is in no later list: the first write is the one that did it.
+            assert!(
+                !knowingly(after.next().unwrap()),
+                "the cancel of submission {pk} was overwritten knowingly"
+            );
+            lost += 1;
+        }
+    }
+    println!(
+        "{} partials, {} cancels, {lost} overwritten",
+        puts.len(),
+        cancelled.len()
+    );
+}
+
+#[tokio::test]
+async fn without_the_lease_nothing_is_written() {
+    let mut world = World::new().await;
+    world.leads.store(false, Ordering::SeqCst);
+    let pk = world.submit();
+    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+    world.ask(pk, false);
+    world.until(pk, |view| view.answered == 1).await;
+    assert_eq!(world.stored(pk), Stored::Submitted);
+    world.leads.store(true, Ordering::SeqCst);
+    assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
+    assert_eq!(world.sent("PUT").len(), 1);
+}
+
+#[tokio::test]
+async fn a_leaderboard_is_compared_with_its_challenge() {
+    let mut world = World::new().await;
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    let labels = loop {
+        if let Some(labels) = world.hub.labels(&leaderboard()).0 {
+            break labels;
+        }
+        world.changed.recv().await.unwrap();
+    };
+    assert_eq!(labels.problems, []);
+    let wrong = Target {
+        phases: [1, 3].into(),
+        labels: ["Driving score".to_owned(), "Bogus".to_owned()].into(),
+        ..world.target.clone()
+    };
+    world.hub.serve(&leaderboard(), &wrong).unwrap();
+    let labels = world.hub.labels(&leaderboard()).0.unwrap();
+    assert!(
+        labels.problems.contains(&Misfit::Phase { challenge: 1, phase: 3 }),
+        "{labels:?}"
+    );
+    assert!(
+        matches!(&labels.problems[0], Misfit::Unknown { phase: 1, labels } if *labels == ["Bogus"]),
+        "{labels:?}"
+    );
+}
+
+#[tokio::test]
+async fn a_lost_message_is_found_by_the_sweep() {
+    let mut world = World::new().await;
+    let known = world.submit();
+    world.ask(known, false);
+    world.until(known, |view| view.answered == 1).await;
+    let lost = world.submit_with(FileState::Stored, Timestamp::now() - SignedDuration::from_secs(300));
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    let found = world.sweep.recv().await.unwrap();
+    assert_eq!((found.challenge, found.phase, found.submission), (1, 1, lost));
+}
+
+#[tokio::test]
+async fn a_refused_token_is_told_and_a_new_one_taken() {
+    let mut world = World::new().await;
+    let good = world.target.clone();
+    world.target = target(&world.server.url(), "local-host-access-token");
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    let why = loop {
+        if let Some(why) = world.hub.token_refused(&leaderboard()) {
+            break why;
+        }
+        world.changed.recv().await.unwrap();
+    };
+    assert!(
+        why.contains("Token has wrong type") && why.contains("refresh token of a host"),
+        "{why}"
+    );
+    let pk = world.submit();
+    world.ask(pk, false);
+    world.target = good;
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    world.ask(pk, false);
+    world.until(pk, |view| view.answered == 1).await;
+    assert_eq!(world.hub.token_refused(&leaderboard()), None);
+    let (used, limit) = world.hub.budget_used(&leaderboard()).unwrap();
+    assert!(used > 0 && limit == 6000);
+}
+
+#[tokio::test]
+async fn an_image_that_cannot_be_had_is_named() {
+    let mut world = World::new().await;
+    let pk = world.submit_with(FileState::Missing, Timestamp::now());
+    world.ask(pk, true);
+    let view = world.until(pk, |view| view.image.is_some()).await;
+    assert!(
+        view.image
+            .is_some_and(|image| image.is_err_and(|why| why.contains("404")))
+    );
+}

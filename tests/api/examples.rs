@@ -1,0 +1,98 @@
+//! The manifests in `examples/` and the files in `crds/`, as a person applies them.
+
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use leaderboard_operator::api::{Leaderboard, Submission, effective};
+
+use crate::support::apiserver::{ApiServer, server};
+
+fn folder(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
+}
+
+fn manifests() -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(folder("examples"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "yaml"))
+        .collect();
+    files.sort();
+    files
+}
+
+fn apply(server: &ApiServer, namespace: &str, file: &Path, output: &str) -> Output {
+    let mut command = server.kubectl();
+    command.args(["apply", "--server-side", "--validate=strict", "--dry-run=server"]);
+    command.args(["--namespace", namespace, "--output", output, "--filename"]);
+    command.arg(file).output().unwrap()
+}
+
+#[tokio::test]
+async fn every_example_is_accepted_without_a_warning() {
+    let server = server().await;
+    let namespace = server.namespace("examples").await;
+    let files = manifests();
+    assert!(files.len() >= 4, "{files:?}");
+    for file in files {
+        let output = apply(server, &namespace, &file, "name");
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{}: {said}", file.display());
+        assert_eq!(said, "", "{}", file.display());
+    }
+}
+
+#[tokio::test]
+async fn the_committed_definitions_change_nothing() {
+    let server = server().await;
+    for file in ["crds/leaderboards.yaml", "crds/submissions.yaml"] {
+        let output = apply(server, "default", &folder(file), "jsonpath={.metadata.generation}");
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{file}: {said}");
+        assert_eq!(
+            String::from_utf8_lossy(&output.stdout),
+            "1",
+            "{file} is not what is installed"
+        );
+    }
+}
+
+#[test]
+fn examples_run_what_their_comments_say() {
+    let read = |name: &str| std::fs::read_to_string(folder("examples").join(name)).unwrap();
+    let leaderboard = |name: &str| -> Leaderboard { serde_saphyr::from_str(&read(name)).unwrap() };
+    for (name, pairs, repetitions) in [
+        ("leaderboard-20.yaml", 4, 1),
+        ("leaderboard-10.yaml", 4, 5),
+        ("leaderboard-local.yaml", 4, 1),
+    ] {
+        let spec = leaderboard(name).spec;
+        for track in &spec.tracks {
+            let shape = effective::shape(&spec, track);
+            assert_eq!(
+                (shape.pairs, shape.routes, shape.repetitions),
+                (pairs, 20, repetitions),
+                "{name}"
+            );
+        }
+    }
+    let submission: Submission = serde_saphyr::from_str(&read("submission-local.yaml")).unwrap();
+    let local = leaderboard("leaderboard-local.yaml");
+    assert_eq!(Some(&submission.spec.leaderboard), local.metadata.name.as_ref());
+    assert!(
+        local
+            .spec
+            .tracks
+            .iter()
+            .any(|track| Some(&track.name) == submission.spec.track.as_ref())
+    );
+    // Manifests that lie in git would take back what the bridge and people changed since.
+    for file in manifests() {
+        let text = std::fs::read_to_string(&file).unwrap();
+        assert!(
+            !text.contains("attempt:") && !text.contains("cancel:"),
+            "{}",
+            file.display()
+        );
+    }
+}

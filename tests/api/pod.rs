@@ -1,0 +1,296 @@
+//! The programs in the Pod against a stand-in for AWS: what they store, restore and report, and what they do when S3 is away
+//! or another Pod has taken over.
+
+mod archives;
+mod cloudwatch;
+mod preparing;
+mod role;
+mod sidecar;
+mod uploads;
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::future::Future;
+use std::io::Write;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use leaderboard_operator::api::{LogGroup, ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_operator::pod::logcopy::{self, LogcopyError};
+use leaderboard_operator::pod::places::{Pace, Places, Setting};
+use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report};
+use leaderboard_operator::pod::run::{Run, STATUS_FOLDER, Stop};
+use leaderboard_operator::pod::tree::Tree;
+use leaderboard_operator::pod::upload::Haste;
+use leaderboard_operator::pod::upload::send::{Sent, Uploader, Wanted};
+use leaderboard_operator::pod::workspace::{self, WorkspaceError, WorkspaceReason, WorkspaceVerdict};
+use leaderboard_operator::pod::{identity, ship};
+use leaderboard_operator::services::archive::{Archive, Cause, Fetched};
+use leaderboard_operator::services::aws::Aws;
+use leaderboard_operator::services::logs::LogClient;
+use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
+use tokio::sync::oneshot;
+use tokio::task::JoinHandle;
+
+use crate::support::ministack::{self, server};
+
+const LIMIT: u64 = 1 << 30;
+const MIB: usize = 1 << 20;
+const PATIENCE: Duration = Duration::from_mins(2);
+
+/// A Pod's volumes in a temporary folder, and its prefix in a bucket of its own.
+struct Pod {
+    folder: tempfile::TempDir,
+    setting: Setting,
+    archive: Archive,
+    aws: Aws,
+}
+
+impl Pod {
+    async fn new() -> Self {
+        let bucket = server().await.bucket().await;
+        Self::on(&server().await.endpoint(), &bucket, run(&bucket)).await
+    }
+
+    async fn on(endpoint: &str, bucket: &str, run: Run) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for name in ["logs", "tools", "podinfo"] {
+            fs::create_dir(at(name)).unwrap();
+        }
+        fs::write(at("runner"), "#!runner").unwrap();
+        fs::write(at("podinfo/stop"), "").unwrap();
+        let aws = ministack::aws(endpoint).await;
+        Self {
+            archive: Archive::new(aws.s3(None, Some(endpoint)), bucket, "runs/77/"),
+            aws,
+            setting: Setting {
+                run,
+                pod_uid: "pod-1".to_owned(),
+                role_arn: None,
+                places: Places {
+                    logs: at("logs"),
+                    tools: at("tools"),
+                    runner: at("runner"),
+                    podinfo: at("podinfo"),
+                    token: at("token"),
+                    termination_log: at("termination-log"),
+                },
+                pace: Pace {
+                    settle: Duration::from_secs(1),
+                    quiet: Duration::from_secs(1),
+                    grace: Duration::from_secs(5),
+                    least: Duration::from_millis(100),
+                    backoff: Duration::from_millis(500),
+                },
+            },
+            folder,
+        }
+    }
+
+    /// The same prefix seen by the Pod that replaces this one.
+    async fn replaced(&self, uid: &str) -> Self {
+        let bucket = &self.setting.run.plan.storage.bucket;
+        let mut next = Self::on(&server().await.endpoint(), bucket, self.setting.run.clone()).await;
+        uid.clone_into(&mut next.setting.pod_uid);
+        next
+    }
+
+    fn logs(&self) -> &Path {
+        &self.setting.places.logs
+    }
+
+    fn path(&self, relative: &str) -> PathBuf {
+        self.logs().join(relative)
+    }
+
+    fn put(&self, relative: &str, bytes: &[u8]) {
+        let path = self.path(relative);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, bytes).unwrap();
+    }
+
+    fn append(&self, relative: &str, bytes: &[u8]) {
+        fs::create_dir_all(self.path(relative).parent().unwrap()).unwrap();
+        let file = OpenOptions::new().append(true).create(true).open(self.path(relative));
+        file.unwrap().write_all(bytes).unwrap();
+    }
+
+    /// What the agent of a pair would write.
+    fn checkpoint(&self, pair: u32, done: u32) {
+        let text = checkpoint((pair - 1) * 2, done, 2);
+        self.put(&format!("agent/agent{pair}/agent_results.json"), text.as_bytes());
+    }
+
+    fn mark(&self, side: Side, pair: u16, mark: Mark) {
+        let pair = Pair::new(pair).unwrap();
+        let root = self.path(STATUS_FOLDER);
+        StatusFile::Of(Member { side, pair }, mark).create(&root).unwrap();
+    }
+
+    fn has(&self, file: StatusFile) -> bool {
+        file.exists(&self.path(STATUS_FOLDER))
+    }
+
+    async fn stored(&self, key: &str) -> Option<Vec<u8>> {
+        self.archive.get(key, LIMIT).await.unwrap().map(|object| object.bytes)
+    }
+
+    async fn report(&self) -> Option<Report> {
+        let bytes = self.archive.get(REPORT_KEY, MAX_BYTES as u64).await.ok()??.bytes;
+        Some(Report::parse(&bytes).unwrap())
+    }
+
+    async fn keys(&self) -> Vec<String> {
+        let listing = self.archive.list("", 1000).await.unwrap();
+        listing.objects.into_iter().map(|object| object.key).collect()
+    }
+
+    async fn prepare(&self) -> Result<(), WorkspaceError> {
+        workspace::prepare(&self.setting, &self.archive).await
+    }
+
+    fn uploader(&self) -> Uploader {
+        let tree = Arc::new(Tree::open(self.logs()).unwrap());
+        Uploader::new(self.archive.clone(), tree, LIMIT)
+    }
+
+    /// Starts logcopy.
+    fn logcopy(&self) -> Logcopy {
+        let (end, ended) = oneshot::channel::<()>();
+        let (setting, aws, archive) = (self.setting.clone(), self.aws.clone(), self.archive.clone());
+        let shutdown = async {
+            let _ = ended.await;
+        };
+        let task = tokio::spawn(async move { logcopy::work(setting, &aws, archive, shutdown).await });
+        Logcopy { end, task }
+    }
+
+    /// Waits for a report that says so. S3 has nothing to wait on, so it is asked.
+    async fn reported(&self, what: impl Fn(&Report) -> bool) -> Report {
+        let seen = until(|| async { self.report().await.filter(|report| what(report)) });
+        seen.await
+    }
+}
+
+struct Logcopy {
+    end: oneshot::Sender<()>,
+    task: JoinHandle<Result<(), LogcopyError>>,
+}
+
+impl Logcopy {
+    /// SIGTERM.
+    async fn end(self) {
+        let _ = self.end.send(());
+        tokio::time::timeout(PATIENCE, self.task)
+            .await
+            .unwrap()
+            .unwrap()
+            .unwrap();
+    }
+
+    /// SIGKILL.
+    async fn kill(self) {
+        self.task.abort();
+        assert!(self.task.await.is_err());
+    }
+}
+
+/// Asks until there is an answer.
+async fn until<T, F: Future<Output = Option<T>>>(ask: impl Fn() -> F) -> T {
+    let asking = async {
+        loop {
+            if let Some(answer) = ask().await {
+                return answer;
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, asking)
+        .await
+        .expect("it never came to be")
+}
+
+async fn until_true(what: impl Fn() -> bool) {
+    until(|| std::future::ready(what().then_some(()))).await;
+}
+
+/// Two pairs of two routes each.
+fn run(bucket: &str) -> Run {
+    Run {
+        namespace: "default".to_owned(),
+        submission: "submission-77".to_owned(),
+        uid: "uid-1".to_owned(),
+        attempt: 1,
+        plan: RunPlan {
+            run_id: "77".to_owned(),
+            results: ResultsFormat::V2,
+            track: "sensors".to_owned(),
+            codename: "SENSORS".to_owned(),
+            phase: None,
+            slices: vec!["0-1".to_owned(), "2-3".to_owned()],
+            routes: 4,
+            repetitions: 1,
+            storage: Storage {
+                bucket: bucket.to_owned(),
+                prefix: Some("runs/".to_owned()),
+                region: None,
+                endpoint: None,
+                limit: i64::try_from(LIMIT).unwrap(),
+            },
+            image: "image".to_owned(),
+            contents_image: "contents".to_owned(),
+            simulator_image: "simulator".to_owned(),
+            resume: false,
+        },
+        verify: Verify::Off,
+        period_seconds: 1,
+        flush_seconds: 60,
+        cancel_seconds: 20,
+        log_group: None,
+    }
+}
+
+/// A checkpoint of Leaderboard 2.0.
+fn checkpoint(first: u32, done: u32, total: u32) -> String {
+    let record = |index: u32| {
+        serde_json::json!({
+            "index": index,
+            "route_id": format!("RouteScenario_{}_rep0", first + index),
+            "status": "Completed",
+            "num_infractions": 0,
+            "infractions": {"collisions_pedestrian": [], "collisions_vehicle": [], "collisions_layout": [],
+                "red_light": [], "stop_infraction": [], "outside_route_lanes": [], "min_speed_infractions": [],
+                "yield_emergency_vehicle_infractions": [], "scenario_timeouts": [], "route_dev": [],
+                "vehicle_blocked": [], "route_timeout": []},
+            "scores": {"score_route": 100.0, "score_penalty": 1.0, "score_composed": 100.0},
+            "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
+        })
+    };
+    let global = if done == total {
+        serde_json::json!({"index": -1})
+    } else {
+        serde_json::json!({})
+    };
+    let file = serde_json::json!({
+        "_checkpoint": {
+            "global_record": global,
+            "progress": [done, total],
+            "records": (0..done).map(record).collect::<Vec<_>>(),
+        },
+        "entry_status": "Started",
+        "eligible": false,
+        "sensors": ["carla_camera", "carla_gnss"],
+        "values": [],
+        "labels": [],
+    });
+    file.to_string()
+}
+
+/// Text that compresses to nothing and repeats nowhere.
+fn noise(len: usize, seed: u64) -> Vec<u8> {
+    let mut random = fastrand::Rng::with_seed(seed);
+    (0..len).map(|_| random.u8(b' '..b'~')).collect()
+}

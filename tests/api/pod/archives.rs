@@ -1,0 +1,87 @@
+//! The run's folder in S3.
+
+use super::*;
+
+#[tokio::test]
+async fn objects_are_read_written_listed_and_deleted() {
+    let pod = Pod::new().await;
+    let archive = &pod.archive;
+    assert!(archive.prefix_is_empty().await.unwrap());
+    assert_eq!(archive.get("a/x", 10).await.unwrap(), None);
+    assert_eq!(
+        archive.get_if_none_match("a/x", None, 10).await.unwrap(),
+        Fetched::Absent
+    );
+    let etag = archive.put("a/x", b"0123456789".to_vec()).await.unwrap();
+    let Fetched::Found(object) = archive.get_if_none_match("a/x", None, 10).await.unwrap() else {
+        panic!("it is not found");
+    };
+    assert_eq!((object.bytes.as_slice(), &object.etag), (&b"0123456789"[..], &etag));
+    let again = archive.get_if_none_match("a/x", etag.as_deref(), 10).await.unwrap();
+    assert_eq!(again, Fetched::NotModified);
+    let error = archive.get("a/x", 9).await.unwrap_err();
+    assert!(matches!(error.cause, Cause::TooLarge(9)), "{error}");
+
+    for i in 0..25 {
+        archive.put(&format!("b/{i:02}"), Vec::new()).await.unwrap();
+    }
+    let some = archive.list("b/", 10).await.unwrap();
+    assert_eq!((some.objects.len(), some.complete), (10, false));
+    let all = archive.list("", 1000).await.unwrap();
+    assert_eq!((all.objects.len(), all.complete), (26, true));
+    assert_eq!((all.objects[0].key.as_str(), all.objects[0].size), ("a/x", 10));
+    let keys: Vec<String> = all.objects.into_iter().map(|object| object.key).collect();
+    archive.delete(&keys).await.unwrap();
+    archive.delete(&["never/there".to_owned()]).await.unwrap();
+    assert!(archive.prefix_is_empty().await.unwrap());
+}
+
+#[tokio::test]
+async fn errors_say_what_to_do() {
+    let endpoint = server().await.endpoint();
+    let client = server().await.aws().await.s3(None, Some(&endpoint));
+    let archive = Archive::new(client, "no-such-bucket", "77/");
+    let error = archive.put("x", Vec::new()).await.unwrap_err();
+    assert!(matches!(error.cause, Cause::NoBucket), "{error}");
+    let text = error.to_string();
+    assert!(
+        text.starts_with("storing s3://no-such-bucket/77/x: the bucket does not exist. Create"),
+        "{text}"
+    );
+    assert!(
+        archive.get("x", 10).await.is_err(),
+        "a missing bucket is not a missing object"
+    );
+}
+
+/// S3 as it is for credentials that may list one prefix only, with nothing stored.
+async fn tight_s3() -> (String, JoinHandle<()>) {
+    const DENIED: &str = "<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>";
+    const EMPTY: &str = "<ListBucketResult><KeyCount>0</KeyCount><IsTruncated>false</IsTruncated></ListBucketResult>";
+    let answer = |request: axum::extract::Request| async move {
+        let query = request.uri().query().unwrap_or_default();
+        if query.contains("list-type=2") && query.contains("prefix=runs%2F77%2F") {
+            (http::StatusCode::OK, EMPTY)
+        } else {
+            (http::StatusCode::FORBIDDEN, DENIED)
+        }
+    };
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let router = axum::Router::new().fallback(answer);
+    let server = tokio::spawn(async move { axum::serve(listener, router).await.unwrap() });
+    (endpoint, server)
+}
+
+#[tokio::test]
+async fn a_missing_object_is_told_from_a_forbidden_one() {
+    let (endpoint, server) = tight_s3().await;
+    let client = || async { ministack::aws(&endpoint).await.s3(None, Some(&endpoint)) };
+    let ours = Archive::new(client().await, "bucket", "runs/77/");
+    assert_eq!(ours.get(REPORT_KEY, 10).await.unwrap(), None);
+    let foreign = Archive::new(client().await, "bucket", "runs/78/");
+    let error = foreign.get(REPORT_KEY, 10).await.unwrap_err();
+    assert!(matches!(error.cause, Cause::Denied(_)), "{error}");
+    assert!(error.to_string().contains("s3:ListBucket"), "{error}");
+    server.abort();
+}

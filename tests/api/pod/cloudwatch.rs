@@ -1,0 +1,89 @@
+//! Each line once.
+
+use super::*;
+
+#[tokio::test]
+async fn each_line_arrives_once_and_in_order() {
+    let group = format!("group-{}", fastrand::u64(..));
+    let mut pod = Pod::new().await;
+    pod.setting.run.log_group = Some(LogGroup {
+        name: group.clone(),
+        region: None,
+        endpoint: None,
+    });
+    let logs = pod.aws.logs(None, None);
+    logs.create_log_group().log_group_name(&group).send().await.unwrap();
+    let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group.as_ref().unwrap());
+    let tree = Arc::new(Tree::open(pod.logs()).unwrap());
+    let shipper = || {
+        let memory = pod.uploader().memory().clone();
+        ship::Shipper::new(client.clone(), Arc::clone(&tree), "77", 2, &memory)
+    };
+    let lines = |from: usize, to: usize| {
+        let lines: Vec<String> = (from..to)
+            .map(|i| {
+                format!(
+                    "line {i}
+"
+                )
+            })
+            .collect();
+        lines.concat()
+    };
+    let log = "agent/agent2/leaderboard.log";
+    pod.append(log, lines(0, 12_000).as_bytes());
+    pod.append(log, b"half a ");
+    let mut first = shipper();
+    first.pass(false).await.unwrap();
+    first.pass(false).await.unwrap();
+    pod.append(log, b"line\n");
+    pod.append(log, lines(12_000, 12_010).as_bytes());
+    pod.append(log, b"no end");
+    let mut second = shipper();
+    second.pass(true).await.unwrap();
+    second.pass(true).await.unwrap();
+    let mut expected: Vec<String> = lines(0, 12_000).lines().map(str::to_owned).collect();
+    expected.push("half a line".to_owned());
+    expected.extend(lines(12_000, 12_010).lines().map(str::to_owned));
+    expected.push("no end".to_owned());
+    assert_eq!(all(&logs, &group, "77/agent-2").await, expected);
+}
+
+#[tokio::test]
+async fn logcopy_sends_the_logs_of_its_run() {
+    let mut pod = Pod::new().await;
+    let group = format!("group-{}", fastrand::u64(..));
+    pod.setting.run.log_group = Some(LogGroup {
+        name: group.clone(),
+        region: None,
+        endpoint: None,
+    });
+    let logs = pod.aws.logs(None, None);
+    logs.create_log_group().log_group_name(&group).send().await.unwrap();
+    pod.prepare().await.unwrap();
+    pod.append("agent/agent1/leaderboard.log", b"first\n");
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.round >= 1).await;
+    pod.append("agent/agent1/leaderboard.log", b"last");
+    logcopy.end().await;
+    assert_eq!(all(&logs, &group, "77/agent-1").await, ["first", "last"]);
+}
+
+async fn all(logs: &aws_sdk_cloudwatchlogs::Client, group: &str, stream: &str) -> Vec<String> {
+    let (mut texts, mut token) = (Vec::new(), None);
+    loop {
+        let request = logs.get_log_events().log_group_name(group).log_stream_name(stream);
+        let request = request.start_from_head(true).set_next_token(token.clone());
+        let page = request.send().await.unwrap();
+        texts.extend(
+            page.events()
+                .iter()
+                .filter_map(|event| event.message().map(str::to_owned)),
+        );
+        let next = page.next_forward_token().map(str::to_owned);
+        if next == token || page.events().is_empty() {
+            return texts;
+        }
+        token = next;
+    }
+}

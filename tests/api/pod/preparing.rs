@@ -1,0 +1,140 @@
+//! The init container: whose prefix it is, and what comes back from it.
+
+use super::*;
+
+#[tokio::test]
+async fn a_fresh_prefix_is_taken_and_everybody_gets_the_runner() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    let runner = fs::metadata(pod.setting.places.runner_for_all()).unwrap();
+    assert_eq!(runner.permissions().mode() & 0o7777, 0o755);
+    assert_eq!(pod.keys().await, [OWNER_KEY, REPORT_KEY]);
+    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
+    let report = pod.report().await.unwrap();
+    assert!(report.belongs_to("uid-1", 1) && !report.is_final && report.done == 0);
+    for folder in ["agent", STATUS_FOLDER, "evalai", "logcopy"] {
+        assert_eq!(
+            fs::metadata(pod.path(folder)).unwrap().mode() & 0o7777,
+            0o777,
+            "{folder}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn somebody_elses_prefix_is_left_alone() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    let mut other = pod.replaced("pod-2").await;
+    other.setting.run.uid = "uid-2".to_owned();
+    let verdict = other.prepare().await.unwrap_err().verdict();
+    assert_eq!(verdict.reason, WorkspaceReason::PrefixInUse);
+    assert!(verdict.message.contains("attempt: 2"), "{}", verdict.message);
+    assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
+    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
+
+    let foreign = Pod::new().await;
+    foreign
+        .archive
+        .put("evalai/results.json", b"[]".to_vec())
+        .await
+        .unwrap();
+    assert!(matches!(foreign.prepare().await, Err(WorkspaceError::PrefixInUse(_))));
+    assert_eq!(foreign.keys().await, ["evalai/results.json"]);
+}
+
+#[tokio::test]
+async fn a_fence_taken_before_the_first_pod_came_is_no_foreign_prefix() {
+    let pod = Pod::new().await;
+    pod.archive.put(OWNER_KEY, b"nobody".to_vec()).await.unwrap();
+    pod.prepare().await.unwrap();
+    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
+}
+
+#[tokio::test]
+async fn a_replaced_pod_goes_on_where_the_lost_one_was() {
+    let lost = Pod::new().await;
+    lost.prepare().await.unwrap();
+    for (key, bytes) in [
+        ("agent/agent1/agent_results.json", checkpoint(0, 1, 2).into_bytes()),
+        ("agent/agent1/leaderboard.log", noise(6 * MIB, 3)),
+        ("agent/agent3/agent_results.json", b"another plan".to_vec()),
+        ("simulator/../../escaped", b"x".to_vec()),
+        ("containers-status/agent-1.crash0", Vec::new()),
+        ("containers-status/simulation.cancel", Vec::new()),
+    ] {
+        lost.archive.put(key, bytes).await.unwrap();
+    }
+    let next = lost.replaced("pod-2").await;
+    next.prepare().await.unwrap();
+    assert_eq!(next.stored(OWNER_KEY).await.unwrap(), b"pod-2");
+    assert_eq!(
+        fs::read(next.path("agent/agent1/leaderboard.log")).unwrap(),
+        noise(6 * MIB, 3)
+    );
+    let file = fs::metadata(next.path("agent/agent1/agent_results.json")).unwrap();
+    let folder = fs::metadata(next.path("agent/agent1")).unwrap();
+    assert_eq!((file.mode() & 0o7777, folder.mode() & 0o7777), (0o666, 0o777));
+    assert!(!next.path("agent/agent3").exists() && !next.folder.path().join("escaped").exists());
+    assert_eq!(fs::read_dir(next.path(STATUS_FOLDER)).unwrap().count(), 0);
+    assert!(!next.keys().await.iter().any(|key| key.starts_with(STATUS_FOLDER)));
+}
+
+#[tokio::test]
+async fn what_was_restored_is_not_sent_again() {
+    let lost = Pod::new().await;
+    lost.prepare().await.unwrap();
+    let log = "agent/agent1/leaderboard.log";
+    lost.archive.put(log, noise(6 * MIB, 3)).await.unwrap();
+    let next = lost.replaced("pod-2").await;
+    next.prepare().await.unwrap();
+    let mut uploader = next.uploader();
+    let stamp = Tree::open(next.logs()).unwrap().file(log).unwrap().unwrap().1;
+    let sent = uploader
+        .sync(&[Wanted::new(log, stamp, Haste::Now)], None)
+        .await
+        .unwrap();
+    assert_eq!(sent, Sent::default());
+}
+
+#[tokio::test]
+async fn a_restarted_node_finds_its_volume_as_it_was_and_takes_no_fence_back() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    pod.checkpoint(1, 1);
+    pod.archive
+        .put("agent/agent1/agent_results.json", b"older".to_vec())
+        .await
+        .unwrap();
+    pod.archive.put(OWNER_KEY, b"pod-2".to_vec()).await.unwrap();
+    pod.prepare().await.unwrap();
+    assert_eq!(
+        fs::read_to_string(pod.path("agent/agent1/agent_results.json")).unwrap(),
+        checkpoint(0, 1, 2)
+    );
+    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-2");
+}
+
+#[tokio::test]
+async fn a_resume_takes_up_what_has_no_report() {
+    let mut pod = Pod::new().await;
+    pod.setting.run.plan.resume = true;
+    pod.archive
+        .put("agent/agent2/agent_results.json", b"{}".to_vec())
+        .await
+        .unwrap();
+    pod.prepare().await.unwrap();
+    assert_eq!(fs::read(pod.path("agent/agent2/agent_results.json")).unwrap(), b"{}");
+}
+
+#[tokio::test]
+async fn a_failure_is_said_in_the_termination_log() {
+    let mut pod = Pod::new().await;
+    pod.setting.run.plan.slices = vec!["0-1".to_owned(), "1-2".to_owned()];
+    // It never asks S3, so that no credentials are needed.
+    workspace::main(pod.setting.clone()).await.unwrap_err();
+    let said = fs::read_to_string(&pod.setting.places.termination_log).unwrap();
+    let verdict = WorkspaceVerdict::parse(&said).unwrap();
+    assert_eq!(verdict.reason, WorkspaceReason::PlanInvalid);
+    assert!(verdict.message.contains("overlap"), "{said}");
+}

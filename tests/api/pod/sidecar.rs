@@ -1,0 +1,246 @@
+//! The sidecar, from the first round to SIGTERM.
+
+use super::*;
+
+#[tokio::test]
+async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.round >= 1).await;
+    for pair in [1, 2] {
+        pod.mark(Side::Simulator, pair, Mark::Start(0));
+        pod.mark(Side::Agent, pair, Mark::Start(0));
+    }
+    pod.append("agent/agent1/leaderboard.log", b"one\n");
+    pod.append("agent/agent2/leaderboard.log", b"two\n");
+    pod.append("simulator/Logs/CarlaUE4.log", b"simulator\n");
+    pod.append("logcopy/logcopy.log", b"{}\n");
+    pod.checkpoint(1, 1);
+    let report = pod.reported(|report| report.done == 1).await;
+    assert_eq!(
+        (report.score, report.is_final, report.pairs[0].state.as_str()),
+        (Some(100.0), false, "Running")
+    );
+    pod.checkpoint(1, 2);
+    pod.checkpoint(2, 2);
+    for pair in [1, 2] {
+        pod.mark(Side::Agent, pair, Mark::Done);
+        pod.mark(Side::Simulator, pair, Mark::Done);
+    }
+    pod.append("agent/agent1/leaderboard.log", b"last line\n");
+    until_true(|| pod.has(StatusFile::Stored)).await;
+    // It was stored before logcopy.done was written.
+    let report = pod.report().await.unwrap();
+    assert!(report.is_final && report.eligible && report.stopped.is_none() && report.why.is_none());
+    assert_eq!(
+        (report.done, report.total, report.entry_status.as_str()),
+        (4, 4, "Finished")
+    );
+    assert!(report.pairs.iter().all(|pair| pair.state == "Done"));
+    assert_eq!(
+        pod.stored("evalai/results.json").await.unwrap(),
+        report.results.as_bytes()
+    );
+    assert!(!pod.has(StatusFile::Cancel));
+    logcopy.end().await;
+    assert_layout(&pod, &report).await;
+}
+
+async fn assert_layout(pod: &Pod, report: &Report) {
+    let expected = [
+        "agent/agent1/agent_results.json",
+        "agent/agent1/leaderboard.log",
+        "agent/agent2/agent_results.json",
+        "agent/agent2/leaderboard.log",
+        "agent/agent_results.json",
+        "containers-status/agent-1.done",
+        "containers-status/agent-1.start0",
+        "containers-status/agent-2.done",
+        "containers-status/agent-2.start0",
+        "containers-status/logcopy.done",
+        "containers-status/simulator-1.done",
+        "containers-status/simulator-1.start0",
+        "containers-status/simulator-2.done",
+        "containers-status/simulator-2.start0",
+        "evalai/metadata.json",
+        "evalai/results.json",
+        "evalai/stdout.txt",
+        "logcopy/logcopy.log",
+        "logcopy/owner",
+        "logcopy/report.json",
+        "simulator/Logs/CarlaUE4.log",
+    ];
+    assert_eq!(pod.keys().await, expected);
+    for key in [
+        "agent/agent1/leaderboard.log",
+        "agent/agent_results.json",
+        "evalai/metadata.json",
+    ] {
+        assert_eq!(
+            pod.stored(key).await.unwrap(),
+            fs::read(pod.path(key)).unwrap(),
+            "{key}"
+        );
+    }
+    let digests: BTreeMap<&str, u64> = report
+        .files
+        .iter()
+        .map(|(key, file)| (key.as_str(), file.size))
+        .collect();
+    assert_eq!(digests.keys().copied().collect::<Vec<_>>(), &expected[14..17]);
+    for (key, size) in digests {
+        assert_eq!(pod.stored(key).await.unwrap().len() as u64, size, "{key}");
+    }
+}
+
+#[tokio::test]
+async fn rounds_without_a_change_store_nothing() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    pod.checkpoint(1, 1);
+    let logcopy = pod.logcopy();
+    let report = pod.reported(|report| report.done == 1).await;
+    let etag = pod.archive.get(REPORT_KEY, LIMIT).await.unwrap().unwrap().etag;
+    // A later round is one that has noticed the next file.
+    pod.put("simulator/late", b"x");
+    until(|| async { pod.stored("simulator/late").await }).await;
+    let after = pod
+        .archive
+        .get_if_none_match(REPORT_KEY, etag.as_deref(), LIMIT)
+        .await
+        .unwrap();
+    assert_eq!(
+        (after, pod.report().await.unwrap().round),
+        (Fetched::NotModified, report.round)
+    );
+    logcopy.end().await;
+}
+
+#[tokio::test]
+async fn a_pod_that_lost_the_fence_stores_nothing_more_and_stops_its_containers() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.round >= 1).await;
+    pod.archive.put(OWNER_KEY, b"pod-2".to_vec()).await.unwrap();
+    until_true(|| pod.has(StatusFile::Cancel) && pod.has(StatusFile::Stored)).await;
+    let before = pod.keys().await;
+    pod.checkpoint(1, 1);
+    logcopy.end().await;
+    assert_eq!(pod.keys().await, before);
+    assert_eq!(pod.report().await.unwrap().done, 0);
+}
+
+#[tokio::test]
+async fn the_results_wait_for_s3_to_come_back() {
+    let bucket = server().await.bucket().await;
+    let proxy = server().await.proxy().await;
+    let pod = Pod::on(&proxy.endpoint(), &bucket, run(&bucket)).await;
+    let direct = Pod::on(&server().await.endpoint(), &bucket, run(&bucket)).await;
+    pod.prepare().await.unwrap();
+    let logcopy = pod.logcopy();
+    direct.reported(|report| report.round >= 1).await;
+    proxy.set_away(true);
+    for pair in [1, 2] {
+        pod.checkpoint(pair, 2);
+        pod.mark(Side::Agent, u16::try_from(pair).unwrap(), Mark::Done);
+    }
+    // The merge goes on without S3.
+    until_true(|| fs::read_to_string(pod.path("evalai/stdout.txt")).is_ok_and(|text| text.contains("All 4 route")))
+        .await;
+    assert!(!pod.has(StatusFile::Stored) && !direct.report().await.unwrap().is_final);
+    proxy.set_away(false);
+    until_true(|| pod.has(StatusFile::Stored)).await;
+    let report = direct.report().await.unwrap();
+    assert!(report.is_final && report.eligible);
+    logcopy.end().await;
+}
+
+#[tokio::test]
+async fn a_stop_cancels_stores_what_there_is_and_says_so() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    pod.checkpoint(1, 1);
+    pod.mark(Side::Agent, 1, Mark::Start(0));
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.done == 1).await;
+    // As the kubelet does it: the name never holds half of the text.
+    fs::write(pod.setting.places.podinfo.join("next"), "Retries").unwrap();
+    fs::rename(pod.setting.places.podinfo.join("next"), pod.setting.places.stop()).unwrap();
+    until_true(|| pod.has(StatusFile::Cancel)).await;
+    pod.append("agent/agent1/leaderboard.log", b"stopped\n");
+    until_true(|| pod.has(StatusFile::Stored)).await;
+    let report = pod.report().await.unwrap();
+    assert!(report.is_final && !report.eligible && report.done == 1);
+    assert_eq!(report.stopped, Some(Stop::Retries));
+    assert_eq!(pod.stored("agent/agent1/leaderboard.log").await.unwrap(), b"stopped\n");
+    assert!(
+        pod.keys()
+            .await
+            .contains(&"containers-status/simulation.cancel".to_owned())
+    );
+    logcopy.end().await;
+}
+
+#[tokio::test]
+async fn a_pair_that_ends_with_refused_results_ends_the_run_as_invalid() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    pod.mark(Side::Agent, 2, Mark::Start(0));
+    let bad = checkpoint(0, 2, 2).replace("RouteScenario_1_", "RouteScenario_3_");
+    pod.put("agent/agent1/agent_results.json", bad.as_bytes());
+    let logcopy = pod.logcopy();
+    let report = pod.reported(|report| report.why.is_some()).await;
+    assert!(!report.is_final);
+    pod.mark(Side::Agent, 1, Mark::Done);
+    until_true(|| pod.has(StatusFile::Stored)).await;
+    let report = pod.report().await.unwrap();
+    assert!(report.is_final && !report.eligible && report.stopped.is_none());
+    let why = report.why.unwrap();
+    assert!(why.contains("outside this pair's routes 0-1"), "{why}");
+    assert!(pod.has(StatusFile::Cancel), "the other pair is stopped");
+    logcopy.end().await;
+}
+
+#[tokio::test]
+async fn a_killed_logcopy_goes_on_where_it_was() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    pod.checkpoint(1, 2);
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.done == 2).await;
+    logcopy.kill().await;
+    fs::write(pod.setting.places.stop(), "Cancel").unwrap();
+    pod.checkpoint(2, 2);
+    let logcopy = pod.logcopy();
+    until_true(|| pod.has(StatusFile::Stored)).await;
+    let report = pod.report().await.unwrap();
+    assert_eq!((report.done, report.stopped), (4, Some(Stop::Cancel)));
+    assert!(pod.has(StatusFile::Cancel));
+    logcopy.kill().await;
+    // The next one finds everything done, and ends when it is told to.
+    let etag = pod.archive.get(REPORT_KEY, LIMIT).await.unwrap().unwrap().etag;
+    pod.logcopy().end().await;
+    let after = pod
+        .archive
+        .get_if_none_match(REPORT_KEY, etag.as_deref(), LIMIT)
+        .await
+        .unwrap();
+    assert_eq!(after, Fetched::NotModified);
+}
+
+#[tokio::test]
+async fn a_sigterm_in_the_middle_stores_what_there_is_without_an_end() {
+    let pod = Pod::new().await;
+    pod.prepare().await.unwrap();
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.round >= 1).await;
+    pod.append("simulator/x.log", b"x");
+    pod.checkpoint(1, 1);
+    logcopy.end().await;
+    let report = pod.report().await.unwrap();
+    assert!(!report.is_final && report.done == 1);
+    assert_eq!(pod.stored("simulator/x.log").await.unwrap(), b"x");
+    assert!(!pod.has(StatusFile::Stored));
+}

@@ -1,0 +1,107 @@
+//! What storing a file costs, and that it reads back as it was.
+
+use super::*;
+
+const LOG: &str = "agent/agent1/leaderboard.log";
+
+async fn sync(pod: &Pod, uploader: &mut Uploader, path: &str) -> Sent {
+    let tree = Tree::open(pod.logs()).unwrap();
+    let (_, stamp) = tree.file(path).unwrap().unwrap();
+    let wanted = [Wanted::new(path, stamp, Haste::Now)];
+    uploader.sync(&wanted, None).await.unwrap()
+}
+
+#[tokio::test]
+async fn a_growing_log_costs_what_it_grew_and_reads_back_byte_for_byte() {
+    let bucket = server().await.bucket().await;
+    let proxy = server().await.proxy().await;
+    let pod = Pod::on(&proxy.endpoint(), &bucket, run(&bucket)).await;
+    let mut uploader = pod.uploader();
+    let mut size = 0;
+    for (step, target) in [1, 3, 5, 6, 7, 20, 21, 50].into_iter().enumerate() {
+        let grown = target * MIB + step - size;
+        pod.append(LOG, &noise(grown, step as u64));
+        let appends = size >= 5 * MIB;
+        size += grown;
+        let before = proxy.sent();
+        assert_eq!(sync(&pod, &mut uploader, LOG).await.objects, 1);
+        let cost = usize::try_from(proxy.sent() - before).unwrap();
+        let aim = if appends { grown } else { size };
+        assert!(cost <= aim + aim / 10 + 32_000, "{cost} bytes sent for {aim} at {size}");
+        assert_eq!(
+            pod.stored(LOG).await.unwrap(),
+            fs::read(pod.path(LOG)).unwrap(),
+            "{target} MiB"
+        );
+    }
+}
+
+#[tokio::test]
+async fn an_unchanged_round_sends_nothing_even_after_a_restart() {
+    let bucket = server().await.bucket().await;
+    let proxy = server().await.proxy().await;
+    let pod = Pod::on(&proxy.endpoint(), &bucket, run(&bucket)).await;
+    pod.put(LOG, &noise(6 * MIB, 1));
+    pod.put("simulator/empty", b"");
+    let mut uploader = pod.uploader();
+    for path in [LOG, "simulator/empty"] {
+        assert_eq!(sync(&pod, &mut uploader, path).await.objects, 1);
+    }
+    let before = proxy.sent();
+    let mut restarted = pod.uploader();
+    for uploader in [&mut uploader, &mut restarted] {
+        for path in [LOG, "simulator/empty"] {
+            assert_eq!(sync(&pod, uploader, path).await, Sent::default());
+        }
+    }
+    File::open(pod.path("simulator/empty"))
+        .unwrap()
+        .set_modified(std::time::SystemTime::UNIX_EPOCH)
+        .unwrap();
+    assert_eq!(sync(&pod, &mut uploader, "simulator/empty").await.objects, 0);
+    assert_eq!(proxy.sent(), before);
+}
+
+#[tokio::test]
+async fn a_log_that_was_written_anew_is_stored_anew() {
+    let pod = Pod::new().await;
+    let mut uploader = pod.uploader();
+    pod.put(LOG, &noise(6 * MIB, 1));
+    sync(&pod, &mut uploader, LOG).await;
+    // The same file, longer, with another beginning.
+    pod.put(LOG, &noise(7 * MIB, 2));
+    assert_eq!(sync(&pod, &mut uploader, LOG).await.objects, 1);
+    assert_eq!(pod.stored(LOG).await.unwrap(), noise(7 * MIB, 2));
+    pod.put(LOG, b"short");
+    assert_eq!(sync(&pod, &mut uploader, LOG).await.objects, 1);
+    assert_eq!(pod.stored(LOG).await.unwrap(), b"short");
+}
+
+#[tokio::test]
+async fn the_limit_leaves_files_out_and_keeps_the_rest() {
+    let pod = Pod::new().await;
+    let tree = Arc::new(Tree::open(pod.logs()).unwrap());
+    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), 100);
+    pod.put("simulator/large", &[0; 90]);
+    pod.put("simulator/small", &[0; 20]);
+    let wanted: Vec<Wanted> = ["simulator/small", "simulator/large"]
+        .map(|path| Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now))
+        .into();
+    let sent = uploader.sync(&wanted, None).await.unwrap();
+    assert_eq!((sent.objects, sent.left_out), (1, 1));
+    assert_eq!(pod.keys().await, ["simulator/small"]);
+    let essential = wanted[1].clone().essential();
+    assert_eq!(uploader.sync(&[essential], None).await.unwrap().objects, 1);
+}
+
+#[tokio::test]
+async fn odd_names_are_stored_and_appended_to() {
+    let pod = Pod::new().await;
+    let mut uploader = pod.uploader();
+    let path = "simulator/a b+c&d=é%20?#.log";
+    pod.put(path, &noise(5 * MIB, 1));
+    sync(&pod, &mut uploader, path).await;
+    pod.append(path, b"more");
+    sync(&pod, &mut uploader, path).await;
+    assert_eq!(pod.stored(path).await.unwrap(), fs::read(pod.path(path)).unwrap());
+}

@@ -1,0 +1,395 @@
+//! For each rule of the API a mistake that a person can make, and its neighbor that is no mistake.
+
+use serde_json::{Value, json};
+
+use super::objects::Kind::{self, Leaderboard, Submission};
+
+/// One mistake. `good` and `bad` are merge patches on the smallest object of the kind.
+pub struct Case {
+    pub kind: Kind,
+    /// A part of the rule's message that no other rule of the kind has.
+    pub message: &'static str,
+    pub step: Step,
+}
+
+/// When the mistake is made.
+pub enum Step {
+    /// `good` is accepted, `bad` on top of it is not.
+    Create { good: Value, bad: Value },
+    /// The object `from` is there, perhaps in a state; the change `bad` is refused, then `good` is accepted.
+    Update {
+        from: Value,
+        state: Option<&'static str>,
+        bad: Value,
+        good: Value,
+    },
+}
+
+fn create(kind: Kind, message: &'static str, good: &Value, bad: &Value) -> Case {
+    let step = Step::Create {
+        good: json!({ "spec": good }),
+        bad: json!({ "spec": bad }),
+    };
+    Case { kind, message, step }
+}
+
+fn update(kind: Kind, message: &'static str, from: &Value, bad: &Value, good: &Value) -> Case {
+    let step = Step::Update {
+        from: json!({ "spec": from }),
+        state: None,
+        bad: json!({ "spec": bad }),
+        good: json!({ "spec": good }),
+    };
+    Case { kind, message, step }
+}
+
+fn named(kind: Kind, message: &'static str, good: &str, bad: &str) -> Case {
+    let step = Step::Create {
+        good: json!({"metadata": {"name": good}}),
+        bad: json!({"metadata": {"name": bad}}),
+    };
+    Case { kind, message, step }
+}
+
+/// Every case.
+pub fn all() -> Vec<Case> {
+    [
+        names(),
+        kept(),
+        tracks(),
+        subsets(),
+        containers(),
+        times(),
+        server(),
+        queue(),
+        pods_and_tables(),
+        submissions(),
+        attempts(),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
+}
+
+fn evalai() -> Value {
+    json!({"apiServer": "https://eval.ai", "challenge": 1, "token": {"secretKeyRef": {"name": "evalai", "key": "token"}}})
+}
+
+fn track(more: &Value) -> Value {
+    let mut track = json!({"name": "sensors", "codename": "SENSORS"});
+    super::objects::merge(&mut track, more);
+    track
+}
+
+fn names() -> Vec<Case> {
+    let [longest, longer] = ["a".repeat(52), "a".repeat(53)];
+    [Leaderboard, Submission]
+        .into_iter()
+        .flat_map(|kind| {
+            [
+                named(kind, "at most 52 characters", &longest, &longer),
+                named(kind, "may not contain a dot", "carla-2-0", "carla-2.0"),
+            ]
+        })
+        .collect()
+}
+
+fn kept() -> Vec<Case> {
+    let paused = json!({"paused": true});
+    let served = json!({"evalai": evalai(), "tracks": [track(&json!({"phase": 7}))]});
+    let prefix = |prefix: &Value| json!({"storage": {"prefix": prefix}});
+    let keeps = |message, from: &Value, bad: &Value| update(Leaderboard, message, from, bad, &paused);
+    vec![
+        keeps("results is immutable", &json!({}), &json!({"results": "V1"})),
+        keeps(
+            "storage.bucket is immutable",
+            &json!({}),
+            &json!({"storage": {"bucket": "other"}}),
+        ),
+        keeps("storage.prefix is immutable", &json!({}), &prefix(&json!("a/"))),
+        keeps(
+            "storage.prefix is immutable",
+            &prefix(&json!("a/")),
+            &prefix(&json!("b/")),
+        ),
+        keeps(
+            "storage.prefix is immutable",
+            &prefix(&json!("a/")),
+            &prefix(&Value::Null),
+        ),
+        keeps(
+            "evalai cannot be removed",
+            &served,
+            &json!({"evalai": null, "tracks": [track(&json!({}))]}),
+        ),
+        keeps(
+            "evalai.challenge is immutable",
+            &served,
+            &json!({"evalai": {"challenge": 2}}),
+        ),
+        // It may be added, and its server may move.
+        update(
+            Leaderboard,
+            "evalai.challenge is immutable",
+            &served,
+            &json!({"evalai": {"challenge": 3}}),
+            &json!({"evalai": {"apiServer": "https://evalai.example.org"}}),
+        ),
+        update(
+            Leaderboard,
+            "results is immutable",
+            &json!({}),
+            &json!({"results": "V1"}),
+            &served,
+        ),
+    ]
+}
+
+fn one_track(more: &Value) -> Value {
+    json!({"tracks": [track(more)]})
+}
+
+fn tracks() -> Vec<Case> {
+    let two = |second: i64| {
+        let more = json!({"name": "map", "codename": "MAP", "phase": second});
+        json!({"evalai": evalai(), "tracks": [track(&json!({"phase": 7})), more]})
+    };
+    let drives = |pairs: i64, routes: i64| json!({"pairs": pairs, "routes": routes});
+    let phase = one_track(&json!({"phase": 7}));
+    let no_phase = one_track(&json!({}));
+    let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    vec![
+        case("two tracks have the same phase", &two(8), &two(7)),
+        case("no track has a phase", &served(&json!({})), &no_phase),
+        case("but evalai is missing", &no_phase, &phase),
+        case("more pairs than routes", &drives(4, 4), &drives(4, 3)),
+        case(
+            "more pairs than routes",
+            &one_track(&drives(2, 2)),
+            &one_track(&drives(2, 1)),
+        ),
+    ]
+}
+
+fn subsets() -> Vec<Case> {
+    let subsets = |list: &Value| one_track(&json!({"pairs": 2, "routeSubsets": list}));
+    let uneven = subsets(&json!(["0-14", "15-19"]));
+    let v1 = json!({"results": "V1", "tracks": [track(&json!({"scenariosFile": "/workspace/scenarios.json"}))]});
+    let case = |message, bad: &Value| create(Leaderboard, message, &uneven, &subsets(bad));
+    vec![
+        case("one entry for each of its pairs", &json!(["0-19"])),
+        case("do not add up to routes", &json!(["0-9", "10-18"])),
+        case("do not add up to routes", &json!(["0-10", "10-19"])),
+        case("ends before it begins", &json!(["0-19", "20-19"])),
+        create(Leaderboard, "only V1 reads one", &v1, &json!({"results": "V2"})),
+    ]
+}
+
+fn containers() -> Vec<Case> {
+    let ran = |part: &str, run: &Value| json!({ part: run });
+    ["agent", "contents", "simulator"]
+        .into_iter()
+        .zip(["agent.args", "contents.args", "simulator.args"])
+        .map(|(part, message)| {
+            let good = ran(part, &json!({"command": ["/bin/sh"], "args": ["-c", "true"]}));
+            create(Leaderboard, message, &good, &ran(part, &json!({"command": null})))
+        })
+        .collect()
+}
+
+fn times() -> Vec<Case> {
+    let deadlines = |deadlines: Value| json!({ "deadlines": deadlines });
+    vec![
+        create(
+            Leaderboard,
+            "idleSeconds must be longer than periodSeconds",
+            &json!({"periodSeconds": 60, "deadlines": {"idleSeconds": 61}}),
+            &deadlines(json!({"idleSeconds": 60})),
+        ),
+        create(
+            Leaderboard,
+            "idleSeconds must be shorter than runSeconds",
+            &deadlines(json!({"idleSeconds": 7199, "runSeconds": 7200})),
+            &deadlines(json!({"idleSeconds": 7200})),
+        ),
+        create(
+            Leaderboard,
+            "readySeconds must be shorter than runSeconds",
+            &deadlines(json!({"readySeconds": 3599, "runSeconds": 3600})),
+            &deadlines(json!({"readySeconds": 3600})),
+        ),
+        create(
+            Leaderboard,
+            "cancelSeconds may not be longer than flushSeconds",
+            &deadlines(json!({"cancelSeconds": 60, "flushSeconds": 60})),
+            &deadlines(json!({"flushSeconds": 59})),
+        ),
+        create(
+            Leaderboard,
+            "running.perTeam is larger than running.total",
+            &json!({"running": {"total": 2, "perTeam": 2}}),
+            &json!({"running": {"total": 1}}),
+        ),
+    ]
+}
+
+fn served(more: &Value) -> Value {
+    let mut spec = json!({"evalai": evalai(), "tracks": [track(&json!({"phase": 7}))]});
+    super::objects::merge(&mut spec, more);
+    spec
+}
+
+fn server() -> Vec<Case> {
+    let at = |server: &str| json!({"evalai": {"apiServer": server}});
+    let root = served(&at("https://api.eval.ai/"));
+    let under_path = served(&at("http://example.org:8000/evalai"));
+    let in_manager = json!({"evalai": {"token": {"secretsManager": {"id": "evalai"}}}});
+    let nowhere = json!({"evalai": {"token": {"secretKeyRef": null}}});
+    let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    let one_place = "exactly one of secretKeyRef and secretsManager";
+    vec![
+        case("without /api", &root, &at("https://eval.ai/api")),
+        case("without /api", &under_path, &at("https://eval.ai/api/")),
+        case("without /api", &root, &at("https://eval.ai/evalai/api/jobs")),
+        case(
+            "neither a query nor credentials",
+            &root,
+            &at("https://host:secret@eval.ai"),
+        ),
+        case(
+            "neither a query nor credentials",
+            &root,
+            &at("https://eval.ai/?token=x"),
+        ),
+        case("neither a query nor credentials", &root, &at("https://eval.ai/#x")),
+        case(one_place, &served(&json!({})), &in_manager),
+        case(one_place, &served(&json!({})), &nowhere),
+    ]
+}
+
+fn queue() -> Vec<Case> {
+    let queue = |url: &str, dead: &str| {
+        let at = |name: &str| format!("https://sqs.example.org/1/{name}");
+        json!({"queue": {"url": at(url), "deadLetterUrl": at(dead)}})
+    };
+    let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    let alone = json!({"queue": {"url": "https://sqs.example.org/1/a"}});
+    vec![
+        case("queue needs evalai", &json!({}), &alone),
+        case("is the queue itself", &served(&queue("a", "b")), &queue("a", "a")),
+        case(
+            "needs a FIFO dead-letter queue",
+            &served(&queue("a.fifo", "b.fifo")),
+            &queue("a.fifo", "b"),
+        ),
+        case(
+            "needs a FIFO dead-letter queue",
+            &served(&queue("a", "b")),
+            &queue("a", "b.fifo"),
+        ),
+    ]
+}
+
+fn pods_and_tables() -> Vec<Case> {
+    let to = |cidr: &str| json!({"network": {"egress": [{"cidr": cidr, "ports": [443]}]}});
+    let identity = |identity: Value| json!({ "podIdentity": identity });
+    let role = "arn:aws:iam::123456789012:role/pods";
+    let secret = identity(json!({"secretRef": "aws", "serviceAccountName": "pods"}));
+    let assumed = identity(json!({"roleArn": role, "serviceAccountName": "pods"}));
+    let table = |sort_key: &Value| json!({"table": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}});
+    let both = table(&json!("submission_id"));
+    let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    let one_way = "exactly one of roleArn and secretRef";
+    vec![
+        case("is not a range of addresses", &to("2001:db8::/32"), &to("10.0.0.1")),
+        case(one_way, &secret, &identity(json!({"roleArn": role}))),
+        case(one_way, &secret, &identity(json!({"secretRef": null}))),
+        case(
+            "roleArn needs serviceAccountName",
+            &assumed,
+            &identity(json!({"serviceAccountName": null})),
+        ),
+        case("are set together", &both, &table(&Value::Null)),
+        case("are the same key", &both, &table(&json!("team_id"))),
+    ]
+}
+
+fn submissions() -> Vec<Case> {
+    let ids = |submission: i64| json!({"challenge": 1, "phase": 7, "submission": submission});
+    let theirs = json!({"track": null, "image": null, "evalai": ids(42)});
+    let first = json!({"priority": 5});
+    let keeps = |message, from: &Value, bad: &Value| update(Submission, message, from, bad, &first);
+    vec![
+        keeps("leaderboard is immutable", &json!({}), &json!({"leaderboard": "other"})),
+        keeps("image is immutable", &json!({}), &json!({"image": "agent:2"})),
+        keeps("image is immutable", &theirs, &json!({"image": "agent:2"})),
+        keeps("evalai is immutable", &theirs, &json!({"evalai": ids(43)})),
+        keeps("track is immutable", &json!({}), &json!({"track": "map"})),
+        create(
+            Submission,
+            "not both and not neither",
+            &json!({}),
+            &json!({"track": null}),
+        ),
+        create(
+            Submission,
+            "not both and not neither",
+            &theirs,
+            &json!({"track": "sensors"}),
+        ),
+        create(
+            Submission,
+            "without evalai needs an image",
+            &json!({}),
+            &json!({"image": null}),
+        ),
+        create(
+            Submission,
+            "team needs an id or a name",
+            &json!({"team": {"name": "a"}}),
+            &json!({"team": {"name": null}}),
+        ),
+    ]
+}
+
+fn attempts() -> Vec<Case> {
+    let second = json!({"attempt": 2, "cancel": false});
+    let ended = |state, message, bad: &Value, good: &Value| {
+        let mut case = update(Submission, message, &json!({}), bad, good);
+        if let Step::Update { state: slot, .. } = &mut case.step {
+            *slot = Some(state);
+        }
+        case
+    };
+    let again = "a finished submission is not resumed";
+    vec![
+        update(
+            Submission,
+            "attempt may only grow",
+            &json!({"attempt": 2}),
+            &json!({"attempt": 1}),
+            &json!({"attempt": 4}),
+        ),
+        update(
+            Submission,
+            "to resume, set cancel to false",
+            &json!({"cancel": true}),
+            &json!({"attempt": 2}),
+            &second,
+        ),
+        update(
+            Submission,
+            "undone only by a higher attempt",
+            &json!({"cancel": true}),
+            &json!({"cancel": false}),
+            &second,
+        ),
+        ended("Finished", again, &json!({"attempt": 2}), &json!({"priority": 5})),
+        ended(
+            "Failed",
+            "to resume, set cancel to false",
+            &json!({"attempt": 2, "cancel": true}),
+            &second,
+        ),
+    ]
+}

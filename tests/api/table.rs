@@ -1,0 +1,315 @@
+//! The DynamoDB recorder against the AWS stand-in.
+#![cfg(test)]
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use aws_sdk_dynamodb::types::{
+    AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
+};
+use leaderboard_operator::api;
+use leaderboard_operator::services::ObjectKey;
+use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
+use serde_json::json;
+use tokio::sync::{mpsc, watch};
+
+use super::bridge::{LIMIT, StandIn};
+
+fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
+    stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))
+}
+
+fn named(stand_in: &StandIn, name: &str) -> api::Table {
+    serde_json::from_value(json!({"name": stand_in.name(name), "endpoint": stand_in.endpoint})).unwrap()
+}
+
+/// A new table with these keys, and its description.
+async fn table(stand_in: &StandIn, name: &str, keys: &[(&str, ScalarAttributeType)]) -> api::Table {
+    let mut request = client(stand_in)
+        .create_table()
+        .table_name(stand_in.name(name))
+        .billing_mode(BillingMode::PayPerRequest);
+    for ((key, kind), role) in keys.iter().zip([KeyType::Hash, KeyType::Range]) {
+        let definition = AttributeDefinition::builder()
+            .attribute_name(*key)
+            .attribute_type(kind.clone())
+            .build();
+        let element = KeySchemaElement::builder().attribute_name(*key).key_type(role).build();
+        request = request
+            .attribute_definitions(definition.unwrap())
+            .key_schema(element.unwrap());
+    }
+    request.send().await.unwrap();
+    named(stand_in, name)
+}
+
+async fn usual(stand_in: &StandIn) -> (api::Table, Table) {
+    let keys = [
+        ("team_id", ScalarAttributeType::S),
+        ("submission_id", ScalarAttributeType::S),
+    ];
+    let spec = table(stand_in, "leaderboard-20", &keys).await;
+    let table = Table::describe(&stand_in.aws, &spec).await.unwrap();
+    (spec, table)
+}
+
+/// All rows of a table as text.
+async fn rows(stand_in: &StandIn, name: &str) -> Vec<BTreeMap<String, String>> {
+    let items = client(stand_in)
+        .scan()
+        .table_name(name)
+        .send()
+        .await
+        .unwrap()
+        .items
+        .unwrap();
+    let text = |value: AttributeValue| match value {
+        AttributeValue::S(text) => text,
+        AttributeValue::N(number) => format!("#{number}"),
+        other => panic!("{other:?}"),
+    };
+    items
+        .into_iter()
+        .map(|item| item.into_iter().map(|(name, value)| (name, text(value))).collect())
+        .collect()
+}
+
+fn row(attempt: i64, status: &str) -> Row {
+    Row {
+        team_id: "12".into(),
+        run_id: "7".into(),
+        attempt,
+        submission_status: status.into(),
+        progress: format!("{attempt}/9"),
+        ..Row::default()
+    }
+}
+
+#[tokio::test]
+async fn a_row_holds_all_columns_under_whatever_keys_the_table_has() {
+    let stand_in = StandIn::start().await;
+    let full = Row {
+        team_name: "Team".into(),
+        track_id: "2".into(),
+        track_name: "SENSORS".into(),
+        submitted_image_uri: "registry.example/a:1".into(),
+        submitted_time: "2026-11-20 10:00:00 UTC".into(),
+        start_time: "2026-11-20 10:01:00 UTC".into(),
+        end_time: "2026-11-20 12:00:00 UTC".into(),
+        results: "s3://bucket/7".into(),
+        metrics: vec![
+            ("driving_score".into(), "41.2".into()),
+            ("name".into(), "a reserved word".into()),
+        ],
+        ..row(1, "FINISHED")
+    };
+    let names = [("team_id", "submission_id"), ("team-id", "submission-id")];
+    for (kind, number) in [(ScalarAttributeType::S, ""), (ScalarAttributeType::N, "#")] {
+        for (team, submission) in names {
+            let name = format!("{team}.{}", kind.as_str());
+            let spec = table(&stand_in, &name, &[(team, kind.clone()), (submission, kind.clone())]).await;
+            let table = Table::describe(&stand_in.aws, &spec).await.unwrap();
+            assert_eq!(table.key_names(), (team, submission));
+            assert_eq!(table.write(&full).await, Ok(Written::Stored));
+            let stored = rows(&stand_in, &spec.name).await.remove(0);
+            assert_eq!(stored.len(), 15, "{stored:?}");
+            assert_eq!(
+                (stored[team].clone(), stored[submission].clone()),
+                (format!("{number}12"), format!("{number}7"))
+            );
+            assert_eq!(
+                (stored["attempt"].as_str(), stored["submission_status"].as_str()),
+                ("#1", "FINISHED")
+            );
+            assert_eq!(
+                (stored["driving_score"].as_str(), stored["name"].as_str()),
+                ("41.2", "a reserved word")
+            );
+            assert_eq!(stored["end_time"], "2026-11-20 12:00:00 UTC");
+        }
+    }
+}
+
+#[tokio::test]
+async fn an_older_row_never_wins() {
+    let stand_in = StandIn::start().await;
+    let (spec, table) = usual(&stand_in).await;
+    let status = async || rows(&stand_in, &spec.name).await.remove(0)["submission_status"].clone();
+    let steps = [
+        (row(1, "PENDING"), Written::Stored),
+        (row(1, "RUNNING"), Written::Stored),
+        (row(1, "FAILED"), Written::Stored),
+        (row(1, "FAILED"), Written::Stored),
+        (row(1, "RUNNING"), Written::Stale),
+        (row(1, "FINISHED"), Written::Stale),
+        (row(2, "RUNNING"), Written::Stored),
+        (row(1, "FAILED"), Written::Stale),
+        (row(2, "CANCELLED"), Written::Stored),
+        (row(2, "RUNNING"), Written::Stale),
+        (row(10, "PENDING"), Written::Stored),
+        (row(9, "FINISHED"), Written::Stale),
+    ];
+    for (step, (row, want)) in steps.into_iter().enumerate() {
+        assert_eq!(table.write(&row).await, Ok(want), "step {step}");
+        if want == Written::Stored {
+            assert_eq!(status().await, row.submission_status, "step {step}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn rows_of_the_pipeline_are_taken_over_and_unknown_columns_stay() {
+    let stand_in = StandIn::start().await;
+    let (spec, table) = usual(&stand_in).await;
+    let text = |text: &str| AttributeValue::S(text.into());
+    let put = client(&stand_in)
+        .put_item()
+        .table_name(&spec.name)
+        .item("team_id", text("12"))
+        .item("submission_id", text("7"));
+    let put = put
+        .item("submission_status", text("FINISHED"))
+        .item("parallelization_workers", text("4"));
+    put.item("start_time", text("-"))
+        .item("team_name", text("Team"))
+        .send()
+        .await
+        .unwrap();
+    let resumed = Row {
+        start_time: "2026-11-20 10:01:00 UTC".into(),
+        ..row(1, "RUNNING")
+    };
+    assert_eq!(table.write(&resumed).await, Ok(Written::Stored));
+    let stored = rows(&stand_in, &spec.name).await.remove(0);
+    assert_eq!(
+        (stored["parallelization_workers"].as_str(), stored["team_name"].as_str()),
+        ("4", "Team")
+    );
+    assert_eq!(
+        (stored["start_time"].as_str(), stored["submission_status"].as_str()),
+        ("2026-11-20 10:01:00 UTC", "RUNNING")
+    );
+}
+
+#[tokio::test]
+async fn of_many_writers_at_once_the_end_of_the_last_attempt_wins() {
+    let stand_in = StandIn::start().await;
+    let (spec, table) = usual(&stand_in).await;
+    for _ in 0..5 {
+        let writes = (1..=4).flat_map(|attempt| ["RUNNING", "FAILED"].map(|status| row(attempt, status)));
+        let table = &table;
+        let done = futures::future::join_all(writes.map(|row| async move { table.write(&row).await })).await;
+        assert!(done.iter().all(Result::is_ok), "{done:?}");
+        let stored = rows(&stand_in, &spec.name).await.remove(0);
+        assert_eq!(
+            (stored["attempt"].as_str(), stored["submission_status"].as_str()),
+            ("#4", "FAILED")
+        );
+        let key = [("team_id", "12"), ("submission_id", "7")];
+        let delete = key.into_iter().fold(
+            client(&stand_in).delete_item().table_name(&spec.name),
+            |delete, (key, value)| delete.key(key, AttributeValue::S(value.into())),
+        );
+        delete.send().await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn a_table_that_cannot_be_used_says_what_to_do() {
+    let stand_in = StandIn::start().await;
+    let missing = Table::describe(&stand_in.aws, &named(&stand_in, "nowhere"))
+        .await
+        .unwrap_err()
+        .to_string();
+    assert!(
+        missing.starts_with(&format!(
+            "table {} does not exist: ResourceNotFoundException",
+            stand_in.name("nowhere")
+        )),
+        "{missing}"
+    );
+    assert!(
+        missing.ends_with("check table.name, table.region and table.endpoint"),
+        "{missing}"
+    );
+    let single = table(&stand_in, "single", &[("team_id", ScalarAttributeType::S)]).await;
+    let no_sort_key = Table::describe(&stand_in.aws, &single).await.unwrap_err().to_string();
+    assert!(
+        no_sort_key.starts_with(&format!("table {} has no sort key", single.name)),
+        "{no_sort_key}"
+    );
+    let (spec, usual) = usual(&stand_in).await;
+    let nobody = Row {
+        team_id: String::new(),
+        ..row(1, "PENDING")
+    };
+    let text = usual.write(&nobody).await.unwrap_err().to_string();
+    assert_eq!(
+        text,
+        format!("table {}: key team_id is empty: the team is not known", spec.name)
+    );
+}
+
+#[tokio::test]
+async fn a_key_that_is_a_number_takes_no_name() {
+    let stand_in = StandIn::start().await;
+    let keys = [
+        ("team_id", ScalarAttributeType::N),
+        ("submission_id", ScalarAttributeType::N),
+    ];
+    let numbers = table(&stand_in, "numbers", &keys).await;
+    let local = Row {
+        run_id: "my-run".into(),
+        ..row(1, "PENDING")
+    };
+    let text = Table::describe(&stand_in.aws, &numbers)
+        .await
+        .unwrap()
+        .write(&local)
+        .await
+        .unwrap_err()
+        .to_string();
+    assert_eq!(
+        text,
+        format!(
+            "table {}: key submission_id is a number in this table, but the submission is called my-run",
+            numbers.name
+        )
+    );
+}
+
+#[tokio::test]
+async fn the_recorder_writes_in_the_background_behind_its_fence() {
+    let stand_in = StandIn::start().await;
+    let (spec, _) = usual(&stand_in).await;
+    let fence = Arc::new(AtomicBool::new(true));
+    let (may_write, (wake, mut woken)) = (fence.clone(), mpsc::unbounded_channel());
+    let (stop, stopped) = watch::channel(false);
+    let recorder = Recorder::new(
+        stand_in.aws.clone(),
+        move || may_write.load(Ordering::SeqCst),
+        wake,
+        stopped,
+    );
+    let key = |name: &str| ObjectKey {
+        namespace: "ns".into(),
+        name: name.into(),
+        uid: "u".into(),
+    };
+    recorder.record(&spec, &key("a"), row(1, "FINISHED"), true);
+    recorder.record(&named(&stand_in, "nowhere"), &key("b"), row(1, "FINISHED"), true);
+    let mut all = Vec::new();
+    for _ in 0..2 {
+        all.push(tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap());
+    }
+    all.sort();
+    assert_eq!(all, [key("a"), key("b")]);
+    let view = recorder.view(&key("a")).unwrap();
+    assert_eq!((view.attempt, view.end_written, view.error), (1, true, None));
+    let view = recorder.view(&key("b")).unwrap();
+    let told = format!("table {} does not exist", stand_in.name("nowhere"));
+    assert!(!view.end_written && view.error.unwrap().starts_with(&told));
+    assert_eq!(rows(&stand_in, &spec.name).await.len(), 1);
+    stop.send_replace(true);
+}

@@ -1,0 +1,80 @@
+//! Watches and the preflight on a real API server.
+
+use std::time::Duration;
+
+use futures::StreamExt;
+use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
+use kube::runtime::watcher::Config;
+use kube::{Api, ResourceExt};
+use leaderboard_operator::api::Submission;
+use leaderboard_operator::controller::watches::preflight::{Need, access_missing, await_kinds};
+use leaderboard_operator::controller::watches::{Touches, guarded, spawn_watch};
+use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::shutdown::Stop;
+use serde_json::json;
+use tokio::time::timeout;
+
+use crate::support::apiserver::server;
+
+/// Longer than anything here may take, also on a busy machine.
+const LIMIT: Duration = Duration::from_mins(2);
+
+/// The next touch that `is` waited for; earlier states may be told or not.
+async fn next(touches: &mut Touches<Submission>, is: impl Fn(&Submission, bool) -> bool) {
+    let search = async {
+        while let Some(touch) = touches.next().await {
+            if is(&touch.object, touch.is_gone) {
+                return;
+            }
+        }
+        panic!("the watch has ended");
+    };
+    timeout(LIMIT, search).await.expect("an event in time");
+}
+
+#[tokio::test]
+async fn creations_changes_and_deletions_are_told() {
+    let (client, namespace) = (server().await.client(), server().await.namespace("watches").await);
+    let (_sender, stop) = Stop::new();
+    let seen = Observability::new(stop);
+    let watch = spawn_watch::<Submission>(
+        guarded(client.clone(), Some(&namespace)),
+        Config::default(),
+        |_| {},
+        &seen,
+    );
+    let mut touches = watch.subscribe();
+    watch.store.wait_until_ready().await.unwrap();
+    let submissions = Api::<Submission>::namespaced(client, &namespace);
+    let object = json!({"apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission", "metadata": {"name": "one"},
+        "spec": {"leaderboard": "board", "image": "agent:1", "track": "SENSORS"}});
+    submissions
+        .create(&PostParams::default(), &serde_json::from_value(object).unwrap())
+        .await
+        .unwrap();
+    next(&mut touches, |object, is_gone| object.name_any() == "one" && !is_gone).await;
+    let patch = Patch::Merge(json!({"spec": {"priority": 7}}));
+    submissions.patch("one", &PatchParams::default(), &patch).await.unwrap();
+    next(&mut touches, |object, _| object.spec.priority == 7).await;
+    assert!(watch.store.state()[0].metadata.managed_fields.is_none());
+    submissions.delete("one", &DeleteParams::default()).await.unwrap();
+    next(&mut touches, |object, is_gone| object.name_any() == "one" && is_gone).await;
+    assert!(watch.store.is_empty() && seen.readiness.missing().is_empty());
+}
+
+#[tokio::test]
+async fn the_preflight_finds_the_kinds_and_the_permissions_of_an_administrator() {
+    let client = server().await.client();
+    let (_sender, stop) = Stop::new();
+    let seen = Observability::new(stop);
+    let found = timeout(LIMIT, await_kinds(&client, &["leaderboards", "submissions"], &seen)).await;
+    assert!(found.expect("in time") && seen.readiness.missing().is_empty());
+    let need = |resource, verb| Need {
+        group: "leaderboard.carla.org",
+        resource,
+        verb,
+        namespace: None,
+    };
+    let needs = [need("submissions", "watch"), need("submissions/status", "patch")];
+    assert_eq!(access_missing(&client, &needs).await, Vec::<String>::new());
+}

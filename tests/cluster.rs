@@ -1,0 +1,36 @@
+//! The whole system on a real cluster: the operator's own programs, real Pods, and stand-ins for AWS and EvalAI.
+//!
+//! Each test has a namespace, queues, a table and a prefix in the bucket of its own, and runs the operator as child processes
+//! that it may kill and stop. Two tests run at once; each prints its seconds.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "clippy knows a test by its attribute; what tests call is a test too"
+)]
+
+#[path = "support/aws.rs"]
+mod aws;
+#[path = "support/evalai.rs"]
+mod evalai;
+#[path = "support/gate.rs"]
+mod gate;
+#[path = "support/operator.rs"]
+mod operator;
+#[path = "support/cluster.rs"]
+mod scene;
+
+mod cluster {
+    mod audit;
+    mod bridge;
+    mod edits;
+    mod expected;
+    mod failures;
+    mod kills;
+    mod losses;
+    mod publish;
+    mod runs;
+    mod stops;
+    mod storage;
+}

@@ -1,0 +1,146 @@
+//! Messages that come wrongly, often, early or again.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use evalai_stand_in::model::Status;
+use leaderboard_operator::api::{FailureClass, State, Submission};
+use serde_json::json;
+
+use super::expected::SIX_ROUTES;
+use crate::evalai::Evalai;
+use crate::operator::{bridge, controller};
+use crate::scene::{Scene, names, reason, scenario, score, state};
+
+const UNKNOWN_AFTER_SECONDS: i64 = 3;
+/// How often an AWS client tries a request whose connection breaks.
+const TRIES: u32 = 3;
+
+#[tokio::test]
+async fn bad_messages_land_in_the_dead_letter_queue_with_their_reasons() {
+    scenario("dead-letters", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        let queue = json!({"queue": {"unknownAfterSeconds": UNKNOWN_AFTER_SECONDS}});
+        scene.evalai_leaderboard("lb", &evalai, queue).await;
+        let _bridge = bridge(scene);
+        let foreign = r#"{"challenge_pk": "999", "phase_pk": "1", "submission_pk": 5}"#;
+        let unknown = r#"{"challenge_pk": 1, "phase_pk": 77, "submission_pk": 6}"#;
+        let mut sent = BTreeMap::new();
+        for body in ["not { json", foreign, unknown] {
+            sent.insert(body, scene.cloud.send(body).await);
+        }
+
+        let mut reasons = BTreeMap::new();
+        for _ in 0..sent.len() {
+            let letter = scene.cloud.dead_letter(Duration::from_secs(75)).await;
+            let waited = letter.sent_ms - sent[letter.body.as_str()];
+            let (reason, detail) = (&letter.attributes["reason"], &letter.attributes["detail"]);
+            if reason == "UnknownPhase" {
+                assert!(
+                    waited > UNKNOWN_AFTER_SECONDS * 1000,
+                    "given up after {waited} ms: {letter:?}"
+                );
+            }
+            assert_eq!(letter.attributes["queue"], scene.cloud.queue_url);
+            reasons.insert(letter.body.clone(), (reason.clone(), detail.clone()));
+        }
+        let reason = |body: &str| (reasons[body].0.as_str(), reasons[body].1.as_str());
+        let nobody = "no Leaderboard that reads this queue serves";
+        assert_eq!(reason("not { json").0, "Malformed");
+        assert!(reason("not { json").1.contains("not JSON"), "{reasons:?}");
+        assert_eq!(
+            reason(foreign),
+            ("UnknownPhase", format!("{nobody} challenge 999, phase 1").as_str())
+        );
+        assert_eq!(
+            reason(unknown),
+            ("UnknownPhase", format!("{nobody} challenge 1, phase 77").as_str())
+        );
+        scene.cloud.await_messages([0, 0], Duration::from_secs(10)).await;
+        assert_eq!(scene.all::<Submission>().await.len(), 0);
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_again() {
+    scenario("redelivery", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        scene.cloud.set_visibility(3).await;
+        let change = json!({
+            "pairs": 2, "routes": 6,
+            // The first crash is the last: the agent crashes once in all.
+            "retries": {"pair": 1},
+        });
+        scene.evalai_leaderboard("lb", &evalai, change).await;
+        scene.gate.keep_back("AmazonSQS.DeleteMessage");
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        let pk = evalai.submit(&scene.lab.challenge("agent:crash-once"), 1).await;
+        let name = format!("submission-{pk}");
+        scene.gate.await_kept_back(3 * TRIES, Duration::from_mins(1)).await;
+
+        let failed = scene.settled(&name, Duration::from_mins(3)).await;
+        let failure = failed.status.clone().unwrap().failure.unwrap();
+        assert_eq!(
+            (failure.class, failure.reason.as_str()),
+            (FailureClass::Participant, "AgentCrashed")
+        );
+        // The message that began it comes again although the run has ended; each deletion is tried three times.
+        scene.gate.await_kept_back(2 * TRIES, Duration::from_mins(1)).await;
+        assert_eq!(names(&scene.all::<Submission>().await), [name.as_str()]);
+        assert_eq!(scene.jobs().await, [format!("{name}-1")]);
+        let still = scene.api::<Submission>().get(&name).await.unwrap();
+        assert_eq!((still.spec.attempt, state(&still)), (1, Some(State::Failed)));
+
+        scene.gate.reopen();
+        scene.cloud.await_messages([0, 0], Duration::from_mins(1)).await;
+        evalai.await_status(pk, Status::Failed, Duration::from_secs(30)).await;
+        evalai.resume(pk).await;
+        let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(2);
+        scene
+            .submission(&name, "the second attempt begins", Duration::from_mins(1), resumed)
+            .await;
+        let running = scene.running(&name, Duration::from_mins(1)).await;
+        assert_eq!((state(&running), reason(&running)), (Some(State::Resumed), "Resumed"));
+        let finished = scene.settled(&name, Duration::from_mins(3)).await;
+        assert_eq!(
+            (state(&finished), score(&finished)),
+            (Some(State::Finished), SIX_ROUTES)
+        );
+        assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-2")]);
+        assert_eq!(evalai.submission(pk).status, Status::Finished);
+        let row = scene.cloud.row(&scene.cloud.table).await;
+        assert_eq!(
+            (row["submission_status"].as_str(), row["attempt"].as_str()),
+            ("FINISHED", "2")
+        );
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_leaderboard_applied_after_its_message_still_serves_it() {
+    scenario("late-board", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        let tracks = |name: &str, phase: u64| {
+            json!({
+                "pairs": 2, "routes": 6,
+                "tracks": [{"name": name, "codename": name.to_uppercase(), "phase": phase}],
+                "storage": {"prefix": format!("{}{name}/", scene.cloud.prefix)},
+            })
+        };
+        scene.evalai_leaderboard("early", &evalai, tracks("map", 2)).await;
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        scene.cloud.await_messages([0, 1], Duration::from_secs(30)).await;
+        scene.evalai_leaderboard("late", &evalai, tracks("sensors", 1)).await;
+        let finished = scene.settled(&format!("submission-{pk}"), Duration::from_mins(3)).await;
+        assert_eq!(
+            (state(&finished), score(&finished)),
+            (Some(State::Finished), SIX_ROUTES)
+        );
+        assert_eq!(finished.spec.leaderboard, "late");
+        assert_eq!(evalai.rows(pk).len(), 1);
+    })
+    .await;
+}

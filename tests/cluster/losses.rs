@@ -1,0 +1,111 @@
+//! Somebody deletes what the operator made: the run goes on from S3.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+use kube::api::DeleteParams;
+use leaderboard_operator::api::{State, Submission};
+use serde_json::{Value, json};
+
+use super::expected::SIX_ROUTES;
+use crate::operator::controller;
+use crate::scene::{Scene, done, scenario, score, state};
+
+/// Six routes for two pairs, one in 3 s.
+fn slow() -> Value {
+    json!({
+        "pairs": 2,
+        "routes": 6,
+        "agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]},
+    })
+}
+
+/// Starts a run and waits until it is half-way.
+async fn half_way(scene: &Scene, name: &str) {
+    scene.leaderboard("lb", slow()).await;
+    scene.submit(name, "agent:standard").await;
+    let half = |s: &Submission| done(s) >= 2;
+    scene
+        .submission(name, "two routes are done", Duration::from_mins(3), half)
+        .await;
+}
+
+/// How often each route was begun, over all Pods: the agents' logs go on where they were.
+async fn begun(scene: &Scene, run: &str) -> Vec<BTreeMap<String, u32>> {
+    let mut pairs = Vec::new();
+    for pair in 1..=2 {
+        let log = scene
+            .cloud
+            .text(run, &format!("agent/agent{pair}/leaderboard.log"))
+            .await;
+        let mut routes = BTreeMap::new();
+        for line in log.lines().filter_map(|line| line.strip_prefix("========= Preparing ")) {
+            let route = line.split(' ').next().unwrap_or_default();
+            *routes.entry(route.to_owned()).or_insert(0) += 1;
+        }
+        pairs.push(routes);
+    }
+    pairs
+}
+
+async fn assert_finished(scene: &Scene, name: &str) {
+    let submission = scene.settled(name, Duration::from_mins(5)).await;
+    assert_eq!(
+        (state(&submission), score(&submission)),
+        (Some(State::Finished), SIX_ROUTES)
+    );
+    for routes in begun(scene, name).await {
+        let again: Vec<_> = routes.iter().filter(|(_, count)| **count > 1).collect();
+        assert_eq!(routes.len(), 3, "each pair has three routes: {routes:?}");
+        assert!(
+            again.len() <= 1 && routes.values().all(|count| *count <= 2),
+            "more than one route is repeated: {routes:?}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_pod_deleted_by_hand_costs_one_route_of_each_pair() {
+    scenario("pod-deleted", async |scene: &Scene| {
+        let _controller = controller(scene);
+        half_way(scene, "lost").await;
+        let pod = scene.pod("lost").await;
+        scene
+            .api::<Pod>()
+            .delete(&pod.name_any(), &DeleteParams::default())
+            .await
+            .unwrap();
+        assert_finished(scene, "lost").await;
+        assert_eq!(scene.jobs().await, ["lost-1"], "the Job makes the next Pod");
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_job_deleted_by_hand_is_made_again() {
+    scenario("job-deleted", async |scene: &Scene| {
+        let _controller = controller(scene);
+        half_way(scene, "lost").await;
+        let old = scene.api::<Job>().get("lost-1").await.unwrap().uid();
+        scene
+            .api::<Job>()
+            .delete("lost-1", &DeleteParams::background())
+            .await
+            .unwrap();
+        let other = move |job: Option<&Job>| job.is_some_and(|job| job.uid() != old);
+        scene
+            .wait("lost-1", "it is made again", Duration::from_mins(2), other)
+            .await;
+        assert_finished(scene, "lost").await;
+        let told = scene.events("lost").await;
+        let told: Vec<_> = told
+            .iter()
+            .filter(|event| event.reason.as_deref() == Some("JobRecreated"))
+            .collect();
+        assert_eq!(told.len(), 1, "{told:?}");
+    })
+    .await;
+}

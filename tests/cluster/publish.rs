@@ -1,0 +1,143 @@
+//! EvalAI's message in, the score out: status, S3, DynamoDB and EvalAI's leaderboard say the same.
+
+use std::time::Duration;
+
+use evalai_stand_in::log::Entry;
+use evalai_stand_in::model::Status;
+use leaderboard_operator::api::Submission;
+use serde_json::json;
+
+use super::expected::{assert_finished, assert_results, assert_row, metrics};
+use crate::evalai::Evalai;
+use crate::operator::{bridge, controller};
+use crate::scene::{Scene, names, scenario};
+
+/// Requests a minute that the operator allows itself by default.
+const BUDGET: usize = 54;
+
+#[tokio::test]
+async fn a_message_becomes_the_same_score_in_all_four_places() {
+    scenario("message", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        scene.evalai_leaderboard("lb", &evalai, json!({})).await;
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        // A controller that has just begun has other questions first, and this run is over in seconds.
+        scene.ready("lb").await;
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        let message = evalai.handle.state().published[0].body.clone();
+        assert_eq!(
+            message["challenge_pk"],
+            json!("1"),
+            "EvalAI's first message has its keys as texts"
+        );
+        let name = format!("submission-{pk}");
+        let submission = scene.settled(&name, Duration::from_mins(3)).await;
+
+        assert_finished(&submission);
+        assert_eq!(names(&scene.all::<Submission>().await), [name.as_str()]);
+        assert_eq!(scene.jobs().await, [format!("{name}-1")]);
+        assert_published(scene, &evalai, pk).await;
+        assert_requests(&evalai.requests());
+        for status in ["queued", "running"] {
+            assert_eq!(
+                evalai.told("PATCH", status),
+                1,
+                "each PATCH starts EvalAI's clock again: {status}"
+            );
+        }
+        assert_eq!(evalai.told("PUT", "finished"), 1);
+
+        let row = scene.cloud.row(&scene.cloud.table).await;
+        assert_row(&row);
+        for (column, text) in [
+            ("team_id", "1"),
+            ("submission_id", pk.to_string().as_str()),
+            ("team_name", "team-a"),
+            ("submission_status", "FINISHED"),
+            ("track_id", "1"),
+            ("track_name", "SENSORS"),
+            ("attempt", "1"),
+            ("progress", "20/20"),
+        ] {
+            assert_eq!(row.get(column).map(String::as_str), Some(text), "{column} of {row:?}");
+        }
+        assert_eq!(
+            scene.cloud.messages().await,
+            [0, 0],
+            "the message is gone from the queue"
+        );
+    })
+    .await;
+}
+
+/// EvalAI's row, its leaderboard and its files are what S3 holds.
+async fn assert_published(scene: &Scene, evalai: &Evalai, pk: u64) {
+    let run = pk.to_string();
+    assert_results(&scene.cloud.text(&run, "evalai/results.json").await);
+    let row = evalai.submission(pk);
+    assert_eq!(row.status, Status::Finished);
+    let rows = evalai.rows(pk);
+    assert_eq!(rows.len(), 1, "{rows:?}");
+    assert_eq!(rows[0].result, metrics());
+    let shown = evalai.leaderboard(1).await;
+    assert_eq!(shown.len(), 1);
+    assert_eq!(shown[0]["submission__id"], json!(pk));
+    assert_eq!(shown[0]["filtering_score"], metrics()["Driving score"]);
+    for (path, key) in [
+        (&row.stdout_file, "evalai/stdout.txt"),
+        (&row.submission_metadata_file, "evalai/metadata.json"),
+    ] {
+        assert_eq!(evalai.file(path.as_ref()), scene.cloud.text(&run, key).await, "{key}");
+    }
+    assert_eq!(evalai.file(row.stderr_file.as_ref()).trim(), "", "nothing went wrong");
+}
+
+/// No minute holds more requests than the budget, and none was refused.
+fn assert_requests(requests: &[Entry]) {
+    for first in requests {
+        let minute = requests.iter().filter(|other| {
+            let age = other.time.duration_since(first.time).as_secs();
+            other.id >= first.id && age < 60
+        });
+        assert!(
+            minute.count() <= BUDGET,
+            "too many requests a minute from {}",
+            first.time
+        );
+    }
+    let refused: Vec<_> = requests
+        .iter()
+        .filter(|r| r.status.is_none_or(|status| status >= 400))
+        .collect();
+    assert!(refused.is_empty(), "{refused:?}");
+}
+
+#[tokio::test]
+async fn a_table_keyed_with_hyphens_gets_its_row_too() {
+    scenario("hyphens", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        let change = json!({"pairs": 2, "routes": 6, "table": {"name": scene.cloud.hyphen_table}});
+        scene.evalai_leaderboard("lb", &evalai, change).await;
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 2).await;
+        scene.settled(&format!("submission-{pk}"), Duration::from_mins(3)).await;
+
+        let row = scene.cloud.row(&scene.cloud.hyphen_table).await;
+        let column = |name: &str| row.get(name).map(String::as_str);
+        assert_eq!(
+            (column("team-id"), column("submission-id")),
+            (Some("1"), Some(pk.to_string().as_str()))
+        );
+        assert_eq!(
+            (column("submission_status"), column("track_name")),
+            (Some("FINISHED"), Some("MAP"))
+        );
+        assert_eq!(column("progress"), Some("6/6"));
+        assert_eq!(
+            scene.cloud.rows(&scene.cloud.table).await.len(),
+            0,
+            "the other table is not named"
+        );
+    })
+    .await;
+}

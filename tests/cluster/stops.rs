@@ -1,0 +1,130 @@
+//! A run is stopped: by its host, by its participant in EvalAI, by deleting it.
+
+use std::time::Duration;
+
+use evalai_stand_in::model::Status;
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+use kube::api::DeleteParams;
+use leaderboard_operator::api::{State, Submission};
+use serde_json::{Value, json};
+
+use crate::evalai::Evalai;
+use crate::operator::{bridge, controller};
+use crate::scene::{Scene, done, reason, scenario, state};
+
+const CANCEL_SECONDS: u64 = 20;
+
+/// Six routes for two pairs, one in 5 s.
+fn slow() -> Value {
+    json!({
+        "pairs": 2,
+        "routes": 6,
+        "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]},
+        "deadlines": {"cancelSeconds": CANCEL_SECONDS},
+    })
+}
+
+/// Waits until each pair has done a route and the next is under way.
+async fn under_way(scene: &Scene, name: &str) {
+    let some = |s: &Submission| done(s) >= 2;
+    scene
+        .submission(name, "two routes are done", Duration::from_mins(3), some)
+        .await;
+}
+
+/// Waits until a Submission's Pod has ended: it has as long as a cancel may take.
+async fn pod_ended(scene: &Scene, pod: &str) {
+    let ended = |pod: Option<&Pod>| {
+        let phase = pod
+            .and_then(|pod| pod.status.as_ref())
+            .and_then(|status| status.phase.as_deref());
+        pod.is_none() || matches!(phase, Some("Succeeded" | "Failed"))
+    };
+    scene
+        .wait(
+            pod,
+            "its Pod has ended",
+            Duration::from_secs(CANCEL_SECONDS + 20),
+            ended,
+        )
+        .await;
+}
+
+/// What the run had reached is in S3.
+async fn assert_partial(scene: &Scene, run: &str) {
+    let merged: Value = serde_json::from_str(&scene.cloud.text(run, "agent/agent_results.json").await).unwrap();
+    let records = merged["_checkpoint"]["records"].as_array().map_or(0, Vec::len);
+    assert!((2..6).contains(&records), "{records} routes are kept");
+    let keys = scene.cloud.keys(run).await;
+    assert!(keys.contains_key("containers-status/simulation.cancel"), "{keys:?}");
+}
+
+#[tokio::test]
+async fn a_cancelled_submission_stops_in_time_and_keeps_its_results() {
+    scenario("cancel", async |scene: &Scene| {
+        scene.leaderboard("lb", slow()).await;
+        let _controller = controller(scene);
+        scene.submit("stopped", "agent:standard").await;
+        under_way(scene, "stopped").await;
+        let pod = scene.pod("stopped").await.name_any();
+        scene.change_submission("stopped", &json!({"cancel": true})).await;
+        pod_ended(scene, &pod).await;
+        let submission = scene.settled("stopped", Duration::from_mins(1)).await;
+        assert_eq!(
+            (state(&submission), reason(&submission)),
+            (Some(State::Cancelled), "Cancelled")
+        );
+        assert_partial(scene, "stopped").await;
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_cancel_in_evalai_stops_the_run() {
+    scenario("evalai-cancel", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        scene.evalai_leaderboard("lb", &evalai, slow()).await;
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        let name = format!("submission-{pk}");
+        under_way(scene, &name).await;
+        let pod = scene.pod(&name).await.name_any();
+        evalai.cancel(pk).await;
+        pod_ended(scene, &pod).await;
+        let submission = scene.settled(&name, Duration::from_mins(1)).await;
+        assert_eq!(state(&submission), Some(State::Cancelled));
+        assert_eq!(evalai.submission(pk).status, Status::Cancelled, "nothing revives it");
+        let row = scene.cloud.row(&scene.cloud.table).await;
+        assert_eq!(row["submission_status"], "CANCELLED");
+        assert_partial(scene, &pk.to_string()).await;
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_submission_deleted_while_it_runs_goes_when_its_end_is_published() {
+    scenario("delete", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        scene.evalai_leaderboard("lb", &evalai, slow()).await;
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        let name = format!("submission-{pk}");
+        under_way(scene, &name).await;
+        let pod = scene.pod(&name).await.name_any();
+        let deleted = scene
+            .api::<Submission>()
+            .delete(&name, &DeleteParams::default())
+            .await
+            .unwrap();
+        let uid = deleted.left().expect("a finalizer holds it").uid().unwrap();
+        pod_ended(scene, &pod).await;
+        let gone = move |found: Option<&Submission>| found.is_none_or(|found| found.uid().as_ref() != Some(&uid));
+        scene.wait(&name, "it is gone", Duration::from_mins(2), gone).await;
+        assert_eq!(evalai.submission(pk).status, Status::Cancelled);
+        let row = scene.cloud.row(&scene.cloud.table).await;
+        assert_eq!(row["submission_status"], "CANCELLED");
+        assert_partial(scene, &pk.to_string()).await;
+    })
+    .await;
+}

@@ -1,0 +1,104 @@
+//! S3 is away when it is needed most.
+
+use std::fs;
+use std::time::Duration;
+
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+use leaderboard_operator::api::{Submission, conditions};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::json;
+use tokio::time::sleep;
+
+use super::expected::{assert_finished, assert_results};
+use crate::gate::Gate;
+use crate::operator::controller;
+use crate::scene::{Scene, containers, done, is_true, scenario};
+
+const S3_AWAY: Duration = Duration::from_mins(2);
+
+#[tokio::test]
+async fn a_killed_logcopy_and_two_minutes_without_s3_lose_no_score() {
+    scenario("no-s3", async |scene: &Scene| {
+        let s3 = Gate::open(&scene.lab.host, &scene.cloud.endpoint).await;
+        let change = json!({
+            "storage": {"endpoint": s3.url},
+            "agent": {"env": [{"name": "ROUTE_MS", "value": "2000"}]},
+        });
+        scene.leaderboard("lb", change).await;
+        let _controller = controller(scene);
+        scene.submit("unstored", "agent:standard").await;
+        let nearly = |s: &Submission| done(s) >= 12;
+        scene
+            .submission("unstored", "12 routes are done", Duration::from_mins(3), nearly)
+            .await;
+        s3.shut();
+        let away = sleep(S3_AWAY);
+        let pod = scene.pod("unstored").await.name_any();
+        let pod = scene
+            .wait(&pod, "all agents have ended", Duration::from_mins(1), have_agents_ended)
+            .await
+            .unwrap();
+        kill_container(&pod, "logcopy");
+        let again = |pod: Option<&Pod>| pod.is_some_and(|pod| restarts(pod, "logcopy") > 0);
+        scene
+            .wait(&pod.name_any(), "logcopy runs again", Duration::from_mins(1), again)
+            .await;
+        away.await;
+        let waiting = scene.api::<Submission>().get("unstored").await.unwrap();
+        assert!(
+            !is_true(&waiting, conditions::FINISHED),
+            "nobody can know the score yet"
+        );
+        s3.reopen();
+
+        let submission = scene.settled("unstored", Duration::from_mins(5)).await;
+        assert_finished(&submission);
+        assert_results(&scene.cloud.text("unstored", "evalai/results.json").await);
+    })
+    .await;
+}
+
+fn have_agents_ended(pod: Option<&Pod>) -> bool {
+    let Some(pod) = pod else { return false };
+    let all = containers(pod);
+    let agents: Vec<_> = all
+        .iter()
+        .filter(|container| container.name.starts_with("agent-"))
+        .collect();
+    let ended = |container: &&k8s_openapi::api::core::v1::ContainerStatus| {
+        container.state.as_ref().is_some_and(|state| state.terminated.is_some())
+    };
+    agents.len() == 4 && agents.iter().all(ended)
+}
+
+fn restarts(pod: &Pod, name: &str) -> i32 {
+    let all = containers(pod);
+    all.iter()
+        .find(|container| container.name == name)
+        .map_or(0, |container| container.restart_count)
+}
+
+/// Kills the processes of a container without a word, as the kernel does when memory is short. The node is this machine.
+fn kill_container(pod: &Pod, name: &str) {
+    let all = containers(pod);
+    let container = all.iter().find(|container| container.name == name).unwrap();
+    let id = container.container_id.as_deref().unwrap();
+    let (_, id) = id.split_once("://").unwrap();
+    let mut killed = 0;
+    for entry in fs::read_dir("/proc").unwrap().flatten() {
+        let Some(pid) = entry.file_name().to_str().and_then(|name| name.parse().ok()) else {
+            continue;
+        };
+        let groups = fs::read_to_string(entry.path().join("cgroup")).unwrap_or_default();
+        if groups.contains(id) {
+            kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
+            killed += 1;
+        }
+    }
+    assert!(
+        killed > 0,
+        "no process of {name} is on this machine: these tests run on the cluster's only node, as root"
+    );
+}

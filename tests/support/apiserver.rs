@@ -1,0 +1,359 @@
+//! A real etcd and kube-apiserver on free loopback ports, with the operator's CRDs installed: one for the whole test program.
+//!
+//! No controller runs beside them: a Job stays as it was created, and a deleted namespace stays Terminating. Each test takes
+//! a namespace of its own. They end with the test program, also when it is killed: see `watchdog`.
+
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::io;
+use std::net::TcpListener;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use k8s_openapi::api::core::v1::Namespace;
+use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
+use kube::api::{Api, ObjectMeta, PostParams};
+use kube::config::{KubeConfigOptions, Kubeconfig};
+use kube::runtime::wait::{await_condition, conditions::is_crd_established};
+use kube::{Client, Config};
+use tokio::sync::OnceCell;
+
+const PROGRAMS: [&str; 3] = ["etcd", "kube-apiserver", "kubectl"];
+const HOW_TO_RUN: &str = "run these tests with `make test`, or set KUBEBUILDER_ASSETS to a folder that holds them";
+/// An idle machine needs 4 s.
+const START_LIMIT: Duration = Duration::from_mins(3);
+const POLL: Duration = Duration::from_millis(50);
+/// A free port can be taken by somebody else before the server has it.
+const TRIES: usize = 3;
+
+/// The running API server.
+pub struct ApiServer {
+    folder: PathBuf,
+    programs: PathBuf,
+    config: Config,
+    _lifeline: ChildStdin,
+}
+
+/// The API server of this test program, started by the first call.
+pub async fn server() -> &'static ApiServer {
+    // A failure is kept too: the other tests would only wait for the same one.
+    static SERVER: OnceCell<Result<ApiServer, String>> = OnceCell::const_new();
+    match SERVER.get_or_init(start).await {
+        Ok(server) => server,
+        Err(why) => panic!("no API server to test against: {why}"),
+    }
+}
+
+impl ApiServer {
+    /// A client with all rights. It belongs to the runtime of the test that calls this: don't share it between tests.
+    pub fn client(&self) -> Client {
+        Client::try_from(self.config.clone()).unwrap()
+    }
+
+    /// A new namespace, `<name>-<number>`.
+    pub async fn namespace(&self, name: &str) -> String {
+        static NUMBER: AtomicU32 = AtomicU32::new(1);
+        let name = format!("{name}-{}", NUMBER.fetch_add(1, Ordering::Relaxed));
+        let namespace = Namespace {
+            metadata: ObjectMeta {
+                name: Some(name.clone()),
+                ..ObjectMeta::default()
+            },
+            ..Namespace::default()
+        };
+        let api = Api::all(self.client());
+        api.create(&PostParams::default(), &namespace).await.unwrap();
+        name
+    }
+
+    /// A kubectl that speaks to this server and keeps nothing in the user's home.
+    pub fn kubectl(&self) -> Command {
+        let mut command = Command::new(self.programs.join("kubectl"));
+        command
+            .env("KUBECONFIG", kubeconfig(&self.folder))
+            .env("KUBECACHEDIR", self.folder.join("kubectl"))
+            .stdin(Stdio::null());
+        command
+    }
+}
+
+async fn start() -> Result<ApiServer, String> {
+    let programs = programs()?;
+    let mut failures = String::new();
+    for number in 1..=TRIES {
+        match start_once(&programs, number).await {
+            Ok(server) => {
+                install(&server).await?;
+                return Ok(server);
+            }
+            Err(why) => _ = write!(failures, "\n{why}"),
+        }
+    }
+    Err(format!("{TRIES} starts failed:{failures}"))
+}
+
+/// Where etcd, kube-apiserver and kubectl are: controller-runtime's variable, else the lab's cache.
+fn programs() -> Result<PathBuf, String> {
+    let folder = if let Some(folder) = std::env::var_os("KUBEBUILDER_ASSETS") {
+        PathBuf::from(folder)
+    } else {
+        let lab = Path::new(env!("CARGO_MANIFEST_DIR")).join("local/lab");
+        let output = Command::new(&lab).arg("tools").args(PROGRAMS).output();
+        let output = output.map_err(|error| format!("{} does not run ({error}); {HOW_TO_RUN}", lab.display()))?;
+        if !output.status.success() {
+            let said = String::from_utf8_lossy(&output.stderr);
+            return Err(format!("`local/lab tools` failed: {}; {HOW_TO_RUN}", said.trim()));
+        }
+        PathBuf::from(String::from_utf8_lossy(&output.stdout).trim())
+    };
+    match PROGRAMS.iter().find(|program| !folder.join(program).is_file()) {
+        None => Ok(folder),
+        Some(missing) => Err(format!("{} has no {missing}; {HOW_TO_RUN}", folder.display())),
+    }
+}
+
+/// Ends its processes and removes its folder when dropped, so that a failed start leaves nothing.
+struct Attempt {
+    folder: PathBuf,
+    children: Vec<(&'static str, Child)>,
+    watchdog: Option<Child>,
+}
+
+impl Drop for Attempt {
+    fn drop(&mut self) {
+        // The watchdog first: once a process is waited for, its id may be another's.
+        for child in self
+            .watchdog
+            .iter_mut()
+            .chain(self.children.iter_mut().map(|(_, child)| child))
+        {
+            _ = child.kill();
+            _ = child.wait();
+        }
+        _ = fs::remove_dir_all(&self.folder);
+    }
+}
+
+impl Attempt {
+    fn spawn(&mut self, programs: &Path, program: &'static str, arguments: &[String]) -> Result<(), String> {
+        let child = log(&self.folder, program).and_then(|log| {
+            Command::new(programs.join(program))
+                .args(arguments)
+                .stdin(Stdio::null())
+                .stdout(log.try_clone()?)
+                .stderr(log)
+                .spawn()
+        });
+        let child = child.map_err(|error| format!("{program} does not start: {error}"))?;
+        self.children.push((program, child));
+        Ok(())
+    }
+
+    /// What a program that ended too early said last.
+    fn ended(&mut self) -> Option<String> {
+        self.children.iter_mut().find_map(|(program, child)| {
+            let status = child.try_wait().ok().flatten()?;
+            let log = fs::read_to_string(self.folder.join(format!("{program}.log"))).unwrap_or_default();
+            let last = log.lines().last().unwrap_or("(nothing)").to_owned();
+            Some(format!("{program} ended ({status}) and said last: {last}"))
+        })
+    }
+}
+
+async fn start_once(programs: &Path, number: usize) -> Result<ApiServer, String> {
+    let folder = std::env::temp_dir().join(format!("leaderboard-apiserver-{}-{number}", std::process::id()));
+    let mut attempt = Attempt {
+        folder: folder.clone(),
+        children: Vec::new(),
+        watchdog: None,
+    };
+    let [client_port, peer_port, port] = free_ports().map_err(|error| format!("no free port: {error}"))?;
+    prepare(&folder)?;
+    attempt.spawn(programs, "etcd", &etcd_arguments(&folder, client_port, peer_port))?;
+    attempt.spawn(
+        programs,
+        "kube-apiserver",
+        &apiserver_arguments(&folder, client_port, port),
+    )?;
+    let watchdog = watchdog(&attempt).map_err(|error| format!("sh does not start: {error}"))?;
+    let lifeline = attempt
+        .watchdog
+        .insert(watchdog)
+        .stdin
+        .take()
+        .ok_or("the watchdog has no pipe")?;
+    let config = ready(&mut attempt, port).await?;
+    // From here on the watchdog alone ends the processes and removes the folder.
+    std::mem::forget(attempt);
+    Ok(ApiServer {
+        folder,
+        programs: programs.to_owned(),
+        config,
+        _lifeline: lifeline,
+    })
+}
+
+/// Ends the servers when this process is gone. Statics are never dropped, and a killed process drops nothing, but the kernel
+/// always closes the pipe that the watchdog reads.
+fn watchdog(attempt: &Attempt) -> io::Result<Child> {
+    const SCRIPT: &str = r#"trap '' INT TERM HUP
+        folder=$1; shift
+        read -r _
+        kill -KILL "$@" 2>/dev/null
+        for _ in 1 2 3 4 5; do rm -rf "$folder" && break; sleep 1; done"#;
+    Command::new("sh")
+        .args(["-c", SCRIPT, "watchdog"])
+        .arg(&attempt.folder)
+        .args(attempt.children.iter().map(|(_, child)| child.id().to_string()))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+}
+
+fn free_ports() -> io::Result<[u16; 3]> {
+    // All at once, so that they differ.
+    let listeners = [free()?, free()?, free()?];
+    let mut ports = [0; 3];
+    for (port, listener) in ports.iter_mut().zip(&listeners) {
+        *port = listener.local_addr()?.port();
+    }
+    Ok(ports)
+}
+
+fn free() -> io::Result<TcpListener> {
+    TcpListener::bind(("127.0.0.1", 0))
+}
+
+fn kubeconfig(folder: &Path) -> PathBuf {
+    folder.join("kubeconfig")
+}
+
+fn log(folder: &Path, program: &str) -> io::Result<File> {
+    File::create(folder.join(format!("{program}.log")))
+}
+
+/// The folder, the token of its only user, and the key that signs the tokens of service accounts.
+fn prepare(folder: &Path) -> Result<(), String> {
+    let failed = |error: io::Error| format!("{} cannot be prepared: {error}", folder.display());
+    _ = fs::remove_dir_all(folder);
+    fs::DirBuilder::new().mode(0o700).create(folder).map_err(failed)?;
+    fs::write(folder.join("tokens.csv"), "tests,admin,admin,system:masters\n").map_err(failed)?;
+    let key = Command::new("openssl")
+        // The traditional format: the server reads no other for this kind of key.
+        .args(["ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out"])
+        .arg(folder.join("service-accounts.key"))
+        .output()
+        .map_err(|error| format!("openssl does not run: {error}; install it"))?;
+    if key.status.success() {
+        return Ok(());
+    }
+    Err(format!(
+        "openssl made no key: {}",
+        String::from_utf8_lossy(&key.stderr).trim()
+    ))
+}
+
+fn etcd_arguments(folder: &Path, client_port: u16, peer_port: u16) -> Vec<String> {
+    let client = format!("http://127.0.0.1:{client_port}");
+    let peer = format!("http://127.0.0.1:{peer_port}");
+    vec![
+        format!("--data-dir={}", folder.join("etcd").display()),
+        format!("--listen-client-urls={client}"),
+        format!("--advertise-client-urls={client}"),
+        format!("--listen-peer-urls={peer}"),
+        format!("--initial-advertise-peer-urls={peer}"),
+        format!("--initial-cluster=default={peer}"),
+        "--unsafe-no-fsync".into(),
+        "--log-level=warn".into(),
+    ]
+}
+
+fn apiserver_arguments(folder: &Path, etcd_port: u16, port: u16) -> Vec<String> {
+    let file = |name: &str| folder.join(name).display().to_string();
+    vec![
+        format!("--etcd-servers=http://127.0.0.1:{etcd_port}"),
+        "--bind-address=127.0.0.1".into(),
+        "--advertise-address=127.0.0.1".into(),
+        // It refuses to write a loopback address to the Service `kubernetes`, which nobody here asks for.
+        "--endpoint-reconciler-type=none".into(),
+        format!("--secure-port={port}"),
+        format!("--cert-dir={}", file("certificates")),
+        format!("--token-auth-file={}", file("tokens.csv")),
+        "--authorization-mode=RBAC".into(),
+        // Nobody makes the namespaces' service accounts.
+        "--disable-admission-plugins=ServiceAccount".into(),
+        "--allow-privileged=true".into(),
+        "--service-cluster-ip-range=10.0.0.0/24".into(),
+        "--service-account-issuer=https://kubernetes.default.svc".into(),
+        format!("--service-account-key-file={}", file("service-accounts.key")),
+        format!("--service-account-signing-key-file={}", file("service-accounts.key")),
+    ]
+}
+
+/// Waits until the server answers `/readyz`.
+async fn ready(attempt: &mut Attempt, port: u16) -> Result<Config, String> {
+    let end = Instant::now() + START_LIMIT;
+    let mut last = "no certificate".to_owned();
+    while Instant::now() < end {
+        if let Some(why) = attempt.ended() {
+            return Err(why);
+        }
+        match probe(&attempt.folder, port).await {
+            Ok(config) => return Ok(config),
+            Err(why) => last = why,
+        }
+        tokio::time::sleep(POLL).await;
+    }
+    Err(format!("not ready after {} s: {last}", START_LIMIT.as_secs()))
+}
+
+async fn probe(folder: &Path, port: u16) -> Result<Config, String> {
+    // The server makes its own authority and writes it behind its certificate.
+    let authority = folder.join("certificates/apiserver.crt");
+    if !authority.is_file() {
+        return Err("no certificate".into());
+    }
+    let path = kubeconfig(folder);
+    let text = serde_json::json!({
+        "apiVersion": "v1",
+        "kind": "Config",
+        "clusters": [{"name": "tests", "cluster": {
+            "server": format!("https://127.0.0.1:{port}"),
+            "certificate-authority": authority,
+        }}],
+        "users": [{"name": "admin", "user": {"token": "tests"}}],
+        "contexts": [{"name": "tests", "context": {"cluster": "tests", "user": "admin", "namespace": "default"}}],
+        "current-context": "tests",
+    });
+    fs::write(&path, text.to_string()).map_err(|error| error.to_string())?;
+    let read = Kubeconfig::read_from(&path).map_err(|error| error.to_string())?;
+    let config = Config::from_custom_kubeconfig(read, &KubeConfigOptions::default())
+        .await
+        .map_err(|error| error.to_string())?;
+    let client = Client::try_from(config.clone()).map_err(|error| error.to_string())?;
+    let request = http::Request::get("/readyz").body(Vec::new());
+    let request = request.map_err(|error| error.to_string())?;
+    client.request_text(request).await.map_err(|error| error.to_string())?;
+    Ok(config)
+}
+
+/// Installs the CRDs and waits until they are served.
+async fn install(server: &ApiServer) -> Result<(), String> {
+    let api: Api<CustomResourceDefinition> = Api::all(server.client());
+    let definitions = leaderboard_operator::crds::definitions().map_err(|error| error.to_string())?;
+    for definition in definitions {
+        let object = definition.object().map_err(|error| error.to_string())?;
+        let refused = |error: kube::Error| format!("the API server refuses {}: {error}", definition.file);
+        let created = api.create(&PostParams::default(), &object).await.map_err(refused)?;
+        let name = created.metadata.name.unwrap_or_default();
+        let established = await_condition(api.clone(), &name, is_crd_established());
+        let established = tokio::time::timeout(Duration::from_mins(1), established).await;
+        let established = established.map_err(|_| format!("{name} is not served after a minute"))?;
+        established.map_err(|error| format!("{name}: {error}"))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,164 @@
+//! EvalAI of one test: the stand-in, served by the test's own process. Pods don't speak to it, so it listens on loopback.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use evalai_stand_in::log::Entry;
+use evalai_stand_in::model::{LeaderboardRow, Status, Submission};
+use evalai_stand_in::sqs::SqsQueues;
+use evalai_stand_in::{Config, Handle, Knobs, Seed};
+use serde_json::{Value, json};
+use tokio::net::TcpListener;
+use tokio::time::timeout;
+
+use super::scene::Scene;
+
+/// The host's token, which the operator has.
+pub const HOST_TOKEN: &str = "local-host-token";
+/// Another host's, with a throttle of its own.
+const PERSON: &str = "local-organizer-token";
+/// Requests a minute that EvalAI lets a token make.
+pub const REQUESTS_PER_MINUTE: usize = 60;
+
+/// A running stand-in.
+pub struct Evalai {
+    pub handle: Handle,
+    /// Where it is reached.
+    pub url: String,
+    http: reqwest::Client,
+}
+
+impl Evalai {
+    /// Starts one whose messages go to the scene's queue.
+    pub async fn start(scene: &Scene) -> Self {
+        let mut seed = Seed::built_in().unwrap();
+        seed.set_queue(&scene.cloud.queue);
+        let config = Config {
+            seed,
+            throttle: REQUESTS_PER_MINUTE,
+            queues: Arc::new(SqsQueues::new(&scene.cloud.endpoint)),
+        };
+        let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+        let handle = evalai_stand_in::serve(config, vec![listener]);
+        Self {
+            url: handle.url(),
+            handle,
+            http: reqwest::Client::builder().no_proxy().build().unwrap(),
+        }
+    }
+
+    /// How slowly results are saved.
+    pub fn set_put_delay(&self, delay: Duration) {
+        self.handle.set_knobs(Knobs {
+            put_delay_ms: u64::try_from(delay.as_millis()).unwrap(),
+            ..Knobs::default()
+        });
+    }
+
+    async fn call(&self, method: reqwest::Method, path: &str, body: &Value) -> Value {
+        let request = self.http.request(method, format!("{}{path}", self.url));
+        let answer = request.bearer_auth(PERSON).json(body).send().await.unwrap();
+        let (status, text) = (answer.status(), answer.text().await.unwrap());
+        assert!(status.is_success(), "{path}: {status} {text}");
+        serde_json::from_str(&text).unwrap()
+    }
+
+    /// Team a pushes an image to a phase of challenge 1; hands back the submission's key.
+    pub async fn submit(&self, image: &str, phase: u64) -> u64 {
+        let body = json!({"team": "team-a", "phase": phase, "image": image});
+        let answer = self.call(reqwest::Method::POST, "/_stand-in/submit", &body).await;
+        answer["submission"].as_u64().unwrap()
+    }
+
+    /// Cancels as the web page does: no message is sent.
+    pub async fn cancel(&self, pk: u64) {
+        let path = format!("/api/jobs/challenges/1/submissions/{pk}/update_submission_meta/");
+        self.call(reqwest::Method::PATCH, &path, &json!({"status": "cancelled"}))
+            .await;
+    }
+
+    /// Resumes as the web page does.
+    pub async fn resume(&self, pk: u64) {
+        self.call(
+            reqwest::Method::POST,
+            &format!("/api/jobs/submissions/{pk}/resume/"),
+            &json!({}),
+        )
+        .await;
+    }
+
+    /// Its row.
+    pub fn submission(&self, pk: u64) -> Submission {
+        self.handle.state().submissions[&pk].clone()
+    }
+
+    /// The leaderboard's rows of a submission. Two of them are EvalAI's end of the world.
+    pub fn rows(&self, pk: u64) -> Vec<LeaderboardRow> {
+        let rows = self.handle.state().rows.into_values();
+        rows.filter(|row| row.submission == pk).collect()
+    }
+
+    /// What everybody sees on the leaderboard of a phase: its entries, best first.
+    pub async fn leaderboard(&self, phase: u64) -> Vec<Value> {
+        let path = format!("/api/jobs/challenge_phase_split/{phase}/leaderboard/");
+        let board = self.call(reqwest::Method::GET, &path, &Value::Null).await;
+        board["results"].as_array().unwrap().clone()
+    }
+
+    /// The text of a file that a submission's row names.
+    pub fn file(&self, path: Option<&String>) -> String {
+        let file = path.and_then(|path| self.handle.state().files.get(path).cloned());
+        String::from_utf8(file.unwrap_or_default()).unwrap()
+    }
+
+    /// What the operator has asked for, oldest first.
+    pub fn requests(&self) -> Vec<Entry> {
+        let all = self.handle.requests().into_iter();
+        all.filter(|entry| entry.token.as_deref() == Some(HOST_TOKEN)).collect()
+    }
+
+    /// The operator's PATCHes that say so, and PUTs of such results.
+    pub fn told(&self, method: &str, status: &str) -> usize {
+        self.requests()
+            .iter()
+            .filter(|entry| is_update(entry, method, status))
+            .count()
+    }
+
+    /// Waits until a submission has this status.
+    pub async fn await_status(&self, pk: u64, status: Status, limit: Duration) {
+        let reached = self
+            .handle
+            .wait_until(|state, _| state.submissions[&pk].status == status);
+        if timeout(limit, reached).await.is_err() {
+            let found = self.submission(pk).status.as_str();
+            panic!(
+                "EvalAI says {found} of submission {pk} after {} s, not {}",
+                limit.as_secs(),
+                status.as_str()
+            );
+        }
+    }
+
+    /// Waits until a PUT of finished results is being worked on that is younger than the request `after`; hands back its id.
+    pub async fn await_final_put(&self, after: u64, limit: Duration) -> u64 {
+        let mut found = 0;
+        let seen = self.handle.wait_until(|_, log| {
+            let open = |entry: &&Entry| entry.id > after && entry.answered.is_none();
+            let put = log
+                .entries()
+                .filter(open)
+                .find(|entry| is_update(entry, "PUT", "FINISHED"));
+            found = put.map_or(0, |entry| entry.id);
+            found > 0
+        });
+        let seen = timeout(limit, seen).await;
+        seen.unwrap_or_else(|_| panic!("no result is put within {} s", limit.as_secs()));
+        found
+    }
+}
+
+fn is_update(entry: &Entry, method: &str, status: &str) -> bool {
+    let said = entry.body.get("submission_status").and_then(Value::as_str);
+    entry.method == method && said.is_some_and(|said| said.eq_ignore_ascii_case(status))
+}

@@ -1,0 +1,113 @@
+//! The operator's programs as child processes of a test: each is limited to the test's namespace and has its own Lease, so
+//! that it can be killed, stopped and started again without anybody else's notice.
+
+use std::fs::File;
+use std::path::PathBuf;
+use std::process::{ExitStatus, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use tokio::process::{Child, Command};
+use tokio::time::timeout;
+
+use super::scene::Scene;
+
+/// What the programs log, unless `LEADERBOARD_TEST_LOG` says otherwise.
+const LOG: &str = "info,leaderboard_operator=debug";
+/// Name of each test's Lease, in its namespace.
+pub const LEASE: &str = "operator";
+
+/// A running program. It is killed when this is dropped.
+pub struct Process {
+    child: Child,
+    name: String,
+}
+
+/// Starts `leaderboard-operator controller`.
+pub fn controller(scene: &Scene) -> Process {
+    let arguments = [
+        "--image",
+        &scene.lab.image,
+        "--lease",
+        LEASE,
+        "--lease-namespace",
+        &scene.namespace,
+    ];
+    Process::start(scene, "controller", &arguments)
+}
+
+/// Starts `leaderboard-operator bridge`.
+pub fn bridge(scene: &Scene) -> Process {
+    Process::start(scene, "bridge", &[])
+}
+
+impl Process {
+    fn start(scene: &Scene, program: &str, arguments: &[&str]) -> Self {
+        static NUMBER: AtomicU32 = AtomicU32::new(1);
+        let name = format!("{program}-{}", NUMBER.fetch_add(1, Ordering::Relaxed));
+        let log = File::create(scene.logs.join(format!("{name}.log"))).unwrap();
+        // A killed test drops nothing; the kernel ends its children all the same.
+        let mut command = Command::new("setpriv");
+        command
+            .args(["--pdeathsig", "KILL"])
+            .arg(binary())
+            .arg(program)
+            .args(["--namespace", &scene.namespace, "--http", "127.0.0.1:0"])
+            .args(arguments)
+            .env("POD_NAME", &name)
+            // As in a cluster: what a Leaderboard names is all there is.
+            .env_remove("AWS_ENDPOINT_URL")
+            .env(
+                "RUST_LOG",
+                std::env::var("LEADERBOARD_TEST_LOG").as_deref().unwrap_or(LOG),
+            )
+            .stdin(Stdio::null())
+            .stdout(log.try_clone().unwrap())
+            .stderr(log)
+            .kill_on_drop(true);
+        let child = command
+            .spawn()
+            .unwrap_or_else(|error| panic!("{program} does not start: {error}"));
+        Self { child, name }
+    }
+
+    fn signal(&self, signal: Signal) {
+        let id = self.child.id().unwrap_or_else(|| panic!("{} has ended", self.name));
+        kill(Pid::from_raw(i32::try_from(id).unwrap()), signal).unwrap();
+    }
+
+    /// Kills it, as a lost node would, and waits for its end.
+    pub async fn kill(&mut self) {
+        assert!(
+            self.child.try_wait().unwrap().is_none(),
+            "{} had ended by itself",
+            self.name
+        );
+        self.child.kill().await.unwrap();
+    }
+
+    /// Stops it in mid-step; it believes that no time passes.
+    pub fn freeze(&self) {
+        self.signal(Signal::SIGSTOP);
+    }
+
+    /// Lets it go on.
+    pub fn thaw(&self) {
+        self.signal(Signal::SIGCONT);
+    }
+
+    /// Waits until it has ended by itself.
+    pub async fn ended(&mut self, limit: Duration) -> ExitStatus {
+        let ended = timeout(limit, self.child.wait()).await;
+        ended
+            .unwrap_or_else(|_| panic!("{} still runs after {} s", self.name, limit.as_secs()))
+            .unwrap()
+    }
+}
+
+fn binary() -> PathBuf {
+    let given = std::env::var_os("LEADERBOARD_OPERATOR_BIN");
+    given.map_or_else(|| env!("CARGO_BIN_EXE_leaderboard-operator").into(), PathBuf::from)
+}
