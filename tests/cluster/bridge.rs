@@ -69,13 +69,14 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         scene.cloud.set_visibility(3).await;
         let change = json!({
             "pairs": 2, "routes": 6,
-            // The first crash is the last: the agent crashes once in all.
             "retries": {"pair": 1},
+            // At every start: what it has left takes less time than a stop needs to reach it.
+            "agent": {"env": [{"name": "AGENT_KNOBS", "value": "pair=2,crash@3"}]},
         });
         scene.evalai_leaderboard("lb", &evalai, change).await;
         scene.gate.keep_back("AmazonSQS.DeleteMessage");
         let (_controller, _bridge) = (controller(scene), bridge(scene));
-        let pk = evalai.submit(&scene.lab.challenge("agent:crash-once"), 1).await;
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");
         scene.gate.await_kept_back(3 * TRIES, Duration::from_mins(1)).await;
 
@@ -95,6 +96,7 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         scene.gate.reopen();
         scene.cloud.await_messages([0, 0], Duration::from_mins(1)).await;
         evalai.await_status(pk, Status::Failed, Duration::from_secs(30)).await;
+        scene.change_leaderboard("lb", &json!({"agent": {"env": []}})).await;
         evalai.resume(pk).await;
         let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(2);
         scene
