@@ -13,7 +13,9 @@ use crate::scene::{Scene, is_true, scenario};
 #[tokio::test]
 async fn a_local_submission_runs_to_finished_with_the_expected_score() {
     scenario("local", async |scene: &Scene| {
-        scene.leaderboard("lb", json!({})).await;
+        // Slow enough that a busy machine's controller sees it run.
+        let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "1500"}]}});
+        scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.submit("first", "agent:standard").await;
         let submission = scene.settled("first", Duration::from_mins(3)).await;
