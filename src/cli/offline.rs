@@ -1,25 +1,31 @@
 //! Subcommands that need no cluster: `crd` and `results`.
 
-use std::fs;
-use std::io::Write as _;
+use std::fs::{self, File};
+use std::io::{ErrorKind, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
-use leaderboard_results::{Files, Format, Plan, offline};
+use leaderboard_results::{Files, Format, Plan, Refusal, Verify, offline};
 
+use crate::api::effective;
 use crate::crds;
 
 /// Exit code of a refusal: nothing that had been good is overwritten.
 const REFUSED: u8 = 2;
+/// One byte more than the largest checkpoint, so that a larger one is known as such without being read.
+const READ_LIMIT: u64 = (64 << 20) + 1;
 
 /// Prints both definitions as one YAML stream.
 pub(super) fn print_crds() -> ExitCode {
-    match crds::all() {
-        Ok(text) => {
-            print!("{text}");
-            ExitCode::SUCCESS
+    let printed = crds::all().map_err(|error| error.to_string()).and_then(|text| {
+        match std::io::stdout().write_all(text.as_bytes()) {
+            Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error.to_string()),
+            _ => Ok(()),
         }
+    });
+    match printed {
+        Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("leaderboard-operator: {error}");
             ExitCode::FAILURE
@@ -33,7 +39,17 @@ enum FormatName {
     V2,
 }
 
+#[derive(ValueEnum, Clone, Copy, Debug)]
+enum VerifyName {
+    Off,
+    Warn,
+    Refuse,
+}
+
 /// Merges the checkpoint files of the workers and renders what EvalAI gets.
+///
+/// Exit code 0: the four files are written. 2: the files or the arguments are refused. 1: something can't be read or
+/// written. Unless it is 0, what had been in the folder is still there.
 #[derive(Args, Debug)]
 pub(super) struct Results {
     /// Format of the checkpoints.
@@ -49,110 +65,201 @@ pub(super) struct Results {
     #[arg(long, requires = "workers")]
     routes: Option<u32>,
     /// How often each route was driven; default 5 in V1, 1 in V2.
-    #[arg(long)]
+    #[arg(long, requires = "workers")]
     repetitions: Option<u32>,
     /// Decide as the original does, its mistakes included.
     #[arg(long)]
     as_original: bool,
+    /// What to do about scores that do not follow from the infractions.
+    #[arg(long, value_enum, default_value = "warn")]
+    verify: VerifyName,
     /// The workers' files in order; an absent file is a worker without results.
     #[arg(required = true)]
     inputs: Vec<PathBuf>,
 }
 
+/// Why there are no new files.
+#[derive(thiserror::Error, Debug)]
+enum Failure {
+    #[error("{0}. {next}", next = .0.next_step())]
+    Refused(#[from] Refusal),
+    #[error("{0}")]
+    Arguments(String),
+    #[error("{} can't be {what}: {error}", .path.display())]
+    File {
+        path: PathBuf,
+        what: &'static str,
+        error: std::io::Error,
+    },
+}
+
+impl Failure {
+    fn exit_code(&self) -> ExitCode {
+        match self {
+            Self::Refused(_) | Self::Arguments(_) => ExitCode::from(REFUSED),
+            Self::File { .. } => ExitCode::FAILURE,
+        }
+    }
+}
+
 impl Results {
-    /// Exit code 0, or 2 with the reason on stderr.
     pub(super) fn run(self) -> ExitCode {
         match self.merge() {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(message) => {
-                eprintln!("leaderboard-operator results: {message}");
-                ExitCode::from(REFUSED)
+            Ok(summary) => {
+                // Nobody has to listen.
+                let _ = writeln!(std::io::stdout(), "{summary}");
+                ExitCode::SUCCESS
+            }
+            Err(failure) => {
+                eprintln!("leaderboard-operator results: {failure}");
+                failure.exit_code()
             }
         }
     }
 
-    fn merge(&self) -> Result<(), String> {
+    fn merge(&self) -> Result<String, Failure> {
         let plan = self.plan()?;
         let inputs = self
             .inputs
             .iter()
             .map(|path| read(path))
             .collect::<Result<Vec<_>, _>>()?;
-        let (merged, files) = offline(&plan, &inputs).map_err(|r| format!("{r}. {}", r.next_step()))?;
+        let (merged, files) = offline(&plan, &inputs)?;
         write_all(&self.out, &merged.text, &files)?;
         for warning in &merged.warnings {
             eprintln!("warning: {warning}");
         }
         let state = if merged.is_final { "final" } else { "not final" };
-        println!(
-            "{} of {} routes, {}, {state}",
-            merged.done, merged.total, merged.entry_status
-        );
-        Ok(())
+        let (done, total, status) = (merged.done, merged.total, &merged.entry_status);
+        Ok(format!("{done} of {total} routes, {status}, {state}"))
     }
 
-    fn plan(&self) -> Result<Plan, String> {
+    fn plan(&self) -> Result<Plan, Failure> {
         let format = match self.format {
             FormatName::V1 => Format::V1,
             FormatName::V2 => Format::V2,
         };
-        let mut plan = Plan {
+        let verify = match self.verify {
+            VerifyName::Off => Verify::Off,
+            VerifyName::Warn => Verify::Warn,
+            VerifyName::Refuse => Verify::Refuse,
+        };
+        let plan = Plan {
             as_original: self.as_original,
+            verify,
             ..Plan::lenient(format)
         };
-        if let (Some(workers), Some(routes)) = (self.workers, self.routes) {
-            if workers != self.inputs.len() {
-                return Err(format!(
-                    "--workers {workers}, but {} files are named; name absent ones too",
-                    self.inputs.len()
-                ));
-            }
-            let routes_in_all = usize::try_from(routes).map_err(|e| e.to_string())?;
-            plan.pairs = crate::api::effective::slices(routes_in_all, workers)
-                .iter()
-                .filter_map(|slice| crate::api::effective::slice_bounds(slice))
-                .map(|(first, last)| leaderboard_results::Slice { first, last })
-                .collect();
-            plan.routes = routes;
-            plan.repetitions = self.repetitions.unwrap_or(match format {
-                Format::V1 => 5,
-                Format::V2 => 1,
-            });
+        let (Some(workers), Some(routes)) = (self.workers, self.routes) else {
+            return Ok(plan);
+        };
+        if workers != self.inputs.len() {
+            let files = self.inputs.len();
+            let words = format!("--workers {workers}, but {files} files are named; name absent ones too");
+            return Err(Failure::Arguments(words));
         }
+        let routes_in_all = usize::try_from(routes).unwrap_or(usize::MAX);
+        if workers > routes_in_all {
+            let words = format!("--routes {routes} can't be shared out over {workers} workers: some would have none");
+            return Err(Failure::Arguments(words));
+        }
+        let usual = match format {
+            Format::V1 => 5,
+            Format::V2 => 1,
+        };
+        let plan = Plan {
+            pairs: effective::slices(routes_in_all, workers)
+                .iter()
+                .filter_map(|slice| effective::slice_bounds(slice))
+                .map(|(first, last)| leaderboard_results::Slice { first, last })
+                .collect(),
+            routes,
+            repetitions: self.repetitions.unwrap_or(usual),
+            ..plan
+        };
+        plan.check()?;
         Ok(plan)
     }
 }
 
-fn read(path: &Path) -> Result<Option<Vec<u8>>, String> {
-    match fs::read(path) {
+fn read(path: &Path) -> Result<Option<Vec<u8>>, Failure> {
+    let bytes = File::open(path).and_then(|file| {
+        let mut bytes = Vec::new();
+        file.take(READ_LIMIT).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    });
+    match bytes {
         Ok(bytes) => Ok(Some(bytes)),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+        Err(error) if error.kind() == ErrorKind::NotFound => {
             eprintln!("{} is absent: that worker has no results", path.display());
             Ok(None)
         }
-        Err(error) => Err(format!("{} cannot be read: {error}", path.display())),
+        Err(error) => Err(failed(path, "read", error)),
     }
 }
 
-fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), String> {
-    fs::create_dir_all(out).map_err(|e| format!("{} cannot be made: {e}", out.display()))?;
-    put(out, "agent_results.json", merged)?;
-    put(out, "results.json", &files.results_json)?;
-    put(out, "stdout.txt", &files.stdout_txt)?;
-    files
-        .metadata_json
-        .as_deref()
-        .map_or(Ok(()), |text| put(out, "metadata.json", text))
+fn failed(path: &Path, what: &'static str, error: std::io::Error) -> Failure {
+    Failure::File {
+        path: path.to_owned(),
+        what,
+        error,
+    }
 }
 
-/// Under another name first, so that a full disk leaves the older file whole.
-fn put(out: &Path, name: &str, text: &str) -> Result<(), String> {
-    let (target, part) = (out.join(name), out.join(format!(".{name}.part")));
-    let write = || -> std::io::Result<()> {
-        let mut file = fs::File::create(&part)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()?;
-        fs::rename(&part, &target)
+/// All files or none: each is written under another name, and only when all of them are on the disk do they take their
+/// places.
+fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
+    fs::create_dir_all(out).map_err(|error| failed(out, "made", error))?;
+    let mut texts = vec![
+        ("agent_results.json", merged),
+        ("results.json", files.results_json.as_str()),
+        ("stdout.txt", files.stdout_txt.as_str()),
+    ];
+    texts.extend(files.metadata_json.as_deref().map(|text| ("metadata.json", text)));
+    let places: Vec<Place> = texts.iter().map(|(name, _)| Place::of(out, name)).collect();
+    let put = || {
+        for (place, (_, text)) in places.iter().zip(&texts) {
+            place.stage(text)?;
+        }
+        places.iter().try_for_each(Place::take)
     };
-    write().map_err(|e| format!("{} cannot be written: {e}", target.display()))
+    let done = put();
+    if done.is_err() {
+        for place in &places {
+            // What is left of the attempt; most of it may not be there.
+            let _ = fs::remove_file(&place.staged);
+        }
+    }
+    done
+}
+
+/// Where a file goes, and where it waits until the others are ready.
+struct Place {
+    target: PathBuf,
+    staged: PathBuf,
+}
+
+impl Place {
+    fn of(out: &Path, name: &str) -> Self {
+        Self {
+            target: out.join(name),
+            staged: out.join(format!(".{name}.{}", std::process::id())),
+        }
+    }
+
+    fn stage(&self, text: &str) -> Result<(), Failure> {
+        let write = || {
+            // The one thing a rename does not replace.
+            if self.target.is_dir() {
+                return Err(ErrorKind::IsADirectory.into());
+            }
+            let mut file = File::create_new(&self.staged)?;
+            file.write_all(text.as_bytes())?;
+            file.sync_all()
+        };
+        write().map_err(|error| failed(&self.target, "written", error))
+    }
+
+    fn take(&self) -> Result<(), Failure> {
+        fs::rename(&self.staged, &self.target).map_err(|error| failed(&self.target, "written", error))
+    }
 }

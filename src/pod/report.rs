@@ -43,7 +43,7 @@ pub struct Report {
     pub is_final: bool,
     /// Whether the results count.
     pub eligible: bool,
-    /// `entry_status` of the merged file.
+    /// `entry_status` of the merged file; `Crashed` and `Rejected` for V1 as well, which has no entry status for them.
     pub entry_status: String,
     /// Which stop was obeyed, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]

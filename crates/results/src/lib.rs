@@ -26,16 +26,18 @@ mod plan;
 mod refusal;
 mod render;
 mod statistics;
+mod verdict;
 mod verify;
 
 pub use checkpoint::{Checkpoint, read_worker};
 pub use json::Limit;
-pub use merge::{Merged, Outcome, PairProgress, merge};
+pub use merge::{Merged, PairProgress, merge};
 pub use names::{Metric, Score, Source, metrics};
 pub use number::number_text;
 pub use plan::{Format, Plan, Slice, Strictness, Verify};
 pub use refusal::{RecordName, RecordProblem, Refusal};
 pub use render::{Files, render};
+pub use verdict::Outcome;
 
 /// Reads, merges and renders the workers' files in one go, as a command on a person's machine does.
 ///

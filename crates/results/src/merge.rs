@@ -3,37 +3,11 @@
 
 use crate::checkpoint::{Checkpoint, Record};
 use crate::json::{KeyOrder, Node, Object, Text, write};
-use crate::names::{self, SENSORS_INVALID, SIMULATION_CRASHED, STARTED, Score};
+use crate::names::{self, STARTED, Score};
 use crate::number::{Number, count};
 use crate::statistics::{self, Global};
-use crate::{Format, Plan, RecordName, Refusal, Slice};
-
-/// How a run ended, whatever the format calls it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Outcome {
-    /// Routes are missing.
-    Running,
-    /// All routes were driven and count.
-    Finished,
-    /// A simulator crashed; the results do not count.
-    Crashed,
-    /// The agent asked for sensors it may not have; the results do not count.
-    Rejected,
-    /// The results contradict themselves; they do not count.
-    Invalid,
-}
-
-impl Outcome {
-    /// Why the results do not count, as one sentence; `None` when they do or may still.
-    pub fn why_not(self) -> Option<&'static str> {
-        match self {
-            Self::Running | Self::Finished => None,
-            Self::Crashed => Some("The simulation crashed in at least one route."),
-            Self::Rejected => Some("The agent's sensors were invalid."),
-            Self::Invalid => Some("The results name no sensors, or hold a route that was never finished."),
-        }
-    }
-}
+use crate::verdict::Verdict;
+use crate::{Format, Outcome, Plan, RecordName, Refusal, Slice};
 
 /// How far one pair is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -91,28 +65,27 @@ pub(crate) struct Line {
     pub(crate) system: Number,
 }
 
+impl Merged {
+    /// The `entry_status`, or what V1 has no entry status for: `Crashed` and `Rejected` runs that do not count.
+    pub fn ended_as(&self) -> &str {
+        match self.outcome {
+            Outcome::Crashed => names::CRASHED,
+            Outcome::Rejected => names::REJECTED,
+            Outcome::Running | Outcome::Finished | Outcome::Invalid => &self.entry_status,
+        }
+    }
+}
+
 /// Merges what the workers have so far; `workers` in the order of the plan's pairs, `None` for one without a readable file.
 pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Refusal> {
-    plan.check()?;
-    if plan.decides() && plan.pairs.len() != workers.len() {
-        let problem = format!(
-            "it has {} pairs, but there are {} workers",
-            plan.pairs.len(),
-            workers.len()
-        );
-        return Err(Refusal::Plan { problem });
-    }
+    check_plan(plan, workers)?;
     let sensors = sensors(workers)?;
     let unsorted: Vec<&Record> = workers.iter().flatten().flat_map(|worker| &worker.records).collect();
     let mut sorted = unsorted.clone();
     sorted.sort_by_key(|record| record.key);
 
-    let done = u32::try_from(sorted.len()).unwrap_or(u32::MAX);
-    let promised = workers
-        .iter()
-        .flatten()
-        .fold(0, |sum: u32, worker| sum.saturating_add(worker.total));
-    let total = plan.expected().unwrap_or(promised);
+    let done = sum(workers, Checkpoint::done);
+    let total = plan.expected().unwrap_or_else(|| sum(workers, Checkpoint::total));
     let is_final = total != 0 && done == total && is_complete(plan, workers);
     if is_final {
         check_routes(plan, workers, &sorted)?;
@@ -132,17 +105,36 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
         score: global.as_ref().map(|global| global.mean(Score::Composed).as_f64()),
         partial_score: partial_score(&sorted),
         pairs: pairs(plan, workers),
-        warnings: workers
-            .iter()
-            .flatten()
-            .flat_map(|worker| worker.warnings.iter().cloned())
-            .collect(),
+        warnings: warnings(workers),
         view: View {
             sensors,
             routes: sorted.iter().map(|record| Line::of(record)).collect(),
             global,
         },
     })
+}
+
+fn check_plan(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<(), Refusal> {
+    plan.check()?;
+    let (pairs, files) = (plan.pairs.len(), workers.len());
+    if plan.decides() && pairs != files {
+        let problem = format!("it has {pairs} pairs, but there are {files} workers");
+        return Err(Refusal::Plan { problem });
+    }
+    Ok(())
+}
+
+fn sum(workers: &[Option<&Checkpoint>], of: fn(&Checkpoint) -> u32) -> u32 {
+    workers
+        .iter()
+        .flatten()
+        .map(|worker| of(worker))
+        .fold(0, u32::saturating_add)
+}
+
+fn warnings(workers: &[Option<&Checkpoint>]) -> Vec<String> {
+    let all = workers.iter().flatten().flat_map(|worker| worker.warnings());
+    all.cloned().collect()
 }
 
 impl Line {
@@ -268,73 +260,6 @@ fn global(plan: &Plan, unsorted: &[&Record], sorted: &[&Record]) -> Result<Globa
     Ok(global)
 }
 
-struct Verdict {
-    entry_status: &'static str,
-    eligible: bool,
-    outcome: Outcome,
-}
-
-impl Verdict {
-    fn of(plan: &Plan, sorted: &[&Record], sensors: &[Text], is_final: bool) -> Self {
-        if !is_final {
-            return Self {
-                entry_status: STARTED,
-                eligible: false,
-                outcome: Outcome::Running,
-            };
-        }
-        match plan.format {
-            Format::V1 => Self::v1(sorted, plan.as_original),
-            Format::V2 => Self::v2(sorted, sensors),
-        }
-    }
-
-    /// The original lets results count although a simulator crashed.
-    fn v1(sorted: &[&Record], as_original: bool) -> Self {
-        let any = |part| sorted.iter().any(|record| record.status.contains(part));
-        let entry_status = if any("Agent") {
-            "Finished with agent errors"
-        } else {
-            "Finished"
-        };
-        let crashed = any(SIMULATION_CRASHED) && !as_original;
-        let outcome = if crashed { Outcome::Crashed } else { Outcome::Finished };
-        Self {
-            entry_status,
-            eligible: !crashed,
-            outcome,
-        }
-    }
-
-    /// The last route that tells of a crash or of wrong sensors decides, as in the original.
-    fn v2(sorted: &[&Record], sensors: &[Text]) -> Self {
-        let telling = sorted.iter().rev().find_map(|record| {
-            if record.status.contains(SIMULATION_CRASHED) {
-                Some(Outcome::Crashed)
-            } else {
-                record.status.contains(SENSORS_INVALID).then_some(Outcome::Rejected)
-            }
-        });
-        let is_invalid = sensors.is_empty() || sorted.iter().any(|record| record.status == STARTED);
-        let outcome = if is_invalid {
-            Outcome::Invalid
-        } else {
-            telling.unwrap_or(Outcome::Finished)
-        };
-        let entry_status = match outcome {
-            Outcome::Invalid => "Invalid",
-            Outcome::Crashed => "Crashed",
-            Outcome::Rejected => "Rejected",
-            Outcome::Running | Outcome::Finished => "Finished",
-        };
-        Self {
-            entry_status,
-            eligible: outcome == Outcome::Finished,
-            outcome,
-        }
-    }
-}
-
 fn partial_score(records: &[&Record]) -> Option<f64> {
     let sum = records
         .iter()
@@ -390,19 +315,18 @@ fn text(
     write(&file, order)
 }
 
+/// The keys of a V2 record, in their order.
+const V2_KEYS: [&str; 6] = ["route_id", "status", "num_infractions", "infractions", "scores", "meta"];
+
 /// The record as it was read, with its index in the merged file. V2 also fills in what is missing and puts the known keys
 /// first.
 fn record_node(format: Format, index: u32, object: &Object) -> Node<'_> {
-    let index = ("index".as_bytes(), Node::int(index));
-    let mut entries = match format {
-        Format::V1 => vec![index],
-        Format::V2 => {
-            let known = v2_defaults()
-                .into_iter()
-                .map(|(key, default)| (key.as_bytes(), object.get(key).map_or(default, Node::Value)));
-            std::iter::once(index).chain(known).collect()
-        }
-    };
+    let mut entries = Vec::with_capacity(object.len() + 1);
+    entries.push(("index".as_bytes(), Node::int(index)));
+    if format == Format::V2 {
+        let value = |key| object.get(key).map_or_else(|| v2_default(key), Node::Value);
+        entries.extend(V2_KEYS.map(|key| (key.as_bytes(), value(key))));
+    }
     let known = entries.len();
     for (key, value) in object.iter() {
         if entries.iter().take(known).all(|(k, _)| *k != key.as_bytes()) {
@@ -412,32 +336,17 @@ fn record_node(format: Format, index: u32, object: &Object) -> Node<'_> {
     Node::Object(entries)
 }
 
-fn v2_defaults() -> [(&'static str, Node<'static>); 6] {
-    let zero = || Node::Number(Number::ZERO);
-    let empty = names::infractions(Format::V2)
-        .iter()
-        .map(|key| (key.as_bytes(), Node::List(Vec::new())))
-        .collect();
-    [
-        ("route_id", Node::Value(&crate::json::Value::Null)),
-        ("status", Node::Str(STARTED)),
-        ("num_infractions", zero()),
-        ("infractions", Node::Object(empty)),
-        (
-            "scores",
-            Node::object([
-                ("score_route", zero()),
-                ("score_penalty", zero()),
-                ("score_composed", zero()),
-            ]),
-        ),
-        (
-            "meta",
-            Node::object([
-                ("route_length", zero()),
-                ("duration_game", zero()),
-                ("duration_system", zero()),
-            ]),
-        ),
-    ]
+fn v2_default(key: &str) -> Node<'static> {
+    let zeros = |keys: [&'static str; 3]| Node::object(keys.map(|key| (key, Node::int(0))));
+    match key {
+        "status" => Node::Str(STARTED),
+        "num_infractions" => Node::int(0),
+        "infractions" => {
+            let names = names::infractions(Format::V2).iter();
+            Node::Object(names.map(|key| (key.as_bytes(), Node::List(Vec::new()))).collect())
+        }
+        "scores" => zeros(["score_route", "score_penalty", "score_composed"]),
+        "meta" => zeros(["route_length", "duration_game", "duration_system"]),
+        _ => Node::Value(&crate::json::Value::Null),
+    }
 }

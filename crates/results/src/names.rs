@@ -196,6 +196,10 @@ pub fn metrics(format: Format) -> &'static [Metric] {
     }
 }
 
+/// The entry status of a file whose last route ended with a crashed simulator.
+pub(crate) const CRASHED: &str = "Crashed";
+/// The entry status of a run whose agent asked for sensors it may not have.
+pub(crate) const REJECTED: &str = "Rejected";
 /// Part of a status that tells a crashed simulator.
 pub(crate) const SIMULATION_CRASHED: &str = "Simulation crashed";
 /// Part of a status that tells forbidden sensors.

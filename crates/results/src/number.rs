@@ -95,19 +95,29 @@ pub(crate) fn square(x: f64) -> Option<f64> {
 /// A float as Python's `repr` writes it: the shortest digits that read back the same, an exponent below 1e-4 and from
 /// 1e16 on, `nan` and `inf` in small letters.
 pub fn number_text(x: f64) -> String {
+    let mut text = String::new();
+    push_number(&mut text, x);
+    text
+}
+
+/// [`number_text`] at the end of another text.
+pub(crate) fn push_number(out: &mut String, x: f64) {
     if x.is_nan() {
-        return "nan".to_owned();
+        return out.push_str("nan");
     }
     if x.is_infinite() {
-        return if x > 0.0 { "inf" } else { "-inf" }.to_owned();
+        return out.push_str(if x > 0.0 { "inf" } else { "-inf" });
     }
     let mut buffer = ryu::Buffer::new();
-    let (sign, unsigned) = match buffer.format_finite(x) {
-        text if text.starts_with('-') => ("-", text.get(1..).unwrap_or_default()),
-        text => ("", text),
-    };
+    let text = buffer.format_finite(x);
+    // Where both write no exponent they write the same.
+    if x == 0.0 || (1e-4..1e16).contains(&x.abs()) {
+        return out.push_str(text);
+    }
+    let (sign, unsigned) = text.strip_prefix('-').map_or(("", text), |unsigned| ("-", unsigned));
     let (digits, point) = decimal(unsigned);
-    format!("{sign}{}", layout(&digits, point))
+    out.push_str(sign);
+    out.push_str(&layout(&digits, point));
 }
 
 /// The digits without leading or trailing zeros, and where the point stands: `0.` digits `* 10^point`.
@@ -121,27 +131,13 @@ fn decimal(text: &str) -> (String, i32) {
     (digits.trim_end_matches('0').to_owned(), point)
 }
 
+/// With an exponent of two digits or more.
 fn layout(digits: &str, point: i32) -> String {
-    if digits.is_empty() {
-        return "0.0".to_owned();
-    }
+    let (first, rest) = digits.split_at_checked(1).unwrap_or(("0", ""));
+    let dot = if rest.is_empty() { "" } else { "." };
     let exponent = point - 1;
-    if !(-4..16).contains(&exponent) {
-        let (first, rest) = digits.split_at(1);
-        let dot = if rest.is_empty() { "" } else { "." };
-        let sign = if exponent < 0 { '-' } else { '+' };
-        return format!("{first}{dot}{rest}e{sign}{:02}", exponent.unsigned_abs());
-    }
-    let zeros = |n: i32| "0".repeat(usize::try_from(n).unwrap_or(0));
-    let length = i32::try_from(digits.len()).unwrap_or(0);
-    if point <= 0 {
-        format!("0.{}{digits}", zeros(-point))
-    } else if point >= length {
-        format!("{digits}{}.0", zeros(point - length))
-    } else {
-        let (whole, fraction) = digits.split_at(usize::try_from(point).unwrap_or(0));
-        format!("{whole}.{fraction}")
-    }
+    let sign = if exponent < 0 { '-' } else { '+' };
+    format!("{first}{dot}{rest}e{sign}{:02}", exponent.unsigned_abs())
 }
 
 #[cfg(test)]
@@ -212,9 +208,19 @@ mod tests {
 
     proptest! {
         #[test]
-        fn texts_read_back_the_same(bits in any::<u64>()) {
-            let x = f64::from_bits(bits);
+        fn texts_read_back_the_same(bits in any::<u64>(), common in -1e17..1e17_f64, pick in 0..3) {
+            let x = match pick {
+                0 => f64::from_bits(bits),
+                1 => common,
+                _ => common / 1e19,
+            };
+            let bits = x.to_bits();
             prop_assume!(x.is_finite());
+            let exponent = format!("{x:e}").split_once('e').map(|(_, exponent)| exponent.parse::<i32>());
+            prop_assert_eq!(
+                number_text(x).contains('e'),
+                x != 0.0 && exponent.is_some_and(|e| e.is_ok_and(|e| !(-4..16).contains(&e)))
+            );
             let text = number_text(x);
             prop_assert_eq!(text.parse::<f64>().map(f64::to_bits), Ok(bits));
             prop_assert!(text.contains(['.', 'e']));

@@ -247,18 +247,12 @@ pub enum RecordProblem {
         /// What follows from its scores.
         expected: f64,
     },
-    /// The penalty is not that of the infractions.
-    #[error("score_penalty is {}, but its infractions make it {}", number_text(*.found), number_text(*.expected))]
+    /// The penalty is better than the infractions allow.
+    #[error("score_penalty is {}, but its infractions allow {} at most", number_text(*.found), number_text(*.allowed))]
     Penalty {
         /// What the record says.
         found: f64,
-        /// The nearest value that follows from its infractions.
-        expected: f64,
-    },
-    /// An infraction message without the number its penalty needs.
-    #[error("a message of {infraction} does not tell its percentage")]
-    Percentage {
-        /// The infraction.
-        infraction: &'static str,
+        /// The most that follows from its infractions.
+        allowed: f64,
     },
 }

@@ -1,17 +1,17 @@
 //! Whether the scores of a record follow from its infractions. The agent runs in the process that computes its score, so
 //! this is the cheap answer to an edited file; it does not see an infraction that was removed together with its penalty.
 //! Pure; called by the checkpoint reader.
-
-use std::ops::RangeInclusive;
+//!
+//! Told is only what makes a score better than it can be. A lower penalty is nobody's gain, and forks have more to punish.
 
 use crate::checkpoint::Record;
 use crate::json::Value;
-use crate::names::{MIN_SPEED, OFF_ROAD};
+use crate::names::MIN_SPEED;
 use crate::number::{Number, count, round};
 use crate::{Format, RecordProblem};
 
-/// Percentages in messages are rounded to two digits.
-const PERCENTAGE_ERROR: f64 = 0.0051;
+/// Where the three scores are rounded, each on its own, their product is off by up to this.
+const PRODUCT_ERROR: f64 = 1e-4;
 
 /// Refuses a record whose driving score or penalty does not follow from the rest of it.
 pub(crate) fn check(format: Format, record: &Record) -> Result<(), RecordProblem> {
@@ -23,9 +23,7 @@ pub(crate) fn check(format: Format, record: &Record) -> Result<(), RecordProblem
     }
     let product = route * penalty;
     let expected = if product < 0.0 { 0.0 } else { product };
-    // V2 rounds all three to six digits, each on its own.
-    let tolerance = if format == Format::V2 { 1e-4 } else { 1e-6 };
-    if is_beyond((composed - expected).abs(), tolerance) {
+    if is_beyond((composed - expected).abs(), PRODUCT_ERROR) {
         let expected = round(expected, 6);
         return Err(RecordProblem::Composed {
             found: composed,
@@ -36,26 +34,23 @@ pub(crate) fn check(format: Format, record: &Record) -> Result<(), RecordProblem
 }
 
 fn check_penalty(format: Format, record: &Record, penalty: f64) -> Result<(), RecordProblem> {
-    let events = Events::of(record);
-    let formulas = match format {
-        Format::V1 => vec![events.product(&V1_FACTORS)?],
-        Format::V2 => vec![events.product(&V2_FACTORS)?, events.harmonic()?],
+    let events = Events { record };
+    let (allowed, rounding) = match format {
+        Format::V1 => (events.product(&V1_FACTORS, 0.0), 1e-9),
+        // 2.0 and 2.1 write the same format, each with a formula of its own.
+        Format::V2 => {
+            let (old, new) = (events.product(&V2_FACTORS, V2_SPEED), events.harmonic());
+            (if old > new { old } else { new }, 1e-6)
+        }
     };
-    let slack = if format == Format::V2 { 1e-6 } else { 1e-9 };
-    let off = |range: &RangeInclusive<f64>| {
-        let below = range.start() - penalty;
-        let above = penalty - range.end();
-        if below > above { below } else { above }
-    };
-    let nearest = formulas.into_iter().min_by(|a, b| off(a).total_cmp(&off(b)));
-    let Some(range) = nearest.filter(|range| is_beyond(off(range), slack)) else {
-        return Ok(());
-    };
-    let expected = round(f64::midpoint(*range.start(), *range.end()), 6);
-    Err(RecordProblem::Penalty {
-        found: penalty,
-        expected,
-    })
+    if is_beyond(penalty - allowed, rounding) {
+        let allowed = round(allowed, 6);
+        return Err(RecordProblem::Penalty {
+            found: penalty,
+            allowed,
+        });
+    }
+    Ok(())
 }
 
 /// NaN is beyond everything.
@@ -72,7 +67,7 @@ const V1_FACTORS: [(&str, f64); 5] = [
     ("stop_infraction", 0.8),
 ];
 
-/// The same for 2.0; slow driving costs up to 0.3 on top.
+/// The same for 2.0.
 const V2_FACTORS: [(&str, f64); 7] = [
     ("collisions_pedestrian", 0.5),
     ("collisions_vehicle", 0.6),
@@ -82,8 +77,10 @@ const V2_FACTORS: [(&str, f64); 7] = [
     ("scenario_timeouts", 0.7),
     ("yield_emergency_vehicle_infractions", 0.7),
 ];
+/// Driving at twice the speed of the traffic raises the penalty by so much in 2.0.
+const V2_SPEED: f64 = 0.3;
 
-/// What each infraction adds to the divisor in 2.1; slow driving adds up to 0.4.
+/// What each infraction adds to the divisor in 2.1.
 const V21_COEFFICIENTS: [(&str, f64); 7] = [
     ("collisions_pedestrian", 1.0),
     ("collisions_vehicle", 0.7),
@@ -93,75 +90,62 @@ const V21_COEFFICIENTS: [(&str, f64); 7] = [
     ("scenario_timeouts", 0.4),
     ("yield_emergency_vehicle_infractions", 0.4),
 ];
+/// Driving at twice the speed of the traffic takes so much from the divisor in 2.1.
+const V21_SPEED: f64 = 0.4;
 
 /// The infraction messages of a record.
+///
+/// Those with a percentage, driving off the road and slow driving, can only take from the penalty, and the percentage is
+/// rounded, missing in some forks and without effect in others: they are counted as taking nothing. Fast driving is the
+/// one thing that gives.
 struct Events<'a> {
     record: &'a Record,
 }
 
 impl<'a> Events<'a> {
-    fn of(record: &'a Record) -> Self {
-        Self { record }
-    }
-
-    fn messages(&self, infraction: &str) -> &'a [Value] {
+    /// The messages an evaluator can have written: plain ASCII. Others are somebody's additions and cost nothing.
+    fn messages(&self, infraction: &str) -> impl Iterator<Item = &'a str> {
         let all = self.record.object.get("infractions").and_then(Value::as_object);
-        all.and_then(|all| all.get(infraction))
+        let list = all
+            .and_then(|all| all.get(infraction))
             .and_then(Value::as_list)
-            .unwrap_or_default()
+            .unwrap_or_default();
+        let is_plain = |text: &&str| text.bytes().all(|byte| (b' '..=b'~').contains(&byte));
+        list.iter().filter_map(Value::as_str).filter(is_plain)
     }
 
     fn count(&self, infraction: &str) -> f64 {
-        count(self.messages(infraction).len())
+        count(self.messages(infraction).count())
     }
 
-    /// The number in front of the `%` of each message.
-    fn percentages(&self, infraction: &'static str) -> Result<Vec<f64>, RecordProblem> {
-        let percentage = |message: &Value| {
-            let before = message.as_str()?.split_once('%')?.0;
-            let number = before.rsplit([' ', '(']).next()?;
-            number.parse::<f64>().ok().filter(|p| p.is_finite())
+    /// By how much each message of the speed is above that of the traffic: 1 is twice as fast.
+    fn faster(&self) -> impl Iterator<Item = f64> {
+        let percentage = |message: &str| {
+            let before = message.split_once('%')?.0;
+            before.rsplit([' ', '(']).next()?.parse::<f64>().ok()
         };
-        let all = self
-            .messages(infraction)
-            .iter()
-            .map(percentage)
-            .collect::<Option<Vec<f64>>>();
-        all.ok_or(RecordProblem::Percentage { infraction })
+        self.messages(MIN_SPEED)
+            .filter_map(percentage)
+            .map(|p| p / 100.0 - 1.0)
+            .filter(|above| *above > 0.0 && above.is_finite())
     }
 
-    /// 1.0 and 2.0: factors multiplied. Between the least and the most the rounded percentages allow.
-    fn product(&self, factors: &[(&str, f64)]) -> Result<RangeInclusive<f64>, RecordProblem> {
-        let mut fixed = 1.0;
-        for (infraction, factor) in factors {
-            fixed *= factor.powf(self.count(infraction));
-        }
-        for p in self.percentages(MIN_SPEED)? {
-            fixed *= 1.0 - 0.3 * (1.0 - p / 100.0);
-        }
-        let (low, high) = self.off_road()?;
-        Ok(fixed * low..=fixed * high)
+    /// 1.0 and 2.0: factors multiplied, and `speed` for driving twice as fast as the traffic.
+    fn product(&self, factors: &[(&str, f64)], speed: f64) -> f64 {
+        let fixed = factors
+            .iter()
+            .fold(1.0, |product, (name, factor)| product * factor.powf(self.count(name)));
+        self.faster()
+            .fold(fixed, |product, above| product * (1.0 + speed * above))
     }
 
     /// 2.1: one over one plus the sum.
-    fn harmonic(&self) -> Result<RangeInclusive<f64>, RecordProblem> {
-        let mut sum = 0.0;
-        for (infraction, coefficient) in V21_COEFFICIENTS {
-            sum += coefficient * self.count(infraction);
-        }
-        for p in self.percentages(MIN_SPEED)? {
-            sum += 0.4 * (1.0 - p / 100.0);
-        }
-        let (low, high) = self.off_road()?;
-        Ok(low / (1.0 + sum)..=high / (1.0 + sum))
-    }
-
-    fn off_road(&self) -> Result<(f64, f64), RecordProblem> {
-        let (mut low, mut high) = (1.0, 1.0);
-        for p in self.percentages(OFF_ROAD)? {
-            low *= 1.0 - (p + PERCENTAGE_ERROR) / 100.0;
-            high *= 1.0 - (p - PERCENTAGE_ERROR) / 100.0;
-        }
-        Ok((low, high))
+    fn harmonic(&self) -> f64 {
+        let sum = V21_COEFFICIENTS
+            .iter()
+            .fold(1.0, |sum, (name, coefficient)| sum + coefficient * self.count(name));
+        let divisor = self.faster().fold(sum, |sum, above| sum - V21_SPEED * above);
+        // So fast that the formula has no sense any more.
+        if divisor > 0.0 { 1.0 / divisor } else { f64::INFINITY }
     }
 }

@@ -341,7 +341,7 @@ fn results_that_do_not_count_say_why() {
     assert_eq!(run(V1, crash, true), ("Finished".to_owned(), false, Outcome::Crashed));
     assert_eq!(
         run(V1, wrong, true),
-        ("Finished with agent errors".to_owned(), true, Outcome::Finished)
+        ("Finished with agent errors".to_owned(), false, Outcome::Rejected)
     );
     for outcome in [Outcome::Crashed, Outcome::Rejected, Outcome::Invalid] {
         assert!(outcome.why_not().is_some_and(|sentence| sentence.ends_with('.')));
@@ -349,16 +349,78 @@ fn results_that_do_not_count_say_why() {
     assert_eq!(Outcome::Finished.why_not(), None);
 }
 
-/// A worker whose simulator crashed in its last route has all its records, and is to repeat that route.
-#[test]
-fn a_worker_ends_with_its_own_global_record() {
-    let (plan, [a, mut b]) = two_pairs(V2);
-    b["_checkpoint"]["global_record"] = json!({"index": -1});
-    let result = merged(&plan, &[Some(a), Some(b)]).unwrap();
-    assert_eq!(
-        result.pairs.iter().map(|pair| pair.ended).collect::<Vec<_>>(),
-        [false, true]
+/// The file an evaluator leaves when its simulator crashes in its last route: no route is missing, and that one is repeated.
+fn crashed_at_the_end(format: Format) -> Value {
+    let mut worker = finished(
+        format,
+        &[
+            Drive::perfect(0),
+            Drive::perfect(1).status("Failed - Simulation crashed"),
+        ],
     );
+    worker["entry_status"] = json!("Crashed");
+    worker
+}
+
+#[test]
+fn a_crashed_last_route_is_not_finished_in_a_pod() {
+    for format in [V1, V2] {
+        let plan = pod(format, 1, &[(0, 1), (2, 4)]);
+        let worker = crashed_at_the_end(format);
+        let files = [Some(worker.clone()), Some(perfect(format, 2..=4))];
+        let result = merged(&plan, &files).unwrap();
+        assert_eq!((result.is_final, result.eligible, result.score), (false, false, None));
+        assert_eq!((result.done, result.total, result.outcome), (4, 5, Outcome::Running));
+        assert_eq!((result.pairs[0].done, result.pairs[1].done), (1, 3));
+        assert!(stdout(&plan, &result).contains("- Completed 4 out of the 5 routes\n"));
+        assert!(result.text.contains("Failed - Simulation crashed"), "people can see it");
+
+        let repeated = [Some(perfect(format, 0..=1)), files[1].clone()];
+        let result = merged(&plan, &repeated).unwrap();
+        assert_eq!((result.is_final, result.outcome), (true, Outcome::Finished));
+
+        // Whoever reads the files later has the last word of everybody.
+        let later = Plan {
+            strictness: leaderboard_results::Strictness::Offline,
+            ..plan.clone()
+        };
+        let result = merged(&later, &files).unwrap();
+        assert_eq!((result.is_final, result.outcome), (true, Outcome::Crashed));
+        assert_eq!(result.ended_as(), "Crashed");
+
+        // An evaluator that came to its end repeats nothing, whatever it calls it.
+        let mut ended = worker;
+        ended["_checkpoint"]["global_record"] = json!({"index": -1});
+        let result = merged(&plan, &[Some(ended), files[1].clone()]).unwrap();
+        assert_eq!((result.is_final, result.outcome), (true, Outcome::Crashed));
+        assert_eq!(
+            result.pairs.iter().map(|pair| pair.ended).collect::<Vec<_>>(),
+            [true, false]
+        );
+    }
+}
+
+#[test]
+fn v1_has_words_for_runs_that_do_not_count() {
+    let plan = pod(V1, 1, &[(0, 0)]);
+    for (status, word) in [
+        ("Failed - Simulation crashed", "Crashed"),
+        ("Failed - Agent's sensors were invalid", "Rejected"),
+        ("Failed - Agent crashed", "Finished with agent errors"),
+        ("Completed", "Finished"),
+    ] {
+        let result = merged(&plan, &[Some(finished(V1, &[Drive::perfect(0).status(status)]))]).unwrap();
+        assert_eq!(result.ended_as(), word);
+        let original = Plan {
+            as_original: true,
+            ..plan.clone()
+        };
+        assert!(
+            merged(&original, &[Some(finished(V1, &[Drive::perfect(0).status(status)]))])
+                .unwrap()
+                .eligible
+        );
+    }
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::fs;
 use std::path::Path;
 
 use common::{Drive, finished, pod, read};
-use leaderboard_results::{Format, Plan, Verify};
+use leaderboard_results::{Format, Plan, Verify, read_worker};
 
 const V1: Format = Format::V1;
 const V2: Format = Format::V2;
@@ -149,6 +149,7 @@ fn honest_records_pass() {
     for (format, drive) in &table {
         assert_eq!(said(*format, drive), None, "{format:?} {drive:?}");
     }
+    common::say(&format!("verify: {} honest records pass", table.len()));
 }
 
 #[test]
@@ -160,11 +161,11 @@ fn forged_records_are_told() {
             "pair 1, route RouteScenario_0_rep0: "
         }
     };
-    for (format, drive, words) in [
+    let table = [
         (
             V1,
             drive(100.0, 1.0, &[times("red_light", 1)]),
-            "score_penalty is 1.0, but its infractions make it 0.7",
+            "score_penalty is 1.0, but its infractions allow 0.7 at most",
         ),
         (
             V1,
@@ -173,38 +174,44 @@ fn forged_records_are_told() {
         ),
         (
             V1,
-            drive(100.0, 0.96, &[(OFF_ROAD, vec![off_road(9.0, 7.92)])]),
-            "score_penalty is 0.96, but",
-        ),
-        (
-            V1,
-            drive(100.0, 0.9, &[(OFF_ROAD, vec!["a b c d e f g h 9".to_owned()])]),
-            "does not tell its percentage",
+            drive(100.0, 0.9, &[times("red_light", 1), (SLOW, vec![slow(250.0)])]),
+            "score_penalty is 0.9, but its infractions allow 0.7 at most",
         ),
         (
             V2,
             drive(100.0, 1.0, &[times("collisions_vehicle", 3)]),
-            "score_penalty is 1.0, but",
+            "score_penalty is 1.0, but its infractions allow 0.322581 at most",
         ),
         (
             V2,
-            drive(100.0, 0.5, &[times("collisions_vehicle", 1)]),
-            "score_penalty is 0.5, but its infractions make it",
+            drive(100.0, 0.61, &[times("collisions_vehicle", 1)]),
+            "score_penalty is 0.61, but its infractions allow 0.6 at most",
         ),
         (
             V2,
-            drive(100.0, 0.9, &[]),
-            "score_penalty is 0.9, but its infractions make it 1.0",
+            drive(
+                100.0,
+                0.65,
+                &[times("collisions_vehicle", 1), (OFF_ROAD, vec![off_road(4.0, 3.88)])],
+            ),
+            "score_penalty is 0.65, but its infractions allow 0.6 at most",
         ),
         (
             V2,
-            drive(100.0, 1.0, &[(SLOW, vec!["slow".to_owned()])]),
-            "min_speed_infractions does not tell its percentage",
+            drive(50.0, 1.1, &[(SLOW, vec![slow(97.2)])]),
+            "score_penalty is 1.1, but its infractions allow 1.0 at most",
         ),
-    ] {
-        let said = said(format, &drive).unwrap_or_default();
-        assert!(said.starts_with(name(format)) && said.contains(words), "{said:?}");
+        (
+            V2,
+            drive(50.0, 1.2, &[(SLOW, vec![slow(129.0)])]),
+            "score_penalty is 1.2, but its infractions allow 1.131222 at most",
+        ),
+    ];
+    for (format, drive, words) in &table {
+        let said = said(*format, drive).unwrap_or_default();
+        assert!(said.starts_with(name(*format)) && said.contains(words), "{said:?}");
     }
+    common::say(&format!("verify: {} forged records are told", table.len()));
 }
 
 #[test]
@@ -224,63 +231,72 @@ fn a_driving_score_that_is_no_product_is_told() {
     }
 }
 
-/// The stored cases were invented without regard to this check, with two exceptions: penalties are the product of the fixed
-/// factors, and case41 has values of public files. So nothing is told but of invented percentages, of the cases that try
-/// number texts (25, 26) and odd messages (32, 34), and of one record of a fork that gives slow driving no penalty.
+/// Lower than the infractions ask for is nobody's gain: a percentage that counts, a fork that punishes more, a message that
+/// is not the evaluator's.
 #[test]
-fn normal_cases_pass_where_their_numbers_are_real() {
+fn what_is_no_gain_is_not_told() {
+    let foreign = vec!["Agent collided with “café” 车".to_owned()];
+    for (format, drive) in [
+        (V1, drive(100.0, 0.9208, &[(OFF_ROAD, vec![off_road(9.466, 7.92)])])),
+        (V2, drive(100.0, 0.5, &[times("collisions_vehicle", 1)])),
+        (V2, drive(100.0, 0.9, &[])),
+        (V2, drive(100.0, 1.0, &[(SLOW, vec!["slow".to_owned()])])),
+        (
+            V2,
+            drive(100.0, 0.7, &[times("red_light", 1), ("collisions_vehicle", foreign)]),
+        ),
+    ] {
+        assert_eq!(said(format, &drive), None, "{format:?} {drive:?}");
+    }
+}
+
+/// Every normal case is honest, and taken as such; but for case25, which tries number texts with scores that are no
+/// product in any of its records.
+#[test]
+fn normal_cases_are_honest() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cases");
-    let (mut passed, mut told) = (0, Vec::new());
-    for line in fs::read_to_string(root.join("index.tsv"))
-        .unwrap()
-        .lines()
-        .filter(|line| line.contains("\tnormal\t"))
-    {
+    let index = fs::read_to_string(root.join("index.tsv")).unwrap();
+    let (mut honest, mut records, mut told) = (0, 0, Vec::new());
+    for line in index.lines().filter(|line| line.contains("\tnormal\t")) {
         let columns: Vec<&str> = line.split('\t').collect();
         let format = if columns[0] == "v1" { V1 } else { V2 };
         let case = format!("{}/{}", columns[0], columns[1]);
+        let before = told.len();
         for pair in 1..=4 {
             let Ok(bytes) = fs::read(root.join(&case).join(format!("in{pair}.json"))) else {
                 continue;
             };
-            let Ok(file) = serde_json::from_slice::<serde_json::Value>(&bytes) else {
+            let warn = Plan {
+                verify: Verify::Warn,
+                ..Plan::lenient(format)
+            };
+            let Some(worker) = read_worker(&warn, pair - 1, &bytes).unwrap() else {
                 continue;
             };
-            for record in file["_checkpoint"]["records"].as_array().into_iter().flatten() {
-                let percentages =
-                    [OFF_ROAD, SLOW].map(|name| record["infractions"][name].as_array().map_or(0, Vec::len));
-                match warning(format, record) {
-                    None => passed += 1,
-                    Some(_) if percentages != [0, 0] && !case.ends_with("case41") => {}
-                    Some(warning) => told.push(format!("{case} {warning}")),
-                }
-            }
+            let refuse = Plan {
+                verify: Verify::Refuse,
+                ..warn.clone()
+            };
+            let warnings = worker.warnings();
+            assert_eq!(
+                read_worker(&refuse, pair - 1, &bytes).is_err(),
+                !warnings.is_empty(),
+                "{case}"
+            );
+            records += worker.done();
+            told.extend(warnings.iter().map(|warning| format!("{case} {warning}")));
         }
+        honest += usize::from(told.len() == before);
     }
-    println!("{passed} records of normal cases pass");
-    assert!(passed > 150, "{passed}");
-    let mut cases: Vec<&str> = told.iter().filter_map(|line| line.split(' ').next()).collect();
-    cases.dedup();
+    common::say(&format!(
+        "verify: {honest} of 54 normal cases are honest, {records} records; {} records told, all of case25",
+        told.len()
+    ));
+    let is_invented = |line: &&String| line.contains("/case25 ") && line.contains("score_composed is ");
     assert_eq!(
-        cases,
-        [
-            "v1/case25",
-            "v1/case26",
-            "v1/case32",
-            "v2/case25",
-            "v2/case26",
-            "v2/case34",
-            "v2/case41"
-        ],
+        (honest, told.iter().filter(is_invented).count()),
+        (52, told.len()),
         "{told:#?}"
     );
-}
-
-fn warning(format: Format, record: &serde_json::Value) -> Option<String> {
-    let plan = Plan {
-        verify: Verify::Refuse,
-        ..Plan::lenient(format)
-    };
-    let file = common::file(1, std::slice::from_ref(record));
-    read(&plan, 0, &file).err().map(|refusal| refusal.to_string())
+    assert_eq!(told.len(), 16);
 }

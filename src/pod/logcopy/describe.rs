@@ -44,7 +44,7 @@ pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&E
         score: score.filter(|score| (0.0..=100.0).contains(score)),
         is_final: ending.is_some(),
         eligible: counts && merged.is_some_and(|merged| merged.eligible),
-        entry_status: merged.map_or_else(|| "Started".to_owned(), |merged| merged.entry_status.clone()),
+        entry_status: merged.map_or("Started", |merged| merged.ended_as()).to_owned(),
         stopped,
         why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
         warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),

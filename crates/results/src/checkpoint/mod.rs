@@ -6,7 +6,8 @@ mod record;
 
 pub(crate) use record::Record;
 
-use crate::json::{self, Limit, Object, ReadError, Text, Value};
+use crate::json::{self, Limit, ReadError, Text, Value};
+use crate::names::CRASHED;
 use crate::plan::Verify;
 use crate::{Plan, Refusal, verify};
 
@@ -21,14 +22,19 @@ pub struct Checkpoint {
     pub(crate) records: Vec<Record>,
     pub(crate) total: u32,
     pub(crate) sensors: Vec<Text>,
-    pub(crate) ended: bool,
-    pub(crate) warnings: Vec<String>,
+    ended: bool,
+    repeats: bool,
+    warnings: Vec<String>,
 }
 
 impl Checkpoint {
     /// How many routes the worker has finished.
+    ///
+    /// In a pod, a route in which the simulation crashed is not finished: whoever starts the evaluator again lets it
+    /// repeat that route.
     pub fn done(&self) -> u32 {
-        u32::try_from(self.records.len()).unwrap_or(u32::MAX)
+        let records = u32::try_from(self.records.len()).unwrap_or(u32::MAX);
+        records.saturating_sub(u32::from(self.repeats))
     }
 
     /// How many the file says it will finish.
@@ -40,6 +46,11 @@ impl Checkpoint {
     /// has none, even when no route is missing.
     pub fn ended(&self) -> bool {
         self.ended
+    }
+
+    /// Records whose scores do not follow from their infractions, one sentence each.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
     }
 }
 
@@ -56,54 +67,57 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
     if value.is_falsy() {
         return Ok(None);
     }
-    let file = File::of(pair, &value)?;
+    let file = File::of(pair, value)?;
     if plan.is_pod() && file.progress.is_empty() && file.records.is_empty() {
         return Ok(None);
     }
-    let sensors = sensors(plan, pair, file.sensors)?;
-    let total = total(plan, pair, file.progress)?;
-    let ended = file.inner.get("global_record").is_some_and(|global| !global.is_falsy());
+    let sensors = sensors(plan, pair, &file.sensors)?;
+    let total = total(plan, pair, &file.progress)?;
     let records = records(plan, pair, file.records)?;
     if plan.is_pod() {
         plausible::check_file(plan, pair, total, &records)?;
     }
     let warnings = verified(plan, pair, &records)?;
+    // The evaluator goes by the same text when it resumes.
+    let repeats = plan.is_pod() && file.has_crashed && !file.ended && !records.is_empty();
     Ok(Some(Checkpoint {
         records,
         total,
         sensors,
-        ended,
+        ended: file.ended,
+        repeats,
         warnings,
     }))
 }
 
-/// The parts of the JSON a checkpoint can't be without.
-struct File<'a> {
-    inner: &'a Object,
-    records: &'a [Value],
-    progress: &'a [Value],
-    sensors: &'a Value,
+/// The parts of the JSON that are looked at, taken out of it.
+struct File {
+    records: Vec<Value>,
+    progress: Vec<Value>,
+    sensors: Value,
+    ended: bool,
+    has_crashed: bool,
 }
 
-impl<'a> File<'a> {
-    fn of(pair: usize, value: &'a Value) -> Result<Self, Refusal> {
+impl File {
+    fn of(pair: usize, value: Value) -> Result<Self, Refusal> {
         let shape = |place, wanted| Refusal::Shape { pair, place, wanted };
-        let outer = value.as_object().ok_or_else(|| shape("the whole file", "an object"))?;
-        let inner = outer
-            .get("_checkpoint")
-            .and_then(Value::as_object)
-            .ok_or_else(|| shape("_checkpoint", "an object"))?;
-        let list = |key: &str, place| {
-            inner
-                .get(key)
-                .and_then(Value::as_list)
-                .ok_or_else(|| shape(place, "a list"))
+        let Value::Object(mut outer) = value else {
+            return Err(shape("the whole file", "an object"));
+        };
+        let Some(Value::Object(mut inner)) = outer.take("_checkpoint") else {
+            return Err(shape("_checkpoint", "an object"));
+        };
+        let mut list = |key: &str, place| match inner.take(key) {
+            Some(Value::List(list)) => Ok(list),
+            _ => Err(shape(place, "a list")),
         };
         Ok(Self {
-            inner,
             records: list("records", "_checkpoint.records")?,
             progress: list("progress", "_checkpoint.progress")?,
-            sensors: outer.get("sensors").ok_or_else(|| shape("sensors", "a list"))?,
+            sensors: outer.take("sensors").ok_or_else(|| shape("sensors", "a list"))?,
+            ended: inner.get("global_record").is_some_and(|global| !global.is_falsy()),
+            has_crashed: outer.get("entry_status").and_then(Value::as_str) == Some(CRASHED),
         })
     }
 }
@@ -159,7 +173,7 @@ fn total(plan: &Plan, pair: usize, progress: &[Value]) -> Result<u32, Refusal> {
     u32::try_from(*total).map_err(|_| shape)
 }
 
-fn records(plan: &Plan, pair: usize, values: &[Value]) -> Result<Vec<Record>, Refusal> {
+fn records(plan: &Plan, pair: usize, values: Vec<Value>) -> Result<Vec<Record>, Refusal> {
     if values.len() > MAX_RECORDS {
         return Err(Refusal::Limit {
             pair,
@@ -167,7 +181,7 @@ fn records(plan: &Plan, pair: usize, values: &[Value]) -> Result<Vec<Record>, Re
         });
     }
     let mut records = Vec::with_capacity(values.len());
-    for (i, value) in values.iter().enumerate() {
+    for (i, value) in values.into_iter().enumerate() {
         let record = Record::of(plan.format, i + 1, value).map_err(|(record, problem)| Refusal::Record {
             pair,
             record,

@@ -55,19 +55,20 @@ pub(super) fn check_file(plan: &Plan, pair: usize, total: u32, records: &[Record
 }
 
 fn check(plan: &Plan, pair: usize, record: &Record) -> Result<(), RecordProblem> {
-    if matches!(record.name, RecordName::Place(_)) {
+    let (route, repetition) = record.key;
+    if matches!(record.name, RecordName::Place(_)) || route < 0 || repetition < 0 {
         return Err(RecordProblem::RouteId {
             repetition: plan.format == Format::V2,
         });
     }
     if let Some(slice) = plan.pairs.get(pair) {
-        if !slice.contains(record.key.0) {
+        if !slice.contains(route) {
             return Err(RecordProblem::OutsideSlice {
                 first: slice.first,
                 last: slice.last,
             });
         }
-        if !(0..i64::from(plan.repetitions)).contains(&record.key.1) {
+        if !(0..i64::from(plan.repetitions)).contains(&repetition) {
             return Err(RecordProblem::Repetition {
                 repetitions: plan.repetitions,
             });

@@ -57,9 +57,11 @@ type Problem = (RecordName, RecordProblem);
 
 impl Record {
     /// `place`: where in the file, from 1.
-    pub(crate) fn of(format: Format, place: usize, value: &Value) -> Result<Self, Problem> {
+    pub(crate) fn of(format: Format, place: usize, value: Value) -> Result<Self, Problem> {
         let unnamed = |problem| (RecordName::Place(place), problem);
-        let object = value.as_object().ok_or_else(|| unnamed(RecordProblem::NotAnObject))?;
+        let Value::Object(object) = value else {
+            return Err(unnamed(RecordProblem::NotAnObject));
+        };
         let route_id = object.get("route_id").and_then(Value::as_str).ok_or_else(|| {
             unnamed(RecordProblem::Shape {
                 key: "route_id",
@@ -74,12 +76,11 @@ impl Record {
         let name = name(format, place, route_id, key);
         let named = |problem| (name.clone(), problem);
 
-        let status = status(format, object).map_err(named)?.to_owned();
-        let (counts, off_road) = infractions(format, object).map_err(named)?;
-        let scores = scores(object).map_err(named)?;
-        let meta = meta(format, object).map_err(named)?;
+        let status = status(format, &object).map_err(named)?.to_owned();
+        let (counts, off_road) = infractions(format, &object).map_err(named)?;
+        let scores = scores(&object).map_err(named)?;
+        let meta = meta(format, &object).map_err(named)?;
         Ok(Self {
-            object: object.clone(),
             route_id: route_id.to_owned(),
             key,
             status,
@@ -88,6 +89,7 @@ impl Record {
             scores,
             meta,
             name,
+            object,
         })
     }
 }

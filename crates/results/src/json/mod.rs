@@ -39,7 +39,13 @@ impl Object {
             .map(|(_, value)| value)
     }
 
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Text, &Value)> {
+    /// Takes a value out; the key stays, with null.
+    pub(crate) fn take(&mut self, key: &str) -> Option<Value> {
+        let entry = self.0.iter_mut().find(|(k, _)| k.as_bytes() == key.as_bytes())?;
+        Some(std::mem::replace(&mut entry.1, Value::Null))
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Text, &Value)> + Clone {
         self.0.iter().map(|(key, value)| (key, value))
     }
 

@@ -1,8 +1,10 @@
 //! The writer: four blanks of indent, everything outside printable ASCII escaped, numbers as Python writes them. Called by
 //! the merge and the renderers, which hand it borrowed trees, so that no record is copied.
 
-use super::{Limit, Object, Text, Value};
-use crate::number::{Number, number_text};
+use std::fmt::Write as _;
+
+use super::{Limit, Text, Value};
+use crate::number::{Number, push_number};
 
 /// The largest text that is written, in bytes.
 const MAX_OUTPUT: usize = 64 << 20;
@@ -70,7 +72,7 @@ impl Writer {
             Node::Bool(b) => self.out.push_str(if *b { "true" } else { "false" }),
             Node::List(items) => self.list(items, depth, Self::node)?,
             Node::Object(entries) => {
-                let entries = entries.iter().map(|(key, node)| (*key, node)).collect();
+                let entries = entries.iter().map(|(key, node)| (*key, node));
                 self.object(entries, depth, Self::node)?;
             }
         }
@@ -86,7 +88,10 @@ impl Writer {
             Value::Float(f) => self.number(Number::Float(*f)),
             Value::Text(text) => self.text(text.as_bytes()),
             Value::List(items) => self.list(items, depth, Self::value)?,
-            Value::Object(object) => self.object(entries(object), depth, Self::value)?,
+            Value::Object(object) => {
+                let entries = object.iter().map(|(key, value)| (key.as_bytes(), value));
+                self.object(entries, depth, Self::value)?;
+            }
         }
         Ok(())
     }
@@ -106,27 +111,38 @@ impl Writer {
         Ok(())
     }
 
-    fn object<T>(
+    fn object<'t, T: 't>(
         &mut self,
-        mut entries: Vec<(&[u8], &T)>,
+        entries: impl Iterator<Item = (&'t [u8], &'t T)> + Clone,
         depth: usize,
         each: fn(&mut Self, &T, usize) -> Written,
     ) -> Written {
-        if entries.is_empty() {
-            self.out.push_str("{}");
-            return Ok(());
+        if self.order == KeyOrder::AsGiven || entries.clone().is_sorted_by_key(|(key, _)| key) {
+            return self.entries(entries, depth, each);
         }
-        if self.order == KeyOrder::Sorted {
-            entries.sort_by_key(|(key, _)| *key);
-        }
+        let mut sorted: Vec<_> = entries.collect();
+        sorted.sort_by_key(|(key, _)| *key);
+        self.entries(sorted.into_iter(), depth, each)
+    }
+
+    fn entries<'t, T: 't>(
+        &mut self,
+        entries: impl Iterator<Item = (&'t [u8], &'t T)>,
+        depth: usize,
+        each: fn(&mut Self, &T, usize) -> Written,
+    ) -> Written {
         self.out.push('{');
-        for (i, (key, value)) in entries.into_iter().enumerate() {
-            self.line(i > 0, depth + 1)?;
+        let mut is_empty = true;
+        for (key, value) in entries {
+            self.line(!is_empty, depth + 1)?;
+            is_empty = false;
             self.text(key);
             self.out.push_str(": ");
             each(self, value, depth + 1)?;
         }
-        self.line(false, depth)?;
+        if !is_empty {
+            self.line(false, depth)?;
+        }
         self.out.push('}');
         Ok(())
     }
@@ -146,33 +162,44 @@ impl Writer {
         match number {
             Number::Float(f) if f.is_nan() => self.out.push_str("NaN"),
             Number::Float(f) if f.is_infinite() => self.out.push_str(if f > 0.0 { "Infinity" } else { "-Infinity" }),
-            Number::Float(f) => self.out.push_str(&number_text(f)),
-            Number::Int(i) => self.out.push_str(&i.to_string()),
+            Number::Float(f) => push_number(&mut self.out, f),
+            // Writing to a String does not fail.
+            Number::Int(i) => drop(write!(self.out, "{i}")),
         }
     }
 
     fn text(&mut self, bytes: &[u8]) {
         self.out.push('"');
         let mut rest = bytes;
-        while let Some((code, after)) = next_code_point(rest) {
+        loop {
+            let is_special = |byte: &u8| !(b' '..=b'~').contains(byte) || *byte == b'"' || *byte == b'\\';
+            let plain = rest.iter().position(is_special).unwrap_or(rest.len());
+            let (plain, special) = rest.split_at(plain);
+            self.out.push_str(std::str::from_utf8(plain).unwrap_or_default());
+            let Some((code, after)) = next_code_point(special) else {
+                break;
+            };
+            self.escaped(code);
             rest = after;
-            match code {
-                0x22 => self.out.push_str("\\\""),
-                0x5c => self.out.push_str("\\\\"),
-                0x0a => self.out.push_str("\\n"),
-                0x0d => self.out.push_str("\\r"),
-                0x09 => self.out.push_str("\\t"),
-                0x08 => self.out.push_str("\\b"),
-                0x0c => self.out.push_str("\\f"),
-                0x20..=0x7e => self.out.extend(char::from_u32(code)),
-                0x1_0000.. => {
-                    self.unit(0xd800 + ((code - 0x1_0000) >> 10));
-                    self.unit(0xdc00 + ((code - 0x1_0000) & 0x3ff));
-                }
-                _ => self.unit(code),
-            }
         }
         self.out.push('"');
+    }
+
+    fn escaped(&mut self, code: u32) {
+        match code {
+            0x22 => self.out.push_str("\\\""),
+            0x5c => self.out.push_str("\\\\"),
+            0x0a => self.out.push_str("\\n"),
+            0x0d => self.out.push_str("\\r"),
+            0x09 => self.out.push_str("\\t"),
+            0x08 => self.out.push_str("\\b"),
+            0x0c => self.out.push_str("\\f"),
+            0x1_0000.. => {
+                self.unit(0xd800 + ((code - 0x1_0000) >> 10));
+                self.unit(0xdc00 + ((code - 0x1_0000) & 0x3ff));
+            }
+            _ => self.unit(code),
+        }
     }
 
     fn unit(&mut self, unit: u32) {
@@ -181,10 +208,6 @@ impl Writer {
             self.out.extend(char::from_digit(unit >> shift & 0xf, 16));
         }
     }
-}
-
-fn entries(object: &Object) -> Vec<(&[u8], &Value)> {
-    object.iter().map(|(key, value)| (key.as_bytes(), value)).collect()
 }
 
 /// The first code point of a well-formed [`super::Text`], and what follows it.

@@ -1,6 +1,8 @@
 //! Checkpoints as an evaluator writes them, built from a few numbers.
 #![allow(dead_code, reason = "each test file uses its part")]
 
+use std::io::Write as _;
+
 use leaderboard_results::{Checkpoint, Format, Merged, Plan, Refusal, Slice, Strictness, Verify, merge, read_worker};
 use serde_json::{Map, Value, json};
 
@@ -144,4 +146,10 @@ pub fn merged(plan: &Plan, files: &[Option<Value>]) -> Result<Merged, Refusal> {
         });
     }
     merge(plan, &read_files.iter().map(Option::as_ref).collect::<Vec<_>>())
+}
+
+/// Says how many cases ran, past the harness, which hides what a passing test prints.
+pub fn say(line: &str) {
+    // A test does not fail because nobody reads it.
+    let _ = writeln!(std::io::stderr(), "{line}");
 }

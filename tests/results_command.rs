@@ -1,0 +1,254 @@
+//! `leaderboard-operator results` as a process: the files it writes, its exit code, its words.
+#![allow(clippy::unwrap_used, reason = "the helpers of a test may fail it")]
+
+use std::fs;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use tempfile::TempDir;
+
+const FILES: [&str; 4] = ["agent_results.json", "results.json", "stdout.txt", "metadata.json"];
+
+fn cases() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("crates/results/tests/cases")
+}
+
+/// The four files of a case, absent ones too.
+fn inputs(case: &str) -> Vec<PathBuf> {
+    (1..=4)
+        .map(|i| cases().join(case).join(format!("in{i}.json")))
+        .collect()
+}
+
+fn results(format: &str, out: &Path, flags: &[&str], inputs: &[PathBuf]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_leaderboard-operator"))
+        .args(["results", "--format", format, "--out"])
+        .arg(out)
+        .args(flags)
+        .args(inputs)
+        .output()
+        .unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).into_iter().flatten();
+    let mut names: Vec<String> = entries
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+fn contents(folder: &Path) -> Vec<Vec<u8>> {
+    FILES.iter().map(|name| fs::read(folder.join(name)).unwrap()).collect()
+}
+
+/// A folder with the good files of case01.
+fn good(format: &str) -> (TempDir, Vec<Vec<u8>>) {
+    let folder = tempfile::tempdir().unwrap();
+    let output = results(format, folder.path(), &[], &inputs(&format!("{format}/case01")));
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let before = contents(folder.path());
+    (folder, before)
+}
+
+/// Exit code and words of a run that must leave the good files as they are.
+fn leaves_all(format: &str, flags: &[&str], inputs: &[PathBuf], code: i32) -> String {
+    let (folder, before) = good(format);
+    let output = results(format, folder.path(), flags, inputs);
+    assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
+    assert_eq!(stdout(&output), "");
+    assert_eq!(contents(folder.path()), before);
+    assert_eq!(names(folder.path()).len(), FILES.len(), "nothing is left behind");
+    stderr(&output)
+}
+
+#[test]
+fn every_normal_case_gives_the_originals_files() {
+    let index = fs::read_to_string(cases().join("index.tsv")).unwrap();
+    let (mut written, mut refused) = (0, 0);
+    for line in index.lines().filter(|line| line.contains("\tnormal\t")) {
+        let columns: Vec<&str> = line.split('\t').collect();
+        let case = format!("{}/{}", columns[0], columns[1]);
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("made/for/it");
+        let output = results(columns[0], &out, &["--as-original"], &inputs(&case));
+        if columns[6].contains("merge:") {
+            assert_eq!(output.status.code(), Some(2), "{case}");
+            assert_eq!(names(&out), [""; 0], "{case}");
+            refused += 1;
+            continue;
+        }
+        assert_eq!(output.status.code(), Some(0), "{case}: {}", stderr(&output));
+        let original = ["merged.json", "results.json", "stdout.txt", "merged.json"];
+        for (name, original) in FILES.iter().zip(original) {
+            let expected = fs::read_to_string(cases().join(&case).join(original)).unwrap();
+            assert_eq!(fs::read_to_string(out.join(name)).unwrap(), expected, "{case} {name}");
+        }
+        assert_eq!(names(&out).len(), FILES.len(), "{case}");
+        written += 1;
+    }
+    // Past the harness, which hides what a passing test prints. Nobody has to read it.
+    let _ = writeln!(
+        std::io::stderr(),
+        "results command: {written} normal cases equal, {refused} refused as by the original"
+    );
+    assert_eq!((written, refused), (48, 6));
+}
+
+#[test]
+fn an_absent_file_is_named_and_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = results("v2", folder.path(), &[], &inputs("v2/case05"));
+    assert_eq!(output.status.code(), Some(0));
+    let words = stderr(&output);
+    let absent = inputs("v2/case05")[3].display().to_string();
+    assert_eq!(
+        words.lines().next(),
+        Some(format!("{absent} is absent: that worker has no results").as_str())
+    );
+    assert_eq!(names(folder.path()).len(), FILES.len());
+}
+
+#[test]
+fn a_refusal_keeps_what_was_good() {
+    for (format, case, words) in [
+        ("v1", "v1/case14", "have different sensor configurations."),
+        ("v2", "v2/case17", "has more than one record."),
+        (
+            "v2",
+            "v2/case19",
+            "results are missing: the records jump from the start to",
+        ),
+        ("v2", "v2/case30", "`route_id` is not a text."),
+        (
+            "v1",
+            "v1/case24",
+            "the statistics can't be computed: route RouteScenario_",
+        ),
+    ] {
+        let said = leaves_all(format, &[], &inputs(case), 2);
+        assert!(
+            said.starts_with("leaderboard-operator results: ") && said.contains(words),
+            "{said}"
+        );
+        assert_eq!(said.lines().count(), 1, "{said}");
+        assert!(said.trim_end().ends_with('.'), "with a next step: {said}");
+    }
+}
+
+#[test]
+fn workers_and_routes_make_a_missing_worker_not_final() {
+    let three = inputs("v2/case05");
+    let folder = tempfile::tempdir().unwrap();
+    let output = results("v2", folder.path(), &[], &three);
+    assert!(stdout(&output).contains(", final\n") && stdout(&output).starts_with("6 of 6 routes, "));
+
+    let flags = ["--workers", "4", "--routes", "8"];
+    let output = results("v2", folder.path(), &flags, &three);
+    assert_eq!(stdout(&output), "6 of 8 routes, Started, not final\n");
+    let summary = fs::read_to_string(folder.path().join("stdout.txt")).unwrap();
+    assert!(summary.contains("- Completed 6 out of the 8 routes\n"), "{summary}");
+
+    let flags = ["--workers", "4", "--routes", "8", "--as-original"];
+    let output = results("v2", folder.path(), &flags, &three);
+    assert!(stdout(&output).contains(", final\n"), "the original believes the files");
+}
+
+#[test]
+fn as_original_keeps_its_mistakes() {
+    let folder = tempfile::tempdir().unwrap();
+    let status = |flags: &[&str]| -> String {
+        let output = results("v1", folder.path(), flags, &inputs("v1/case02"));
+        assert_eq!(output.status.code(), Some(0));
+        let merged: serde_json::Value =
+            serde_json::from_slice(&fs::read(folder.path().join("agent_results.json")).unwrap()).unwrap();
+        merged["_checkpoint"]["global_record"]["status"]
+            .as_str()
+            .unwrap()
+            .to_owned()
+    };
+    assert_eq!(status(&[]), "Completed");
+    assert_eq!(status(&["--as-original"]), "Failed");
+}
+
+#[test]
+fn scores_that_do_not_follow_are_told_or_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let case = inputs("v2/case25");
+    let told = |flags: &[&str]| stderr(&results("v2", folder.path(), flags, &case));
+    assert!(told(&[]).lines().all(|line| line.starts_with("warning: pair ")) && !told(&[]).is_empty());
+    assert_eq!(told(&["--verify", "off"]), "");
+    let said = leaves_all("v2", &["--verify", "refuse"], &case, 2);
+    assert!(said.contains("but score_route x score_penalty is"), "{said}");
+}
+
+#[test]
+fn arguments_that_can_not_be_meant_are_refused() {
+    let four = inputs("v2/case01");
+    for (flags, words) in [
+        (
+            vec!["--workers", "3", "--routes", "20"],
+            "--workers 3, but 4 files are named",
+        ),
+        (vec!["--workers", "4", "--routes", "3"], "some would have none"),
+        (
+            vec!["--workers", "4", "--routes", "20", "--repetitions", "0"],
+            "it has no repetition",
+        ),
+        (vec!["--workers", "4"], "--routes"),
+        (vec!["--repetitions", "2"], "--workers"),
+        (vec!["--verify", "maybe"], "possible values: off, warn, refuse"),
+    ] {
+        let said = leaves_all("v2", &flags, &four, 2);
+        assert!(said.contains(words), "{flags:?}: {said}");
+    }
+}
+
+#[test]
+fn files_that_are_none_are_refused_without_being_read_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let large = folder.path().join("large.json");
+    fs::File::create(&large).unwrap().set_len(10 << 30).unwrap();
+    let said = leaves_all("v2", &[], &[large], 2);
+    assert!(said.contains("pair 1: the checkpoint is larger than 64 MiB."), "{said}");
+    let said = leaves_all("v2", &[], &[folder.path().to_owned()], 1);
+    assert!(said.contains("can't be read"), "{said}");
+}
+
+/// All four files or none of them, even when it is the last that can't be written.
+#[test]
+fn a_file_that_can_not_be_written_leaves_the_others_as_they_were() {
+    for blocked in FILES {
+        let (folder, before) = good("v1");
+        let place = folder.path().join(blocked);
+        fs::remove_file(&place).unwrap();
+        fs::create_dir(&place).unwrap();
+        let output = results("v1", folder.path(), &[], &inputs("v1/case13"));
+        assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+        assert!(
+            stderr(&output).contains(&format!("{blocked} can't be written")),
+            "{}",
+            stderr(&output)
+        );
+        for (name, before) in FILES.iter().zip(&before).filter(|(name, _)| **name != blocked) {
+            assert_eq!(&fs::read(folder.path().join(name)).unwrap(), before, "{name}");
+        }
+        assert_eq!(names(folder.path()).len(), FILES.len(), "nothing is left behind");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    let output = results("v1", &file, &[], &inputs("v1/case01"));
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("can't be made"), "{}", stderr(&output));
+}
