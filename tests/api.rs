@@ -15,6 +15,7 @@ mod api {
     mod definitions;
     mod evalai;
     mod examples;
+    mod failure_log;
     mod leader;
     mod objects;
     mod pod;

@@ -65,6 +65,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
         *may(controller, "get list watch create patch delete", "batch/jobs", namespace),
         *may(controller, "get list watch patch delete", "pods", namespace),
+        *may(controller, "get", "pods:log", namespace),
         *may(controller, "get list", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
         *may(controller, "get create patch", "networking.k8s.io/networkpolicies", namespace),
@@ -88,7 +89,6 @@ def never(controller: str, bridge: str) -> list[Access]:
         *may_not(controller, "update delete deletecollection", f"{OWN}/submissions"),
         *may_not(controller, "create update", "pods"),
         *may_not(controller, "create", "pods:exec"),
-        *may_not(controller, "get", "pods:log"),
         *may_not(controller, "deletecollection", "batch/jobs"),
         *may_not(controller, "delete", "networking.k8s.io/networkpolicies"),
         *may_not(controller, "list watch create patch delete", "secrets"),
@@ -98,7 +98,9 @@ def never(controller: str, bridge: str) -> list[Access]:
         *may_not(controller, "get update", "coordination.k8s.io/leases", SYSTEM, "another"),
         *may_not(controller, "create", "coordination.k8s.io/leases", "leaderboard"),
         *may_not(controller, "create", "serviceaccounts:token", SYSTEM),
-        *may_not(controller, "list", "nodes", ""),
+        *may_not(controller, "list watch patch delete", "nodes", ""),
+        *may_not(bridge, "get", "pods:log"),
+        *may_not(bridge, "get", "nodes", ""),
         *may_not(bridge, "list watch update delete", f"{OWN}/submissions"),
         *may_not(bridge, "patch", f"{OWN}/submissions:status"),
         *may_not(bridge, "patch", f"{OWN}/leaderboards"),
@@ -124,6 +126,7 @@ CLUSTER_WIDE = (
     *never(CONTROLLER, BRIDGE),
     *lease(CONTROLLER),
     *may(CONTROLLER, "get", "secrets", name="evalai"),
+    *may(CONTROLLER, "get", "nodes", ""),
 )
 # ci/roles.yaml: another account, secrets in two namespaces.
 WITH_ROLES = (
@@ -146,5 +149,7 @@ NAMESPACED = (
     *may_not(CONTROLLER, "get list create patch", f"{OWN}/submissions", "other"),
     *may_not(CONTROLLER, "get list create", "batch/jobs", "other"),
     *may_not(CONTROLLER, "list", "pods", ""),
+    *may_not(CONTROLLER, "get", "pods:log", "other"),
+    *may_not(CONTROLLER, "get", "nodes", ""),
     *may_not(BRIDGE, "get list", f"{OWN}/leaderboards", "other"),
 )

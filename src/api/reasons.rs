@@ -10,6 +10,7 @@ pub const WAITING_FOR_SLOT: &str = "WaitingForSlot";
 pub const PAUSED: &str = "Paused";
 pub const UNSCHEDULABLE: &str = "Unschedulable";
 pub const QUOTA_EXCEEDED: &str = "QuotaExceeded";
+pub const POD_REFUSED: &str = "PodRefused";
 pub const IMAGE_PULL: &str = "ImagePull";
 pub const CONTAINER_CONFIG: &str = "ContainerConfig";
 /// The Pod is being scheduled, pulls images or fills its volumes.
@@ -57,7 +58,6 @@ pub const START_DEADLINE: &str = "StartDeadline";
 pub const SCHEDULE_DEADLINE: &str = "ScheduleDeadline";
 pub const JOB_FAILED: &str = "JobFailed";
 pub const NODE_LOST: &str = "NodeLost";
-pub const POD_REFUSED: &str = "PodRefused";
 
 // Of the other conditions.
 pub const NOT_WANTED: &str = "NotWanted";

@@ -201,7 +201,7 @@ pub struct LastEnd {
 pub struct Waiting {
     /// From 1.
     pub position: i32,
-    /// A band such as `20m-40m`; absent until runs of this track have ended.
+    /// Until it starts, a band such as `20-35 min`; absent until runs of this track have ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub eta: Option<String>,
 }
@@ -250,6 +250,9 @@ pub struct Failure {
     pub message: String,
     /// Whether it should cost the participant an attempt.
     pub charged: bool,
+    /// The pair that it happened in, from 1; absent if it concerns the whole run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pair: Option<i32>,
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]

@@ -15,6 +15,7 @@ use serde_json::json;
 
 use super::context::{CALL_TIMEOUT, Context};
 use super::decide::{Action, Event, Plan};
+use super::failure_log;
 use super::job_spec::{self, JobInput};
 use super::observe::{is_pod_of, uid_of};
 use super::significance::{Change, change, patience};
@@ -117,6 +118,10 @@ impl Actor<'_> {
                 let patch = json!({ "spec": { "ttlSecondsAfterFinished": seconds } });
                 self.patch::<Job>("the time to live", name, &patch).await
             }
+            Action::KeepLog { places } => {
+                failure_log::keep(self.context, self.view, status, places).await;
+                Ok(())
+            }
             Action::AskEvalai => {
                 self.context.sync.ask(self.view);
                 Ok(())
@@ -127,6 +132,7 @@ impl Actor<'_> {
             }
             Action::ForgetEvalai => {
                 self.context.sync.forget(self.submission());
+                self.context.failure_logs.forget(&uid_of(self.submission()));
                 Ok(())
             }
             Action::Record { end } => {
@@ -166,6 +172,14 @@ impl Actor<'_> {
         if let Some(old) = &self.submission().status {
             match change(old, status) {
                 Change::Nothing => return Ok(None),
+                Change::Place => {
+                    let position = status.waiting.as_ref().map_or(0, |w| w.position);
+                    let now = tokio::time::Instant::now();
+                    let waits = self.context.memory.place_waits(self.submission(), position, now);
+                    if waits.is_some() {
+                        return Ok(waits);
+                    }
+                }
                 Change::Progress => {
                     let patience = patience(self.view.leaderboard.as_ref().map(|l| &l.spec));
                     let since = self.context.memory.since_write(self.submission());

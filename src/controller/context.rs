@@ -11,6 +11,7 @@ use kube::runtime::events::Recorder;
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::{Api, Client, ResourceExt};
 
+use super::failure_log::FailureLogs;
 use super::leaderboards::Desk;
 use super::memory::Memory;
 use super::observe::board::Board;
@@ -69,6 +70,7 @@ pub struct Context {
     pub memory: Memory,
     pub reports: Reports,
     pub board: Board,
+    pub failure_logs: FailureLogs,
     pub desk: Desk,
     pub sync: Sync,
     pub aws: Aws,
@@ -85,6 +87,7 @@ impl Context {
             memory: Memory::default(),
             reports: Reports::default(),
             board: Board::default(),
+            failure_logs: FailureLogs::default(),
             desk: Desk::default(),
             sync,
             aws,
@@ -138,6 +141,7 @@ impl Context {
     pub fn forget(&self, uid: &str) {
         self.memory.forget(uid);
         self.reports.forget(uid);
+        self.failure_logs.forget(uid);
         self.board.release(uid);
     }
 }

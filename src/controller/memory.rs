@@ -12,16 +12,25 @@ use tokio::time::Instant;
 use super::observe::uid_of;
 use crate::api::{Submission, SubmissionStatus};
 
+/// Places in line that are written without waiting for their turn.
+const FIRST_PLACES: i32 = 20;
+/// Time between two writes of the places behind them, over all Submissions.
+const PLACE_PACE: Duration = Duration::from_secs(1);
+
 /// One entry for each Submission, by UID.
 #[derive(Default)]
 pub struct Memory {
     entries: Mutex<HashMap<String, Entry>>,
+    /// When the next place of those far behind may be written.
+    next_place: Mutex<Option<Instant>>,
 }
 
 #[derive(Clone, Default)]
 struct Entry {
     written: Option<Written>,
     partial: Option<(i64, u32)>,
+    /// When its place may be written.
+    place_at: Option<Instant>,
 }
 
 #[derive(Clone)]
@@ -67,6 +76,28 @@ impl Memory {
             .get(&uid_of(submission))
             .and_then(|e| e.written.as_ref())
             .map(|w| w.at.elapsed())
+    }
+
+    /// How long a changed place has to wait for its write; None: not at all. The first in line are told at once; of the others
+    /// each has a moment of its own, so that a step of a thousand is not a thousand writes.
+    pub fn place_waits(&self, submission: &Submission, position: i32, now: Instant) -> Option<Duration> {
+        let mut entries = self.lock();
+        let entry = entries.entry(uid_of(submission)).or_default();
+        if position <= FIRST_PLACES {
+            entry.place_at = None;
+            return None;
+        }
+        let at = *entry.place_at.get_or_insert_with(|| {
+            let mut next = self.next_place.lock().unwrap_or_else(PoisonError::into_inner);
+            let at = next.unwrap_or(now).max(now);
+            *next = Some(at + PLACE_PACE);
+            at
+        });
+        if at <= now {
+            entry.place_at = None;
+            return None;
+        }
+        Some(at - now)
     }
 
     /// Whether our last status, too, has no Job: a submission that still waits.
@@ -118,6 +149,30 @@ mod tests {
             ..Default::default()
         });
         object
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_step_of_a_thousand_in_line_is_one_write_a_second() {
+        let memory = Memory::default();
+        let mut object = object("1", "WaitingForSlot");
+        let mut writes = Vec::new();
+        let begin = Instant::now();
+        for second in 0..200 {
+            let now = begin + Duration::from_secs(second);
+            let mut count = 0;
+            for position in 1..=120 {
+                object.metadata.uid = Some(format!("u{position}"));
+                let waits = memory.place_waits(&object, position, now);
+                if position <= FIRST_PLACES {
+                    assert_eq!(waits, None);
+                } else {
+                    count += u32::from(waits.is_none());
+                }
+            }
+            writes.push(count);
+        }
+        assert!(writes.iter().all(|count| *count <= 1), "{writes:?}");
+        assert!(writes.iter().sum::<u32>() >= 190, "nobody is forgotten: {writes:?}");
     }
 
     #[test]

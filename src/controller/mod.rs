@@ -8,6 +8,7 @@ pub mod act;
 pub mod backoff;
 pub mod context;
 pub mod decide;
+pub mod failure_log;
 pub mod job_spec;
 pub mod leader;
 pub mod leaderboards;

@@ -6,8 +6,9 @@ use serde_json::Value;
 use sha2::{Digest, Sha256};
 
 use super::context::Context;
+use super::failure_log::Tail;
 use super::view::View;
-use crate::api::{FailureClass, ResultsFormat, State, SubmissionStatus};
+use crate::api::{FailureClass, LogTail, ResultsFormat, State, SubmissionStatus};
 use crate::pod::report::Report;
 use crate::services::evalai::Payload;
 use crate::services::table::Row;
@@ -46,6 +47,23 @@ pub(super) fn stderr(status: &SubmissionStatus) -> String {
         FailureClass::Infrastructure => "infrastructure, not charged",
     };
     format!("{} ({class}): {}", failure.reason, failure.message)
+}
+
+/// Who may read the log of a failure.
+pub(super) fn log_readers(view: &View) -> LogTail {
+    let leaderboard = view.leaderboard.as_ref();
+    let evalai = leaderboard.and_then(|l| l.spec.evalai.as_ref());
+    evalai.map(|e| e.log_tail).unwrap_or_default()
+}
+
+/// Puts the log of a failure where those who may read it find it. Participants get no log but their own program's: the
+/// others' are the host's.
+pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTail) {
+    let Some(tail) = tail else { return };
+    if readers == LogTail::Participants && tail.is_agents() {
+        payload.stderr = format!("{}\n\n{}", payload.stderr, tail.text);
+    }
+    payload.environment_log = tail.text;
 }
 
 async fn stored(context: &Context, view: &View, report: &Report, key: &str) -> Result<String, String> {
@@ -146,6 +164,34 @@ mod tests {
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
         assert_eq!(get("agent_blocked"), Some("0"));
+    }
+
+    #[test]
+    fn a_log_is_shown_to_hosts_alone_unless_they_say_otherwise() {
+        let shown = |container: &str, readers| {
+            let tail = Tail {
+                container: container.into(),
+                text: "route 7".into(),
+            };
+            let mut payload = Payload {
+                stderr: "AgentCrashed (participant): it crashed.".into(),
+                ..Payload::default()
+            };
+            add_log(&mut payload, Some(tail), readers);
+            assert_eq!(payload.environment_log, "route 7");
+            assert!(!payload.stdout.contains("route") && !payload.metadata.contains("route"));
+            payload.stderr
+        };
+        for container in ["agent-1", "simulator-1", "contents"] {
+            assert!(!shown(container, LogTail::Hosts).contains("route"), "{container}");
+        }
+        assert!(shown("agent-1", LogTail::Participants).ends_with("it crashed.\n\nroute 7"));
+        for container in ["simulator-1", "contents", "workspace", "logcopy"] {
+            assert!(
+                !shown(container, LogTail::Participants).contains("route"),
+                "{container}"
+            );
+        }
     }
 
     #[test]

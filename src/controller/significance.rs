@@ -15,6 +15,8 @@ const PERIODS: u32 = 3;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Change {
     Nothing,
+    /// Only its place in line, which moves for many at once.
+    Place,
     /// Only how far it is, and the words for it.
     Progress,
     Real,
@@ -24,11 +26,22 @@ pub enum Change {
 pub fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
     if old == new {
         Change::Nothing
+    } else if is_place_alone(old, new) {
+        Change::Place
     } else if steady(old) == steady(new) {
         Change::Progress
     } else {
         Change::Real
     }
+}
+
+fn is_place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> bool {
+    let waits = old.waiting.is_some() && new.waiting.is_some();
+    let moved = SubmissionStatus {
+        waiting: new.waiting.clone(),
+        ..old.clone()
+    };
+    waits && moved == *new
 }
 
 /// How long progress may wait since the last write.
@@ -82,6 +95,22 @@ mod tests {
             ..running(20)
         };
         assert_eq!(change(&running(19), &finished), Change::Real);
+    }
+
+    #[test]
+    fn a_step_forward_is_a_place_and_the_first_place_is_not() {
+        let waiting = |position| SubmissionStatus {
+            waiting: Some(crate::api::Waiting { position, eta: None }),
+            ..SubmissionStatus::default()
+        };
+        assert_eq!(change(&waiting(3), &waiting(2)), Change::Place);
+        assert_eq!(change(&waiting(3), &waiting(3)), Change::Nothing);
+        assert_eq!(change(&SubmissionStatus::default(), &waiting(3)), Change::Progress);
+        let started = SubmissionStatus {
+            state: Some(State::Running),
+            ..SubmissionStatus::default()
+        };
+        assert_eq!(change(&waiting(1), &started), Change::Real);
     }
 
     #[test]

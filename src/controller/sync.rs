@@ -184,6 +184,11 @@ async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, o
         },
     };
     payload.stderr = result_texts::stderr(status);
+    if outcome == Outcome::Failed {
+        let uid = uid_of(view.submission.as_ref());
+        let tail = context.failure_logs.tail(&uid, status);
+        result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
+    }
     Some(Wish::Final(outcome, Arc::new(payload)))
 }
 

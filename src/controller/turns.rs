@@ -1,20 +1,25 @@
-//! Whose turn it is: which waiting submissions start now, and the place of the others.
+//! Whose turn it is: which waiting submissions start now, the place of the others, and how long they may have to wait.
 //!
 //! Pure; called by `observe` through `Board`. Fair between teams: each pick goes to the team that has the least running
-//! and picked so far, so that a team with a hundred submissions does not hold up another's first. Within a team the
-//! higher priority goes first, then the older.
+//! and picked so far, and among these to the one whose last run began longest ago. So a team with a hundred submissions
+//! does not hold up another's first, even where only one runs at a time. Within a team the higher priority goes first,
+//! then the older.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 
 use jiff::Timestamp;
 
 use super::view::Turn;
+
+/// Runs of a track that its waiting times are estimated from.
+pub const RUNS: usize = 20;
 
 /// A submission that waits for a slot.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InLine {
     pub uid: String,
     pub team: String,
+    pub track: String,
     pub priority: i32,
     pub submitted: Timestamp,
 }
@@ -27,39 +32,43 @@ pub struct Limits {
     pub paused: bool,
 }
 
-/// The turn of everyone in line. `occupied` holds the team of each submission that has a slot.
-pub fn turns(mut line: Vec<InLine>, occupied: &[String], limits: Limits) -> HashMap<String, Turn> {
-    line.sort_by(|a, b| {
-        b.priority
-            .cmp(&a.priority)
-            .then(a.submitted.cmp(&b.submitted))
-            .then(a.uid.cmp(&b.uid))
-    });
-    let mut load: HashMap<&str, usize> = HashMap::new();
-    for team in occupied {
-        *load.entry(team).or_default() += 1;
-    }
-    let mut teams: BTreeMap<String, std::collections::VecDeque<InLine>> = BTreeMap::new();
-    for waiting in line {
-        teams.entry(waiting.team.clone()).or_default().push_back(waiting);
-    }
-    // A set ordered by (load, first in line) would save the scan; the number of teams in line is small.
-    let mut load: HashMap<String, usize> = load.into_iter().map(|(team, n)| (team.to_owned(), n)).collect();
+/// What a Leaderboard runs and has run.
+#[derive(Clone, Debug, Default)]
+pub struct Past {
+    /// The team of each submission that has a slot.
+    pub occupied: Vec<String>,
+    /// When the last run of a team began.
+    pub served: HashMap<String, Timestamp>,
+    /// When runs of a track ended, and the seconds that they took.
+    pub runs: HashMap<String, Vec<(Timestamp, i64)>>,
+}
+
+/// What decides between teams, the least first: running and picked, the number of the last pick, the last start.
+type Rank<'a> = (usize, usize, Option<Timestamp>, Timestamp, &'a str);
+
+/// The teams in line.
+struct Teams {
+    waiting: BTreeMap<String, VecDeque<InLine>>,
+    load: HashMap<String, usize>,
+    picked: HashMap<String, usize>,
+    served: HashMap<String, Timestamp>,
+}
+
+/// The turn of everyone in line.
+pub fn turns(line: Vec<InLine>, past: Past, limits: Limits) -> HashMap<String, Turn> {
     let mut free = limits
         .total
-        .map_or(usize::MAX, |total| total.saturating_sub(occupied.len()));
+        .map_or(usize::MAX, |total| total.saturating_sub(past.occupied.len()));
+    let quartiles: HashMap<String, Quartiles> = past
+        .runs
+        .into_iter()
+        .filter_map(|(track, runs)| Some((track, Quartiles::of(runs)?)))
+        .collect();
+    let mut teams = Teams::new(line, &past.occupied, past.served);
     let mut result = HashMap::new();
     let mut position = 0;
-    while let Some(team) = next_team(&teams, &load) {
-        let Some(pick) = teams.get_mut(&team).and_then(std::collections::VecDeque::pop_front) else {
-            break;
-        };
-        if teams.get(&team).is_some_and(std::collections::VecDeque::is_empty) {
-            teams.remove(&team);
-        }
-        let running = load.entry(team).or_default();
-        let full = limits.per_team.is_some_and(|limit| *running >= limit);
-        *running += 1;
+    while let Some((pick, running)) = teams.pick() {
+        let full = limits.per_team.is_some_and(|limit| running >= limit);
         let turn = if !limits.paused && !full && free > 0 {
             free -= 1;
             Turn::Go
@@ -68,7 +77,10 @@ pub fn turns(mut line: Vec<InLine>, occupied: &[String], limits: Limits) -> Hash
             if limits.paused {
                 Turn::Paused { position }
             } else {
-                Turn::Wait { position, eta: None }
+                let slots = limits.total.and_then(|n| i64::try_from(n).ok());
+                let known = quartiles.get(&pick.track);
+                let eta = known.zip(slots).map(|(known, slots)| known.band(position, slots));
+                Turn::Wait { position, eta }
             }
         };
         result.insert(pick.uid, turn);
@@ -76,18 +88,115 @@ pub fn turns(mut line: Vec<InLine>, occupied: &[String], limits: Limits) -> Hash
     result
 }
 
-fn next_team(
-    teams: &BTreeMap<String, std::collections::VecDeque<InLine>>,
-    load: &HashMap<String, usize>,
-) -> Option<String> {
-    teams
-        .iter()
-        .filter_map(|(team, line)| {
-            let first = line.front()?;
-            Some((load.get(team).copied().unwrap_or(0), first.submitted, team))
+impl Teams {
+    fn new(mut line: Vec<InLine>, occupied: &[String], served: HashMap<String, Timestamp>) -> Self {
+        line.sort_by(|a, b| {
+            b.priority
+                .cmp(&a.priority)
+                .then(a.submitted.cmp(&b.submitted))
+                .then(a.uid.cmp(&b.uid))
+        });
+        let mut load: HashMap<String, usize> = HashMap::new();
+        for team in occupied {
+            *load.entry(team.clone()).or_default() += 1;
+        }
+        let mut waiting: BTreeMap<String, VecDeque<InLine>> = BTreeMap::new();
+        for each in line {
+            waiting.entry(each.team.clone()).or_default().push_back(each);
+        }
+        Self {
+            waiting,
+            load,
+            picked: HashMap::new(),
+            served,
+        }
+    }
+
+    /// The next one, and how many of its team run or were picked before it.
+    fn pick(&mut self) -> Option<(InLine, usize)> {
+        // A set ordered by rank would save the scan; the number of teams in line is small.
+        let (.., team) = self
+            .waiting
+            .iter()
+            .filter_map(|(team, line)| self.rank(team, line))
+            .min()?;
+        let team = team.to_owned();
+        let line = self.waiting.get_mut(&team)?;
+        let pick = line.pop_front()?;
+        if line.is_empty() {
+            self.waiting.remove(&team);
+        }
+        let number = self.picked.values().max().copied().unwrap_or(0) + 1;
+        self.picked.insert(team.clone(), number);
+        let load = self.load.entry(team).or_default();
+        let running = *load;
+        *load += 1;
+        Some((pick, running))
+    }
+
+    fn rank<'a>(&self, team: &'a str, line: &VecDeque<InLine>) -> Option<Rank<'a>> {
+        let load = self.load.get(team).copied().unwrap_or(0);
+        let picked = self.picked.get(team).copied().unwrap_or(0);
+        Some((
+            load,
+            picked,
+            self.served.get(team).copied(),
+            line.front()?.submitted,
+            team,
+        ))
+    }
+}
+
+/// How long runs of a track take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Quartiles {
+    lower: i64,
+    median: i64,
+    upper: i64,
+}
+
+impl Quartiles {
+    /// Of the runs that ended last. None without runs.
+    fn of(mut runs: Vec<(Timestamp, i64)>) -> Option<Self> {
+        runs.sort_by_key(|run| std::cmp::Reverse(*run));
+        runs.truncate(RUNS);
+        let mut seconds: Vec<i64> = runs.into_iter().map(|(_, seconds)| seconds).collect();
+        seconds.sort_unstable();
+        let at = |quarter: usize| {
+            seconds
+                .get((seconds.len().checked_sub(1)? * quarter).div_ceil(4))
+                .copied()
+        };
+        Some(Self {
+            lower: at(1)?,
+            median: at(2)?,
+            upper: at(3)?,
         })
-        .min()
-        .map(|(_, _, team)| team.clone())
+    }
+
+    /// The wait of a place in line: the median times position over slots, a fifth to either side, or more where runs differ.
+    fn band(self, position: i32, slots: i64) -> String {
+        let wait = |seconds: i64| seconds.saturating_mul(position.into()) / slots.max(1);
+        let low = wait(self.lower).min(wait(self.median) * 4 / 5);
+        let high = wait(self.upper).max(wait(self.median).saturating_mul(6) / 5);
+        band(low, high)
+    }
+}
+
+/// Seconds as people say them: in minutes, hours or days, no finer than an estimate can be.
+fn band(low: i64, high: i64) -> String {
+    const MINUTE: i64 = 60;
+    const HOUR: i64 = 60 * MINUTE;
+    const DAY: i64 = 24 * HOUR;
+    let (unit, step, word) = match high {
+        ..=600 => (MINUTE, MINUTE, "min"),
+        ..=5_400 => (MINUTE, 5 * MINUTE, "min"),
+        ..=172_800 => (HOUR, HOUR, "h"),
+        _ => (DAY, DAY, "d"),
+    };
+    let low = low / step * step / unit;
+    let high = (high.max(1) + step - 1) / step * step / unit;
+    format!("{low}-{high} {word}")
 }
 
 #[cfg(test)]
@@ -99,6 +208,7 @@ mod tests {
         InLine {
             uid: uid.into(),
             team: team.into(),
+            track: "sensors".into(),
             priority: 0,
             submitted,
         }
@@ -111,13 +221,24 @@ mod tests {
         }
     }
 
+    fn occupied(teams: &[&str]) -> Past {
+        Past {
+            occupied: teams.iter().map(|team| (*team).to_owned()).collect(),
+            ..Past::default()
+        }
+    }
+
     fn wait(position: i32) -> Turn {
         Turn::Wait { position, eta: None }
     }
 
     #[test]
     fn without_limits_everyone_goes() {
-        let all = turns(vec![waiting("a", "x", 1), waiting("b", "x", 2)], &[], Limits::default());
+        let all = turns(
+            vec![waiting("a", "x", 1), waiting("b", "x", 2)],
+            occupied(&[]),
+            Limits::default(),
+        );
         assert!(all.values().all(|t| *t == Turn::Go));
         assert_eq!(all.len(), 2);
     }
@@ -126,7 +247,7 @@ mod tests {
     fn a_flood_of_one_team_does_not_hold_up_anothers_first() {
         let mut line: Vec<_> = (0..100).map(|n| waiting(&format!("x{n:03}"), "x", n)).collect();
         line.push(waiting("y", "y", 1000));
-        let all = turns(line, &["x".into()], limits(2));
+        let all = turns(line, occupied(&["x"]), limits(2));
         assert_eq!(all["y"], Turn::Go);
         assert_eq!(all["x000"], wait(1));
         assert_eq!(all["x099"], wait(100));
@@ -138,7 +259,7 @@ mod tests {
         urgent.priority = 5;
         let all = turns(
             vec![waiting("early", "x", 1), urgent, waiting("other", "y", 2)],
-            &[],
+            occupied(&[]),
             limits(2),
         );
         assert_eq!(all["late"], Turn::Go);
@@ -153,7 +274,11 @@ mod tests {
             per_team: Some(1),
             paused: false,
         };
-        let all = turns(vec![waiting("a", "x", 1), waiting("b", "y", 2)], &["x".into()], limits);
+        let all = turns(
+            vec![waiting("a", "x", 1), waiting("b", "y", 2)],
+            occupied(&["x"]),
+            limits,
+        );
         assert_eq!(all["a"], wait(1));
         assert_eq!(all["b"], Turn::Go);
     }
@@ -164,14 +289,198 @@ mod tests {
             paused: true,
             ..Limits::default()
         };
-        let all = turns(vec![waiting("a", "x", 1), waiting("b", "y", 2)], &[], limits);
+        let all = turns(vec![waiting("a", "x", 1), waiting("b", "y", 2)], occupied(&[]), limits);
         assert_eq!(all["a"], Turn::Paused { position: 1 });
         assert_eq!(all["b"], Turn::Paused { position: 2 });
     }
 
     #[test]
     fn a_full_leaderboard_starts_nobody() {
-        let all = turns(vec![waiting("a", "x", 1)], &["y".into(), "z".into()], limits(2));
+        let all = turns(vec![waiting("a", "x", 1)], occupied(&["y", "z"]), limits(2));
         assert_eq!(all["a"], wait(1));
+    }
+
+    #[test]
+    fn one_slot_goes_round_the_teams() {
+        let mut line: Vec<_> = (0..100).map(|n| waiting(&format!("x{n:03}"), "x", n)).collect();
+        line.push(waiting("y", "y", 1000));
+        let mut past = occupied(&[]);
+        past.served.insert("x".into(), Timestamp::from_second(2000).unwrap());
+        let all = turns(line.clone(), past.clone(), limits(1));
+        assert_eq!((&all["y"], &all["x000"]), (&Turn::Go, &wait(1)));
+        // While y runs, and when it has ended and pushed again.
+        past.occupied = vec!["y".into()];
+        past.served.insert("y".into(), Timestamp::from_second(3000).unwrap());
+        line.pop();
+        line.push(waiting("y2", "y", 4000));
+        let all = turns(line.clone(), past.clone(), limits(1));
+        assert_eq!((&all["x000"], &all["y2"], &all["x001"]), (&wait(1), &wait(2), &wait(3)));
+        past.occupied.clear();
+        assert_eq!(turns(line, past, limits(1))["x000"], Turn::Go);
+    }
+
+    #[test]
+    fn a_wait_is_the_median_run_times_the_place_over_the_slots() {
+        let runs = |track: &str, seconds: &[i64]| {
+            let ended = (0i64..).map(|n| Timestamp::from_second(n).unwrap());
+            (track.to_owned(), ended.zip(seconds.iter().copied()).collect::<Vec<_>>())
+        };
+        let eta = |seconds: &[i64], place: i64, slots: usize| {
+            let line = (1..=place).map(|n| waiting(&n.to_string(), "x", n)).collect();
+            let mut past = occupied(&["y"].repeat(slots));
+            past.runs = [runs("sensors", seconds), runs("map", &[1])].into();
+            match turns(line, past, limits(slots)).remove(&place.to_string()) {
+                Some(Turn::Wait { eta, .. }) => eta,
+                other => panic!("{other:?}"),
+            }
+        };
+        assert_eq!(eta(&[], 1, 1), None, "nothing is known of the track");
+        assert_eq!(eta(&[1500], 1, 1).as_deref(), Some("20-30 min"));
+        assert_eq!(eta(&[1500], 2, 4).as_deref(), Some("10-15 min"));
+        assert_eq!(eta(&[300], 1, 1).as_deref(), Some("4-6 min"));
+        assert_eq!(eta(&[1], 1, 4).as_deref(), Some("0-1 min"));
+        assert_eq!(eta(&[36_000], 1, 1).as_deref(), Some("8-12 h"));
+        assert_eq!(eta(&[36_000], 10, 1).as_deref(), Some("3-5 d"));
+        assert_eq!(
+            eta(&[600, 1500, 1500, 1500, 3000], 1, 1).as_deref(),
+            Some("20-30 min"),
+            "one outlier to either side changes nothing"
+        );
+        assert_eq!(
+            eta(&[600, 600, 1500, 3000, 3000], 1, 1).as_deref(),
+            Some("10-50 min"),
+            "runs that differ make it wide"
+        );
+        let mut old = vec![90_000; 50];
+        old.extend([1500; RUNS]);
+        assert_eq!(
+            eta(&old, 1, 1).as_deref(),
+            Some("20-30 min"),
+            "only the last runs count"
+        );
+    }
+
+    #[test]
+    fn without_a_total_nobody_guesses() {
+        let limits = Limits {
+            per_team: Some(1),
+            ..Limits::default()
+        };
+        let mut past = occupied(&["x"]);
+        past.runs = [("sensors".to_owned(), vec![(Timestamp::UNIX_EPOCH, 60)])].into();
+        assert_eq!(turns(vec![waiting("a", "x", 1)], past, limits)["a"], wait(1));
+    }
+
+    /// A day of a Leaderboard: teams that push again as soon as they can, each keeping so many in line.
+    struct Day {
+        now: i64,
+        slots: usize,
+        line: Vec<InLine>,
+        running: Vec<(i64, String)>,
+        past: Past,
+        random: fastrand::Rng,
+        number: i64,
+        /// Runs and seconds of each team.
+        had: BTreeMap<String, (f64, f64)>,
+    }
+
+    impl Day {
+        fn new(slots: usize, seed: u64) -> Self {
+            Self {
+                now: 0,
+                slots,
+                line: Vec::new(),
+                running: Vec::new(),
+                past: Past::default(),
+                random: fastrand::Rng::with_seed(seed),
+                number: 0,
+                had: BTreeMap::new(),
+            }
+        }
+
+        fn push(&mut self, team: &str) {
+            self.number += 1;
+            self.line.push(waiting(&format!("{:06}", self.number), team, self.now));
+        }
+
+        /// Starts whoever may, then goes on to the next end. Hands back the team that ended.
+        fn step(&mut self) -> String {
+            self.past.occupied = self.running.iter().map(|(_, team)| team.clone()).collect();
+            let turns = turns(self.line.clone(), self.past.clone(), limits(self.slots));
+            let (start, wait): (Vec<_>, Vec<_>) = self.line.drain(..).partition(|each| turns[&each.uid] == Turn::Go);
+            self.line = wait;
+            for each in start {
+                let seconds = self.random.i64(20 * 60..120 * 60);
+                let had = self.had.entry(each.team.clone()).or_default();
+                *had = (had.0 + 1.0, had.1 + f64::from(i32::try_from(seconds).unwrap()));
+                let now = Timestamp::from_second(self.now).unwrap();
+                self.past.served.insert(each.team.clone(), now);
+                self.running.push((self.now + seconds, each.team));
+            }
+            self.running.sort();
+            let (at, team) = self.running.remove(0);
+            self.now = at;
+            team
+        }
+    }
+
+    /// 1 is fair, 1/n is all to one.
+    fn jain(shares: &[f64]) -> f64 {
+        let n = f64::from(u32::try_from(shares.len()).unwrap());
+        let (sum, squares) = shares.iter().fold((0.0, 0.0), |(sum, sq), x| (sum + x, sq + x * x));
+        sum * sum / (n * squares)
+    }
+
+    #[test]
+    fn a_day_is_fair_to_all_who_always_have_work() {
+        for (slots, seed) in [(1, 1), (2, 2), (4, 3), (8, 4), (12, 5)] {
+            let mut day = Day::new(slots, seed);
+            // One keeps a hundred in line, one twenty, the others push again when their last one has ended.
+            for _ in 0..100 {
+                day.push("flood");
+            }
+            for _ in 0..20 {
+                day.push("many");
+            }
+            for team in ["a", "b", "c", "d"] {
+                for _ in 0..slots.div_ceil(4) {
+                    day.push(team);
+                }
+            }
+            while day.now < 86_400 {
+                let ended = day.step();
+                day.push(&ended);
+            }
+            let runs: Vec<f64> = day.had.values().map(|had| had.0).collect();
+            let seconds: Vec<f64> = day.had.values().map(|had| had.1).collect();
+            assert_eq!(runs.len(), 6, "{:?}", day.had);
+            let (of_runs, of_time) = (jain(&runs), jain(&seconds));
+            println!("{slots} slots: Jain index {of_runs:.3} of runs, {of_time:.3} of time; runs {runs:?}");
+            assert!(of_runs >= 0.95, "{slots} slots: {of_runs}");
+            // With a handful of runs a team, how long each takes is luck.
+            let is_many = runs.iter().all(|runs| *runs >= 10.0);
+            assert!(of_time >= 0.95 || !is_many, "{slots} slots: {of_time}");
+        }
+    }
+
+    #[test]
+    fn a_flood_of_a_hundred_holds_up_nobodys_first_for_longer_than_one_run() {
+        for slots in [1, 2, 4] {
+            let mut day = Day::new(slots, 7);
+            for _ in 0..100 {
+                day.push("flood");
+            }
+            for _ in 0..10 {
+                day.step();
+            }
+            day.push("late");
+            let pushed = day.now;
+            while !day.had.contains_key("late") {
+                day.step();
+            }
+            // `step` has gone on to the end after its start.
+            let started = day.past.served["late"].as_second();
+            assert_eq!(started, pushed, "{slots} slots: the next one that is free is theirs");
+        }
     }
 }

@@ -18,6 +18,7 @@ pub struct View {
     pub turn: Turn,
     pub job: JobSight,
     pub pod: Option<PodView>,
+    pub node: NodeSight,
     pub report: ReportSight,
     /// None for a submission that is not EvalAI's.
     pub evalai: Option<EvalaiView>,
@@ -83,6 +84,8 @@ pub struct PodView {
     pub unschedulable: Option<String>,
     /// When it has to be gone, once it is being deleted (its grace included).
     pub delete_by: Option<Timestamp>,
+    /// When its deletion was asked for.
+    pub deleted: Option<Timestamp>,
     /// When its first agent started.
     pub agent_started: Option<Timestamp>,
     pub logcopy_running: bool,
@@ -90,6 +93,20 @@ pub struct PodView {
     /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
     pub ended_by_node: Option<(String, String)>,
     pub stop: Option<Stop>,
+}
+
+/// The Pod's node, which is looked at only while the Pod is being deleted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum NodeSight {
+    /// There was no reason to look, or no right to.
+    #[default]
+    Unknown,
+    /// Its kubelet speaks to the API server.
+    Reports,
+    /// Its kubelet has not been heard of since.
+    Silent { since: Timestamp },
+    /// There is no such node any more.
+    Gone,
 }
 
 /// One container of the Pod.

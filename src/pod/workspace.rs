@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 use super::gather::results_plan;
 use super::identity;
 use super::places::{Places, Setting};
-use super::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
+use super::report::{FAILURE_LOG_KEY, MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError};
@@ -216,9 +216,10 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     if stored.is_some_and(|report| report.submission_uid == run.uid) {
         return Ok(Claim::TakeUp);
     }
-    // The controller may have taken the fence from a Pod that never came this far.
-    let there = archive.list("", 2).await?.objects;
-    if there.iter().all(|object| object.key == OWNER_KEY) {
+    // The controller may have taken the fence from a Pod that never came this far, and told why it failed.
+    let controllers = [OWNER_KEY, FAILURE_LOG_KEY];
+    let there = archive.list("", controllers.len() + 1).await?.objects;
+    if there.iter().all(|object| controllers.contains(&object.key.as_str())) {
         return Ok(Claim::Fresh);
     }
     let plan = &run.plan;

@@ -153,6 +153,29 @@ impl Archive {
         }))
     }
 
+    /// The last `bytes` of an object, or all of it; `None` if there is none.
+    pub async fn tail(&self, key: &str, bytes: u64) -> Result<Option<Vec<u8>>, ArchiveError> {
+        const OP: &str = "reading";
+        let request = self.client.get_object().bucket(&self.bucket).key(self.full(key));
+        let mut output = match request.range(format!("bytes=-{bytes}")).send().await {
+            Ok(output) => output,
+            Err(error) if is_absent(&error) => return Ok(None),
+            // An empty object has no range.
+            Err(error) if error::status(&error) == Some(416) => return Ok(Some(Vec::new())),
+            Err(error) if error::status(&error) == Some(403) && self.is_unlisted(key).await => return Ok(None),
+            Err(error) => return Err(self.failed(OP, key, &error)),
+        };
+        let mut tail = Vec::new();
+        while let Some(chunk) = output.body.try_next().await.map_err(|e| self.broken(OP, key, &e))? {
+            tail.extend_from_slice(&chunk);
+            if tail.len() as u64 > bytes {
+                // A stand-in that knows no ranges sends everything.
+                return Err(self.error(OP, key, Cause::TooLarge(bytes)));
+            }
+        }
+        Ok(Some(tail))
+    }
+
     /// Writes an object's content to `into`, at most `limit` bytes. Returns how many; `None` if there is no object.
     pub async fn download(
         &self,

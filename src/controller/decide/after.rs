@@ -6,7 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
 use super::failure::sentence;
-use super::{Action, Tell, accept, stop};
+use super::{Action, Tell, accept, log, stop};
 use crate::api::conditions::{self, Truth};
 use crate::api::{State, reasons};
 use crate::controller::view::{EvalaiEnd, JobSight, JobView};
@@ -17,6 +17,8 @@ const AGAIN: Duration = Duration::from_secs(30);
 /// Decides for a submission in a terminal state.
 pub(super) fn decide(draft: &mut Draft<'_>) {
     leave_job(draft);
+    // Before EvalAI is told, since its hosts read it there.
+    log::keep_at_end(draft);
     let published = publish(draft);
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = published != Sync::Waiting && record(draft) == Sync::Done;

@@ -6,7 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::Draft;
 use crate::api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
-use crate::controller::view::{ContainerView, EndView, JobEnd, PodView};
+use crate::controller::view::{ContainerView, EndView, JobEnd, NodeSight, PodView};
 use crate::pod::run::Stop;
 
 /// A failure that is the participant's.
@@ -16,6 +16,7 @@ pub(super) fn participant(reason: &str, message: impl Into<String>) -> Failure {
         reason: reason.into(),
         message: message.into(),
         charged: true,
+        pair: None,
     }
 }
 
@@ -26,6 +27,7 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
         reason: reason.into(),
         message: format!("{what} {}", next_step(reason)).trim_end().to_owned(),
         charged: false,
+        pair: None,
     }
 }
 
@@ -73,12 +75,14 @@ pub(super) fn job_deleted() -> Failure {
     )
 }
 
-pub(super) fn node_lost(node: Option<&str>) -> Failure {
+pub(super) fn node_lost(node: Option<&str>, sight: NodeSight) -> Failure {
     let node = node.map_or_else(|| "Its node".to_owned(), |node| format!("Node {node}"));
-    infrastructure(
-        reasons::NODE_LOST,
-        &format!("{node} was lost and its Pod with it; finished routes are kept."),
-    )
+    let what = if sight == NodeSight::Reports {
+        "did not end its Pod within its grace"
+    } else {
+        "was lost and its Pod with it"
+    };
+    infrastructure(reasons::NODE_LOST, &format!("{node} {what}; finished routes are kept."))
 }
 
 pub(super) fn time_limit(seconds: i64) -> Failure {
@@ -250,6 +254,13 @@ fn worst_pair(status: &SubmissionStatus) -> Option<Failure> {
 }
 
 fn of_pair(id: i32, crashes: i32, word: &str) -> Failure {
+    Failure {
+        pair: Some(id),
+        ..cause_of_pair(id, crashes, word)
+    }
+}
+
+fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
     let times = if crashes == 1 {
         "once".to_owned()
     } else {

@@ -73,7 +73,7 @@ fn in_line(draft: &mut Draft<'_>) {
         Turn::Go => return start_job(draft),
         Turn::Wait { position, eta } => (
             position,
-            eta,
+            known_eta(draft, position).or(eta),
             reasons::WAITING_FOR_SLOT,
             "All slots of the Leaderboard are in use; running.total and running.perTeam set their number.",
         ),
@@ -88,6 +88,12 @@ fn in_line(draft: &mut Draft<'_>) {
     draft.moves();
     draft.say(State::Pending, reason, message);
     draft.requeue_in(BACKSTOP);
+}
+
+/// What was said of this place. A wait that is only estimated anew is not worth a write; it follows the place.
+fn known_eta(draft: &Draft<'_>, position: i32) -> Option<String> {
+    let known = draft.status.waiting.as_ref().filter(|known| known.position == position);
+    known.and_then(|known| known.eta.clone())
 }
 
 fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {

@@ -10,6 +10,7 @@ mod draft;
 mod end;
 mod failure;
 mod live;
+mod log;
 mod start;
 mod stop;
 #[cfg(test)]
@@ -22,6 +23,7 @@ use super::view::View;
 use crate::api::{SubmissionStatus, names};
 use crate::pod::run::Stop;
 use draft::Draft;
+pub use log::{LogAt, LogPlace};
 
 /// What a pass wants: the status to show, then the actions in order, then the events.
 #[derive(Clone, Debug, PartialEq)]
@@ -56,6 +58,8 @@ pub enum Action {
     AnnotateStop { pod: String, stop: Stop },
     /// Let Kubernetes remove the finished Job after its time.
     SetJobTtl { name: String, seconds: i32 },
+    /// Keep the tail of the log that explains the failure, from the first of these places that has it.
+    KeepLog { places: Vec<LogPlace> },
     /// Ask EvalAI for the submission.
     AskEvalai,
     /// Tell EvalAI.

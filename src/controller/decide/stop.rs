@@ -6,17 +6,22 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
-use super::{Action, failure, start};
+use super::{Action, failure, log, start};
 use crate::api::reasons;
-use crate::controller::view::{JobView, PodView};
+use crate::controller::view::{JobView, NodeSight, PodView};
 use crate::pod::run::Stop;
 
 /// Added to `cancelSeconds` before a Pod that was told to stop is deleted.
 const STOP_MARGIN_SECONDS: i64 = 15;
 /// Grace of a Pod that is deleted because it did not stop by itself.
 pub(super) const DELETE_GRACE_SECONDS: i64 = 60;
-/// How long a Pod may be past its grace before its node is given up.
+/// How long a Pod may be past its grace before its node is given up, where nobody knows about the node.
 const LOST_MARGIN_SECONDS: i64 = 30;
+/// The same while the kubelet reports: it may still be cleaning up.
+const STUCK_MARGIN_SECONDS: i64 = 120;
+/// How long a node must have been silent, or gone, and its Pod been deleted, before the Pod is given up. The node controller
+/// itself has waited some 40 s for a word, and 60 s more before it deletes the Pod.
+const SILENT_SECONDS: i64 = 30;
 /// How soon a deletion is looked at again.
 const SOON: Duration = Duration::from_secs(2);
 
@@ -24,6 +29,7 @@ const SOON: Duration = Duration::from_secs(2);
 pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
     let since = stopping_since(draft);
     show(draft);
+    log::keep_while_there(draft);
     let view = draft.view;
     // Without agents there is nothing to store; with them, a logcopy that is being restarted may still do so.
     let listening = view
@@ -130,17 +136,36 @@ pub(super) fn remove_overdue_pod(draft: &mut Draft<'_>) {
     }
 }
 
-/// A Pod that is past its grace although nobody told it to stop: its node is gone, and the Job would wait for it.
-pub(super) fn lost_pod<'a>(draft: &Draft<'a>) -> Option<&'a PodView> {
+/// A Pod that goes away although nobody told it to stop, on a node that is gone: the Job would wait for the node.
+pub(super) fn lost_pod<'a>(draft: &mut Draft<'a>) -> Option<&'a PodView> {
     let is_given_up = |f: &crate::api::Failure| f.reason == reasons::NODE_LOST;
     let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));
     let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
-    (draft.now() >= after(pod.delete_by?, LOST_MARGIN_SECONDS)).then_some(pod)
+    let at = given_up_at(draft.view.node, pod)?;
+    if draft.now() >= at {
+        return Some(pod);
+    }
+    draft.requeue_at(at);
+    None
+}
+
+/// When a Pod that is being deleted is given up. While the kubelet reports it has the whole grace, and then some.
+fn given_up_at(node: NodeSight, pod: &PodView) -> Option<Timestamp> {
+    let by = pod.delete_by?;
+    let deleted = pod.deleted.unwrap_or(by);
+    let at = match node {
+        NodeSight::Unknown => after(by, LOST_MARGIN_SECONDS),
+        NodeSight::Reports => after(by, STUCK_MARGIN_SECONDS),
+        NodeSight::Silent { since } => after(deleted.max(since), SILENT_SECONDS),
+        NodeSight::Gone => after(deleted, SILENT_SECONDS),
+    };
+    // A grace that is shorter than the silence is over all the same.
+    Some(at.min(after(by, STUCK_MARGIN_SECONDS)))
 }
 
 /// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
 pub(super) fn leave_lost_pod(draft: &mut Draft<'_>, job: &JobView, pod: &PodView) {
-    let found = failure::node_lost(pod.node.as_deref());
+    let found = failure::node_lost(pod.node.as_deref(), draft.view.node);
     start::replacing(draft, &failure::what_happened(&found));
     draft.fail(found);
     force(draft, pod);

@@ -41,6 +41,13 @@ pub(super) fn of_pod(pod: &PodView) -> Option<Trouble> {
     })
 }
 
+/// The container before the agents that fails.
+pub(super) fn failing_before_agents(pod: &PodView) -> Option<&str> {
+    let is_failing =
+        |c: &&ContainerView| is_before_agents(&c.name) && c.last.as_ref().is_some_and(|l| l.exit_code != 0);
+    pod.containers.iter().find(is_failing).map(|c| c.name.as_str())
+}
+
 fn is_before_agents(name: &str) -> bool {
     [
         names::CONTAINER_CONTENTS,

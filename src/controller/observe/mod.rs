@@ -2,6 +2,7 @@
 
 pub mod board;
 pub mod job;
+mod node;
 pub mod pod;
 pub mod report;
 
@@ -15,7 +16,7 @@ use kube::{Resource, ResourceExt};
 
 use super::context::Context;
 use super::decide::job_name;
-use super::view::{JobSight, PodView, ReportSight, View};
+use super::view::{JobSight, NodeSight, PodView, ReportSight, View};
 use crate::api::{Leaderboard, Submission, conditions, names};
 
 /// Sees everything a pass may depend on.
@@ -34,12 +35,18 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         }
         other => other,
     };
+    let node = match &pod {
+        Some(pod) if pod.delete_by.is_some() => node::sight(context, pod).await,
+        _ => NodeSight::Unknown,
+    };
     let report = report::read(context, &submission, &job, now).await;
-    let turn = context.board.turn(context, &submission, leaderboard.as_deref());
     let record = leaderboard
         .as_ref()
         .and_then(|l| context.sync.record_view(l, &submission));
     let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission);
+    let is_asked = evalai.as_ref().is_none_or(|e| e.info.is_some());
+    let all = context.stores.submissions.state();
+    let turn = context.board.turn(&all, &submission, leaderboard.as_deref(), is_asked);
     let partial_told = context.memory.partial_told(&submission);
     View {
         now,
@@ -48,6 +55,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         turn,
         job,
         pod,
+        node,
         report,
         evalai,
         record,

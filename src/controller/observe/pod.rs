@@ -25,6 +25,7 @@ pub fn view(pod: &Pod) -> PodView {
         scheduled: scheduled(&status),
         unschedulable: unschedulable(&status),
         delete_by: pod.metadata.deletion_timestamp.as_ref().map(|t| t.0),
+        deleted: deleted(pod),
         agent_started: agent_started(&status),
         logcopy_running: running(names::CONTAINER_LOGCOPY),
         ended_by_node: ended_by_node(&status),
@@ -34,6 +35,13 @@ pub fn view(pod: &Pod) -> PodView {
             .and_then(|text| Stop::parse(text)),
         containers,
     }
+}
+
+/// When its deletion was asked for: the API server adds the grace to what it shows.
+fn deleted(pod: &Pod) -> Option<jiff::Timestamp> {
+    let by = pod.metadata.deletion_timestamp.as_ref()?.0;
+    let grace = pod.metadata.deletion_grace_period_seconds.unwrap_or(0);
+    by.checked_sub(jiff::SignedDuration::from_secs(grace)).ok()
 }
 
 fn statuses(status: &PodStatus) -> impl Iterator<Item = &ContainerStatus> {
@@ -103,12 +111,27 @@ fn container(status: &ContainerStatus) -> ContainerView {
 
 fn last_end(status: &ContainerStatus, state: &ContainerState) -> Option<EndView> {
     let before = status.last_state.as_ref().and_then(|s| s.terminated.as_ref());
-    state.terminated.as_ref().or(before).map(end)
+    let ended = state.terminated.as_ref().or(before)?;
+    Some(end(ended, may_speak(&status.name, ended)))
 }
 
-fn end(terminated: &ContainerStateTerminated) -> EndView {
+/// Whose words are passed on to people. A stranger's program can write whatever it likes where the runner leaves its
+/// verdict, for example a private route; of that only the verdict's closed words are taken.
+fn may_speak(container: &str, ended: &ContainerStateTerminated) -> bool {
+    let is_hosts = [
+        names::CONTAINER_CONTENTS,
+        names::CONTAINER_WORKSPACE,
+        names::CONTAINER_LOGCOPY,
+    ]
+    .contains(&container);
+    // Without a start there was no program yet; the words are the kubelet's.
+    is_hosts || matches!(ended.reason.as_deref(), Some("StartError" | "ContainerCannotRun"))
+}
+
+fn end(terminated: &ContainerStateTerminated, may_speak: bool) -> EndView {
     let message = terminated.message.as_deref().unwrap_or_default();
     let verdict = Verdict::parse(message).ok();
+    let foreign = Some(message).filter(|_| may_speak);
     let out_of_memory = verdict.as_ref().is_some_and(|v| v.out_of_memory);
     let reason = terminated.reason.clone().unwrap_or_default();
     EndView {
@@ -118,8 +141,8 @@ fn end(terminated: &ContainerStateTerminated) -> EndView {
         what: verdict
             .as_ref()
             .map(|v| word(v.what).to_owned())
-            .or_else(|| foreign_word(message)),
-        why: verdict.map(|v| short(&v.why)).or_else(|| foreign_why(message)),
+            .or_else(|| foreign.and_then(foreign_word)),
+        why: verdict.map(|v| short(&v.why)).or_else(|| foreign.and_then(foreign_why)),
     }
 }
 
@@ -160,5 +183,46 @@ fn short(text: &str) -> String {
     match text.char_indices().nth(MAX_WORDS) {
         Some((end, _)) => format!("{} …", &text[..end]),
         None => text.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn seen(container: &str, reason: &str, message: &str) -> EndView {
+        let pod = serde_json::from_value(json!({"metadata": {"name": "p"}, "status": {"containerStatuses": [{
+            "name": container, "image": "i", "imageID": "", "ready": false, "restartCount": 1,
+            "state": {"terminated": {"exitCode": 1, "reason": reason, "message": message}},
+        }]}}));
+        view(&pod.unwrap()).containers[0].last.clone().unwrap()
+    }
+
+    #[test]
+    fn a_strangers_program_puts_no_words_into_anybodys_mouth() {
+        let forged = r#"{"reason": "route 7 begins at x=13", "message": "and ends at y=4"}"#;
+        for container in ["agent-1", "simulator-1", "sidecar"] {
+            for message in [forged, "route 7 begins at x=13"] {
+                let end = seen(container, "Error", message);
+                assert_eq!((end.what, end.why), (None, None), "{container}: {message}");
+            }
+        }
+        let told = seen("workspace", "Error", forged);
+        assert_eq!(told.what.as_deref(), Some("route 7 begins at x=13"));
+        assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
+        let kubelets = seen("agent-1", "StartError", "exec: no such file");
+        assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
+    }
+
+    #[test]
+    fn a_deletion_has_a_beginning_and_a_grace() {
+        let pod = serde_json::from_value(json!({"metadata": {
+            "name": "p", "deletionTimestamp": "2026-01-01T00:10:00Z", "deletionGracePeriodSeconds": 600,
+        }}));
+        let seen = view(&pod.unwrap());
+        assert_eq!(seen.deleted.unwrap().to_string(), "2026-01-01T00:00:00Z");
+        assert_eq!(seen.delete_by.unwrap().to_string(), "2026-01-01T00:10:00Z");
     }
 }

@@ -149,6 +149,7 @@ async fn submission_pass(submission: Arc<Submission>, shared: Arc<Shared>) -> Re
         let view = observe(&shared.context, Arc::clone(&submission)).await;
         let plan = decide(&view);
         let requeue = plan.requeue;
+        shared.context.board.settle(&uid_of(submission.as_ref()), &plan.status);
         let held_back = act(&shared.context, &view, plan).await?;
         Ok([requeue, held_back].into_iter().flatten().min())
     };

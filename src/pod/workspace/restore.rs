@@ -9,7 +9,7 @@ use std::sync::Arc;
 use futures::{StreamExt, TryStreamExt};
 
 use super::WorkspaceError;
-use crate::pod::report::{OWNER_KEY, REPORT_KEY};
+use crate::pod::report::{FAILURE_LOG_KEY, OWNER_KEY, REPORT_KEY};
 use crate::pod::run::{Run, STATUS_FOLDER};
 use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
 use crate::pod::upload::{Memory, Stored, fingerprint};
@@ -72,7 +72,7 @@ struct Chosen {
 
 /// What is restored: the smallest first, so that a huge log never keeps a checkpoint out.
 fn choose(mut objects: Vec<Listed>, pairs: usize, limit: u64) -> Chosen {
-    let ours = [OWNER_KEY, REPORT_KEY];
+    let ours = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
     objects.retain(|object| {
         !ours.contains(&object.key.as_str())
             && !object.key.starts_with(&format!("{STATUS_FOLDER}/"))

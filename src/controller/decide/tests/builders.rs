@@ -11,8 +11,8 @@ use crate::api::conditions;
 use crate::api::{Leaderboard, LeaderboardSpec, State, Submission, SubmissionStatus, names};
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobSight, JobView, PodView, RecordView,
-    ReportSight, Standing, Turn, View,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobSight, JobView, NodeSight, PodView,
+    RecordView, ReportSight, Standing, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -96,6 +96,7 @@ impl World {
                 turn: Turn::Go,
                 job: JobSight::Absent,
                 pod: None,
+                node: NodeSight::Unknown,
                 report: ReportSight::NotRead,
                 evalai: evalai.then_some(known),
                 record: Some(RecordView::default()),

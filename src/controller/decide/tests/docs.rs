@@ -34,3 +34,42 @@ fn every_explained_reason_exists() {
         );
     }
 }
+
+/// The constants below a comment of `api::reasons`, up to the next empty line.
+fn group(comment: &str) -> Vec<&'static str> {
+    let (_, rest) = REASONS.split_once(comment).unwrap();
+    let lines = rest.lines().take_while(|line| !line.is_empty());
+    lines
+        .filter_map(|line| line.strip_prefix("pub const ")?.split('"').nth(1))
+        .collect()
+}
+
+/// The rows below a heading of docs/states.md.
+fn section(heading: &str) -> Vec<&'static str> {
+    let (_, rest) = STATES.split_once(heading).unwrap();
+    let (text, _) = rest.split_once("\n## ").unwrap();
+    let rows = text
+        .lines()
+        .filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+    rows.collect()
+}
+
+#[test]
+fn a_failures_class_is_that_of_its_section() {
+    for (comment, heading) in [
+        (
+            "// Failures of the participant.\n",
+            "## Failures of the participant (charged)\n",
+        ),
+        (
+            "// Failures of the infrastructure.\n",
+            "## Failures of the infrastructure (never charged)\n",
+        ),
+    ] {
+        let (mut known, mut told) = (group(comment), section(heading));
+        assert!(known.len() >= 8, "{comment}{known:?}");
+        known.sort_unstable();
+        told.sort_unstable();
+        assert_eq!(known, told, "{heading}");
+    }
+}

@@ -8,7 +8,7 @@ use crate::controller::view::{JobSight, Turn};
 #[test]
 fn who_waits_sees_place_and_time() {
     let mut world = World::local();
-    let eta = Some("20m-40m".to_owned());
+    let eta = Some("20-35 min".to_owned());
     world.view.turn = Turn::Wait {
         position: 3,
         eta: eta.clone(),
@@ -17,13 +17,27 @@ fn who_waits_sees_place_and_time() {
     assert_eq!(plan.status.waiting, Some(Waiting { position: 3, eta }));
     assert!(!creates(&plan));
 
-    world.view.turn = Turn::Wait { position: 2, eta: None };
+    let before = world.status();
+    world.view.turn = Turn::Wait {
+        position: 3,
+        eta: Some("25-40 min".into()),
+    };
+    assert_eq!(world.pass().status, before, "another estimate is not another write");
+
+    let eta = Some("15-25 min".to_owned());
+    world.view.turn = Turn::Wait {
+        position: 2,
+        eta: eta.clone(),
+    };
     let plan = world.pass();
-    assert_eq!(plan.status.waiting.unwrap().position, 2);
+    assert_eq!(plan.status.waiting, Some(Waiting { position: 2, eta }));
     assert!(plan.events.is_empty(), "a step forward is no transition");
 
-    world.view.turn = Turn::Paused { position: 1 };
-    assert_eq!(events(&world.pass_to(Pending, reasons::PAUSED)), [reasons::PAUSED]);
+    world.view.turn = Turn::Paused { position: 2 };
+    let plan = world.pass_to(Pending, reasons::PAUSED);
+    assert_eq!(events(&plan), [reasons::PAUSED]);
+    let place = Some(Waiting { position: 2, eta: None });
+    assert_eq!(plan.status.waiting, place, "nobody knows for how long");
 
     world.view.turn = Turn::Go;
     let plan = world.pass_to(Pending, reasons::PREPARING);

@@ -8,6 +8,7 @@ mod docs;
 mod end;
 mod failure;
 mod line;
+mod log;
 mod properties;
 mod resume;
 mod rules;

@@ -8,7 +8,9 @@ use proptest::sample::select;
 
 use super::builders::*;
 use crate::controller::decide::job_name;
-use crate::controller::view::{EvalaiEnd, EvalaiView, JobEnd, JobSight, JobView, PodView, ReportSight, Standing, Turn};
+use crate::controller::view::{
+    EvalaiEnd, EvalaiView, JobEnd, JobSight, JobView, NodeSight, PodView, ReportSight, Standing, Turn,
+};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 
@@ -18,6 +20,7 @@ enum Change {
     Time(i64),
     Job(Sight),
     Pod(Option<Box<PodView>>),
+    Node(NodeSight),
     Report(ReportSight),
     Evalai(EvalaiView),
     Recorded(bool),
@@ -152,6 +155,7 @@ fn pod_view() -> impl Strategy<Value = PodView> {
             agent_started,
             logcopy_running,
             delete_by,
+            deleted: delete_by.map(|by| by.min(at(300))),
             ended_by_node,
             unschedulable: (unschedulable && scheduled.is_none()).then(|| "no node".into()),
             stop,
@@ -219,11 +223,19 @@ fn change() -> impl Strategy<Value = Change> {
         Turn::Wait { position: 2, eta: None },
         Turn::Paused { position: 1 },
     ];
+    let nodes = vec![
+        NodeSight::Unknown,
+        NodeSight::Reports,
+        NodeSight::Silent { since: at(20) },
+        NodeSight::Silent { since: at(60_000) },
+        NodeSight::Gone,
+    ];
     let leaderboard = (prop::bool::weighted(0.8), 0..3, select(vec![0i64, 0, 300]));
     prop_oneof![
         6 => select(vec![1i64, 20, 130, 2000, 90_000, -500, -200_000]).prop_map(Change::Time),
         8 => job().prop_map(Change::Job),
         6 => prop::option::weighted(0.9, pod_view().prop_map(Box::new)).prop_map(Change::Pod),
+        3 => select(nodes).prop_map(Change::Node),
         5 => report_sight().prop_map(Change::Report),
         3 => evalai_view().prop_map(Change::Evalai),
         1 => any::<bool>().prop_map(Change::Recorded),
@@ -268,6 +280,7 @@ fn apply(world: &mut World, change: Change) {
         Change::Time(seconds) => world.wait(seconds),
         Change::Job(sight) => see_job(world, sight),
         Change::Pod(pod) => world.view.pod = pod.map(|pod| *pod),
+        Change::Node(node) => world.view.node = node,
         Change::Report(report) => world.view.report = report,
         Change::Evalai(view) => world.view.evalai = is_evalais.then_some(view),
         Change::Recorded(end) => world.view.record.get_or_insert_default().end_written = end,

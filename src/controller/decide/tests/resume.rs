@@ -107,6 +107,34 @@ fn a_jump_or_a_first_attempt_above_one_is_an_attempt_like_any() {
 }
 
 #[test]
+fn what_the_old_pipeline_left_is_taken_up_without_status_or_report() {
+    // Resumed in EvalAI: a message for a submission that this cluster has never seen.
+    let mut world = World::evalai();
+    world.in_evalai().info.as_mut().unwrap().standing = crate::controller::view::Standing::Resumed;
+    world.view.report = ReportSight::Absent;
+    let plan = world.pass();
+    assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: 0 }));
+    assert!(
+        plan.status.plan.as_ref().unwrap().resume,
+        "workspace restores what is there"
+    );
+    world.see_job();
+    world.view.pod = Some(pod(5));
+    world.see_agents();
+    let plan = world.pass_to(Resumed, reasons::RESUMED);
+    assert_eq!(tells(&plan), [Tell::Running]);
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+
+    // By hand, for data without EvalAI.
+    let mut world = World::local();
+    world.submission().spec.attempt = 2;
+    world.pass();
+    assert!(world.pass().status.plan.unwrap().resume);
+}
+
+#[test]
 fn the_image_is_the_first_attempts() {
     let mut world = failed();
     world.submission().spec.image = None;

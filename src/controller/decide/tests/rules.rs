@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use crate::api::conditions::{self, FINISHED, PUBLISHED};
 use crate::api::{FailureClass, State, SubmissionStatus};
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
-use crate::controller::view::{JobSight, View};
+use crate::controller::view::{JobSight, NodeSight, View};
 
 /// Passes after which nothing may change any more in a world that stands still.
 const SETTLED_AFTER: usize = 5;
@@ -15,6 +15,8 @@ pub fn check(view: &View, plan: &Plan) {
     terminal_states_stay(view, plan);
     one_job(view, plan);
     tells_fit(view, plan);
+    logs_come_first(plan);
+    a_reporting_node_has_its_grace(view, plan);
     status_is_whole(plan);
     conditions_are_conventional(plan);
     live_ones_are_looked_at_again(plan);
@@ -71,6 +73,46 @@ fn one_job(view: &View, plan: &Plan) {
             let is_seen = matches!(&view.job, JobSight::Ours(job) if job.name == *name && job.uid == *uid);
             assert!(is_seen, "deletes a Job it does not see");
         }
+    }
+}
+
+/// The log of a failure is kept before anything takes it away, and before EvalAI is told.
+fn logs_come_first(plan: &Plan) {
+    let place = plan.actions.iter().position(|a| matches!(a, Action::KeepLog { .. }));
+    let Some(place) = place else { return };
+    assert!(plan.status.failure.is_some(), "the log of no failure");
+    let takes_it_away = |a: &Action| {
+        matches!(
+            a,
+            Action::DeleteJob { .. } | Action::ForceDeletePod { .. } | Action::Tell(_) | Action::ForgetEvalai
+        )
+    };
+    let first = plan.actions.iter().position(takes_it_away);
+    // A Job that shows up after the end is not the failed one.
+    let is_over = is_finished(&plan.status);
+    assert!(is_over || first.is_none_or(|first| place < first), "{:?}", plan.actions);
+    let told = plan
+        .actions
+        .iter()
+        .position(|a| matches!(a, Action::Tell(_) | Action::ForgetEvalai));
+    assert!(told.is_none_or(|told| place < told), "{:?}", plan.actions);
+}
+
+/// As long as its kubelet reports, a Pod that nobody here stops has the whole of its grace.
+fn a_reporting_node_has_its_grace(view: &View, plan: &Plan) {
+    let before = view.submission.status.clone().unwrap_or_default();
+    let is_live = !is_finished(&before) && before.failure.is_none();
+    let is_lost = plan
+        .status
+        .failure
+        .as_ref()
+        .is_some_and(|f| f.reason == crate::api::reasons::NODE_LOST);
+    if let (true, true, Some(pod)) = (is_live, is_lost, &view.pod) {
+        let by = pod.delete_by.expect("only a Pod that is being deleted is given up");
+        assert!(
+            view.node != NodeSight::Reports || view.now > by,
+            "given up within its grace"
+        );
     }
 }
 

@@ -6,7 +6,7 @@ use crate::api::State::{Failed, Finished, Pending, Resumed, Running};
 use crate::api::conditions::{RUNNING, STALLED};
 use crate::api::reasons;
 use crate::controller::decide::{Action, Tell};
-use crate::controller::view::{JobSight, PodView, ReportSight};
+use crate::controller::view::{JobSight, NodeSight, PodView, ReportSight};
 use crate::pod::run::Stop;
 
 #[test]
@@ -196,6 +196,115 @@ fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
     assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: 1 }));
     assert_eq!(tells(&plan), [], "EvalAI keeps saying running");
     assert_eq!(plan.status.job.as_deref(), Some("sub-1-r1"));
+}
+
+/// A Pod that somebody else deletes at second 100 with a grace of 600 s, on a node that is seen like this.
+fn going(node: NodeSight) -> World {
+    let mut world = World::evalai().running();
+    world.see(ended("agent-1", 2, "exited", 1, 50));
+    world.see(running("agent-1"));
+    world.go_to(100);
+    world.pod().deleted = Some(at(100));
+    world.pod().delete_by = Some(at(700));
+    world.view.node = node;
+    world
+}
+
+#[test]
+fn a_pod_is_given_up_early_only_where_its_kubelet_is_silent() {
+    let silent = |since| NodeSight::Silent { since: at(since) };
+    let cases = [
+        ("silent before the eviction", silent(40), 130),
+        ("silent since just now", silent(110), 140),
+        ("silent late in its grace", silent(695), 725),
+        ("no such node any more", NodeSight::Gone, 130),
+        ("the kubelet reports", NodeSight::Reports, 820),
+        ("nobody may look", NodeSight::Unknown, 730),
+    ];
+    for (what, node, second) in cases {
+        let mut world = going(node);
+        world.pass_to(Running, reasons::REPLACING);
+        world.go_to(second - 1);
+        let plan = world.pass_to(Running, reasons::REPLACING);
+        assert!(!has(&plan, |a| *a == Action::TakeOwnership), "{what}");
+        let left = plan.requeue.unwrap();
+        assert!(
+            left <= std::time::Duration::from_millis(1050),
+            "{what}: by exact requeue, not {left:?}"
+        );
+        world.go_to(second);
+        let plan = world.pass_to(Running, reasons::REPLACING);
+        let order = plan.actions.iter().filter_map(|a| match a {
+            Action::TakeOwnership => Some("fence"),
+            Action::ForceDeletePod { .. } => Some("pod"),
+            Action::DeleteJob { grace_seconds: 0, .. } => Some("job"),
+            _ => None,
+        });
+        assert_eq!(order.collect::<Vec<_>>(), ["fence", "pod", "job"], "{what}");
+    }
+}
+
+#[test]
+fn a_lost_node_costs_neither_an_attempt_nor_a_pairs_retry() {
+    let mut world = going(NodeSight::Silent { since: at(40) });
+    world.pass();
+    world.go_to(130);
+    world.pass_to(Running, reasons::REPLACING);
+    world.job_gone();
+    world.view.node = NodeSight::Unknown;
+    let plan = world.pass_to(Pending, reasons::REPLACING);
+    assert_eq!((plan.status.attempt, plan.status.failure.as_ref()), (Some(1), None));
+    assert!(
+        plan.status.pairs.iter().all(|pair| pair.crashes == 0),
+        "{:?}",
+        plan.status.pairs
+    );
+    assert!(plan.status.message.as_ref().unwrap().contains("Node node-a was lost"));
+}
+
+#[test]
+fn a_kubelet_that_comes_back_in_time_keeps_its_pod() {
+    let mut world = going(NodeSight::Silent { since: at(90) });
+    world.pass();
+    world.go_to(129);
+    world.pass();
+    world.view.node = NodeSight::Reports;
+    world.go_to(400);
+    let plan = world.pass_to(Running, reasons::REPLACING);
+    assert!(!has(&plan, |a| *a == Action::TakeOwnership));
+    // It ends the Pod in order, and the Job makes another.
+    world.view.pod = Some(PodView {
+        uid: "pod-2".into(),
+        ..pod(410)
+    });
+    world.view.node = NodeSight::Unknown;
+    world.go_to(500);
+    let plan = world.pass_to(Running, reasons::REPLACING);
+    assert_eq!(plan.status.failure, None);
+}
+
+#[test]
+fn deadlines_and_retries_are_the_leaderboards_of_this_moment() {
+    let mut world = World::local().running();
+    world.leaderboard().deadlines.run_seconds = 1000;
+    world.go_to(1009);
+    world.leaderboard().deadlines.run_seconds = 5000;
+    world.go_to(1010);
+    world.pass_to(Running, reasons::RUNNING);
+    world.leaderboard().deadlines.run_seconds = 1100;
+    world.go_to(1110);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::TIME_LIMIT);
+    // What was recorded stands.
+    world.leaderboard().deadlines.run_seconds = 90_000;
+    world.pass_to(Running, reasons::STOPPING);
+
+    let mut world = World::local().running();
+    world.see(ended("agent-1", 3, "exited", 1, 100));
+    world.leaderboard().retries.pair = 9;
+    world.pass_to(Running, reasons::RUNNING);
+    world.leaderboard().retries.pair = 4;
+    world.pass_to(Running, reasons::STOPPING);
 }
 
 #[test]

@@ -88,6 +88,118 @@ fn between_two_tries_it_ends_at_once() {
     }
 }
 
+/// What a cancel does at once: nothing is to be stopped, the Job is deleted, or its Pod is told.
+#[derive(Debug, PartialEq)]
+enum Done {
+    Ended,
+    Deleted,
+    Told,
+    /// It waits for what it needs to end.
+    Waits,
+}
+
+#[test]
+fn a_cancel_is_obeyed_at_each_stage() {
+    type Stage = (&'static str, fn() -> World, Done);
+    let stages: [Stage; 9] = [
+        (
+            "EvalAI is asked",
+            || {
+                let mut world = World::evalai();
+                world.in_evalai().info = None;
+                world
+            },
+            Done::Ended,
+        ),
+        (
+            "the Leaderboard is missing",
+            || {
+                let mut world = World::evalai();
+                world.view.leaderboard = None;
+                world
+            },
+            Done::Ended,
+        ),
+        ("no Pod yet", || World::evalai().with_job(), Done::Deleted),
+        (
+            "no node fits",
+            || {
+                let mut world = World::evalai().with_pod();
+                world.pod().scheduled = None;
+                world.pod().unschedulable = Some("no GPU".into());
+                world
+            },
+            Done::Deleted,
+        ),
+        (
+            "an image is pulled",
+            || {
+                let mut world = World::evalai().with_pod();
+                world.see(waiting("agent-1", "ErrImagePull", "not found"));
+                world
+            },
+            Done::Deleted,
+        ),
+        (
+            "contents are copied",
+            || {
+                let mut world = World::evalai().with_pod();
+                world.see(running("contents"));
+                world
+            },
+            Done::Deleted,
+        ),
+        (
+            "its agents have not started, logcopy has",
+            || {
+                let mut world = World::evalai().with_pod();
+                world.pod().logcopy_running = true;
+                world
+            },
+            Done::Told,
+        ),
+        ("it runs", || World::evalai().running(), Done::Told),
+        (
+            "its end cannot be read",
+            || {
+                let mut world = World::evalai().running();
+                world.complete();
+                world.view.report = ReportSight::Unreadable("away".into());
+                world
+            },
+            Done::Waits,
+        ),
+    ];
+    for (wish, _) in WISHES {
+        for (what, stage, wanted) in &stages {
+            let mut world = stage();
+            world.pass();
+            wish(&mut world);
+            let plan = world.pass();
+            let done = match plan.status.state {
+                Some(Cancelled) => Done::Ended,
+                _ if has(&plan, |a| matches!(a, Action::DeleteJob { .. })) => Done::Deleted,
+                _ if annotated(&plan) == Some(Stop::Cancel) => Done::Told,
+                _ => Done::Waits,
+            };
+            assert_eq!(&done, wanted, "{what}");
+            assert!(!creates(&plan), "{what}");
+        }
+    }
+}
+
+#[test]
+fn a_cancel_after_the_end_changes_nothing() {
+    let mut world = World::evalai().running();
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    world.submission().spec.cancel = true;
+    assert_eq!(tells(&world.pass_to(Finished, reasons::FINISHED)), [Tell::Finished]);
+    world.published();
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
 #[test]
 fn a_cancel_that_comes_after_the_last_route_loses() {
     let mut world = World::evalai().running();

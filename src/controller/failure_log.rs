@@ -1,0 +1,370 @@
+//! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
+//! stored in S3 for people.
+//!
+//! Called by `act`, where `decide` wishes it; `sync` hands the text on to EvalAI's hosts. A log may hold private routes, so it
+//! never gets into status, events or our own log. Nothing here fails a pass or holds an end up.
+
+use std::collections::HashMap;
+use std::pin::pin;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use futures::AsyncReadExt;
+use k8s_openapi::api::core::v1::Pod;
+use kube::api::LogParams;
+use kube::{Api, Client, ResourceExt};
+
+use super::context::Context;
+use super::decide::{LogAt, LogPlace};
+use super::observe::uid_of;
+use super::view::View;
+use crate::api::SubmissionStatus;
+use crate::pod::report::FAILURE_LOG_KEY;
+
+/// Characters that are kept, as EvalAI's own worker does.
+const TAIL_CHARS: usize = 10_000;
+/// Bytes that are read of a stored log: as many characters of four bytes, and what is dropped of colors.
+const STORED_BYTES: u64 = 64 << 10;
+/// Lines that a node is asked for. It counts bytes from the first of them, so they must all fit into the limit.
+const NODE_LINES: i64 = 200;
+/// Bytes that are read of a node's answer.
+const NODE_BYTES: u64 = 1 << 20;
+/// Time that reading one place, or storing, may take.
+const TRY: Duration = Duration::from_secs(5);
+
+/// What was kept, by UID of the Submission.
+#[derive(Default)]
+pub struct FailureLogs(Mutex<HashMap<String, Kept>>);
+
+/// The log of one failed Job.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Kept {
+    attempt: Option<i64>,
+    retry: i32,
+    /// None: there is no log.
+    tail: Option<Tail>,
+    stored: bool,
+}
+
+/// The last lines of a log.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Tail {
+    pub container: String,
+    /// With a first line that says whose log it is; at most 10,000 characters in all.
+    pub text: String,
+}
+
+impl Tail {
+    /// Whether the participant's own program wrote it.
+    pub fn is_agents(&self) -> bool {
+        self.container.starts_with("agent-")
+    }
+}
+
+impl FailureLogs {
+    /// The log of the failure that a status speaks of.
+    pub fn tail(&self, uid: &str, status: &SubmissionStatus) -> Option<Tail> {
+        self.of(uid, status)?.tail
+    }
+
+    /// Drops what is kept for an object.
+    pub fn forget(&self, uid: &str) {
+        self.lock().remove(uid);
+    }
+
+    fn of(&self, uid: &str, status: &SubmissionStatus) -> Option<Kept> {
+        let found = self.lock().get(uid).cloned();
+        found.filter(|kept| kept.attempt == status.attempt && kept.retry == status.retry)
+    }
+
+    fn put(&self, uid: &str, kept: Kept) {
+        self.lock().insert(uid.to_owned(), kept);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, Kept>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// What became of looking for a log.
+#[derive(Debug, PartialEq, Eq)]
+enum Look {
+    Found(Tail),
+    /// Nobody has one.
+    Nothing,
+    /// Somebody who may have one did not answer.
+    Unclear,
+}
+
+/// Keeps the tail of the first log that is there. Stores it once the submission has come to its end.
+pub(super) async fn keep(context: &Context, view: &View, status: &SubmissionStatus, places: &[LogPlace]) {
+    let uid = uid_of(view.submission.as_ref());
+    let is_over = status.times.finished.is_some();
+    let logs = &context.failure_logs;
+    let mut kept = match logs.of(&uid, status) {
+        Some(kept) => kept,
+        None => match look(context, view, status, places).await {
+            Look::Found(tail) => Kept::new(status, Some(tail)),
+            Look::Nothing if is_over => Kept::new(status, None),
+            // A later place, or a later time, may have it.
+            Look::Nothing | Look::Unclear => return,
+        },
+    };
+    if is_over && !kept.stored {
+        kept.stored = store(context, view, status, kept.tail.as_ref()).await;
+    }
+    logs.put(&uid, kept);
+}
+
+impl Kept {
+    fn new(status: &SubmissionStatus, tail: Option<Tail>) -> Self {
+        Self {
+            attempt: status.attempt,
+            retry: status.retry,
+            tail,
+            stored: false,
+        }
+    }
+}
+
+async fn look(context: &Context, view: &View, status: &SubmissionStatus, places: &[LogPlace]) -> Look {
+    let mut look = Look::Nothing;
+    for place in places {
+        let read = async {
+            match &place.at {
+                LogAt::Node { pod, previous } => {
+                    let namespace = view.submission.namespace().unwrap_or_default();
+                    of_node(&context.client, &namespace, pod, &place.container, *previous).await
+                }
+                LogAt::Bucket { key } => of_bucket(context, status, key).await,
+            }
+        };
+        let read = tokio::time::timeout(TRY, read).await;
+        match read.unwrap_or_else(|_| Err("no answer in time".into())) {
+            Ok(Some(bytes)) => {
+                let text = tail(&heading(status, place), &bytes);
+                if let Some(text) = text {
+                    let container = place.container.clone();
+                    return Look::Found(Tail { container, text });
+                }
+            }
+            Ok(None) => {}
+            Err(why) => {
+                let name = view.submission.name_any();
+                tracing::warn!(submission = %name, container = %place.container, %why, "the log of a failure was not read");
+                look = Look::Unclear;
+            }
+        }
+    }
+    look
+}
+
+fn heading(status: &SubmissionStatus, place: &LogPlace) -> String {
+    let attempt = status.attempt.unwrap_or(1);
+    let container = &place.container;
+    match &place.at {
+        LogAt::Bucket { key } => format!("The end of {container}'s log in attempt {attempt}; all of it is in {key}.\n"),
+        LogAt::Node { .. } => format!("The end of {container}'s log in attempt {attempt}.\n"),
+    }
+}
+
+/// The log of a container, from its node. None if the node has none.
+async fn of_node(
+    client: &Client,
+    namespace: &str,
+    pod: &str,
+    container: &str,
+    previous: bool,
+) -> Result<Option<Vec<u8>>, String> {
+    let api: Api<Pod> = Api::namespaced(client.clone(), namespace);
+    let params = LogParams {
+        container: Some(container.to_owned()),
+        previous,
+        tail_lines: Some(NODE_LINES),
+        limit_bytes: i64::try_from(NODE_BYTES).ok(),
+        ..LogParams::default()
+    };
+    let stream = match api.log_stream(pod, &params).await {
+        Ok(stream) => stream,
+        // Gone, or the container has no earlier run that the node remembers.
+        Err(kube::Error::Api(status)) if [400, 404].contains(&status.code) => return Ok(None),
+        Err(error) => return Err(error.to_string()),
+    };
+    let mut bytes = Vec::new();
+    let read = pin!(stream).take(NODE_BYTES).read_to_end(&mut bytes).await;
+    read.map(|_| Some(bytes)).map_err(|error| error.to_string())
+}
+
+/// The end of a log that logcopy has stored. None if there is none.
+async fn of_bucket(context: &Context, status: &SubmissionStatus, key: &str) -> Result<Option<Vec<u8>>, String> {
+    let Some(plan) = &status.plan else { return Ok(None) };
+    let archive = context.archive(&plan.storage, &plan.run_id);
+    archive.tail(key, STORED_BYTES).await.map_err(|error| error.to_string())
+}
+
+/// True when there is nothing left to store.
+async fn store(context: &Context, view: &View, status: &SubmissionStatus, tail: Option<&Tail>) -> bool {
+    let (Some(tail), Some(plan)) = (tail, &status.plan) else {
+        return true;
+    };
+    let archive = context.archive(&plan.storage, &plan.run_id);
+    let put = archive.put(FAILURE_LOG_KEY, tail.text.clone().into_bytes());
+    let why = match tokio::time::timeout(TRY, put).await {
+        Ok(Ok(_)) => return true,
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "no answer in time".to_owned(),
+    };
+    tracing::warn!(submission = %view.submission.name_any(), %why, "the log of a failure was not stored");
+    false
+}
+
+/// The last characters of a log below a heading: text alone, without colors and control characters. None if nothing is left.
+fn tail(heading: &str, bytes: &[u8]) -> Option<String> {
+    let clean = plain(&String::from_utf8_lossy(bytes));
+    // What was read may begin in the middle of a character.
+    let clean = clean.trim_start_matches(char::REPLACEMENT_CHARACTER).trim();
+    if clean.is_empty() {
+        return None;
+    }
+    let room = TAIL_CHARS.saturating_sub(heading.chars().count());
+    let skip = clean.chars().count().saturating_sub(room);
+    Some(heading.chars().chain(clean.chars().skip(skip)).collect())
+}
+
+/// A terminal's text as a file's: a carriage return ends a line, sequences that move or color are dropped.
+fn plain(text: &str) -> String {
+    let mut plain = String::with_capacity(text.len());
+    let mut chars = text.chars().peekable();
+    while let Some(char) = chars.next() {
+        match char {
+            '\u{1b}' => skip_sequence(&mut chars),
+            '\r' if chars.peek() == Some(&'\n') => {}
+            '\r' => plain.push('\n'),
+            '\n' | '\t' => plain.push(char),
+            char if char.is_control() => {}
+            char => plain.push(char),
+        }
+    }
+    plain
+}
+
+/// The rest of an escape sequence.
+fn skip_sequence(chars: &mut std::iter::Peekable<std::str::Chars<'_>>) {
+    match chars.next_if(|c| ('\u{20}'..='\u{7e}').contains(c)) {
+        // Parameters, then one letter.
+        Some('[') => {
+            while chars.next_if(|c| ('\u{20}'..='\u{3f}').contains(c)).is_some() {}
+            chars.next_if(|c| ('\u{40}'..='\u{7e}').contains(c));
+        }
+        // A title, up to a bell or the next escape.
+        Some(']') => while chars.next_if(|c| !matches!(c, '\u{7}' | '\u{1b}' | '\n')).is_some() {},
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use http::{Request, Response};
+    use kube::client::Body;
+
+    use super::*;
+
+    #[test]
+    fn a_tail_is_the_end_of_the_text_and_no_longer_than_allowed() {
+        let long: String = (0..5000).map(|n| format!("line {n} ü\n")).collect();
+        let found = tail("The end:\n", long.as_bytes()).unwrap();
+        assert_eq!(found.chars().count(), TAIL_CHARS);
+        assert!(
+            found.starts_with("The end:\n") && found.ends_with("line 4999 ü"),
+            "{found}"
+        );
+        assert_eq!(tail("The end:\n", b"short\n").as_deref(), Some("The end:\nshort"));
+        for nothing in ["", " \n\r\n", "\u{1b}[0m\u{0}"] {
+            assert_eq!(tail("The end:\n", nothing.as_bytes()), None, "{nothing:?}");
+        }
+    }
+
+    #[test]
+    fn a_tail_is_plain_text() {
+        for (bytes, text) in [
+            (&b"\xbc\xbcmain\xff\n"[..], "main\u{fffd}"),
+            (b"a\x00b\x07c\td", "abc\td"),
+            (b"1%\r2%\r\n3%", "1%\n2%\n3%"),
+            (b"\x1b[1;31mred\x1b[0m end", "red end"),
+            (b"\x1b]0;title\x07shown", "shown"),
+            (b"\x1b]0;title\x1b\\shown", "shown"),
+            (b"\x1bMup \x1b(Bx", "up Bx"),
+            (b"cut \x1b[3", "cut"),
+            (b"cut \x1b", "cut"),
+            ("\u{85}\u{9b}31m é".as_bytes(), "31m é"),
+        ] {
+            assert_eq!(tail("", bytes).as_deref(), Some(text), "{bytes:?}");
+        }
+    }
+
+    #[test]
+    fn a_log_belongs_to_one_job() {
+        let logs = FailureLogs::default();
+        let mut status = SubmissionStatus {
+            attempt: Some(1),
+            ..SubmissionStatus::default()
+        };
+        let found = Tail {
+            container: "agent-2".into(),
+            text: "t".into(),
+        };
+        assert!(found.is_agents());
+        logs.put("u", Kept::new(&status, Some(found.clone())));
+        assert_eq!(logs.tail("u", &status), Some(found));
+        assert_eq!(logs.tail("v", &status), None);
+        status.retry = 1;
+        assert_eq!(logs.tail("u", &status), None, "another Job, another log");
+        status.retry = 0;
+        logs.forget("u");
+        assert_eq!(logs.tail("u", &status), None);
+    }
+
+    /// What a node's answer of this status and body is taken for, and what was asked.
+    async fn asked(code: u16, body: &'static str, previous: bool) -> (Result<Option<Vec<u8>>, String>, String) {
+        let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
+        let client = Client::new(service, "default");
+        let serve = async {
+            let (request, send) = handle.next_request().await.unwrap();
+            let answer = Response::builder()
+                .status(code)
+                .body(Body::from(body.as_bytes().to_vec()));
+            send.send_response(answer.unwrap());
+            request.uri().to_string()
+        };
+        tokio::join!(of_node(&client, "ns", "sub-1-x", "simulator-2", previous), serve)
+    }
+
+    #[tokio::test]
+    async fn a_node_is_asked_for_the_last_lines_of_one_container() {
+        let (found, uri) = asked(200, "Segmentation fault\n", true).await;
+        assert_eq!(found.unwrap().unwrap(), b"Segmentation fault\n");
+        assert!(uri.starts_with("/api/v1/namespaces/ns/pods/sub-1-x/log?"), "{uri}");
+        for part in [
+            "container=simulator-2",
+            "previous=true",
+            "tailLines=200",
+            "limitBytes=1048576",
+        ] {
+            assert!(uri.contains(part), "{uri}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_log_that_is_gone_is_no_fault_and_a_refusal_is() {
+        let status =
+            |code: u16| format!(r#"{{"kind":"Status","status":"Failure","message":"no","reason":"r","code":{code}}}"#);
+        for code in [400, 404] {
+            let body = Box::leak(status(code).into_boxed_str());
+            assert_eq!(asked(code, body, false).await.0, Ok(None), "{code}");
+        }
+        for code in [403, 500] {
+            let body = Box::leak(status(code).into_boxed_str());
+            assert!(asked(code, body, false).await.0.is_err(), "{code}");
+        }
+    }
+}

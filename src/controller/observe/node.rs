@@ -1,0 +1,70 @@
+//! Whether a Pod's node still speaks. Read from the API server, and only while the Pod is being deleted: then the answer
+//! decides between waiting for its kubelet and giving the Pod up.
+
+use k8s_openapi::api::core::v1::Node;
+use kube::Api;
+
+use crate::controller::context::{CALL_TIMEOUT, Context};
+use crate::controller::view::{NodeSight, PodView};
+
+/// Looks at the node of a Pod. Without the right to (an operator of one namespace has none) it stays unknown.
+pub(super) async fn sight(context: &Context, pod: &PodView) -> NodeSight {
+    let Some(name) = &pod.node else {
+        return NodeSight::Unknown;
+    };
+    let nodes: Api<Node> = Api::all(context.client.clone());
+    match tokio::time::timeout(CALL_TIMEOUT, nodes.get_opt(name)).await {
+        Ok(Ok(Some(node))) => of(&node),
+        Ok(Ok(None)) => NodeSight::Gone,
+        Ok(Err(error)) => {
+            tracing::debug!(node = %name, %error, "the node of a lost Pod cannot be looked at");
+            NodeSight::Unknown
+        }
+        Err(_) => NodeSight::Unknown,
+    }
+}
+
+/// The node controller says `Unknown` of a kubelet whose lease and status have run out; `False` is the kubelet's own word.
+fn of(node: &Node) -> NodeSight {
+    let conditions = node.status.as_ref().and_then(|s| s.conditions.as_deref());
+    let ready = conditions.unwrap_or_default().iter().find(|c| c.type_ == "Ready");
+    match ready {
+        Some(ready) if ready.status != "Unknown" => NodeSight::Reports,
+        Some(ready) => ready
+            .last_transition_time
+            .as_ref()
+            .map_or(NodeSight::Unknown, |since| NodeSight::Silent { since: since.0 }),
+        None => NodeSight::Unknown,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn only_unknown_is_silence() {
+        let since = "2026-01-01T00:00:00Z";
+        let silent = NodeSight::Silent {
+            since: since.parse().unwrap(),
+        };
+        let ready = |status: &str| json!([{"type": "Ready", "status": status, "lastTransitionTime": since}]);
+        for (conditions, sight) in [
+            (ready("True"), NodeSight::Reports),
+            (ready("False"), NodeSight::Reports),
+            (ready("Unknown"), silent),
+            (json!([{"type": "Ready", "status": "Unknown"}]), NodeSight::Unknown),
+            (
+                json!([{"type": "DiskPressure", "status": "Unknown"}]),
+                NodeSight::Unknown,
+            ),
+            (json!([]), NodeSight::Unknown),
+        ] {
+            let node = json!({"metadata": {"name": "n"}, "status": {"conditions": conditions}});
+            assert_eq!(of(&serde_json::from_value(node.clone()).unwrap()), sight, "{node}");
+        }
+        assert_eq!(of(&Node::default()), NodeSight::Unknown);
+    }
+}

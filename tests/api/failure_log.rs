@@ -1,0 +1,279 @@
+//! A run whose agent prints the private routes and crashes: hosts find them in the failure's log, a participant nowhere.
+//!
+//! The real controller against a real API server and both stand-ins; the test plays the Job controller, the kubelet and
+//! logcopy.
+#![cfg(test)]
+
+use evalai_stand_in::model::{FileState, Status};
+use evalai_stand_in::submissions::{NewSubmission, create};
+use evalai_stand_in::{Config, Handle};
+use jiff::Timestamp;
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Pod, Secret};
+use k8s_openapi::api::events::v1::Event;
+use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
+use kube::runtime::wait::await_condition;
+use kube::{Api, Client, ResourceExt};
+use leaderboard_operator::api::{Leaderboard, Storage, Submission, names};
+use leaderboard_operator::controller::context::Settings;
+use leaderboard_operator::controller::leader::{self, Identity};
+use leaderboard_operator::controller::run::{self, Clients};
+use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::pod::report::FAILURE_LOG_KEY;
+use leaderboard_operator::services::archive::Archive;
+use serde_json::{Map, Value, json};
+use tokio::net::TcpListener;
+use tokio::time::timeout;
+
+use super::bridge::{LIMIT, StandIn};
+use crate::support::apiserver;
+
+/// A line of the routes file.
+const ROUTE: &str = r#"<waypoint x="4711.25" y="-815.5" z="1.0"/>"#;
+const HOST: &str = "local-host-token";
+const PARTICIPANT: &str = "local-team-a-token";
+
+struct World {
+    client: Client,
+    namespace: String,
+    aws: StandIn,
+    bucket: String,
+    evalai: Handle,
+    http: reqwest::Client,
+}
+
+impl World {
+    async fn new() -> Self {
+        // Somebody else may have installed it.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let server = apiserver::server().await;
+        let aws = StandIn::start().await;
+        let bucket = aws.name("failure-log");
+        let s3 = aws.aws.s3(None, Some(&aws.endpoint));
+        s3.create_bucket().bucket(&bucket).send().await.unwrap();
+        let (config, _) = Config::in_memory().unwrap();
+        let config = Config { throttle: 0, ..config };
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        Self {
+            client: server.client(),
+            namespace: server.namespace("failure-log").await,
+            aws,
+            bucket,
+            evalai: evalai_stand_in::serve(config, vec![listener]),
+            http: reqwest::Client::builder().no_proxy().build().unwrap(),
+        }
+    }
+
+    fn api<K>(&self) -> Api<K>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
+        K::DynamicType: Default,
+    {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    /// Starts a controller that stops when the sender goes.
+    fn controller(&self) -> tokio::sync::watch::Sender<bool> {
+        let (sender, stop) = Stop::new();
+        let clients = Clients {
+            api: self.client.clone(),
+            watch: self.client.clone(),
+            lease: self.client.clone(),
+        };
+        let lease = leader::Settings::new(&self.namespace, "operator", Identity::random("test"));
+        let settings = Settings {
+            image: "operator:1".into(),
+            image_pull_policy: None,
+            region: None,
+            namespace: Some(self.namespace.clone()),
+            concurrency: 4,
+        };
+        let aws = self.aws.aws.clone();
+        tokio::spawn(run::run(clients, lease, settings, aws, Observability::new(stop)));
+        sender
+    }
+
+    /// A Leaderboard of one phase, made as a person writes it.
+    async fn leaderboard(&self, name: &str, phase: i64, log_tail: &str) {
+        let leaderboard = json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard", "metadata": {"name": name},
+            "spec": {
+                "evalai": {
+                    "apiServer": self.evalai.url(), "challenge": 1, "requestsPerMinute": 6000, "logTail": log_tail,
+                    "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
+                },
+                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+                "results": "V2",
+                "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                "pairs": 1, "routes": 1, "retries": {"pair": 1}, "periodSeconds": 1,
+                "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
+            },
+        });
+        let kind = ApiResource::erase::<Leaderboard>(&());
+        let api: Api<DynamicObject> = Api::namespaced_with(self.client.clone(), &self.namespace, &kind);
+        let object = serde_json::from_value(leaderboard).unwrap();
+        api.create(&PostParams::default(), &object).await.unwrap();
+    }
+
+    /// Team a pushes to a phase; hands back EvalAI's key and the object's name.
+    async fn submit(&self, leaderboard: &str, phase: u64) -> (u64, String) {
+        let new = NewSubmission {
+            team: 1,
+            phase,
+            user: 11,
+            input: json!({"submitted_image_uri": "r/team-a:1"}).to_string().into_bytes(),
+            fields: Map::new(),
+        };
+        let pk = self
+            .evalai
+            .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
+        let name = names::submission(i64::try_from(pk).unwrap());
+        let spec = json!({"leaderboard": leaderboard, "image": "r/team-a:1",
+                          "evalai": {"challenge": 1, "phase": phase, "submission": pk}});
+        let submission = Submission::new(&name, serde_json::from_value(spec).unwrap());
+        self.api().create(&PostParams::default(), &submission).await.unwrap();
+        (pk, name)
+    }
+
+    fn archive(&self, run: u64) -> Archive {
+        let storage = json!({"bucket": self.bucket, "endpoint": self.aws.endpoint});
+        let storage: Storage = serde_json::from_value(storage).unwrap();
+        Archive::of_run(&self.aws.aws, &storage, &run.to_string())
+    }
+
+    /// Its Job runs, its agent prints the routes and crashes, logcopy stores the log, and the Job goes as it is told.
+    async fn run_that_crashes(&self, pk: u64, name: &str) {
+        let job_name = names::job(name, 1, 0);
+        let jobs = self.api::<Job>();
+        let is_there = |job: Option<&Job>| job.is_some();
+        let job = timeout(LIMIT, await_condition(jobs.clone(), &job_name, is_there)).await;
+        let job = job.expect("a Job is made").unwrap().unwrap();
+        let log = format!("\u{1b}[32mloading routes\u{1b}[0m\n{ROUTE}\nTraceback: boom\n");
+        let archive = self.archive(pk);
+        let stored = archive.put("agent/agent1/leaderboard.log", log.into_bytes());
+        stored.await.unwrap();
+        let pods = self.api::<Pod>();
+        let pod = self.pod(&job);
+        pods.create(&PostParams::default(), &pod).await.unwrap();
+        let status = json!({"status": crashed()});
+        let (pod_name, params) = (pod.name_any(), PatchParams::default());
+        pods.patch_status(&pod_name, &params, &Patch::Merge(&status))
+            .await
+            .unwrap();
+        let is_told = |pod: Option<&Pod>| pod.is_some_and(|p| p.annotations().contains_key(names::ANNOTATION_STOP));
+        let told = timeout(LIMIT, await_condition(pods, &pod_name, is_told)).await;
+        told.expect("the Pod is told to stop").unwrap();
+        jobs.delete(&job_name, &DeleteParams::background()).await.unwrap();
+    }
+
+    fn pod(&self, job: &Job) -> Pod {
+        let template = job.spec.as_ref().unwrap().template.metadata.as_ref().unwrap();
+        let pod = json!({
+            "metadata": {
+                "name": format!("{}-x", job.name_any()), "namespace": self.namespace, "labels": template.labels,
+                "ownerReferences": [{"apiVersion": "batch/v1", "kind": "Job", "name": job.name_any(),
+                                     "uid": job.metadata.uid, "controller": true}],
+            },
+            "spec": {
+                "nodeName": "node-a", "restartPolicy": "OnFailure", "automountServiceAccountToken": false,
+                "initContainers": [{"name": "logcopy", "image": "i", "restartPolicy": "Always"}],
+                "containers": [{"name": "simulator-1", "image": "i"}, {"name": "agent-1", "image": "i"}],
+            },
+        });
+        serde_json::from_value(pod).unwrap()
+    }
+
+    /// All that EvalAI hands this user of a submission: the row, and the text behind each of its links.
+    async fn fetched(&self, pk: u64, token: &str) -> (Value, String) {
+        let get = async |url: String| {
+            let answer = self.http.get(&url).bearer_auth(token).send().await.unwrap();
+            assert!(answer.status().is_success(), "{url}: {}", answer.status());
+            answer.text().await.unwrap()
+        };
+        let row = get(format!("{}/api/jobs/submission/{pk}", self.evalai.url())).await;
+        let row: Value = serde_json::from_str(&row).unwrap();
+        let mut all = row.to_string();
+        for (field, value) in row.as_object().unwrap() {
+            if let Some(url) = value.as_str().filter(|_| field.ends_with("_file")) {
+                all += &get(url.to_owned()).await;
+            }
+        }
+        (row, all)
+    }
+
+    /// Everything that Kubernetes shows of a submission.
+    async fn shown(&self, name: &str) -> String {
+        let object = self.api::<Submission>().get(name).await.unwrap();
+        let events = self.api::<Event>().list(&ListParams::default()).await.unwrap();
+        let events: Vec<_> = events
+            .items
+            .iter()
+            .map(|e| e.note.clone().unwrap_or_default())
+            .collect();
+        assert!(!events.is_empty());
+        format!("{} {events:?}", serde_json::to_string(&object).unwrap())
+    }
+}
+
+/// The Pod's status after the crash. What the agent leaves as its last word is no verdict of a runner.
+fn crashed() -> Value {
+    let now = Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
+    let running = |name: &str| json!({"name": name, "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": {"running": {"startedAt": now}}});
+    let mut agent = running("agent-1");
+    let word = json!({"reason": ROUTE, "message": ROUTE}).to_string();
+    agent["ready"] = json!(false);
+    agent["state"] =
+        json!({"terminated": {"exitCode": 1, "reason": "Error", "message": word, "startedAt": now, "finishedAt": now}});
+    json!({
+        "phase": "Running",
+        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
+        "initContainerStatuses": [running("logcopy")],
+        "containerStatuses": [running("simulator-1"), agent],
+    })
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
+    let world = World::new().await;
+    let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": HOST}});
+    let secret: Secret = serde_json::from_value(secret).unwrap();
+    world.api().create(&PostParams::default(), &secret).await.unwrap();
+    world.leaderboard("closed", 1, "Hosts").await;
+    world.leaderboard("open", 2, "Participants").await;
+    let _controller = world.controller();
+
+    for (leaderboard, phase, is_open) in [("closed", 1, false), ("open", 2, true)] {
+        let (pk, name) = world.submit(leaderboard, phase).await;
+        world.run_that_crashes(pk, &name).await;
+        let failed = world
+            .evalai
+            .wait_until(|state, _| state.submissions[&pk].status == Status::Failed);
+        timeout(LIMIT, failed).await.expect("EvalAI hears of the failure");
+
+        let (own, fetched) = world.fetched(pk, PARTICIPANT).await;
+        assert!(own.get("environment_log_file").is_none());
+        assert!(
+            fetched.contains("AgentCrashed (participant): Agent 1 crashed once."),
+            "{fetched}"
+        );
+        assert_eq!(fetched.contains("4711"), is_open, "{leaderboard}: {fetched}");
+        assert_eq!(own["stdout_file"].as_str().map(|_| ()), Some(()));
+
+        let (row, all) = world.fetched(pk, HOST).await;
+        assert!(row["environment_log_file"].is_string());
+        let kept = world.archive(pk).get(FAILURE_LOG_KEY, 1 << 20).await.unwrap().unwrap();
+        let kept = String::from_utf8(kept.bytes).unwrap();
+        let text = format!("loading routes\n{ROUTE}\nTraceback: boom");
+        assert!(
+            kept.starts_with("The end of agent-1's log in attempt 1;") && kept.ends_with(&text),
+            "{kept}"
+        );
+        assert!(all.contains(&kept), "{all}");
+        let shown = world.shown(&name).await;
+        assert!(
+            shown.contains("Agent 1 crashed once") && !shown.contains("4711"),
+            "{shown}"
+        );
+    }
+}
