@@ -10,6 +10,7 @@
 mod support;
 
 mod api {
+    mod boards;
     mod bridge;
     mod columns;
     mod definitions;
@@ -17,10 +18,12 @@ mod api {
     mod examples;
     mod leader;
     mod objects;
+    mod operator;
     mod pod;
     mod queue;
     mod rule_cases;
     mod rules;
     mod table;
+    mod token;
     mod watches;
 }

@@ -19,6 +19,7 @@ use leaderboard_operator::services::evalai::{
     Changed, Ended, Hub, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target, Timeouts,
     Timing, View, Wish,
 };
+use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
 use serde_json::{Map, json};
 use tokio::net::TcpListener;
@@ -89,6 +90,7 @@ impl World {
             sweep: found,
             timing,
             timeouts,
+            meter: Meter::default(),
         });
         let target = target(&server.url(), "local-host-token");
         Self {
