@@ -23,6 +23,7 @@ mod api {
     mod queue;
     mod rule_cases;
     mod rules;
+    mod scale;
     mod table;
     mod token;
     mod watches;

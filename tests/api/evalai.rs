@@ -2,7 +2,9 @@
 //!
 //! The stand-in holds the facts: the texts of its errors, writes that are read early and saved late, faults on purpose.
 
+mod cancels;
 mod faults;
+mod load;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
