@@ -6,10 +6,10 @@ STATIC := RUSTFLAGS="-C target-feature=+crt-static"
 LAB := ./local/lab
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core cluster down status build static image images crds fmt lint deny bench chart-test lab-test
+.PHONY: help demo test test-core measure-scale cluster down status build static image images crds fmt lint deny bench chart-test lab-test
 
 help: ## Explain every target
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time)
 	$(LAB) demo
@@ -19,6 +19,12 @@ test: ## Run all tests: formats, pure logic, API server, the real cluster (root,
 
 test-core: ## Run the tests that need neither root nor a node
 	$(LAB) test --core
+
+measure-scale: ## Measure 200 submissions and 1,000 cancels against the stand-ins (half an hour; no root, no node)
+	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
+	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
+	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
+		two_hundred_submissions a_thousand_cancels
 
 cluster: ## Start the one-node cluster and the AWS stand-in; prints the KUBECONFIG line to copy
 	$(LAB) up

@@ -10,6 +10,7 @@
 mod support;
 
 mod api {
+    mod boards;
     mod bridge;
     mod columns;
     mod definitions;
@@ -18,10 +19,13 @@ mod api {
     mod failure_log;
     mod leader;
     mod objects;
+    mod operator;
     mod pod;
     mod queue;
     mod rule_cases;
     mod rules;
+    mod scale;
     mod table;
+    mod token;
     mod watches;
 }

@@ -37,7 +37,8 @@ use super::leaderboard_parts::{ResultsFormat, Verify};
     printcolumn = r#"{"name":"Running","type":"integer","jsonPath":".status.counts.running"}"#,
     printcolumn = r#"{"name":"Finished","type":"integer","jsonPath":".status.counts.finished"}"#,
     printcolumn = r#"{"name":"Failed","type":"integer","jsonPath":".status.counts.failed"}"#,
-    printcolumn = r#"{"name":"Budget","type":"string","jsonPath":".status.budget","priority":1}"#,
+    printcolumn = r#"{"name":"Cancelled","type":"integer","jsonPath":".status.counts.cancelled"}"#,
+    printcolumn = r#"{"name":"Budget","type":"string","jsonPath":".status.budget"}"#,
     printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#
 )]
 #[serde(rename_all = "camelCase")]

@@ -85,3 +85,9 @@ pub const RELEASED_UNPUBLISHED: &str = "ReleasedUnpublished";
 pub const LABELS_DIFFER: &str = "LabelsDiffer";
 /// The bucket, or what stands in for it, does not answer or refuses.
 pub const BUCKET_UNREACHABLE: &str = "BucketUnreachable";
+/// The table does not answer, refuses, or has other keys.
+pub const TABLE_UNREACHABLE: &str = "TableUnreachable";
+/// The queue does not answer or refuses.
+pub const QUEUE_UNREACHABLE: &str = "QueueUnreachable";
+/// The dead-letter queue does not answer or refuses.
+pub const DEAD_LETTER_QUEUE_UNREACHABLE: &str = "DeadLetterQueueUnreachable";

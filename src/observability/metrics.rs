@@ -93,6 +93,7 @@ pub struct Metrics {
     lease_errors: Family<Reason, Counter>,
     submissions: Family<State, Gauge>,
     evalai_requests: Family<Op, Counter>,
+    evalai_request_seconds: Timings<ServiceOp>,
     evalai_budget_used: Gauge,
     evalai_waiting: Gauge,
     cloud_calls: Family<Call, Counter>,
@@ -170,6 +171,12 @@ impl Metrics {
                 "evalai_requests",
                 "Requests to EvalAI by operation and outcome",
                 Family::default(),
+            ),
+            evalai_request_seconds: add(
+                r,
+                "evalai_request_seconds",
+                "Duration of requests to EvalAI",
+                Family::new_with_constructor(timing as fn() -> _),
             ),
             evalai_budget_used: add(
                 r,
@@ -257,8 +264,12 @@ impl Metrics {
     }
 
     /// EvalAI was asked something.
-    pub fn evalai_request(&self, op: &'static str, outcome: &'static str) {
+    pub fn evalai_request(&self, op: &'static str, outcome: &'static str, took: Duration) {
+        let service = "evalai";
         self.evalai_requests.get_or_create(&Op { op, outcome }).inc();
+        self.evalai_request_seconds
+            .get_or_create(&ServiceOp { service, op })
+            .observe(took.as_secs_f64());
     }
 
     /// Requests within the last minute, over all tokens, and the wishes that wait for one.
@@ -327,7 +338,7 @@ mod tests {
         metrics.set_leading(Some(7));
         metrics.lease_failed("timeout");
         metrics.set_submissions("Running", 2);
-        metrics.evalai_request("put", "ok");
+        metrics.evalai_request("put_finished", "ok", Duration::from_millis(20));
         metrics.set_evalai_load(54, 1);
         metrics.cloud_call("s3", "GetObject", "ok", Duration::from_secs(1));
         metrics.sqs_message("created");
@@ -344,7 +355,8 @@ mod tests {
             "leaderboard_leader_term 7",
             "leaderboard_lease_errors_total{reason=\"timeout\"} 1",
             "leaderboard_submissions{state=\"Running\"} 2",
-            "leaderboard_evalai_requests_total{op=\"put\",outcome=\"ok\"} 1",
+            "leaderboard_evalai_requests_total{op=\"put_finished\",outcome=\"ok\"} 1",
+            "leaderboard_evalai_request_seconds_bucket{le=\"0.025\",service=\"evalai\",op=\"put_finished\"} 1",
             "leaderboard_evalai_budget_used 54",
             "leaderboard_evalai_waiting 1",
             "leaderboard_cloud_calls_total{service=\"s3\",op=\"GetObject\",outcome=\"ok\"} 1",

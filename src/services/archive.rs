@@ -19,6 +19,7 @@ use tokio::io::AsyncWriteExt;
 
 use crate::api::{Storage, effective};
 use crate::services::aws::Aws;
+use crate::services::meter::Meter;
 
 pub use error::{ArchiveError, Cause};
 pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};
@@ -43,6 +44,7 @@ pub struct Archive {
     client: aws_sdk_s3::Client,
     bucket: String,
     prefix: String,
+    meter: Meter,
 }
 
 /// An object with its content.
@@ -101,13 +103,17 @@ impl Archive {
             client,
             bucket: bucket.into(),
             prefix: prefix.into(),
+            meter: Meter::default(),
         }
     }
 
     /// The prefix of a run.
     pub fn of_run(aws: &Aws, storage: &Storage, run_id: &str) -> Self {
         let client = aws.s3(storage.region.as_deref(), storage.endpoint.as_deref());
-        Self::new(client, &storage.bucket, effective::key_prefix(storage, run_id))
+        Self {
+            meter: aws.meter().clone(),
+            ..Self::new(client, &storage.bucket, effective::key_prefix(storage, run_id))
+        }
     }
 
     /// The same bucket by the same client, below another prefix.
@@ -131,7 +137,8 @@ impl Archive {
     pub async fn get_if_none_match(&self, key: &str, etag: Option<&str>, limit: u64) -> Result<Fetched, ArchiveError> {
         const OP: &str = "reading";
         let request = self.client.get_object().bucket(&self.bucket).key(self.full(key));
-        let mut output = match request.set_if_none_match(etag.map(str::to_owned)).send().await {
+        let request = request.set_if_none_match(etag.map(str::to_owned)).send();
+        let mut output = match self.meter.aws("s3", "GetObject", request).await {
             Ok(output) => output,
             Err(error) if error::status(&error) == Some(304) => return Ok(Fetched::NotModified),
             Err(error) if is_absent(&error) => return Ok(Fetched::Absent),
@@ -185,7 +192,7 @@ impl Archive {
     ) -> Result<Option<u64>, ArchiveError> {
         const OP: &str = "downloading";
         let request = self.client.get_object().bucket(&self.bucket).key(self.full(key));
-        let mut output = match request.send().await {
+        let mut output = match self.meter.aws("s3", "GetObject", request.send()).await {
             Ok(output) => output,
             Err(error) if is_absent(&error) => return Ok(None),
             Err(error) => return Err(self.failed(OP, key, &error)),
@@ -206,7 +213,8 @@ impl Archive {
     /// Stores an object that fits into memory. Returns its entity tag.
     pub async fn put(&self, key: &str, bytes: Vec<u8>) -> Result<Option<String>, ArchiveError> {
         let request = self.client.put_object().bucket(&self.bucket).key(self.full(key));
-        let output = request.body(ByteStream::from(bytes)).send().await;
+        let request = request.body(ByteStream::from(bytes)).send();
+        let output = self.meter.aws("s3", "PutObject", request).await;
         Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
     }
 
@@ -218,7 +226,8 @@ impl Archive {
             let page = i32::try_from((limit - objects.len()).clamp(1, 1000)).unwrap_or(1000);
             let request = self.client.list_objects_v2().bucket(&self.bucket).max_keys(page);
             let request = request.prefix(self.full(folder)).set_continuation_token(next);
-            let output = request.send().await.map_err(|e| self.failed("listing", folder, &e))?;
+            let output = self.meter.aws("s3", "ListObjectsV2", request.send()).await;
+            let output = output.map_err(|e| self.failed("listing", folder, &e))?;
             objects.extend(output.contents.unwrap_or_default().into_iter().filter_map(|object| {
                 Some(Listed {
                     key: object.key?.strip_prefix(&self.prefix)?.to_owned(),

@@ -7,6 +7,8 @@ use std::time::Duration;
 use aws_config::{BehaviorVersion, Region, SdkConfig};
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
+use super::meter::Meter;
+
 /// Time an AWS call may take, with its retries.
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);
 /// Time one try may take.
@@ -16,6 +18,7 @@ const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(20);
 #[derive(Clone, Debug)]
 pub struct Aws {
     base: SdkConfig,
+    meter: Meter,
 }
 
 impl Aws {
@@ -34,12 +37,26 @@ impl Aws {
             .timeout_config(timeouts)
             .load()
             .await;
-        Self { base }
+        Self::from_config(base)
     }
 
     /// From a ready configuration, for tests and for assumed roles.
     pub fn from_config(base: SdkConfig) -> Self {
-        Self { base }
+        Self {
+            base,
+            meter: Meter::default(),
+        }
+    }
+
+    /// The same way, whose calls are counted.
+    #[must_use]
+    pub fn counted_by(self, meter: Meter) -> Self {
+        Self { meter, ..self }
+    }
+
+    /// Who counts the calls.
+    pub fn meter(&self) -> &Meter {
+        &self.meter
     }
 
     /// The region that was found, if any.

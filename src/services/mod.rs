@@ -6,6 +6,8 @@ pub mod aws;
 pub mod evalai;
 pub mod fault;
 pub mod logs;
+pub mod meter;
+pub mod queue;
 pub mod table;
 pub mod token;
 

@@ -23,6 +23,7 @@ pub use recorder::Recorder;
 use crate::api;
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
+use crate::services::meter::Meter;
 
 /// Column with the attempt, a number.
 const ATTEMPT: &str = "attempt";
@@ -166,6 +167,7 @@ impl TableError {
 #[derive(Clone, Debug)]
 pub struct Table {
     client: Client,
+    meter: Meter,
     name: String,
     partition: Key,
     sort: Key,
@@ -185,7 +187,8 @@ impl Table {
         let client = aws.dynamodb(table.region.as_deref(), table.endpoint.as_deref());
         let name = table.name.clone();
         let set = table.partition_key.clone().zip(table.sort_key.clone());
-        let answer = client.describe_table().table_name(&name).send().await;
+        let request = client.describe_table().table_name(&name).send();
+        let answer = aws.meter().aws("dynamodb", "DescribeTable", request).await;
         let (partition, sort) = match answer.map_err(|error| failed(&name, "DescribeTable", &error)) {
             Ok(output) => keys(&name, output.table.as_ref(), set)?,
             Err(TableError::Denied { .. }) if set.is_some() => {
@@ -196,6 +199,7 @@ impl Table {
         };
         Ok(Self {
             client,
+            meter: aws.meter().clone(),
             name,
             partition,
             sort,
@@ -240,7 +244,8 @@ impl Table {
                 .expression_attribute_names(name, *column)
                 .expression_attribute_values(format!(":v{index}"), AttributeValue::S((*value).into()));
         }
-        match request.update_expression(update.join(", ")).send().await {
+        let request = request.update_expression(update.join(", ")).send();
+        match self.meter.aws("dynamodb", "UpdateItem", request).await {
             Ok(_) => Ok(Written::Stored),
             Err(error) => match error.as_service_error() {
                 Some(UpdateItemError::ConditionalCheckFailedException(lost)) => {

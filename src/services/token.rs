@@ -82,7 +82,8 @@ impl TokenSource {
                 endpoint,
             } => {
                 let client = aws.secrets(region.as_deref(), endpoint.as_deref());
-                let answer = client.get_secret_value().secret_id(id).send().await;
+                let request = client.get_secret_value().secret_id(id).send();
+                let answer = aws.meter().aws("secretsmanager", "GetSecretValue", request).await;
                 let answer = answer.map_err(|e| TokenError::Unreadable {
                     id: id.clone(),
                     why: reason(&e),

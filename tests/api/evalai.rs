@@ -2,7 +2,9 @@
 //!
 //! The stand-in holds the facts: the texts of its errors, writes that are read early and saved late, faults on purpose.
 
+mod cancels;
 mod faults;
+mod load;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,6 +21,7 @@ use leaderboard_operator::services::evalai::{
     Changed, Ended, Hub, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target, Timeouts,
     Timing, View, Wish,
 };
+use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
 use serde_json::{Map, json};
 use tokio::net::TcpListener;
@@ -89,6 +92,7 @@ impl World {
             sweep: found,
             timing,
             timeouts,
+            meter: Meter::default(),
         });
         let target = target(&server.url(), "local-host-token");
         Self {

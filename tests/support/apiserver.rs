@@ -53,6 +53,11 @@ impl ApiServer {
         Client::try_from(self.config.clone()).unwrap()
     }
 
+    /// How it is reached with all rights, for clients of one's own kind.
+    pub fn config(&self) -> Config {
+        self.config.clone()
+    }
+
     /// A new namespace, `<name>-<number>`.
     pub async fn namespace(&self, name: &str) -> String {
         static NUMBER: AtomicU32 = AtomicU32::new(1);

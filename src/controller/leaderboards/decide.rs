@@ -7,6 +7,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
+use super::reach::Unreachable;
 use crate::api::conditions::{self, Truth};
 use crate::api::leaderboard::Counts;
 use crate::api::{Leaderboard, LeaderboardStatus, effective, names, reasons};
@@ -23,8 +24,8 @@ pub struct LeaderboardView {
     pub in_use: usize,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
-    /// Why its bucket or table cannot be used.
-    pub unreachable: Option<(&'static str, String)>,
+    /// What of its bucket, table and queues cannot be reached.
+    pub unreachable: Option<Unreachable>,
     pub evalai: EvalaiStanding,
     /// Requests of the last minute and the limit.
     pub budget: Option<(u32, u32)>,
@@ -102,9 +103,25 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     LeaderboardPlan { status, finalizer }
 }
 
-/// The first thing that is wrong, the gravest first.
+/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong.
 fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
-    let no = |reason, message: String| (Truth::False, reason, message);
+    let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
+    let (evalai_truth, reason, message) = evalai(&view.evalai);
+    if let Some(wrong) = of_spec(view) {
+        return wrong;
+    }
+    if let Some(found) = unreachable(Truth::False) {
+        return (Truth::False, found.reason, found.message.clone());
+    }
+    match unreachable(Truth::Unknown) {
+        Some(found) if evalai_truth != Truth::False => (Truth::Unknown, found.reason, found.message.clone()),
+        _ => (evalai_truth, reason, message),
+    }
+}
+
+/// What is wrong with the Leaderboard as it is written.
+fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
+    let no = |reason, message: String| Some((Truth::False, reason, message));
     if let Some(older) = phase_conflict(view) {
         return no(
             reasons::PHASE_CONFLICT,
@@ -122,10 +139,12 @@ fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
     if let Some(why) = &view.invalid_pod {
         return no(reasons::INVALID_POD, why.clone());
     }
-    if let Some((reason, why)) = &view.unreachable {
-        return no(reason, why.clone());
-    }
-    match &view.evalai {
+    None
+}
+
+fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
+    let no = |reason, message: String| (Truth::False, reason, message);
+    match standing {
         EvalaiStanding::NoToken(why) => no(reasons::TOKEN_MISSING, why.clone()),
         EvalaiStanding::TokenRefused(why) => no(reasons::TOKEN_REFUSED, why.clone()),
         EvalaiStanding::Misfit(why) => no(reasons::LABELS_DIFFER, why.clone()),

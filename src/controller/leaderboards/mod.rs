@@ -1,10 +1,12 @@
 //! A pass of one Leaderboard: its token and checks, the policy of its Pods, its status and finalizer.
 //!
-//! Reads the token (every five minutes, or when EvalAI refuses it), looks at the bucket, and hands the way to EvalAI to
-//! `sync`. `decide` is pure.
+//! Reads the token (every five minutes, or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands
+//! the way to EvalAI to `sync`. `decide` and `reach` are pure.
 
 pub mod decide;
+mod places;
 mod probe;
+mod reach;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -27,6 +29,8 @@ use probe::Probe;
 
 /// A status whose counts alone have changed is written at most this often.
 const COUNTS_EVERY: Duration = Duration::from_secs(5);
+/// A pass that something is due for is at least so far away.
+const SOONEST: Duration = Duration::from_secs(1);
 /// A Leaderboard is looked at this often without any cause.
 const RESYNC: Duration = Duration::from_mins(1);
 
@@ -108,7 +112,9 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, context: Arc<Context>) -> 
         context.sync.hub.retire(&key_of(&leaderboard));
         return Ok(RESYNC);
     }
-    write_status(&context, &leaderboard, &plan, now).await
+    let again = write_status(&context, &leaderboard, &plan, now).await?;
+    let next = probe.next(now).map(|at| at.duration_since(now).unsigned_abs());
+    Ok(next.map_or(again, |next| next.max(SOONEST).min(again)))
 }
 
 fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now: Timestamp) -> LeaderboardView {
@@ -121,7 +127,7 @@ fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now
         counts,
         in_use,
         invalid_pod: probe.invalid_pod(),
-        unreachable: probe.unreachable(),
+        unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(context, leaderboard, &key, now),
         budget: context.sync.hub.budget_used(&key),
     }

@@ -1,4 +1,4 @@
-//! What is tried for a Leaderboard from time to time: its token, its bucket, its Pod.
+//! What is tried for a Leaderboard from time to time: its token, its places in AWS, its Pod.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +10,9 @@ use kube::{Api, ResourceExt};
 use leaderboard_results::metrics;
 
 use super::decide::EvalaiStanding;
-use crate::api::{Evalai, Leaderboard, ResultsFormat, Submission, Token as TokenPlace, effective, reasons};
+use super::places;
+use super::reach::{Reach, Unreachable};
+use crate::api::{Evalai, Leaderboard, ResultsFormat, Submission, Token as TokenPlace, effective};
 use crate::controller::context::{CALL_TIMEOUT, Context};
 use crate::controller::job_spec::{self, JobInput};
 use crate::controller::pod_overlay;
@@ -18,7 +20,7 @@ use crate::services::ObjectKey;
 use crate::services::evalai::Target;
 use crate::services::token::{Token, TokenSource};
 
-/// A token and a bucket are looked at again after this long.
+/// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
 /// A failed look is repeated sooner.
 const SOON: SignedDuration = SignedDuration::from_secs(15);
@@ -28,8 +30,7 @@ const SOON: SignedDuration = SignedDuration::from_secs(15);
 pub(super) struct Probe {
     token: Option<Result<Arc<Token>, String>>,
     token_at: Option<Timestamp>,
-    bucket: Option<Result<(), String>>,
-    bucket_at: Option<Timestamp>,
+    reach: Reach,
     /// Generation whose Pod was tried, and why it was refused.
     pod: Option<(i64, Option<String>)>,
     /// Generation whose policy was applied.
@@ -43,34 +44,39 @@ impl Probe {
         if self.pod.as_ref().is_none_or(|(tried, _)| *tried != generation) {
             self.pod = Some((generation, refused_pod(context, leaderboard).await));
         }
-        if due(self.bucket_at, self.bucket.as_ref().is_some_and(Result::is_ok), now) {
-            self.bucket = Some(try_bucket(context, leaderboard).await);
-            self.bucket_at = Some(now);
-        }
-        if let Some(evalai) = &leaderboard.spec.evalai {
-            let refused = context.sync.hub.token_refused(&super::key_of(leaderboard)).is_some();
-            if due(
-                self.token_at,
-                self.token.as_ref().is_some_and(Result::is_ok) && !refused,
-                now,
-            ) {
-                self.token = Some(read_token(context, leaderboard, &evalai.token).await);
-                self.token_at = Some(now);
-            }
-            if let Some(Ok(token)) = &self.token {
-                serve(context, leaderboard, evalai, token);
-            }
-        }
+        let reach = std::mem::take(&mut self.reach);
+        // A bucket that hangs must not keep EvalAI waiting.
+        let places = places::look(context, leaderboard, reach, now);
+        (self.reach, ()) = tokio::join!(places, self.refresh_token(context, leaderboard, now));
         self
+    }
+
+    async fn refresh_token(&mut self, context: &Context, leaderboard: &Leaderboard, now: Timestamp) {
+        let Some(evalai) = &leaderboard.spec.evalai else { return };
+        let refused = context.sync.hub.token_refused(&super::key_of(leaderboard)).is_some();
+        let good = self.token.as_ref().is_some_and(Result::is_ok) && !refused;
+        if due(self.token_at, good, now) {
+            self.token = Some(read_token(context, leaderboard, &evalai.token).await);
+            self.token_at = Some(now);
+        }
+        if let Some(Ok(token)) = &self.token {
+            serve(context, leaderboard, evalai, token);
+        }
     }
 
     pub(super) fn invalid_pod(&self) -> Option<String> {
         self.pod.as_ref().and_then(|(_, why)| why.clone())
     }
 
-    pub(super) fn unreachable(&self) -> Option<(&'static str, String)> {
-        let why = self.bucket.as_ref()?.as_ref().err()?;
-        Some((reasons::BUCKET_UNREACHABLE, why.clone()))
+    pub(super) fn unreachable(&self, now: Timestamp) -> Option<Unreachable> {
+        self.reach.unreachable(now)
+    }
+
+    /// When something has to be tried again.
+    pub(super) fn next(&self, now: Timestamp) -> Option<Timestamp> {
+        let waits = self.token.as_ref().is_some_and(Result::is_err);
+        let token = self.token_at.filter(|_| waits).and_then(|at| at.checked_add(SOON).ok());
+        [self.reach.next(now), token].into_iter().flatten().min()
     }
 
     pub(super) fn policy_is_applied(&self, leaderboard: &Leaderboard) -> bool {
@@ -119,7 +125,10 @@ fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
             .expires()
             .map(|t| t.strftime("%Y-%m-%d").to_string())
             .unwrap_or_default();
-        format!("EvalAI's token ends on {when}; put a new one into its Secret before.")
+        if token.expires().is_some_and(|end| end <= now) {
+            return format!("EvalAI's token has ended on {when}; put a new one where evalai.token says.");
+        }
+        format!("EvalAI's token ends on {when}; put a new one where evalai.token says before.")
     })
 }
 
@@ -127,18 +136,6 @@ fn due(at: Option<Timestamp>, good: bool, now: Timestamp) -> bool {
     let wait = if good { AGAIN } else { SOON };
     // A clock that was set back makes it due as well.
     at.is_none_or(|at| now.duration_since(at) >= wait || now < at)
-}
-
-async fn try_bucket(context: &Context, leaderboard: &Leaderboard) -> Result<(), String> {
-    let archive = context.archive(&leaderboard.spec.storage, "none");
-    match tokio::time::timeout(Duration::from_secs(10), archive.prefix_is_empty()).await {
-        Ok(Ok(_)) => Ok(()),
-        Ok(Err(error)) => Err(error.to_string()),
-        Err(_) => Err(format!(
-            "the bucket {} does not answer",
-            leaderboard.spec.storage.bucket
-        )),
-    }
 }
 
 async fn read_token(context: &Context, leaderboard: &Leaderboard, place: &TokenPlace) -> Result<Arc<Token>, String> {

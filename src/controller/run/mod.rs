@@ -3,6 +3,7 @@
 //! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error: the kubelet
 //! starts it again with empty hands.
 
+mod counts;
 mod passes;
 
 use std::collections::HashMap;
@@ -74,7 +75,7 @@ pub async fn run(
     let parts = Parts {
         client: clients.api,
         settings,
-        aws,
+        aws: aws.counted_by(counts::meter(&seen)),
         watches,
         seen,
     };
@@ -321,6 +322,11 @@ impl Parts {
         };
         let events = EventRecorder::new(self.client.clone(), reporter);
         let sync = Sync::new(hub.clone(), recorder);
+        tokio::spawn(counts::keep(
+            hub.clone(),
+            self.watches.submissions.store.clone(),
+            self.seen.clone(),
+        ));
         let stores = self.watches.stores();
         let context = Arc::new(Context::new(self.client, self.settings, stores, sync, self.aws, events));
         self.watches.feed(&touched);
@@ -414,6 +420,7 @@ fn hub(
         sweep,
         timing: Timing::default(),
         timeouts: Timeouts::default(),
+        meter: counts::meter(seen),
     })
 }
 

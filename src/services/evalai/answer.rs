@@ -60,6 +60,18 @@ pub struct Silence {
 }
 
 impl<T> Answer<T> {
+    /// A word for metrics.
+    pub fn word(&self) -> &'static str {
+        match self {
+            Self::Done(_) => "ok",
+            Self::Refused(_) => "refused",
+            Self::Broken(_) => "broken",
+            Self::Throttled(_) => "throttled",
+            Self::Unanswered(Silence { sent: true, .. }) => "unanswered",
+            Self::Unanswered(_) => "unreachable",
+        }
+    }
+
     /// The sentence for people, if it is not done.
     pub fn error(&self) -> Option<String> {
         match self {

@@ -43,6 +43,12 @@ impl Budget {
         (self.limit / 6).max(2).min(self.limit)
     }
 
+    /// Requests of a minute that are kept for lists of cancelled submissions: after a burst nothing else is left for ten
+    /// seconds in each minute.
+    pub fn kept(&self) -> u32 {
+        self.limit / 18
+    }
+
     /// Requests in any 60 s.
     pub fn limit(&self) -> u32 {
         self.limit
@@ -57,11 +63,17 @@ impl Budget {
 
     /// When `count` requests may be made, one after the other, if nothing else is. More than a burst counts as a burst.
     pub fn ready_at(&self, now: Duration, count: u32) -> Duration {
+        self.ready_keeping(now, count, 0)
+    }
+
+    /// The same, if `keep` more of the minute's requests are left for what comes at any time.
+    pub fn ready_keeping(&self, now: Duration, count: u32, keep: u32) -> Duration {
         let count = count.clamp(1, self.burst());
         let credit = self.credit_at(now);
         let earned = now + (self.interval() * count).saturating_sub(credit);
         let recent = self.sent.iter().filter(|at| **at + WINDOW > now);
-        let excess = (recent.clone().count() + count as usize).saturating_sub(self.limit as usize);
+        let wanted = recent.clone().count() + count as usize + keep as usize;
+        let excess = wanted.saturating_sub(self.limit as usize);
         let room = match excess {
             0 => now,
             excess => recent.clone().nth(excess - 1).map_or(now, |at| *at + WINDOW),

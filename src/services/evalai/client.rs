@@ -15,6 +15,7 @@ use super::answer::{About, Answer, Refusal, Silence, classify};
 use super::request::{Reply, Request, Subject};
 use super::row::image;
 use super::types::Payload;
+use crate::services::meter::Meter;
 use crate::services::token::Token;
 
 /// Largest answer that is read, a list of many thousand rows, in bytes.
@@ -53,6 +54,7 @@ pub struct Client {
     files: reqwest::Client,
     base: String,
     timeouts: Timeouts,
+    meter: Meter,
 }
 
 /// The body of a PUT, as the server wants it: `result` and `metadata` are texts that hold JSON.
@@ -95,11 +97,25 @@ impl Client {
             files: made(builder().redirect(reqwest::redirect::Policy::limited(5)))?,
             base: format!("{}/api/", api_server.trim_end_matches('/')),
             timeouts,
+            meter: Meter::default(),
         })
+    }
+
+    /// The same client, whose requests are counted.
+    #[must_use]
+    pub fn counted_by(self, meter: Meter) -> Self {
+        Self { meter, ..self }
     }
 
     /// Sends a request and reads its answer.
     pub async fn send(&self, token: &Token, request: &Request) -> Reply {
+        let running = self.meter.begin("evalai", request.op());
+        let reply = self.exchange(token, request).await;
+        running.end(reply.answer().word());
+        reply
+    }
+
+    async fn exchange(&self, token: &Token, request: &Request) -> Reply {
         match request {
             Request::Get(s) => Reply::Row(self.get(token, &format!("jobs/submission/{}", s.pk)).await),
             Request::Image(_, url) => Reply::Image(self.upload(url).await),

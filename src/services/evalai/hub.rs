@@ -16,6 +16,7 @@ use super::labels::Labels;
 use super::queue::{Queue, Timing};
 use super::task::{Outlets, Shared, now, run};
 use super::types::{Changed, Key, Run, SweepRow, Target, View, Wish};
+use crate::services::meter::Meter;
 
 /// Says, right before each write, whether this process still leads.
 pub trait Fence: Send + Sync + 'static {
@@ -40,6 +41,8 @@ pub struct Options {
     pub sweep: mpsc::UnboundedSender<SweepRow>,
     pub timing: Timing,
     pub timeouts: Timeouts,
+    /// Counts the requests.
+    pub meter: Meter,
 }
 
 /// See the module's text. Clones are the same hub.
@@ -158,6 +161,16 @@ impl Hub {
         Some(used)
     }
 
+    /// Requests of the last minute, and wishes that wait for one, over all tokens.
+    pub fn load(&self) -> (usize, usize) {
+        let queues: Vec<_> = self.state().tokens.values().map(|entry| entry.shared.clone()).collect();
+        queues.iter().fold((0, 0), |(used, waiting), shared| {
+            let queue = shared.queue();
+            let (sent, _) = queue.budget_used(shared.now());
+            (used + sent as usize, waiting + queue.waiting())
+        })
+    }
+
     /// What EvalAI says of a Leaderboard's token, while it refuses it.
     pub fn token_refused(&self, leaderboard: &Key) -> Option<String> {
         self.place(leaderboard)?.queue().token_refused().map(str::to_owned)
@@ -267,7 +280,7 @@ impl Hub {
         let shared = Arc::new(Shared::new(queue, target.token.clone(), inner.start));
         let task = tokio::spawn(run(
             shared.clone(),
-            client,
+            client.counted_by(inner.options.meter.clone()),
             inner.options.fence.clone(),
             inner.outlets.clone(),
             inner.closing.subscribe(),

@@ -85,6 +85,29 @@ impl Request {
         }
     }
 
+    /// For metrics: the method and what it is about, without a submission's id.
+    pub fn op(&self) -> &'static str {
+        match self {
+            Self::Get(_) => "get_submission",
+            Self::Image(..) => "get_image",
+            Self::Progress(_, Progress::Queued, _) => "patch_queued",
+            Self::Progress(_, Progress::Running, _) => "patch_running",
+            Self::Partial(..) => "put_partial",
+            Self::Final(_, Outcome::Finished, _) => "put_finished",
+            Self::Final(_, Outcome::Failed, _) => "put_failed",
+            Self::Final(_, Outcome::Cancelled, _) => "put_cancelled",
+            Self::List { purpose, .. } => match purpose {
+                Purpose::Cancel => "list_cancelled",
+                Purpose::Accept => "list_submitted",
+                Purpose::SweepSubmitted => "sweep_submitted",
+                Purpose::SweepResuming => "sweep_resuming",
+            },
+            Self::Phases(_) => "get_phases",
+            Self::Splits(_) => "get_splits",
+            Self::DatasetSplit(..) => "get_dataset_split",
+        }
+    }
+
     /// For logs.
     pub fn name(&self) -> &'static str {
         match self {

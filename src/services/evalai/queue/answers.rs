@@ -20,6 +20,11 @@ use crate::services::evalai::types::{Changed, Ended};
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);
 
+/// Longest wait after a write that EvalAI broke down over: results are to be there two minutes after an outage.
+const OUTAGE_PAUSE: Duration = Duration::from_secs(90);
+/// So many such waits are well over an hour.
+const OUTAGE_TRIES: u32 = 60;
+
 impl Queue {
     /// Takes an answer in.
     pub fn answered(&mut self, ticket: &Ticket, reply: Reply, now: Now) {
@@ -146,8 +151,7 @@ impl Queue {
                     // Part of it may have been done.
                     (sub.outdated, sub.wrote_at) = (true, now.at);
                     drop_partial(sub, request);
-                    let wait = (pause(sub.write_failures) * 6).min(retry);
-                    sub.write_failed(why, wait, now);
+                    sub.write_failed(why, broken_pause(sub.write_failures, retry), now);
                 });
             }
             Answer::Unanswered(silence) => self.unanswered(subject, silence, now),
@@ -205,6 +209,16 @@ impl Queue {
         if sub.view != before {
             self.changes.insert(Changed::Submission(subject.key.clone()));
         }
+    }
+}
+
+/// The wait before a write that EvalAI broke down over is tried again: short while it may be an outage, whose end nobody
+/// announces; long once it must be this row, which only EvalAI's own people can mend.
+fn broken_pause(failures: u32, of_the_row: Duration) -> Duration {
+    if failures < OUTAGE_TRIES {
+        (pause(failures) * 6).min(OUTAGE_PAUSE)
+    } else {
+        of_the_row
     }
 }
 

@@ -36,7 +36,7 @@ pub(super) enum Priority {
     Acceptance,
     Sweep,
     Progress,
-    /// An end that EvalAI knows already.
+    /// An end that EvalAI knows already, or did not take again and again.
     Cancelled,
     /// What is left.
     Rest,
@@ -52,6 +52,7 @@ enum What {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Step {
     Get,
+    /// A read that is worth nothing without the write that follows it.
     GetForEnd,
     Image,
     Progress,
@@ -71,23 +72,28 @@ struct Offer {
 impl Queue {
     /// The next request, and marks it as sent. `may_write` is the fence: false keeps every write back.
     pub fn next(&mut self, now: Now, may_write: bool) -> Next {
-        let mut best: Option<Offer> = None;
-        let mut soonest: Option<Duration> = (!may_write).then(|| now.at + RECHECK);
-        for offer in self.offers(&now, may_write) {
-            if offer.ready > now.at {
-                soonest = Some(soonest.map_or(offer.ready, |at| at.min(offer.ready)));
-            } else if best
-                .as_ref()
-                .is_none_or(|b| (offer.priority, offer.since) < (b.priority, b.since))
-            {
-                best = Some(offer);
-            }
-        }
-        let Some(best) = best else { return Next::Wait(soonest) };
-        let ready = self.affordable_at(&now, &best);
-        if ready > now.at {
-            return Next::Wait(Some(soonest.map_or(ready, |at| at.min(ready))));
-        }
+        let (due, later): (Vec<_>, Vec<_>) = self
+            .offers(&now, may_write)
+            .into_iter()
+            .partition(|offer| offer.ready <= now.at);
+        let first = |one: &&Offer, other: &&Offer| (one.priority, one.since).cmp(&(other.priority, other.since));
+        let best = due.iter().min_by(first);
+        // Ends wait for room for two requests; the list of the runs that are to stop goes in between.
+        let list = due
+            .iter()
+            .filter(|offer| offer.priority == Priority::CancelList)
+            .min_by(first);
+        let chosen = [best, list].into_iter().flatten();
+        let (now_affordable, not_yet): (Vec<_>, Vec<_>) = chosen
+            .map(|offer| (self.affordable_at(&now, offer), offer))
+            .partition(|(at, _)| *at <= now.at);
+        let Some((_, best)) = now_affordable.first() else {
+            let waits = later
+                .iter()
+                .map(|offer| offer.ready)
+                .chain(not_yet.iter().map(|(at, _)| *at));
+            return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).min());
+        };
         match self.start(&best.what, &now) {
             Some(request) => {
                 if request.counts() {
@@ -98,7 +104,7 @@ impl Queue {
                     requested: now.at,
                 })
             }
-            None => Next::Wait(soonest),
+            None => Next::Wait(Some(now.at + RECHECK)),
         }
     }
 
@@ -117,7 +123,10 @@ impl Queue {
             _ => reserved.saturating_add(1),
         };
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
-        self.budget.ready_at(now.at, count).max(token)
+        // A list that is due, and a write whose read is made, may use what the others leave.
+        let urgent = [Priority::EndNow, Priority::CancelList].contains(&offer.priority);
+        let keep = if urgent { 0 } else { self.budget.kept() };
+        self.budget.ready_keeping(now.at, count, keep).max(token)
     }
 
     fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer> {
@@ -199,8 +208,16 @@ impl Queue {
             if lane.unsure || sub.outdated || sub.read.is_none() {
                 return Some((Priority::Rest, partial.since, true, Step::Get));
             }
-            if sub.partial_verdict() == Some(Verdict::Send) && within(sub.clear_at, self.timing.window, now) {
-                return Some((Priority::Rest, partial.since, true, Step::Partial));
+            let window = self.timing.window;
+            if sub.partial_verdict() == Some(Verdict::Send) {
+                if within(sub.clear_at, window, now) {
+                    return Some((Priority::Rest, partial.since, true, Step::Partial));
+                }
+                // A slow list tells of a past in which somebody may have cancelled since: a read of its own does not.
+                let late = |challenge: &Challenge| challenge.cancel.is_late_for(window);
+                if self.challenges.get(&sub.challenge).is_some_and(late) {
+                    return Some((Priority::Rest, partial.since, true, Step::GetForEnd));
+                }
             }
         }
         let stale = sub.read.is_none() || sub.outdated || read_at + self.timing.refresh <= now.at;
@@ -219,7 +236,8 @@ impl Queue {
         if !lane.unsure && fresh && sub.end_verdict() == Some(End::Put) {
             return (Priority::EndNow, since, true, Step::End);
         }
-        let priority = if outcome == Outcome::Cancelled {
+        // Ends that EvalAI breaks down over must not keep it from being asked for cancellations.
+        let priority = if outcome == Outcome::Cancelled || sub.write_failures > 1 {
             Priority::Cancelled
         } else {
             Priority::End

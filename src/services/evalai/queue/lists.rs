@@ -86,7 +86,7 @@ impl Queue {
                 return;
             }
         };
-        challenge.poll(purpose).done(now.at, every);
+        challenge.poll(purpose).done(requested, now.at, every);
         let mut cancelled = std::collections::BTreeSet::new();
         for row in rows {
             cancelled.insert(row.id);
@@ -158,9 +158,9 @@ impl Queue {
         match answer {
             Answer::Done(content) => {
                 take(look, content);
-                look.poll.done(now.at, Duration::ZERO);
+                look.poll.done(now.at, now.at, Duration::ZERO);
                 if look.request(id).is_none() {
-                    look.poll.done(now.at, every);
+                    look.poll.done(now.at, now.at, every);
                     look.close(now.wall);
                 }
             }

@@ -283,6 +283,17 @@ impl Queue {
         (self.budget.used(now.at), self.budget.limit())
     }
 
+    /// Wishes and questions that wait for a request.
+    pub fn waiting(&self) -> usize {
+        let of = |sub: &Sub| {
+            usize::from(sub.asked.is_some())
+                + usize::from(sub.progress.is_some())
+                + usize::from(sub.partial.is_some())
+                + usize::from(sub.end.is_some())
+        };
+        self.subs.values().map(of).sum()
+    }
+
     /// What EvalAI last said of the token, if it refused it.
     pub fn token_refused(&self) -> Option<&str> {
         self.token_refused.as_ref().map(|(why, _)| why.as_str())

@@ -21,17 +21,26 @@ const FIRST_PAUSE: Duration = Duration::from_secs(5);
 pub(super) struct Poll {
     pub busy: bool,
     pub due: Duration,
+    /// How long the last answer took.
+    took: Duration,
     failures: u32,
 }
 
 impl Poll {
-    /// It went well: next time after `every`.
-    pub fn done(&mut self, now: Duration, every: Duration) {
+    /// It went well: next time `every` after the request, however long its answer took. A server that needs the whole time
+    /// for its answer is given a rest.
+    pub fn done(&mut self, requested: Duration, now: Duration, every: Duration) {
         *self = Self {
             busy: false,
-            due: now + every,
+            due: (requested + every).max(now + every / 4),
+            took: now.saturating_sub(requested),
             failures: 0,
         };
+    }
+
+    /// Whether too little is left of `window` after its answer to act on it.
+    pub fn is_late_for(&self, window: Duration) -> bool {
+        self.took * 2 > window
     }
 
     /// Whether it went wrong last time.

@@ -59,7 +59,7 @@ pub(super) struct Sub {
     pub read: Option<Read>,
     /// Answer of the last read of it, or of the last list that would have held it, had it been cancelled.
     pub fresh_at: Option<Duration>,
-    /// The same, if it said that it is not cancelled, by whatever attempt.
+    /// Answer of the last read, or request of the last list, that says that it is not cancelled, by whatever attempt.
     pub clear_at: Option<Duration>,
     /// The row is known to be outdated.
     pub outdated: bool,
@@ -215,7 +215,8 @@ impl Sub {
             .as_ref()
             .is_some_and(|row| row.status == Status::Cancelled);
         if !cancelled {
-            (self.fresh_at, self.clear_at) = (Some(now.at), Some(now.at));
+            // What it tells may be as old as its request.
+            (self.fresh_at, self.clear_at) = (Some(now.at), self.clear_at.max(Some(requested)));
         } else if self.read.is_none_or(|read| requested >= read.requested) {
             self.outdated = true;
         }

@@ -181,3 +181,42 @@ fn somebody_elses_end_is_noticed_by_a_read_now_and_then() {
     }
     assert_eq!((reads, bench.view(7).ended), (1, Some(Status::Archived)));
 }
+
+#[test]
+fn a_slow_list_is_too_old_for_partials_and_a_read_takes_its_place() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wait(10.0);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    let list = bench.expect("list of cancelled");
+    bench.wait(3.0);
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
+    bench.get(7, row(7, Status::Running));
+    bench.wait(1.9);
+    bench.write("partial 7");
+    bench.wish(7, 1, Wish::Partial(results(42.0)));
+    bench.wait(0.2);
+    bench.get(7, row(7, Status::Cancelled));
+    bench.expect_nothing();
+    assert_eq!(
+        bench.view(7).ended,
+        Some(Status::Cancelled),
+        "and the read finds the cancellation before the next list"
+    );
+}
+
+#[test]
+fn the_time_that_a_list_takes_is_taken_off_its_window() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wait(10.0);
+    let list = bench.expect("list of cancelled");
+    bench.wait(0.9);
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
+    bench.wait(1.0);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.write("partial 7");
+    bench.wish(7, 1, Wish::Partial(results(42.0)));
+    bench.wait(0.2);
+    bench.expect_nothing();
+}

@@ -4,6 +4,7 @@ mod cancels;
 mod faults;
 mod life;
 mod order;
+mod outage;
 
 use jiff::SignedDuration;
 

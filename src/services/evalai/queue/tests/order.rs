@@ -183,3 +183,58 @@ fn a_leaderboard_is_checked_at_its_start_and_hourly() {
     bench.wait(3600.0);
     bench.expect_nothing();
 }
+
+#[test]
+fn lists_keep_their_period_however_slow_they_are() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wait(10.0);
+    for _ in 0..5 {
+        let ticket = bench.expect("list of cancelled");
+        bench.wait(3.0);
+        bench.answer(&ticket, Reply::Rows(Answer::Done(vec![])));
+        bench.wait(6.9);
+        bench.expect_nothing();
+        bench.wait(0.1);
+    }
+    // A server that needs longer than that is never asked twice at the same time, and is given a rest.
+    let ticket = bench.expect("list of cancelled");
+    bench.wait(25.0);
+    bench.expect_nothing();
+    bench.answer(&ticket, Reply::Rows(Answer::Done(vec![])));
+    bench.wait(2.4);
+    bench.expect_nothing();
+    bench.wait(0.2);
+    bench.expect("list of cancelled");
+}
+
+#[test]
+fn many_ends_do_not_keep_the_list_of_cancelled_ones_waiting() {
+    let mut bench = Bench::new();
+    bench.live(500, 1);
+    for pk in 1..=200 {
+        bench.wish(pk, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    }
+    let (mut lists, mut ends) = (Vec::new(), 0);
+    for _ in 0..2400 {
+        bench.wait(0.1);
+        while let Some((name, ticket)) = bench.next() {
+            let reply = match &ticket.request {
+                Request::List { .. } => {
+                    lists.push(bench.at);
+                    Reply::Rows(Answer::Done(vec![]))
+                }
+                Request::Get(subject) => Reply::Row(Answer::Done(row(subject.pk, Status::Running))),
+                _ => {
+                    assert!(name.starts_with("failed"), "{name}");
+                    ends += 1;
+                    Reply::Written(Answer::Done(()))
+                }
+            };
+            bench.answer(&ticket, reply);
+        }
+    }
+    let longest = lists.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap();
+    assert!(longest < Duration::from_secs(16), "{longest:?} without a list");
+    assert!(ends > 80, "{ends} ends in four minutes");
+}

@@ -1,0 +1,203 @@
+//! Asks AWS for a Leaderboard's bucket, table and queues: one cheap request each, all at once, each with a limit of time.
+//!
+//! Called by `probe`. When to ask, and what follows, is `reach`'s to say.
+
+use std::time::Duration;
+
+use futures::future::{BoxFuture, FutureExt, join_all};
+use jiff::Timestamp;
+
+use super::reach::{Finding, Place, Reach};
+use crate::api::Leaderboard;
+use crate::controller::context::Context;
+use crate::services::archive::ArchiveError;
+use crate::services::fault::Fault;
+use crate::services::queue::{self, QueueError};
+use crate::services::table::{Table, TableError};
+
+/// Time one answer may take.
+const LIMIT: Duration = Duration::from_secs(10);
+/// A run that nobody has: the list below it is empty, and costs nothing.
+const NO_RUN: &str = "none";
+
+/// Asks what is due.
+pub(super) async fn look(context: &Context, leaderboard: &Leaderboard, mut reach: Reach, now: Timestamp) -> Reach {
+    let generation = leaderboard.metadata.generation.unwrap_or_default();
+    let named = named(leaderboard);
+    let places: Vec<Place> = named.iter().map(|(place, _)| *place).collect();
+    reach.retain(&places);
+    let due = named
+        .into_iter()
+        .filter(|(place, address)| reach.is_due(*place, address, generation, now));
+    let asked = due.map(|(place, address)| {
+        let question = ask(context, leaderboard, place);
+        async move {
+            let answer = tokio::time::timeout(LIMIT, question).await;
+            let silent = || Finding::Silent(format!("{address} did not answer within {} s", LIMIT.as_secs()));
+            let found = answer.unwrap_or_else(|_| silent());
+            (place, address, found)
+        }
+    });
+    for (place, address, found) in join_all(asked).await {
+        if found != Finding::Good {
+            tracing::warn!(leaderboard = ?leaderboard.metadata.name, ?found, "a place cannot be reached");
+        }
+        reach.take(place, &address, generation, found, now);
+    }
+    reach
+}
+
+/// What a Leaderboard names, each with its address in words.
+fn named(leaderboard: &Leaderboard) -> Vec<(Place, String)> {
+    let spec = &leaderboard.spec;
+    let at = |region: &Option<String>, endpoint: &Option<String>| {
+        let place = endpoint.as_ref().or(region.as_ref());
+        place.map(|place| format!(" at {place}")).unwrap_or_default()
+    };
+    let (region, endpoint) = (&spec.storage.region, &spec.storage.endpoint);
+    let bucket = format!("the bucket {}{}", spec.storage.bucket, at(region, endpoint));
+    let mut places = vec![(Place::Bucket, bucket)];
+    if let Some(table) = &spec.table {
+        let keys = table.partition_key.as_deref().zip(table.sort_key.as_deref());
+        let keys = keys.map(|(team, submission)| format!(" by {team} and {submission}"));
+        let (keys, at) = (keys.unwrap_or_default(), at(&table.region, &table.endpoint));
+        places.push((Place::Table, format!("the table {}{keys}{at}", table.name)));
+    }
+    if let Some(queue) = &spec.queue {
+        let at = at(&queue.region, &queue.endpoint);
+        places.push((Place::Queue, format!("the queue {}{at}", queue.url)));
+        let dead = queue.dead_letter_url.as_ref();
+        places.extend(dead.map(|url| (Place::DeadLetterQueue, format!("the dead-letter queue {url}{at}"))));
+    }
+    places
+}
+
+fn ask<'a>(context: &'a Context, leaderboard: &'a Leaderboard, place: Place) -> BoxFuture<'a, Finding> {
+    let (aws, spec) = (&context.aws, &leaderboard.spec);
+    match (place, &spec.table, &spec.queue) {
+        (Place::Bucket, ..) => {
+            let archive = context.archive(&spec.storage, NO_RUN);
+            async move { of_bucket(archive.prefix_is_empty().await.map(|_| ())) }.boxed()
+        }
+        (Place::Table, Some(table), _) => {
+            async move { of_table(Table::describe(aws, table).await.map(|_| ())) }.boxed()
+        }
+        (Place::Queue, _, Some(queue)) => async move { of_queue(queue::look(aws, queue, &queue.url).await) }.boxed(),
+        (Place::DeadLetterQueue, _, Some(queue)) => {
+            let url = queue.dead_letter_url.as_deref().unwrap_or_default();
+            async move { of_queue(queue::look(aws, queue, url).await) }.boxed()
+        }
+        // It is named by nobody.
+        _ => async { Finding::Good }.boxed(),
+    }
+}
+
+fn of_bucket(answer: Result<(), ArchiveError>) -> Finding {
+    match answer {
+        Ok(()) => Finding::Good,
+        Err(error) if error.cause.is_transient() => Finding::Silent(error.to_string()),
+        Err(error) => Finding::Bad(error.to_string()),
+    }
+}
+
+fn of_table(answer: Result<(), TableError>) -> Finding {
+    match answer {
+        Ok(()) => Finding::Good,
+        Err(error @ TableError::Passing { .. }) => Finding::Silent(error.to_string()),
+        Err(error) => Finding::Bad(error.to_string()),
+    }
+}
+
+/// The bridge reads the queue, with rights of its own.
+fn of_queue(answer: Result<(), QueueError>) -> Finding {
+    match answer {
+        Ok(()) => Finding::Good,
+        Err(error) => match error.fault {
+            Fault::Denied => Finding::Hidden(error.to_string()),
+            Fault::Throttled | Fault::Unavailable | Fault::Conflict => Finding::Silent(error.to_string()),
+            Fault::Missing | Fault::Refused => Finding::Bad(error.to_string()),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::services::archive::Cause;
+    use serde_json::json;
+
+    #[test]
+    fn what_a_refusal_means() {
+        use std::mem::discriminant;
+        let archive = |cause| ArchiveError {
+            op: "listing",
+            object: "bucket/none/".into(),
+            cause,
+        };
+        let table = || "table".to_owned();
+        let queue = |fault| QueueError {
+            url: "https://sqs/one".into(),
+            fault,
+            text: "words".into(),
+        };
+        let (bad, hidden, silent) = (
+            discriminant(&Finding::Bad(String::new())),
+            discriminant(&Finding::Hidden(String::new())),
+            discriminant(&Finding::Silent(String::new())),
+        );
+        let cases = [
+            (of_bucket(Err(archive(Cause::NoBucket))), bad),
+            (of_bucket(Err(archive(Cause::Denied("403".into())))), bad),
+            (of_bucket(Err(archive(Cause::Away("503".into())))), silent),
+            (
+                of_table(Err(TableError::Missing {
+                    table: table(),
+                    text: "gone".into(),
+                })),
+                bad,
+            ),
+            (of_table(Err(TableError::NoSortKey { table: table() })), bad),
+            (
+                of_table(Err(TableError::Passing {
+                    table: table(),
+                    action: "DescribeTable",
+                    text: "503".into(),
+                })),
+                silent,
+            ),
+            (of_queue(Err(queue(Fault::Missing))), bad),
+            (of_queue(Err(queue(Fault::Denied))), hidden),
+            (of_queue(Err(queue(Fault::Throttled))), silent),
+        ];
+        for (found, kind) in cases {
+            assert_eq!(discriminant(&found), kind, "{found:?}");
+        }
+    }
+
+    #[test]
+    fn only_what_is_named_is_asked_for() {
+        let mut spec = json!({
+            "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+            "results": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            "storage": {"bucket": "bucket"},
+        });
+        let places = |spec: &serde_json::Value| {
+            let board = Leaderboard::new("one", serde_json::from_value(spec.clone()).unwrap());
+            named(&board)
+                .into_iter()
+                .map(|(_, address)| address)
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(places(&spec), ["the bucket bucket"]);
+        spec["table"] = json!({"name": "rows", "region": "eu-west-1"});
+        spec["queue"] = json!({"url": "https://sqs/one", "deadLetterUrl": "https://sqs/dead"});
+        let all = [
+            "the bucket bucket",
+            "the table rows at eu-west-1",
+            "the queue https://sqs/one",
+            "the dead-letter queue https://sqs/dead",
+        ];
+        assert_eq!(places(&spec), all);
+    }
+}

@@ -1,0 +1,47 @@
+//! Whether an SQS queue is there. Called by the controller's checks of a Leaderboard; messages are the bridge's alone.
+
+use aws_sdk_sqs::types::QueueAttributeName;
+
+use super::aws::Aws;
+use super::fault::{self, Fault};
+use crate::api;
+
+/// Why a queue could not be looked at.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("queue {url}: {text}; {}", self.next_step())]
+pub struct QueueError {
+    /// Its URL.
+    pub url: String,
+    /// What kind of failure.
+    pub fault: Fault,
+    /// SQS's words.
+    pub text: String,
+}
+
+impl QueueError {
+    fn next_step(&self) -> &'static str {
+        match self.fault {
+            Fault::Denied => {
+                "the controller cannot tell whether it is there: give its AWS identity sqs:GetQueueAttributes on it"
+            }
+            Fault::Missing => "create it, or correct queue.url, queue.deadLetterUrl, queue.region and queue.endpoint",
+            Fault::Refused => "check queue.url, queue.deadLetterUrl, queue.region and queue.endpoint",
+            Fault::Throttled | Fault::Unavailable | Fault::Conflict => {
+                "it is asked again; check queue.endpoint and the network if this stays"
+            }
+        }
+    }
+}
+
+/// Looks whether a queue answers: the one that is read, or its dead-letter queue.
+pub async fn look(aws: &Aws, queue: &api::Queue, url: &str) -> Result<(), QueueError> {
+    let client = aws.sqs(queue.region.as_deref(), queue.endpoint.as_deref());
+    let request = client.get_queue_attributes().queue_url(url);
+    let request = request.attribute_names(QueueAttributeName::QueueArn).send();
+    let answer = aws.meter().aws("sqs", "GetQueueAttributes", request).await;
+    answer.map(|_| ()).map_err(|error| QueueError {
+        url: url.to_owned(),
+        fault: fault::of(&error),
+        text: fault::sentence(&error),
+    })
+}

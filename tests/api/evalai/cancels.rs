@@ -1,0 +1,106 @@
+//! How many cancellations a partial result undoes: the server saves the whole row that it read when the request came in.
+//!
+//! The small version of it is `cancels_during_partial_traffic_are_lost_only_inside_a_request`; this one measures:
+//! `make measure-scale`.
+
+use super::*;
+
+const CANCELS: usize = 1000;
+const OVER: Duration = Duration::from_mins(4);
+/// How long the server works on partial results.
+const PUT: Duration = Duration::from_millis(500);
+
+/// Where the cancels fell that were undone.
+#[derive(Debug, Default)]
+struct Undone {
+    /// While the server worked on the partial results.
+    inside: usize,
+    /// Before that, since the last read or list that did not show them; with the longest such time.
+    before: usize,
+    longest: f64,
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "it measures for ten minutes: make measure-scale"]
+async fn a_thousand_cancels_at_random_moments_during_partial_traffic() {
+    for (what, list, requests) in [
+        ("the usual budget, a slow list", 3000, 54),
+        ("all that four requests at once can do, a slow list", 3000, 6000),
+        ("the same, a fast list", 100, 6000),
+    ] {
+        measure(what, list, requests).await;
+    }
+}
+
+async fn measure(what: &str, list_delay_ms: u64, requests_per_minute: u32) {
+    let mut world = World::with(Timing::default(), Timeouts::default()).await;
+    world.target.period = Duration::from_secs(10);
+    world.target.requests_per_minute = requests_per_minute;
+    world.server.set_knobs(Knobs {
+        put_delay_ms: u64::try_from(PUT.as_millis()).unwrap(),
+        list_delay_ms,
+        ..Knobs::default()
+    });
+    let pks: Vec<i64> = (0..CANCELS).map(|_| world.submit()).collect();
+    for pk in &pks {
+        world.ask(*pk, false);
+    }
+    for pk in &pks {
+        world.until(*pk, |view| view.answered == 1).await;
+        world.live(*pk);
+    }
+    let cancelled = cancel_all(&world, &pks).await;
+    assert!(world.hub.drain().await);
+    let (undone, partials) = count(&world, &cancelled);
+    println!(
+        "{what}: {partials} partials in {} s, {CANCELS} cancels; undone while the server worked on one: {}, between a read \
+         and one: {} (at most {:.2} s after the cancel)",
+        OVER.as_secs(),
+        undone.inside,
+        undone.before,
+        undone.longest,
+    );
+}
+
+/// Cancels each at a random moment; all that are left wish for newer partial results in each period.
+async fn cancel_all(world: &World, pks: &[i64]) -> BTreeMap<i64, Timestamp> {
+    let mut moments: Vec<_> = pks.iter().map(|pk| (OVER.mul_f64(fastrand::f64()), *pk)).collect();
+    moments.sort();
+    let began = Instant::now();
+    let (mut cancelled, mut round) = (BTreeMap::new(), 0_u32);
+    for (moment, pk) in moments {
+        while began + Duration::from_secs(10) * round <= began + moment {
+            tokio::time::sleep_until(began + Duration::from_secs(10) * round).await;
+            round += 1;
+            let results = results(&world.target, f64::from(round));
+            for pk in pks.iter().filter(|pk| !cancelled.contains_key(*pk)) {
+                world.wish(*pk, Wish::Partial(results.clone()));
+            }
+        }
+        tokio::time::sleep_until(began + moment).await;
+        world.set(pk, Stored::Cancelled);
+        cancelled.insert(pk, Timestamp::now());
+    }
+    cancelled
+}
+
+fn count(world: &World, cancelled: &BTreeMap<i64, Timestamp>) -> (Undone, usize) {
+    let puts = world.sent("PUT");
+    let mut undone = Undone::default();
+    for (pk, at) in cancelled
+        .iter()
+        .filter(|(pk, _)| world.stored(**pk) != Stored::Cancelled)
+    {
+        let mut of = puts.iter().filter(|put| put.body["submission"] == json!(pk));
+        let by = of
+            .find(|put| put.answered.is_none_or(|answered| answered > *at))
+            .unwrap();
+        if by.time <= *at {
+            undone.inside += 1;
+        } else {
+            undone.before += 1;
+            undone.longest = undone.longest.max(by.time.duration_since(*at).as_secs_f64());
+        }
+    }
+    (undone, puts.len())
+}

@@ -1,0 +1,66 @@
+//! The whole controller inside a test: against the real API server, in a namespace and with a Lease of its own.
+
+use std::time::Duration;
+
+use leaderboard_operator::controller::context::Settings;
+use leaderboard_operator::controller::leader::{self, Identity};
+use leaderboard_operator::controller::run::{self, Clients, RunError};
+use leaderboard_operator::controller::watches::watch_client;
+use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::services::aws::Aws;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+use crate::support::apiserver::server;
+
+/// Longer than it takes to end, with a write to EvalAI under way.
+const END_LIMIT: Duration = Duration::from_mins(3);
+
+/// A controller that leads, or will.
+pub struct Operator {
+    pub seen: Observability,
+    stop: watch::Sender<bool>,
+    task: JoinHandle<Result<(), RunError>>,
+}
+
+impl Operator {
+    /// Starts one for a namespace.
+    pub async fn start(namespace: &str, aws: Aws) -> Self {
+        let server = server().await;
+        let (stop, signal) = Stop::new();
+        let seen = Observability::new(signal);
+        let config = server.config();
+        let clients = Clients {
+            api: server.client(),
+            watch: watch_client(config.clone()).unwrap(),
+            lease: leader::lease_client(config).unwrap(),
+        };
+        let lease = leader::Settings::new(namespace, "operator", Identity::random("test"));
+        let settings = Settings {
+            image: "operator:1".into(),
+            image_pull_policy: None,
+            region: Some("us-east-1".into()),
+            namespace: Some(namespace.to_owned()),
+            concurrency: 16,
+        };
+        let running = run::run(clients, lease, settings, aws, seen.clone());
+        Self {
+            seen,
+            stop,
+            task: tokio::spawn(Box::pin(running)),
+        }
+    }
+
+    /// What Prometheus would get.
+    pub fn metrics(&self) -> String {
+        self.seen.metrics.text().unwrap()
+    }
+
+    /// Tells it to end, and waits for that.
+    pub async fn end(self) {
+        self.stop.send_replace(true);
+        let ended = tokio::time::timeout(END_LIMIT, self.task).await;
+        ended.expect("it ends when told").unwrap().unwrap();
+    }
+}

@@ -1,0 +1,410 @@
+//! Many submissions at once, on a real API server with a played cluster: the budget of requests to EvalAI holds, every result
+//! is published, a cancellation in EvalAI reaches the Pod.
+//!
+//! The small size belongs to the tests. The full one measures, and takes a quarter of an hour: `make measure-scale`.
+
+mod player;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use evalai_stand_in::log::Entry;
+use evalai_stand_in::model::{FileState, Status as Stored};
+use evalai_stand_in::submissions::{NewSubmission, create as push};
+use evalai_stand_in::{Config, Handle, Knobs};
+use futures::StreamExt;
+use jiff::{SignedDuration, Timestamp};
+use kube::api::Api;
+use kube::runtime::{WatchStreamExt, watcher};
+use kube::{Client, ResourceExt};
+use leaderboard_operator::api::{Leaderboard, State, Submission, conditions};
+use serde_json::{Map, Value, json};
+use tokio::net::TcpListener;
+use tokio::time::{Instant, timeout_at};
+
+use super::bridge::StandIn;
+use super::objects::{Kind, create};
+use super::operator::Operator;
+use crate::support::apiserver::server;
+use player::{Player, Props, ROUTES};
+
+const BOARD: &str = "carla";
+
+/// How much of everything.
+struct Size {
+    /// Submissions that come to their own end, all of them at the same moment.
+    finals: usize,
+    /// Submissions that are cancelled in EvalAI while all others run.
+    cancels: usize,
+    /// Time over which they are cancelled.
+    cancel_over: Duration,
+    requests_per_minute: usize,
+    period_seconds: u32,
+    /// How long EvalAI takes for a list, and for a result.
+    list: Duration,
+    put: Duration,
+    /// Longest time for each of the three parts.
+    limit: Duration,
+}
+
+const SMALL: Size = Size {
+    finals: 20,
+    cancels: 6,
+    cancel_over: Duration::from_secs(8),
+    requests_per_minute: 300,
+    period_seconds: 2,
+    list: Duration::from_millis(300),
+    put: Duration::from_millis(50),
+    limit: Duration::from_mins(3),
+};
+
+/// The numbers of a large challenge, and of EvalAI on a slow day.
+const FULL: Size = Size {
+    finals: 200,
+    cancels: 100,
+    cancel_over: Duration::from_mins(4),
+    requests_per_minute: 54,
+    period_seconds: 10,
+    list: Duration::from_secs(3),
+    put: Duration::from_millis(500),
+    limit: Duration::from_mins(20),
+};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn many_submissions_stay_inside_the_budget_and_all_are_published() {
+    measure(&SMALL).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "it measures for a quarter of an hour: make measure-scale"]
+async fn two_hundred_submissions_at_the_size_of_a_large_challenge() {
+    measure(&FULL).await;
+}
+
+async fn measure(size: &Size) {
+    let mut world = World::start(size).await;
+    let began = Instant::now();
+    let pks: Vec<u64> = (0..size.finals + size.cancels).map(|_| world.submit()).collect();
+    for pk in &pks {
+        world.apply(*pk).await;
+    }
+    let all: BTreeSet<String> = pks.iter().map(|pk| name(*pk)).collect();
+    world
+        .until(size, "all run", |seen| {
+            all.iter().all(|name| seen.is(name, State::Running))
+        })
+        .await;
+    println!(
+        "{} submissions run after {:.1} s",
+        pks.len(),
+        began.elapsed().as_secs_f64()
+    );
+
+    let (cancelled, others) = pks.split_at(size.cancels);
+    let times = world.cancel(cancelled, size.cancel_over).await;
+    let undone = world.settle(size, cancelled).await;
+    let stopped = world.player.seen().told_to_stop;
+    let waits = cancelled
+        .iter()
+        .filter_map(|pk| Some(between(times[pk], *stopped.get(&name(*pk))?)));
+    say("cancelled in EvalAI to the stop on the Pod", waits.collect());
+    println!(
+        "{} of {} cancels were undone by a write of ours",
+        undone.len(),
+        cancelled.len()
+    );
+
+    world.player.fall_the_curtain();
+    let rest: BTreeSet<String> = others.iter().chain(&undone).map(|pk| name(*pk)).collect();
+    world
+        .until(size, "all are published", |seen| {
+            all.iter().all(|name| seen.terminal.contains_key(name))
+                && rest.iter().all(|name| seen.published.contains(name))
+        })
+        .await;
+    world.report_ends(&rest);
+    world.check(size, &rest, cancelled, &undone);
+    world.operator.end().await;
+}
+
+fn name(pk: u64) -> String {
+    format!("submission-{pk}")
+}
+
+fn between(from: Timestamp, to: Timestamp) -> f64 {
+    to.duration_since(from).as_secs_f64()
+}
+
+/// Prints the middle, the 99th percentile and the last of some times.
+fn say(what: &str, mut seconds: Vec<f64>) {
+    seconds.sort_by(f64::total_cmp);
+    let at = |part: usize| {
+        seconds
+            .get((seconds.len() * part).div_ceil(100).saturating_sub(1))
+            .copied()
+    };
+    if let (Some(middle), Some(late), Some(last)) = (at(50), at(99), seconds.last()) {
+        println!(
+            "{what}: {} times, p50 {middle:.2} s, p99 {late:.2} s, max {last:.2} s",
+            seconds.len()
+        );
+    }
+}
+
+/// Everything around the controller.
+struct World {
+    operator: Operator,
+    evalai: Handle,
+    player: Player,
+    client: Client,
+    namespace: String,
+    submissions: Seen,
+    changes: std::pin::Pin<Box<dyn futures::Stream<Item = Submission> + Send>>,
+}
+
+/// What the Submissions' statuses have said.
+#[derive(Default)]
+struct Seen {
+    states: BTreeMap<String, State>,
+    terminal: BTreeMap<String, Timestamp>,
+    published: BTreeSet<String>,
+}
+
+impl Seen {
+    fn is(&self, name: &str, state: State) -> bool {
+        self.states.get(name) == Some(&state)
+    }
+
+    fn take(&mut self, submission: &Submission) {
+        let Some(status) = &submission.status else { return };
+        let name = submission.name_any();
+        self.states.extend(status.state.map(|state| (name.clone(), state)));
+        if conditions::is_true(&status.conditions, conditions::FINISHED) {
+            self.terminal.entry(name.clone()).or_insert_with(Timestamp::now);
+        }
+        if conditions::is_true(&status.conditions, conditions::PUBLISHED) {
+            self.published.insert(name);
+        }
+    }
+}
+
+impl World {
+    async fn start(size: &Size) -> Self {
+        let aws = StandIn::start().await;
+        let client = server().await.client();
+        let namespace = server().await.namespace("scale").await;
+        let (config, _) = Config::in_memory().unwrap();
+        let labels = config.seed.challenges[0].phases[0].splits[0].schema.labels.clone();
+        // Its own limit is a little above ours, as in EvalAI.
+        let config = Config {
+            throttle: size.requests_per_minute * 60 / 54,
+            ..config
+        };
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let evalai = evalai_stand_in::serve(config, vec![listener]);
+        let millis = |time: Duration| u64::try_from(time.as_millis()).unwrap();
+        evalai.set_knobs(Knobs {
+            list_delay_ms: millis(size.list),
+            put_delay_ms: millis(size.put),
+            ..Knobs::default()
+        });
+        let bucket = aws.name("scale");
+        let s3 = aws.aws.s3(None, Some(&aws.endpoint));
+        s3.create_bucket().bucket(&bucket).send().await.unwrap();
+        make_board(&client, &namespace, size, &evalai, &bucket, &aws.endpoint).await;
+        let player = Player::start(Props {
+            client: client.clone(),
+            namespace: namespace.clone(),
+            s3,
+            bucket,
+            period: Duration::from_secs(size.period_seconds.into()),
+            labels,
+        });
+        let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
+        let changes = watcher(api, watcher::Config::default())
+            .default_backoff()
+            .applied_objects();
+        Self {
+            operator: Operator::start(&namespace, aws.aws).await,
+            evalai,
+            player,
+            client,
+            namespace,
+            submissions: Seen::default(),
+            changes: changes.filter_map(async |event| event.ok()).boxed(),
+        }
+    }
+
+    /// A participant pushes an image; its message goes nowhere.
+    fn submit(&self) -> u64 {
+        let new = NewSubmission {
+            team: 1,
+            phase: 1,
+            user: 11,
+            input: br#"{"submitted_image_uri": "registry.example/team-a:1"}"#.to_vec(),
+            fields: Map::new(),
+        };
+        self.evalai
+            .with_state(|state| push(state, new, FileState::Stored, Timestamp::now()))
+    }
+
+    async fn apply(&self, pk: u64) {
+        let spec = json!({"spec": {
+            "leaderboard": BOARD, "track": null, "evalai": {"challenge": 1, "phase": 1, "submission": pk},
+        }});
+        let api = Kind::Submission.api(&self.client, &self.namespace);
+        create(&api, Kind::Submission.object(&name(pk), &[&spec]), false)
+            .await
+            .unwrap();
+    }
+
+    /// Follows the Submissions until something holds.
+    async fn until(&mut self, size: &Size, what: &str, holds: impl Fn(&Seen) -> bool) {
+        let end = Instant::now() + size.limit;
+        while !holds(&self.submissions) {
+            let change = timeout_at(end, self.changes.next()).await;
+            let Ok(Some(submission)) = change else {
+                panic!("not after {:?}: {what}; {:?}", size.limit, self.submissions.states);
+            };
+            self.submissions.take(&submission);
+        }
+    }
+
+    /// Cancels at random moments, and says when each was.
+    async fn cancel(&self, pks: &[u64], over: Duration) -> BTreeMap<u64, Timestamp> {
+        let seed = fastrand::u64(..);
+        println!("the moments of the cancels are of seed {seed}");
+        let mut random = fastrand::Rng::with_seed(seed);
+        let mut moments: Vec<_> = pks.iter().map(|pk| (over.mul_f64(random.f64()), *pk)).collect();
+        moments.sort();
+        let began = Instant::now();
+        let mut times = BTreeMap::new();
+        for (moment, pk) in moments {
+            tokio::time::sleep_until(began + moment).await;
+            self.evalai
+                .with_state(|state| state.submissions.get_mut(&pk).unwrap().status = Stored::Cancelled);
+            times.insert(pk, Timestamp::now());
+        }
+        times
+    }
+
+    /// Waits until each cancelled submission is stopped, or EvalAI has forgotten that it was cancelled; gives the latter.
+    async fn settle(&mut self, size: &Size, pks: &[u64]) -> Vec<u64> {
+        let end = Instant::now() + size.limit;
+        loop {
+            let stopped = self.player.seen().told_to_stop;
+            let state = self.evalai.state();
+            let (undone, open): (Vec<u64>, Vec<u64>) = pks
+                .iter()
+                .filter(|pk| !stopped.contains_key(&name(**pk)))
+                .partition(|pk| state.submissions[*pk].status != Stored::Cancelled);
+            if open.is_empty() {
+                return undone;
+            }
+            assert!(
+                Instant::now() < end,
+                "not told to stop after {:?}: {open:?}",
+                size.limit
+            );
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    }
+
+    fn puts(&self, status: &str) -> BTreeMap<u64, Entry> {
+        let log = self.evalai.requests().into_iter();
+        let puts = log.filter(|entry| entry.method == "PUT" && entry.body["submission_status"] == json!(status));
+        puts.map(|entry| (entry.body["submission"].as_u64().unwrap(), entry))
+            .collect()
+    }
+
+    fn report_ends(&self, rest: &BTreeSet<String>) {
+        let ended = self.player.seen().ended;
+        let puts = self.puts("finished");
+        let of = |name: &str| name.trim_start_matches("submission-").parse::<u64>().unwrap();
+        let status = rest
+            .iter()
+            .map(|name| between(ended[name], self.submissions.terminal[name]));
+        say("the Job's end to the terminal status", status.collect());
+        let put = rest
+            .iter()
+            .filter_map(|name| Some(between(ended[name], puts.get(&of(name))?.time)));
+        say("the Job's end to the PUT of the result", put.collect());
+    }
+
+    fn check(&self, size: &Size, rest: &BTreeSet<String>, cancelled: &[u64], undone: &[u64]) {
+        let log = self.evalai.requests();
+        let times: Vec<Timestamp> = log.iter().map(|entry| entry.time).collect();
+        let (minute, sixth) = (most_within(&times, 60_000), most_within(&times, 10_000));
+        println!(
+            "{} requests, at most {minute} in any minute, {sixth} in any 10 s",
+            log.len()
+        );
+        let throttled = log.iter().filter(|entry| entry.status == Some(429)).count();
+        assert_eq!(throttled, 0, "EvalAI throttled us");
+        // What leaves in time may arrive a little closer together.
+        let limit = size.requests_per_minute;
+        assert!(most_within(&times, 59_000) <= limit, "{minute} requests in a minute");
+        assert!(
+            sixth <= limit / 3 + 2,
+            "{sixth} requests in 10 s: a burst and a sixth of a minute"
+        );
+        let state = self.evalai.state();
+        for name in rest {
+            let pk: u64 = name.trim_start_matches("submission-").parse().unwrap();
+            assert_eq!(state.submissions[&pk].status, Stored::Finished, "{name}");
+            let rows: Vec<_> = state.rows.values().filter(|row| row.submission == pk).collect();
+            assert_eq!(rows.len(), 1, "{name} has one row on the leaderboard");
+            assert_eq!(
+                rows[0].result["Driving score"].as_f64(),
+                Some(100.0),
+                "{name}: the result of all {ROUTES} routes"
+            );
+            assert!(self.submissions.is(name, State::Finished), "{name}");
+        }
+        for pk in cancelled.iter().filter(|pk| !undone.contains(pk)) {
+            assert_eq!(state.submissions[pk].status, Stored::Cancelled, "submission {pk}");
+            assert!(self.submissions.is(&name(*pk), State::Cancelled), "submission {pk}");
+        }
+        let partials = log
+            .iter()
+            .filter(|entry| entry.path.contains("partially_evaluated"))
+            .count();
+        println!("{partials} partial results");
+    }
+}
+
+/// The most moments within any so many milliseconds.
+fn most_within(times: &[Timestamp], milliseconds: i64) -> usize {
+    let window = SignedDuration::from_millis(milliseconds);
+    let from = |first: usize| {
+        times[first..]
+            .iter()
+            .take_while(|time| time.duration_since(times[first]) < window)
+            .count()
+    };
+    (0..times.len()).map(from).max().unwrap_or(0)
+}
+
+async fn make_board(client: &Client, namespace: &str, size: &Size, evalai: &Handle, bucket: &str, endpoint: &str) {
+    let secret: Api<k8s_openapi::api::core::v1::Secret> = Api::namespaced(client.clone(), namespace);
+    let token = json!({"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "evalai"}, "stringData": {"token": "local-host-token"}});
+    let token = serde_json::from_value(token).unwrap();
+    secret.create(&kube::api::PostParams::default(), &token).await.unwrap();
+    let spec: Value = json!({"spec": {
+        "evalai": {
+            "apiServer": evalai.url(), "challenge": 1, "requestsPerMinute": size.requests_per_minute,
+            "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
+        },
+        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+        "storage": {"bucket": bucket, "endpoint": endpoint},
+        "periodSeconds": size.period_seconds,
+        "pairs": 1,
+        "routes": ROUTES,
+    }});
+    let api = Kind::Leaderboard.api(client, namespace);
+    create(&api, Kind::Leaderboard.object(BOARD, &[&spec]), false)
+        .await
+        .unwrap();
+    let boards: Api<Leaderboard> = Api::namespaced(client.clone(), namespace);
+    assert!(boards.get(BOARD).await.is_ok());
+}

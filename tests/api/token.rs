@@ -1,0 +1,71 @@
+//! EvalAI's token in Secrets Manager, against the AWS stand-in.
+
+use leaderboard_operator::services::token::{Scheme, TokenError, TokenSource};
+
+use super::bridge::StandIn;
+
+impl StandIn {
+    fn token(&self, name: &str, key: &str) -> TokenSource {
+        TokenSource::SecretsManager {
+            id: self.name(name),
+            key: key.to_owned(),
+            region: None,
+            endpoint: Some(self.endpoint.clone()),
+        }
+    }
+
+    async fn store(&self, name: &str, text: &str) {
+        let client = self.aws.secrets(None, Some(&self.endpoint));
+        let request = client.create_secret().name(self.name(name)).secret_string(text);
+        request.send().await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn it_is_read_from_a_key_of_the_entry() {
+    let stand_in = StandIn::start().await;
+    let key = "0123456789abcdef0123456789abcdef01234567";
+    let text = format!(r#"{{"auth_token": "Token {key}\n", "api_server": "https://eval.ai", "challenge_pk": 2098}}"#);
+    stand_in.store("evalai", &text).await;
+    let token = stand_in
+        .token("evalai", "auth_token")
+        .read(&stand_in.aws)
+        .await
+        .unwrap();
+    assert_eq!((token.scheme(), token.expires()), (Scheme::Token, None));
+}
+
+#[tokio::test]
+async fn why_there_is_none_is_said_without_what_is_stored() {
+    let stand_in = StandIn::start().await;
+    stand_in.store("keyless", r#"{"other": "very-secret"}"#).await;
+    stand_in.store("plain", "very-secret").await;
+    stand_in.store("empty", r#"{"auth_token": " "}"#).await;
+    for (name, words) in [
+        ("missing", "check its name, region and the permission to read it"),
+        ("keyless", "check token.secretsManager.key"),
+        ("plain", "check token.secretsManager.key"),
+        ("empty", "put a host's refresh token there"),
+    ] {
+        let error: TokenError = stand_in
+            .token(name, "auth_token")
+            .read(&stand_in.aws)
+            .await
+            .unwrap_err();
+        let said = error.to_string();
+        assert!(said.contains(words) && !said.contains("very-secret"), "{name}: {said}");
+    }
+}
+
+#[tokio::test]
+async fn a_new_value_of_the_entry_is_another_token() {
+    let stand_in = StandIn::start().await;
+    stand_in.store("evalai", r#"{"auth_token": "one"}"#).await;
+    let source = stand_in.token("evalai", "auth_token");
+    let old = source.read(&stand_in.aws).await.unwrap();
+    let client = stand_in.aws.secrets(None, Some(&stand_in.endpoint));
+    let put = client.put_secret_value().secret_id(stand_in.name("evalai"));
+    put.secret_string(r#"{"auth_token": "two"}"#).send().await.unwrap();
+    let new = source.read(&stand_in.aws).await.unwrap();
+    assert!(old != new && old.identity() != new.identity());
+}
