@@ -17,6 +17,8 @@ pub const RECORDED: &str = "Recorded";
 pub const PUBLISHED: &str = "Published";
 /// Nothing moves, although it should.
 pub const STALLED: &str = "Stalled";
+/// The scores follow from the infractions; only there once they did not.
+pub const PLAUSIBLE: &str = "Plausible";
 /// The submission has come to its end: True in Finished, Failed and Cancelled.
 pub const FINISHED: &str = "Finished";
 /// A Leaderboard can run submissions.

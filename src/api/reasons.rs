@@ -32,6 +32,8 @@ pub const RUNNING: &str = "Running";
 pub const RESUMED: &str = "Resumed";
 pub const REPLACING: &str = "Replacing";
 pub const STOPPING: &str = "Stopping";
+/// Scores do not follow from the infractions.
+pub const UNEXPLAINED_SCORES: &str = "UnexplainedScores";
 
 // Ends.
 pub const FINISHED: &str = "Finished";

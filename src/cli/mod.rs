@@ -33,6 +33,7 @@ enum Command {
     /// Prints the custom resource definitions.
     Crd,
     /// Merges and renders checkpoint files without a cluster.
+    #[command(after_help = offline::EXIT_CODES)]
     Results(offline::Results),
 }
 

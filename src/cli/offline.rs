@@ -46,10 +46,11 @@ enum VerifyName {
     Refuse,
 }
 
+/// What the exit code of `results` says.
+pub(super) const EXIT_CODES: &str = "Exit code 0: the four files are written. 2: the files or the arguments are refused. 1: \
+    something can't be read or written. Unless it is 0, what had been in the folder is still there.";
+
 /// Merges the checkpoint files of the workers and renders what EvalAI gets.
-///
-/// Exit code 0: the four files are written. 2: the files or the arguments are refused. 1: something can't be read or
-/// written. Unless it is 0, what had been in the folder is still there.
 #[derive(Args, Debug)]
 pub(super) struct Results {
     /// Format of the checkpoints.

@@ -27,7 +27,7 @@ pub enum Refusal {
         limit: Limit,
     },
     /// The merged file would be too large.
-    #[error("the checkpoints together are too large: the merged file {limit}")]
+    #[error("the checkpoints together are too large: this {limit}")]
     Output {
         /// The bound.
         limit: Limit,

@@ -297,6 +297,24 @@ fn limits_are_refusals() {
             .to_string()
             .contains("more than 10,000 records")
     );
+    for (place, value, words) in [
+        (
+            "/sensors",
+            json!(vec!["carla_gnss"; 1001]),
+            "holds more than 1,000 sensors",
+        ),
+        (
+            "/_checkpoint/progress",
+            json!([0, 1_000_001]),
+            "is not a pair of whole numbers",
+        ),
+        ("/values", json!(vec![0; 500_001]), "holds more than 500,000 values"),
+    ] {
+        let mut edited = perfect(V2, 0..=2);
+        *edited.pointer_mut(place).unwrap() = value;
+        let refusal = read(&Plan::lenient(V2), 0, &edited).unwrap_err().to_string();
+        assert!(refusal.contains(words), "{refusal}");
+    }
     let deep = format!("{}1{}", "[".repeat(100_000), "]".repeat(100_000));
     let refusal = leaderboard_results::read_worker(&plan, 0, deep.as_bytes())
         .unwrap_err()
@@ -311,6 +329,18 @@ fn limits_are_refusals() {
         .unwrap_err()
         .to_string();
     assert_eq!(refusal, "pair 2: the checkpoint is not UTF-8 text");
+}
+
+/// A byte of a text can become six when it is written.
+#[test]
+fn what_is_written_has_a_limit_too() {
+    let mut worker = perfect(V2, 0..=0);
+    worker["_checkpoint"]["records"][0]["long"] = json!(vec!["\u{7f}".repeat(1 << 20); 11]);
+    let refusal = merged(&Plan::lenient(V2), &[Some(worker)]).unwrap_err().to_string();
+    assert_eq!(
+        refusal,
+        "the checkpoints together are too large: this would make the merged file larger than 64 MiB"
+    );
 }
 
 #[test]
@@ -387,6 +417,11 @@ fn a_crashed_last_route_is_not_finished_in_a_pod() {
         let result = merged(&later, &files).unwrap();
         assert_eq!((result.is_final, result.outcome), (true, Outcome::Crashed));
         assert_eq!(result.ended_as(), "Crashed");
+        let original = Plan {
+            as_original: true,
+            ..plan.clone()
+        };
+        assert!(merged(&original, &files).unwrap().is_final);
 
         // An evaluator that came to its end repeats nothing, whatever it calls it.
         let mut ended = worker;

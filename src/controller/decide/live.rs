@@ -257,6 +257,25 @@ fn take_report(draft: &mut Draft<'_>, report: &Report) {
             }
         })
         .collect();
+    note_scores(draft, report);
+}
+
+/// Says that scores do not follow from the infractions, and that they do again.
+fn note_scores(draft: &mut Draft<'_>, report: &Report) {
+    const LONGEST: usize = 500;
+    let (truth, reason, message) = match report.warnings.first() {
+        Some(first) => {
+            let first: String = first.chars().take(LONGEST).collect();
+            let message = format!(
+                "Scores do not follow from the infractions: {}",
+                failure::sentence(&first)
+            );
+            (Truth::False, reasons::UNEXPLAINED_SCORES, message)
+        }
+        None if conditions::get(&draft.status.conditions, conditions::PLAUSIBLE).is_none() => return,
+        None => (Truth::True, reasons::OK, String::new()),
+    };
+    draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
 }
 
 /// Limits of a run under way: disk, crashes, time.

@@ -60,7 +60,7 @@ pub(super) fn to_bytes(report: &Report) -> Vec<u8> {
         return bytes;
     }
     let short = Report {
-        warnings: Vec::new(),
+        warnings: report.warnings.iter().take(1).cloned().collect(),
         files: BTreeMap::new(),
         ..report.clone()
     };

@@ -79,7 +79,8 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
     }
     let warnings = verified(plan, pair, &records)?;
     // The evaluator goes by the same text when it resumes.
-    let repeats = plan.is_pod() && file.has_crashed && !file.ended && !records.is_empty();
+    let is_left_open = file.has_crashed && !file.ended && !records.is_empty();
+    let repeats = is_left_open && plan.is_pod() && !plan.as_original;
     Ok(Some(Checkpoint {
         records,
         total,

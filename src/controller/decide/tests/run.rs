@@ -3,10 +3,11 @@
 use super::builders::*;
 use crate::api::FailureClass::{Infrastructure, Participant};
 use crate::api::State::{Failed, Finished, Pending, Resumed, Running};
-use crate::api::conditions::{RUNNING, STALLED};
+use crate::api::conditions::{self, PLAUSIBLE, RUNNING, STALLED};
 use crate::api::reasons;
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{JobSight, NodeSight, PodView, ReportSight};
+use crate::pod::report::Report;
 use crate::pod::run::Stop;
 
 #[test]
@@ -24,6 +25,40 @@ fn progress_is_no_transition_and_is_told_once() {
     assert_eq!(tells(&world.pass()), [Tell::Running]);
     world.report(report(2));
     assert_eq!(tells(&world.pass()), [Tell::Running, Tell::Partial]);
+}
+
+#[test]
+fn scores_without_reason_are_a_condition_and_no_failure() {
+    let mut world = World::local().running();
+    world.report(report(1));
+    assert_eq!(condition(&world.pass_to(Running, reasons::RUNNING), PLAUSIBLE).0, "");
+    let words = "pair 1, route RouteScenario_3: score_penalty is 1.0, but its infractions allow 0.7 at most";
+    let warned = |report: Report| Report {
+        warnings: vec![words.to_owned(), "pair 2".to_owned()],
+        ..report
+    };
+    world.report(warned(report(2)));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!(
+        condition(&plan, PLAUSIBLE),
+        ("False".to_owned(), reasons::UNEXPLAINED_SCORES.to_owned())
+    );
+    let found = conditions::get(&plan.status.conditions, PLAUSIBLE).unwrap();
+    assert_eq!(
+        found.message,
+        format!("Scores do not follow from the infractions: {words}.")
+    );
+
+    world.report(report(3));
+    assert_eq!(
+        condition(&world.pass_to(Running, reasons::RUNNING), PLAUSIBLE).0,
+        "True"
+    );
+
+    world.complete();
+    world.report(warned(final_report()));
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(condition(&plan, PLAUSIBLE).0, "False");
 }
 
 #[test]
