@@ -16,7 +16,7 @@ mod api {
     mod definitions;
     mod evalai;
     mod examples;
-    mod failure_log;
+    mod failures;
     mod leader;
     mod objects;
     mod operator;

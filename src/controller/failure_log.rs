@@ -271,7 +271,8 @@ mod tests {
 
     #[test]
     fn a_tail_is_the_end_of_the_text_and_no_longer_than_allowed() {
-        let long: String = (0..5000).map(|n| format!("line {n} ü\n")).collect();
+        let long: Vec<String> = (0..5000).map(|n| format!("line {n} ü")).collect();
+        let long = long.join("\n");
         let found = tail("The end:\n", long.as_bytes()).unwrap();
         assert_eq!(found.chars().count(), TAIL_CHARS);
         assert!(

@@ -32,7 +32,7 @@ pub(super) fn keep_while_there(draft: &mut Draft<'_>) {
     }
     let mut places = places(&draft.status, draft.view.pod.as_ref());
     // What is in S3 is complete only when the Pod has ended; it is read then, and the best place first.
-    if places.first().is_some_and(|place| is_on_node(place)) {
+    if places.first().is_some_and(is_on_node) {
         places.retain(is_on_node);
         draft.act(Action::KeepLog { places });
     }

@@ -87,7 +87,7 @@ fn line_of(
     let mut line = Vec::new();
     let mut past = Past::default();
     for other in all {
-        if other.spec.leaderboard != name || other.namespace() != namespace {
+        if other.spec.leaderboard != name || other.metadata.namespace != namespace {
             continue;
         }
         note_past(&mut past, other);
@@ -99,7 +99,7 @@ fn line_of(
         if uid == own {
             line.push(in_line(uid, other));
         } else if granted.contains(&uid) || has_job || is_between_tries(other) {
-            past.occupied.push(team(other));
+            past.occupied.push(team(other).to_owned());
         } else if can_start(other) {
             line.push(in_line(uid, other));
         }
@@ -114,13 +114,18 @@ fn note_past(past: &mut Past, submission: &Submission) {
     let Some(began) = times.scheduled.as_ref().or(times.started.as_ref()).map(|t| t.0) else {
         return;
     };
-    let served = past.served.entry(team(submission)).or_insert(began);
-    *served = began.max(*served);
+    let team = team(submission);
+    match past.served.get_mut(team) {
+        Some(served) => *served = began.max(*served),
+        None => _ = past.served.insert(team.to_owned(), began),
+    }
     // What never ran says nothing of how long a run takes.
     if let (Some(track), Some(_), Some(ended)) = (&status.track, &times.started, &times.finished) {
-        let seconds = ended.0.duration_since(began).as_secs();
-        let runs = past.runs.entry(track.clone()).or_default();
-        runs.push((ended.0, seconds.max(0)));
+        let run = (ended.0, ended.0.duration_since(began).as_secs().max(0));
+        match past.runs.get_mut(track) {
+            Some(runs) => runs.push(run),
+            None => _ = past.runs.insert(track.clone(), vec![run]),
+        }
     }
 }
 
@@ -139,22 +144,21 @@ fn in_line(uid: String, submission: &Submission) -> InLine {
     let submitted = submitted.or(created).map(|t| t.0).unwrap_or_default();
     InLine {
         uid,
-        team: team(submission),
+        team: team(submission).to_owned(),
         track: track.unwrap_or_default(),
         priority: submission.spec.priority,
         submitted,
     }
 }
 
-fn team(submission: &Submission) -> String {
+fn team(submission: &Submission) -> &str {
     let known = submission
         .status
         .as_ref()
         .and_then(|s| s.team.as_ref())
         .or(submission.spec.team.as_ref());
-    known
-        .and_then(|t| t.id.clone().or_else(|| t.name.clone()))
-        .unwrap_or_default()
+    let name = known.and_then(|t| t.id.as_deref().or(t.name.as_deref()));
+    name.unwrap_or_default()
 }
 
 fn is_over(submission: &Submission) -> bool {

@@ -172,6 +172,7 @@ mod tests {
             listed("containers-status/agent-1.done", 0),
             listed("logcopy/report.json", 5),
             listed("logcopy/owner", 5),
+            listed("evalai/environment_log.txt", 5),
             listed("logcopy/.stored.json", 5),
             listed("logcopy/logcopy.log", 40),
         ];

@@ -47,6 +47,8 @@ async fn somebody_elses_prefix_is_left_alone() {
 async fn a_fence_taken_before_the_first_pod_came_is_no_foreign_prefix() {
     let pod = Pod::new().await;
     pod.archive.put(OWNER_KEY, b"nobody".to_vec()).await.unwrap();
+    let told = pod.archive.put(FAILURE_LOG_KEY, b"why it failed".to_vec()).await;
+    told.unwrap();
     pod.prepare().await.unwrap();
     assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
 }

@@ -146,6 +146,7 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         world.complete();
         let plan = world.pass_to(Pending, reasons::REPLACING);
         assert_eq!(events(&plan), [reasons::REPLACING]);
+        assert_eq!(tells(&plan), [], "EvalAI keeps saying running");
         assert_eq!((plan.status.retry, plan.status.attempt), (n, Some(1)));
         assert_eq!((plan.status.failure.as_ref(), plan.status.node.as_ref()), (None, None));
         let message = plan.status.message.unwrap();
@@ -155,7 +156,8 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         );
         world.job_gone();
         world.wait(pause - 1);
-        assert!(!creates(&world.pass()));
+        let plan = world.pass();
+        assert!(!creates(&plan) && tells(&plan).is_empty());
         world.wait(1);
         let plan = world.pass();
         assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: n }));

@@ -98,80 +98,82 @@ enum Done {
     Waits,
 }
 
+type Stage = (&'static str, fn() -> World, Done);
+
+const STAGES: [Stage; 9] = [
+    (
+        "EvalAI is asked",
+        || {
+            let mut world = World::evalai();
+            world.in_evalai().info = None;
+            world
+        },
+        Done::Ended,
+    ),
+    (
+        "the Leaderboard is missing",
+        || {
+            let mut world = World::evalai();
+            world.view.leaderboard = None;
+            world
+        },
+        Done::Ended,
+    ),
+    ("no Pod yet", || World::evalai().with_job(), Done::Deleted),
+    (
+        "no node fits",
+        || {
+            let mut world = World::evalai().with_pod();
+            world.pod().scheduled = None;
+            world.pod().unschedulable = Some("no GPU".into());
+            world
+        },
+        Done::Deleted,
+    ),
+    (
+        "an image is pulled",
+        || {
+            let mut world = World::evalai().with_pod();
+            world.see(waiting("agent-1", "ErrImagePull", "not found"));
+            world
+        },
+        Done::Deleted,
+    ),
+    (
+        "contents are copied",
+        || {
+            let mut world = World::evalai().with_pod();
+            world.see(running("contents"));
+            world
+        },
+        Done::Deleted,
+    ),
+    (
+        "its agents have not started, logcopy has",
+        || {
+            let mut world = World::evalai().with_pod();
+            world.pod().logcopy_running = true;
+            world
+        },
+        Done::Told,
+    ),
+    ("it runs", || World::evalai().running(), Done::Told),
+    (
+        "its end cannot be read",
+        || {
+            let mut world = World::evalai().running();
+            world.complete();
+            world.view.report = ReportSight::Unreadable("away".into());
+            world
+        },
+        Done::Waits,
+    ),
+];
+
 #[test]
 fn a_cancel_is_obeyed_at_each_stage() {
-    type Stage = (&'static str, fn() -> World, Done);
-    let stages: [Stage; 9] = [
-        (
-            "EvalAI is asked",
-            || {
-                let mut world = World::evalai();
-                world.in_evalai().info = None;
-                world
-            },
-            Done::Ended,
-        ),
-        (
-            "the Leaderboard is missing",
-            || {
-                let mut world = World::evalai();
-                world.view.leaderboard = None;
-                world
-            },
-            Done::Ended,
-        ),
-        ("no Pod yet", || World::evalai().with_job(), Done::Deleted),
-        (
-            "no node fits",
-            || {
-                let mut world = World::evalai().with_pod();
-                world.pod().scheduled = None;
-                world.pod().unschedulable = Some("no GPU".into());
-                world
-            },
-            Done::Deleted,
-        ),
-        (
-            "an image is pulled",
-            || {
-                let mut world = World::evalai().with_pod();
-                world.see(waiting("agent-1", "ErrImagePull", "not found"));
-                world
-            },
-            Done::Deleted,
-        ),
-        (
-            "contents are copied",
-            || {
-                let mut world = World::evalai().with_pod();
-                world.see(running("contents"));
-                world
-            },
-            Done::Deleted,
-        ),
-        (
-            "its agents have not started, logcopy has",
-            || {
-                let mut world = World::evalai().with_pod();
-                world.pod().logcopy_running = true;
-                world
-            },
-            Done::Told,
-        ),
-        ("it runs", || World::evalai().running(), Done::Told),
-        (
-            "its end cannot be read",
-            || {
-                let mut world = World::evalai().running();
-                world.complete();
-                world.view.report = ReportSight::Unreadable("away".into());
-                world
-            },
-            Done::Waits,
-        ),
-    ];
     for (wish, _) in WISHES {
-        for (what, stage, wanted) in &stages {
+        for (what, stage, wanted) in &STAGES {
             let mut world = stage();
             world.pass();
             wish(&mut world);

@@ -1,4 +1,5 @@
-//! A run whose agent prints the private routes and crashes: hosts find them in the failure's log, a participant nowhere.
+//! Failures as the whole controller meets them: an agent that prints the private routes and crashes, whose log hosts find and
+//! participants don't; and a node that falls silent.
 //!
 //! The real controller against a real API server and both stand-ins; the test plays the Job controller, the kubelet and
 //! logcopy.
@@ -7,20 +8,20 @@
 use evalai_stand_in::model::{FileState, Status};
 use evalai_stand_in::submissions::{NewSubmission, create};
 use evalai_stand_in::{Config, Handle};
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Pod, Secret};
+use k8s_openapi::api::core::v1::{Node, Pod, Secret};
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, Storage, Submission, names};
+use leaderboard_operator::api::{Leaderboard, State, Storage, Submission, SubmissionStatus, names};
 use leaderboard_operator::controller::context::Settings;
 use leaderboard_operator::controller::leader::{self, Identity};
 use leaderboard_operator::controller::run::{self, Clients};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::pod::report::FAILURE_LOG_KEY;
+use leaderboard_operator::pod::report::{FAILURE_LOG_KEY, OWNER_KEY};
 use leaderboard_operator::services::archive::Archive;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
@@ -31,6 +32,8 @@ use crate::support::apiserver;
 
 /// A line of the routes file.
 const ROUTE: &str = r#"<waypoint x="4711.25" y="-815.5" z="1.0"/>"#;
+/// Where all Pods are.
+const NODE: &str = "node-of-failures";
 const HOST: &str = "local-host-token";
 const PARTICIPANT: &str = "local-team-a-token";
 
@@ -55,14 +58,18 @@ impl World {
         let (config, _) = Config::in_memory().unwrap();
         let config = Config { throttle: 0, ..config };
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        Self {
+        let world = Self {
             client: server.client(),
             namespace: server.namespace("failure-log").await,
             aws,
             bucket,
             evalai: evalai_stand_in::serve(config, vec![listener]),
             http: reqwest::Client::builder().no_proxy().build().unwrap(),
-        }
+        };
+        let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": HOST}});
+        let secret: Secret = serde_json::from_value(secret).unwrap();
+        world.api().create(&PostParams::default(), &secret).await.unwrap();
+        world
     }
 
     fn api<K>(&self) -> Api<K>
@@ -144,30 +151,29 @@ impl World {
 
     /// Its Job runs, its agent prints the routes and crashes, logcopy stores the log, and the Job goes as it is told.
     async fn run_that_crashes(&self, pk: u64, name: &str) {
-        let job_name = names::job(name, 1, 0);
-        let jobs = self.api::<Job>();
-        let is_there = |job: Option<&Job>| job.is_some();
-        let job = timeout(LIMIT, await_condition(jobs.clone(), &job_name, is_there)).await;
-        let job = job.expect("a Job is made").unwrap().unwrap();
+        let job = self.job(name, 0).await;
         let log = format!("\u{1b}[32mloading routes\u{1b}[0m\n{ROUTE}\nTraceback: boom\n");
         let archive = self.archive(pk);
         let stored = archive.put("agent/agent1/leaderboard.log", log.into_bytes());
         stored.await.unwrap();
-        let pods = self.api::<Pod>();
-        let pod = self.pod(&job);
-        pods.create(&PostParams::default(), &pod).await.unwrap();
-        let status = json!({"status": crashed()});
-        let (pod_name, params) = (pod.name_any(), PatchParams::default());
-        pods.patch_status(&pod_name, &params, &Patch::Merge(&status))
-            .await
-            .unwrap();
+        let pod = self.pod(&job, &crashed()).await;
         let is_told = |pod: Option<&Pod>| pod.is_some_and(|p| p.annotations().contains_key(names::ANNOTATION_STOP));
-        let told = timeout(LIMIT, await_condition(pods, &pod_name, is_told)).await;
+        let told = timeout(LIMIT, await_condition(self.api(), &pod, is_told)).await;
         told.expect("the Pod is told to stop").unwrap();
-        jobs.delete(&job_name, &DeleteParams::background()).await.unwrap();
+        let jobs = self.api::<Job>();
+        jobs.delete(&job.name_any(), &DeleteParams::background()).await.unwrap();
     }
 
-    fn pod(&self, job: &Job) -> Pod {
+    /// Waits for the Job of the first attempt that follows so many failures of the infrastructure.
+    async fn job(&self, name: &str, retry: i32) -> Job {
+        let is_there = |job: Option<&Job>| job.is_some();
+        let job_name = names::job(name, 1, retry);
+        let job = timeout(LIMIT, await_condition(self.api(), &job_name, is_there)).await;
+        job.expect("a Job is made").unwrap().unwrap()
+    }
+
+    /// Makes the Pod of a Job, with this status; hands back its name.
+    async fn pod(&self, job: &Job, status: &Value) -> String {
         let template = job.spec.as_ref().unwrap().template.metadata.as_ref().unwrap();
         let pod = json!({
             "metadata": {
@@ -176,12 +182,25 @@ impl World {
                                      "uid": job.metadata.uid, "controller": true}],
             },
             "spec": {
-                "nodeName": "node-a", "restartPolicy": "OnFailure", "automountServiceAccountToken": false,
+                "nodeName": NODE, "terminationGracePeriodSeconds": 600, "restartPolicy": "OnFailure",
+                "automountServiceAccountToken": false,
                 "initContainers": [{"name": "logcopy", "image": "i", "restartPolicy": "Always"}],
                 "containers": [{"name": "simulator-1", "image": "i"}, {"name": "agent-1", "image": "i"}],
             },
         });
-        serde_json::from_value(pod).unwrap()
+        let pod: Pod = serde_json::from_value(pod).unwrap();
+        let (pods, name) = (self.api::<Pod>(), pod.name_any());
+        pods.create(&PostParams::default(), &pod).await.unwrap();
+        let status = Patch::Merge(json!({"status": status}));
+        let patched = pods.patch_status(&name, &PatchParams::default(), &status).await;
+        patched.unwrap();
+        name
+    }
+
+    async fn until(&self, name: &str, what: &str, holds: impl Fn(&SubmissionStatus) -> bool) {
+        let holds = |found: Option<&Submission>| found.and_then(|s| s.status.as_ref()).is_some_and(&holds);
+        let seen = timeout(LIMIT, await_condition(self.api::<Submission>(), name, holds)).await;
+        seen.expect(what).unwrap();
     }
 
     /// All that EvalAI hands this user of a submission: the row, and the text behind each of its links.
@@ -216,29 +235,39 @@ impl World {
     }
 }
 
+/// Some seconds ago, as Kubernetes writes it.
+fn ago(seconds: i64) -> String {
+    let at = Timestamp::now() - SignedDuration::from_secs(seconds);
+    at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
+}
+
 /// The Pod's status after the crash. What the agent leaves as its last word is no verdict of a runner.
 fn crashed() -> Value {
-    let now = Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
-    let running = |name: &str| json!({"name": name, "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": {"running": {"startedAt": now}}});
-    let mut agent = running("agent-1");
+    let now = ago(0);
+    let mut status = running();
     let word = json!({"reason": ROUTE, "message": ROUTE}).to_string();
+    let agent = &mut status["containerStatuses"][1];
     agent["ready"] = json!(false);
     agent["state"] =
         json!({"terminated": {"exitCode": 1, "reason": "Error", "message": word, "startedAt": now, "finishedAt": now}});
+    status
+}
+
+/// The status of a Pod all of whose containers run.
+fn running() -> Value {
+    let now = ago(0);
+    let running = |name: &str| json!({"name": name, "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": {"running": {"startedAt": now}}});
     json!({
         "phase": "Running",
         "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
         "initContainerStatuses": [running("logcopy")],
-        "containerStatuses": [running("simulator-1"), agent],
+        "containerStatuses": [running("simulator-1"), running("agent-1")],
     })
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
     let world = World::new().await;
-    let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": HOST}});
-    let secret: Secret = serde_json::from_value(secret).unwrap();
-    world.api().create(&PostParams::default(), &secret).await.unwrap();
     world.leaderboard("closed", 1, "Hosts").await;
     world.leaderboard("open", 2, "Participants").await;
     let _controller = world.controller();
@@ -275,5 +304,79 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
             shown.contains("Agent 1 crashed once") && !shown.contains("4711"),
             "{shown}"
         );
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let _controller = world.controller();
+    let nodes: Api<Node> = Api::all(world.client.clone());
+    let node = serde_json::from_value(json!({"metadata": {"name": NODE}})).unwrap();
+    nodes.create(&PostParams::default(), &node).await.unwrap();
+    let silent = json!({"status": {"conditions": [{
+        "type": "Ready", "status": "Unknown", "reason": "NodeStatusUnknown", "lastTransitionTime": ago(100),
+    }]}});
+    let patch = Patch::Merge(&silent);
+    nodes.patch_status(NODE, &PatchParams::default(), &patch).await.unwrap();
+
+    let (pk, name) = world.submit("lb", 1).await;
+    let job = world.job(&name, 0).await;
+    let pod = world.pod(&job, &running()).await;
+    let runs = |s: &SubmissionStatus| s.state == Some(State::Running);
+    world.until(&name, "it runs", runs).await;
+    let is_told = |status: &'static str| {
+        world
+            .evalai
+            .wait_until(move |state, _| state.submissions[&pk].status.as_str() == status)
+    };
+    timeout(LIMIT, is_told("running"))
+        .await
+        .expect("EvalAI hears of the run");
+    // As the eviction by the node's taint does it. Nobody is there to end the Pod; its grace is ten minutes.
+    let deleted = world.api::<Pod>().delete(&pod, &DeleteParams::default()).await.unwrap();
+    assert!(deleted.left().unwrap().metadata.deletion_timestamp.is_some());
+    let next = world.job(&name, 1).await;
+
+    let gone = world.api::<Pod>().get_opt(&pod).await.unwrap();
+    assert_eq!(gone, None, "removed by force");
+    let mark = world.archive(pk).get(OWNER_KEY, 1024).await.unwrap().unwrap();
+    assert!(
+        mark.bytes.starts_with(b"controller-"),
+        "what it may still write counts for nobody"
+    );
+    world.pod(&next, &running()).await;
+    let job = next.name_any();
+    let is_back = |s: &SubmissionStatus| runs(s) && s.job.as_ref() == Some(&job);
+    world.until(&name, "it runs again", is_back).await;
+    let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
+    assert_eq!((status.attempt, status.retry, status.failure), (Some(1), 1, None));
+    assert!(status.pairs.iter().all(|pair| pair.crashes == 0));
+    let patches = world.evalai.requests().into_iter().filter(|r| r.method == "PATCH");
+    let told = patches.filter(|r| r.body["submission_status"] == json!("running"));
+    assert_eq!(told.count(), 1, "EvalAI keeps saying running");
+}
+
+#[tokio::test]
+async fn of_a_stored_log_only_the_end_is_read() {
+    let stand_in = StandIn::start().await;
+    let bucket = stand_in.name("tails");
+    let s3 = stand_in.aws.s3(None, Some(&stand_in.endpoint));
+    s3.create_bucket().bucket(&bucket).send().await.unwrap();
+    let archive = Archive::new(s3, bucket, "runs/77/");
+    let log: Vec<u8> = (0..100_000u32)
+        .flat_map(|n| format!("line {n}\n").into_bytes())
+        .collect();
+    archive.put("long", log.clone()).await.unwrap();
+    archive.put("short", b"one\n".to_vec()).await.unwrap();
+    archive.put("empty", Vec::new()).await.unwrap();
+    for (key, tail) in [
+        ("long", Some(log[log.len() - 65_536..].to_vec())),
+        ("short", Some(b"one\n".to_vec())),
+        ("empty", Some(Vec::new())),
+        ("missing", None),
+    ] {
+        assert_eq!(archive.tail(key, 65_536).await.unwrap(), tail, "{key}");
     }
 }
