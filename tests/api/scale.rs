@@ -113,6 +113,7 @@ async fn measure(size: &Size) {
         undone.len(),
         cancelled.len()
     );
+    world.explain(&undone, &times);
 
     world.player.fall_the_curtain();
     let rest: BTreeSet<String> = others.iter().chain(&undone).map(|pk| name(*pk)).collect();
@@ -307,6 +308,21 @@ impl World {
                 size.limit
             );
             tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    }
+
+    /// Says which write it was that undid each cancel.
+    fn explain(&self, undone: &[u64], times: &BTreeMap<u64, Timestamp>) {
+        let log = self.evalai.requests();
+        for pk in undone {
+            let mut writes = log.iter().filter(|entry| entry.body["submission"] == json!(pk));
+            if let Some(by) = writes.find(|entry| entry.answered.is_none_or(|at| at > times[pk])) {
+                let (after, said) = (between(times[pk], by.time), &by.body["submission_status"]);
+                println!(
+                    "submission {pk}: {} {said} came {after:.2} s after the cancel",
+                    by.method
+                );
+            }
         }
     }
 
