@@ -29,6 +29,8 @@ use crate::support::apiserver::server;
 use player::{Player, Props, ROUTES};
 
 const BOARD: &str = "carla";
+/// How often it is looked whether the controller goes on.
+const LOOK: Duration = Duration::from_secs(5);
 
 /// How much of everything.
 struct Size {
@@ -62,7 +64,7 @@ const SMALL: Size = Size {
 const FULL: Size = Size {
     finals: 200,
     cancels: 100,
-    cancel_over: Duration::from_mins(4),
+    cancel_over: Duration::from_mins(3),
     requests_per_minute: 54,
     period_seconds: 10,
     list: Duration::from_secs(3),
@@ -263,7 +265,11 @@ impl World {
     async fn until(&mut self, size: &Size, what: &str, holds: impl Fn(&Seen) -> bool) {
         let end = Instant::now() + size.limit;
         while !holds(&self.submissions) {
-            let change = timeout_at(end, self.changes.next()).await;
+            assert!(self.operator.is_running(), "the controller has ended by itself: {what}");
+            let change = timeout_at(end.min(Instant::now() + LOOK), self.changes.next()).await;
+            if change.is_err() && Instant::now() < end {
+                continue;
+            }
             let Ok(Some(submission)) = change else {
                 panic!("not after {:?}: {what}; {:?}", size.limit, self.submissions.states);
             };
