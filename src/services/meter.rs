@@ -26,9 +26,11 @@ pub struct Call {
     pub took: Duration,
 }
 
+type Listener = dyn Fn(&Call) + Send + Sync;
+
 /// Whoever listens. Clones tell the same listener; the default has none.
 #[derive(Clone, Default)]
-pub struct Meter(Option<Arc<dyn Fn(&Call) + Send + Sync>>);
+pub struct Meter(Option<Arc<Listener>>);
 
 impl fmt::Debug for Meter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -54,19 +56,23 @@ impl Meter {
     }
 
     /// Counts a call of AWS.
-    pub async fn aws<T, E>(
+    pub fn aws<T, E>(
         &self,
         service: &'static str,
         op: &'static str,
-        call: impl Future<Output = Result<T, SdkError<E, HttpResponse>>>,
-    ) -> Result<T, SdkError<E, HttpResponse>>
+        call: impl Future<Output = Result<T, SdkError<E, HttpResponse>>> + Send,
+    ) -> impl Future<Output = Result<T, SdkError<E, HttpResponse>>> + Send
     where
         E: ProvideErrorMetadata + std::error::Error + 'static,
     {
         let running = self.begin(service, op);
-        let answer = call.await;
-        running.end(answer.as_ref().map_or_else(outcome, |_| "ok"));
-        answer
+        // The SDK's futures are large, and every caller would be as large as what it counts.
+        let call = Box::pin(call);
+        async move {
+            let answer = call.await;
+            running.end(answer.as_ref().map_or_else(outcome, |_| "ok"));
+            answer
+        }
     }
 }
 

@@ -264,6 +264,23 @@ async fn a_bucket_that_is_away_for_a_moment_changes_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_bucket_that_has_never_answered_is_not_known() {
+    let world = World::new().await;
+    // Takes connections and says nothing.
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    world
+        .apply(&json!({"spec": {"storage": {"bucket": world.bucket(), "endpoint": endpoint}}}))
+        .await;
+    let said = world.says("Unknown", reasons::BUCKET_UNREACHABLE).await;
+    assert!(said.message.contains("did not answer within 10 s"), "{}", said.message);
+    world
+        .counted("leaderboard_cloud_calls_total{service=\"s3\",op=\"ListObjectsV2\",outcome=\"abandoned\"}")
+        .await;
+    world.operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_missing_table_stops_no_submission() {
     let world = World::new().await;
     world.make_bucket().await;

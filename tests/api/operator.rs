@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use leaderboard_operator::controller::context::Settings;
-use leaderboard_operator::controller::leader::{self, Identity};
+use leaderboard_operator::controller::leader::{self, Identity, Timing};
 use leaderboard_operator::controller::run::{self, Clients, RunError};
 use leaderboard_operator::controller::watches::watch_client;
 use leaderboard_operator::observability::Observability;
@@ -16,6 +16,9 @@ use crate::support::apiserver::server;
 
 /// Longer than it takes to end, with a write to EvalAI under way.
 const END_LIMIT: Duration = Duration::from_mins(3);
+
+/// Nobody else wants its Lease.
+const LEASE: Duration = Duration::from_mins(4);
 
 /// A controller that leads, or will.
 pub struct Operator {
@@ -36,7 +39,17 @@ impl Operator {
             watch: watch_client(config.clone()).unwrap(),
             lease: leader::lease_client(config).unwrap(),
         };
-        let lease = leader::Settings::new(namespace, "operator", Identity::random("test"));
+        // A machine that compiles something else at the same time may leave an API server silent for ten seconds.
+        let timing = Timing {
+            lease: LEASE,
+            renew_deadline: LEASE / 2,
+            call: LEASE / 4,
+            ..Timing::default()
+        };
+        let lease = leader::Settings {
+            timing,
+            ..leader::Settings::new(namespace, "operator", Identity::random("test"))
+        };
         let settings = Settings {
             image: "operator:1".into(),
             image_pull_policy: None,
@@ -50,6 +63,11 @@ impl Operator {
             stop,
             task: tokio::spawn(Box::pin(running)),
         }
+    }
+
+    /// Whether it goes on; one that has ended by itself is the end of a test.
+    pub fn is_running(&self) -> bool {
+        !self.task.is_finished()
     }
 
     /// What Prometheus would get.

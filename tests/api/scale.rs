@@ -29,6 +29,8 @@ use crate::support::apiserver::server;
 use player::{Player, Props, ROUTES};
 
 const BOARD: &str = "carla";
+/// How often it is looked whether the controller goes on.
+const LOOK: Duration = Duration::from_secs(5);
 
 /// How much of everything.
 struct Size {
@@ -62,7 +64,7 @@ const SMALL: Size = Size {
 const FULL: Size = Size {
     finals: 200,
     cancels: 100,
-    cancel_over: Duration::from_mins(4),
+    cancel_over: Duration::from_mins(3),
     requests_per_minute: 54,
     period_seconds: 10,
     list: Duration::from_secs(3),
@@ -113,6 +115,7 @@ async fn measure(size: &Size) {
         undone.len(),
         cancelled.len()
     );
+    world.explain(&undone, &times);
 
     world.player.fall_the_curtain();
     let rest: BTreeSet<String> = others.iter().chain(&undone).map(|pk| name(*pk)).collect();
@@ -262,7 +265,11 @@ impl World {
     async fn until(&mut self, size: &Size, what: &str, holds: impl Fn(&Seen) -> bool) {
         let end = Instant::now() + size.limit;
         while !holds(&self.submissions) {
-            let change = timeout_at(end, self.changes.next()).await;
+            assert!(self.operator.is_running(), "the controller has ended by itself: {what}");
+            let change = timeout_at(end.min(Instant::now() + LOOK), self.changes.next()).await;
+            if change.is_err() && Instant::now() < end {
+                continue;
+            }
             let Ok(Some(submission)) = change else {
                 panic!("not after {:?}: {what}; {:?}", size.limit, self.submissions.states);
             };
@@ -307,6 +314,21 @@ impl World {
                 size.limit
             );
             tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    }
+
+    /// Says which write it was that undid each cancel.
+    fn explain(&self, undone: &[u64], times: &BTreeMap<u64, Timestamp>) {
+        let log = self.evalai.requests();
+        for pk in undone {
+            let mut writes = log.iter().filter(|entry| entry.body["submission"] == json!(pk));
+            if let Some(by) = writes.find(|entry| entry.answered.is_none_or(|at| at > times[pk])) {
+                let (after, said) = (between(times[pk], by.time), &by.body["submission_status"]);
+                println!(
+                    "submission {pk}: {} {said} came {after:.2} s after the cancel",
+                    by.method
+                );
+            }
         }
     }
 

@@ -315,6 +315,63 @@ mod tests {
     }
 
     #[test]
+    fn what_is_surely_wrong_comes_before_what_nobody_knows() {
+        let one = leaderboard("one", 1, 7, "https://e", "a/");
+        let unreachable = |truth| {
+            Some(Unreachable {
+                truth,
+                reason: reasons::TABLE_UNREACHABLE,
+                message: "It is not there.".into(),
+            })
+        };
+        let fits = || EvalaiStanding::Fits { note: None };
+        let missing = || EvalaiStanding::NoToken("x".into());
+        let cases = [
+            (unreachable(Truth::False), fits(), "False", reasons::TABLE_UNREACHABLE),
+            (
+                unreachable(Truth::False),
+                missing(),
+                "False",
+                reasons::TABLE_UNREACHABLE,
+            ),
+            (
+                unreachable(Truth::Unknown),
+                fits(),
+                "Unknown",
+                reasons::TABLE_UNREACHABLE,
+            ),
+            (unreachable(Truth::Unknown), missing(), "False", reasons::TOKEN_MISSING),
+            (
+                unreachable(Truth::Unknown),
+                EvalaiStanding::Unchecked(None),
+                "Unknown",
+                reasons::TABLE_UNREACHABLE,
+            ),
+            (None, fits(), "True", reasons::READY),
+        ];
+        for (unreachable, evalai, status, expected) in cases {
+            let seen = LeaderboardView {
+                unreachable,
+                evalai,
+                ..view(&one, &[])
+            };
+            assert_eq!(
+                reason(&decide(&seen)),
+                (status.to_owned(), expected.to_owned()),
+                "{seen:?}"
+            );
+            let broken = LeaderboardView {
+                invalid_pod: Some("no".into()),
+                ..seen
+            };
+            assert_eq!(
+                reason(&decide(&broken)),
+                ("False".to_owned(), reasons::INVALID_POD.to_owned())
+            );
+        }
+    }
+
+    #[test]
     fn what_is_wrong_with_evalai_is_said() {
         let one = leaderboard("one", 1, 7, "https://e", "a/");
         let cases = [

@@ -204,12 +204,13 @@ mod tests {
         reach.unreachable(at(second)).map(|found| found.truth)
     }
 
+    type Case = (&'static str, Vec<(i64, Finding)>, Vec<(i64, Option<Truth>)>);
+
     /// Looks one after the other, each with its second, and what is said at other seconds.
     #[test]
     fn an_answer_counts_at_once_and_silence_when_it_lasts() {
         use Truth::{False, Unknown};
         let hidden = || Finding::Hidden("the controller may not look".into());
-        type Case = (&'static str, Vec<(i64, Finding)>, Vec<(i64, Option<Truth>)>);
         let cases: Vec<Case> = vec![
             ("good", vec![(0, Finding::Good)], vec![(0, None), (10_000, None)]),
             ("bad", vec![(0, bad())], vec![(0, Some(False))]),

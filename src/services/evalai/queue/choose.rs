@@ -213,9 +213,7 @@ impl Queue {
                 if within(sub.clear_at, window, now) {
                     return Some((Priority::Rest, partial.since, true, Step::Partial));
                 }
-                // A slow list tells of a past in which somebody may have cancelled since: a read of its own does not.
-                let late = |challenge: &Challenge| challenge.cancel.is_late_for(window);
-                if self.challenges.get(&sub.challenge).is_some_and(late) {
+                if self.lists_are_late(sub) {
                     return Some((Priority::Rest, partial.since, true, Step::GetForEnd));
                 }
             }
@@ -253,12 +251,28 @@ impl Queue {
         if lane.unsure || sub.outdated || verdict.is_none() {
             return get;
         }
-        if verdict == Some(Verdict::Send) && within(sub.fresh_at, self.fresh(), now) {
+        let late = self.lists_are_late(sub);
+        let seen = if late {
+            sub.read.map(|read| read.answered)
+        } else {
+            sub.fresh_at
+        };
+        if verdict == Some(Verdict::Send) && within(seen, self.fresh(), now) {
             return Some((Priority::Progress, since, true, Step::Progress));
+        }
+        if late {
+            return Some((Priority::Progress, since, true, Step::GetForEnd));
         }
         let soon = |challenge: &Challenge| challenge.period <= self.timing.fresh * 2 && !challenge.cancel.is_failing();
         let listed = sub.live.is_some() && self.challenges.get(&sub.challenge).is_some_and(soon);
         if listed { None } else { get }
+    }
+
+    /// Whether lists take so long that somebody may have cancelled since they were asked for: a read of one's own tells of
+    /// a past that is nearer.
+    fn lists_are_late(&self, sub: &Sub) -> bool {
+        let late = |challenge: &Challenge| challenge.cancel.is_late_for(self.timing.window);
+        sub.live.is_some() && self.challenges.get(&sub.challenge).is_some_and(late)
     }
 
     /// How old a read may be when an end or progress follows it: a small budget needs its time.

@@ -220,3 +220,19 @@ fn the_time_that_a_list_takes_is_taken_off_its_window() {
     bench.wait(0.2);
     bench.expect_nothing();
 }
+
+#[test]
+fn with_slow_lists_progress_follows_a_read_of_its_own() {
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Submitted));
+    bench.live(7, 1);
+    let list = bench.expect("list of cancelled");
+    bench.wait(3.0);
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
+    bench.wait(5.0);
+    bench.wish(7, 1, Wish::Running);
+    bench.get(7, row(7, Status::Submitted));
+    bench.write("running 7");
+    bench.expect_nothing();
+}
