@@ -18,6 +18,10 @@ mod evalai;
 mod gate;
 #[path = "support/operator.rs"]
 mod operator;
+#[path = "support/processes.rs"]
+mod processes;
+#[path = "support/registry.rs"]
+mod registry;
 #[path = "support/cluster.rs"]
 mod scene;
 
@@ -29,6 +33,11 @@ mod cluster {
     mod failures;
     mod kills;
     mod losses;
+    mod matrix;
+    mod matrix_outages;
+    mod matrix_runs;
+    mod matrix_stops;
+    mod matrix_waits;
     mod publish;
     mod runs;
     mod stops;

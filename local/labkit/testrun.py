@@ -139,7 +139,22 @@ def in_cluster(plan: Plan) -> None:
         "LEADERBOARD_OPERATOR_IMAGE": images[demo.OPERATOR],
         "LEADERBOARD_OPERATOR_BIN": str(build.program(plan.settings, OPERATOR)),
     }
-    cargo_test(plan, ["--test=cluster"], env)
+    lines = plan.settings.logs / "matrix.tsv"
+    lines.unlink(missing_ok=True)
+    try:
+        cargo_test(plan, ["--test=cluster"], {**env, "LEADERBOARD_MATRIX": str(lines)})
+    finally:
+        if lines.exists():
+            print(matrix(lines.read_text()), flush=True)
+
+
+def matrix(lines: str) -> str:
+    """The cases that the tests wrote down, one a line: what was expected, what was seen, and after how many seconds."""
+    titles = ["case", "expected", "seen", "shown after s"]
+    rows = [titles, *sorted(line.split("\t") for line in lines.splitlines())]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(titles))]
+    text = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
+    return "\n".join(["", *text])
 
 
 def test_environment(settings: Settings) -> dict[str, str]:

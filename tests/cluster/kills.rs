@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use tokio::time::sleep;
 
 use super::expected::{assert_finished, assert_row, metrics};
+use super::matrix::Case;
 use crate::evalai::Evalai;
 use crate::operator::{LEASE, Process, bridge, controller};
 use crate::scene::{Scene, names, say, scenario};
@@ -56,8 +57,15 @@ async fn ten_kills_of_controller_and_bridge_change_nothing() {
             sleep(PUT_DELAY.mul_f64(random.f64())).await;
             running.kill(KILLS_IN_RUN + number, 1).await;
         }
-        let submission = scene.settled(&format!("submission-{pk}"), TAKEOVER).await;
+        let mut case = Case::open(
+            "controller and bridge killed ten times",
+            "Finished; EvalAI finished; one Job, one row",
+        );
+        let submission = case.ends(scene, &format!("submission-{pk}"), TAKEOVER).await;
+        case.evalai(evalai.submission(pk).status);
         assert_untouched(scene, &evalai, &submission, pk).await;
+        case.also("one Job, one row");
+        case.close();
     })
     .await;
 }
@@ -137,6 +145,7 @@ async fn a_controller_that_slept_while_another_took_over_ends_without_a_write() 
             .unwrap()
             .holder_identity;
 
+        let mut case = Case::open("two controllers at once", "Finished; EvalAI finished; one Job, one row");
         old.freeze();
         let _new = controller(scene);
         let overlap = sleep(Duration::from_secs(30));
@@ -151,8 +160,11 @@ async fn a_controller_that_slept_while_another_took_over_ends_without_a_write() 
         old.thaw();
         let status = old.ended(Duration::from_mins(1)).await;
         assert!(!status.success(), "who has lost the Lease ends with an error: {status}");
-        let submission = scene.settled(&name, TAKEOVER).await;
+        let submission = case.ends(scene, &name, TAKEOVER).await;
+        case.evalai(evalai.submission(pk).status);
         assert_untouched(scene, &evalai, &submission, pk).await;
+        case.also("one Job, one row");
+        case.close();
     })
     .await;
 }

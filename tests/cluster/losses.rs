@@ -11,8 +11,12 @@ use leaderboard_operator::api::{State, Submission};
 use serde_json::{Value, json};
 
 use super::expected::SIX_ROUTES;
+use super::matrix::Case;
 use crate::operator::controller;
 use crate::scene::{Scene, done, scenario, score, state};
+
+/// How the matrix has these cases.
+const REPEATED: &str = "Finished; at most one route of a pair repeated";
 
 /// Six routes for two pairs, one in 3 s.
 fn slow() -> Value {
@@ -51,8 +55,8 @@ async fn begun(scene: &Scene, run: &str) -> Vec<BTreeMap<String, u32>> {
     pairs
 }
 
-async fn assert_finished(scene: &Scene, name: &str) {
-    let submission = scene.settled(name, Duration::from_mins(5)).await;
+async fn assert_finished(case: &mut Case, scene: &Scene, name: &str) {
+    let submission = case.ends(scene, name, Duration::from_mins(5)).await;
     assert_eq!(
         (state(&submission), score(&submission)),
         (Some(State::Finished), SIX_ROUTES)
@@ -65,6 +69,7 @@ async fn assert_finished(scene: &Scene, name: &str) {
             "more than one route is repeated: {routes:?}"
         );
     }
+    case.also("at most one route of a pair repeated");
 }
 
 #[tokio::test]
@@ -78,8 +83,10 @@ async fn a_pod_deleted_by_hand_costs_one_route_of_each_pair() {
             .delete(&pod.name_any(), &DeleteParams::default())
             .await
             .unwrap();
-        assert_finished(scene, "lost").await;
+        let mut case = Case::open("Pod deleted by hand", REPEATED);
+        assert_finished(&mut case, scene, "lost").await;
         assert_eq!(scene.jobs().await, ["lost-1"], "the Job makes the next Pod");
+        case.close();
     })
     .await;
 }
@@ -99,13 +106,15 @@ async fn a_job_deleted_by_hand_is_made_again() {
         scene
             .wait("lost-1", "it is made again", Duration::from_mins(2), other)
             .await;
-        assert_finished(scene, "lost").await;
+        let mut case = Case::open("Job deleted by hand", REPEATED);
+        assert_finished(&mut case, scene, "lost").await;
         let told = scene.events("lost").await;
         let told: Vec<_> = told
             .iter()
             .filter(|event| event.reason.as_deref() == Some("JobRecreated"))
             .collect();
         assert_eq!(told.len(), 1, "{told:?}");
+        case.close();
     })
     .await;
 }

@@ -7,6 +7,7 @@ use leaderboard_operator::api::{Submission, conditions};
 use serde_json::{Value, json};
 
 use super::expected::{assert_finished, assert_results};
+use super::matrix::Case;
 use crate::operator::controller;
 use crate::scene::{Scene, is_true, scenario};
 
@@ -138,7 +139,8 @@ async fn a_crash_of_an_agent_costs_one_restart_and_no_points() {
         scene.leaderboard("lb", json!({})).await;
         let _controller = controller(scene);
         scene.submit("crashing", "agent:crash-once").await;
-        let submission: Submission = scene.settled("crashing", Duration::from_mins(4)).await;
+        let mut case = Case::open("agent crashes once", "Finished");
+        let submission: Submission = case.ends(scene, "crashing", Duration::from_mins(4)).await;
         assert_finished(&submission);
         let crashes: Vec<_> = submission
             .status
@@ -150,6 +152,7 @@ async fn a_crash_of_an_agent_costs_one_restart_and_no_points() {
         assert_eq!(crashes, [0, 1, 0, 0]);
         assert_results(&scene.cloud.text("crashing", "evalai/results.json").await);
         assert_eq!(scene.jobs().await, ["crashing-1"]);
+        case.close();
     })
     .await;
 }

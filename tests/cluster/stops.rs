@@ -1,17 +1,18 @@
 //! A run is stopped: by its host, by its participant in EvalAI, by deleting it.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use evalai_stand_in::model::Status;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
-use leaderboard_operator::api::{State, Submission};
+use leaderboard_operator::api::Submission;
 use serde_json::{Value, json};
 
+use super::matrix::{Case, measured};
 use crate::evalai::Evalai;
 use crate::operator::{bridge, controller};
-use crate::scene::{Scene, done, reason, scenario, state};
+use crate::processes;
+use crate::scene::{Scene, done, scenario};
 
 const CANCEL_SECONDS: u64 = 20;
 
@@ -67,15 +68,22 @@ async fn a_cancelled_submission_stops_in_time_and_keeps_its_results() {
         let _controller = controller(scene);
         scene.submit("stopped", "agent:standard").await;
         under_way(scene, "stopped").await;
-        let pod = scene.pod("stopped").await.name_any();
+        let pod = scene.pod("stopped").await;
+        let agent = processes::named(&pod, "agent-1", "python3", Duration::from_mins(1)).await;
+        let mut case = Case::open("cancel while it runs", "Cancelled");
+        case.cause();
+        let since = Instant::now();
         scene.change_submission("stopped", &json!({"cancel": true})).await;
-        pod_ended(scene, &pod).await;
-        let submission = scene.settled("stopped", Duration::from_mins(1)).await;
-        assert_eq!(
-            (state(&submission), reason(&submission)),
-            (Some(State::Cancelled), "Cancelled")
+        let ended = processes::ended(&[agent], Duration::from_mins(1)).await;
+        measured(
+            "cancel by kubectl → SIGTERM in the container",
+            ended - since,
+            "aim p99 < 2 s",
         );
+        pod_ended(scene, &pod.name_any()).await;
+        case.ends(scene, "stopped", Duration::from_mins(1)).await;
         assert_partial(scene, "stopped").await;
+        case.close();
     })
     .await;
 }
@@ -89,15 +97,29 @@ async fn a_cancel_in_evalai_stops_the_run() {
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");
         under_way(scene, &name).await;
-        let pod = scene.pod(&name).await.name_any();
+        let pod = scene.pod(&name).await;
+        let agent = processes::named(&pod, "agent-1", "python3", Duration::from_mins(1)).await;
+        let mut case = Case::open(
+            "cancel in EvalAI while it runs",
+            "Cancelled EndedInEvalAI; EvalAI cancelled",
+        );
+        case.cause();
+        let since = Instant::now();
         evalai.cancel(pk).await;
-        pod_ended(scene, &pod).await;
-        let submission = scene.settled(&name, Duration::from_mins(1)).await;
-        assert_eq!(state(&submission), Some(State::Cancelled));
-        assert_eq!(evalai.submission(pk).status, Status::Cancelled, "nothing revives it");
+        let ended = processes::ended(&[agent], Duration::from_mins(1)).await;
+        measured(
+            "cancel in EvalAI → SIGTERM in the container",
+            ended - since,
+            "aim < 15 s",
+        );
+        pod_ended(scene, &pod.name_any()).await;
+        case.ends(scene, &name, Duration::from_mins(1)).await;
+        // Nothing revives it.
+        case.evalai(evalai.submission(pk).status);
         let row = scene.cloud.row(&scene.cloud.table).await;
         assert_eq!(row["submission_status"], "CANCELLED");
         assert_partial(scene, &pk.to_string()).await;
+        case.close();
     })
     .await;
 }
@@ -117,14 +139,17 @@ async fn a_submission_deleted_while_it_runs_goes_when_its_end_is_published() {
             .delete(&name, &DeleteParams::default())
             .await
             .unwrap();
+        let mut case = Case::open("deleted while it runs", "gone; EvalAI cancelled; row CANCELLED");
         let uid = deleted.left().expect("a finalizer holds it").uid().unwrap();
         pod_ended(scene, &pod).await;
         let gone = move |found: Option<&Submission>| found.is_none_or(|found| found.uid().as_ref() != Some(&uid));
         scene.wait(&name, "it is gone", Duration::from_mins(2), gone).await;
-        assert_eq!(evalai.submission(pk).status, Status::Cancelled);
+        case.also("gone");
+        case.evalai(evalai.submission(pk).status);
         let row = scene.cloud.row(&scene.cloud.table).await;
-        assert_eq!(row["submission_status"], "CANCELLED");
+        case.also(&format!("row {}", row["submission_status"]));
         assert_partial(scene, &pk.to_string()).await;
+        case.close();
     })
     .await;
 }

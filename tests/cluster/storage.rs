@@ -1,19 +1,18 @@
 //! S3 is away when it is needed most.
 
-use std::fs;
 use std::time::Duration;
 
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use leaderboard_operator::api::{Submission, conditions};
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
 use serde_json::json;
 use tokio::time::sleep;
 
 use super::expected::{assert_finished, assert_results};
+use super::matrix::Case;
 use crate::gate::Gate;
 use crate::operator::controller;
+use crate::processes::kill_container;
 use crate::scene::{Scene, containers, done, is_true, scenario};
 
 const S3_AWAY: Duration = Duration::from_mins(2);
@@ -53,9 +52,11 @@ async fn a_killed_logcopy_and_two_minutes_without_s3_lose_no_score() {
         );
         s3.reopen();
 
-        let submission = scene.settled("unstored", Duration::from_mins(5)).await;
+        let mut case = Case::open("logcopy killed, and S3 away and back", "Finished");
+        let submission = case.ends(scene, "unstored", Duration::from_mins(5)).await;
         assert_finished(&submission);
         assert_results(&scene.cloud.text("unstored", "evalai/results.json").await);
+        case.close();
     })
     .await;
 }
@@ -78,27 +79,4 @@ fn restarts(pod: &Pod, name: &str) -> i32 {
     all.iter()
         .find(|container| container.name == name)
         .map_or(0, |container| container.restart_count)
-}
-
-/// Kills the processes of a container without a word, as the kernel does when memory is short. The node is this machine.
-fn kill_container(pod: &Pod, name: &str) {
-    let all = containers(pod);
-    let container = all.iter().find(|container| container.name == name).unwrap();
-    let id = container.container_id.as_deref().unwrap();
-    let (_, id) = id.split_once("://").unwrap();
-    let mut killed = 0;
-    for entry in fs::read_dir("/proc").unwrap().flatten() {
-        let Some(pid) = entry.file_name().to_str().and_then(|name| name.parse().ok()) else {
-            continue;
-        };
-        let groups = fs::read_to_string(entry.path().join("cgroup")).unwrap_or_default();
-        if groups.contains(id) {
-            kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
-            killed += 1;
-        }
-    }
-    assert!(
-        killed > 0,
-        "no process of {name} is on this machine: these tests run on the cluster's only node, as root"
-    );
 }

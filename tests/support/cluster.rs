@@ -187,7 +187,8 @@ impl Scene {
             .expect("the policy has no effect");
     }
 
-    async fn secret(&self, name: &str, data: &Value) {
+    /// Makes a Secret.
+    pub async fn secret(&self, name: &str, data: &Value) {
         let secret = json!({"metadata": {"name": name}, "stringData": data});
         let secret: Secret = serde_json::from_value(secret).unwrap();
         self.api().create(&PostParams::default(), &secret).await.unwrap();
@@ -284,15 +285,23 @@ impl Scene {
 
     /// Applies a Submission of the local Leaderboard `lb`, track sensors.
     pub async fn submit(&self, name: &str, agent: &str) {
-        let submission = json!({
-            "metadata": {"name": name},
-            "spec": {
-                "leaderboard": "lb",
-                "track": "sensors",
-                "image": self.lab.challenge(agent),
-                "team": {"id": "7", "name": "Team Seven"},
-            },
+        self.submit_to("lb", name, agent).await;
+    }
+
+    /// Applies a Submission of a local Leaderboard, track sensors.
+    pub async fn submit_to(&self, board: &str, name: &str, agent: &str) {
+        let spec = json!({
+            "leaderboard": board,
+            "track": "sensors",
+            "image": self.lab.challenge(agent),
+            "team": {"id": "7", "name": "Team Seven"},
         });
+        self.apply_submission(name, spec).await;
+    }
+
+    /// Applies any Submission.
+    pub async fn apply_submission(&self, name: &str, spec: Value) {
+        let submission = json!({"metadata": {"name": name}, "spec": spec});
         let submission: Submission = serde_json::from_value(submission).unwrap();
         self.api().create(&PostParams::default(), &submission).await.unwrap();
     }
@@ -386,6 +395,14 @@ impl Scene {
             .collect();
         assert_eq!(pods.len(), 1, "{submission} has one Pod: {:?}", names(&pods));
         pods.remove(0)
+    }
+
+    /// Waits for the Pod of a Submission's first Job.
+    pub async fn first_pod(&self, submission: &str, limit: Duration) -> Pod {
+        let made = |job: Option<&Job>| job.is_some_and(|job| job.status.as_ref().is_some_and(|s| s.active == Some(1)));
+        let job = format!("{submission}-1");
+        self.wait(&job, "it has a Pod", limit, made).await;
+        self.pod(submission).await
     }
 
     /// The events about an object, oldest first.
@@ -555,10 +572,15 @@ async fn keep_others_out(client: &Client) {
     bindings.patch(POLICY, &params, &Patch::Apply(&binding)).await.unwrap();
 }
 
-fn lay_over(base: &mut Value, change: Value) {
+/// Lays `change` over `base`: objects deep, all else whole; null removes.
+pub fn lay_over(base: &mut Value, change: Value) {
     match (base, change) {
         (Value::Object(base), Value::Object(change)) => {
             for (key, value) in change {
+                if value.is_null() {
+                    base.remove(&key);
+                    continue;
+                }
                 lay_over(base.entry(key).or_insert(Value::Null), value);
             }
         }

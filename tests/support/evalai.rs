@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use evalai_stand_in::faults::{Failure, Fault, When};
 use evalai_stand_in::log::Entry;
 use evalai_stand_in::model::{LeaderboardRow, Status, Submission};
 use evalai_stand_in::sqs::SqsQueues;
@@ -17,6 +18,8 @@ use super::scene::Scene;
 pub const HOST_TOKEN: &str = "local-host-token";
 /// Another host's, with a throttle of its own.
 const PERSON: &str = "local-organizer-token";
+/// Id of the first phase that [`Evalai::start_wide`] adds.
+pub const FIRST_PHASE: u64 = 101;
 /// Requests a minute that EvalAI lets a token make.
 pub const REQUESTS_PER_MINUTE: usize = 60;
 
@@ -31,11 +34,30 @@ pub struct Evalai {
 impl Evalai {
     /// Starts one whose messages go to the scene's queue.
     pub async fn start(scene: &Scene) -> Self {
+        Self::serve(scene, Seed::built_in().unwrap(), REQUESTS_PER_MINUTE).await
+    }
+
+    /// Starts one with so many phases more in challenge 1, from [`FIRST_PHASE`] on, that serves everybody at once.
+    pub async fn start_wide(scene: &Scene, phases: u64) -> Self {
         let mut seed = Seed::built_in().unwrap();
+        let model = seed.challenges[0].phases[0].clone();
+        for id in FIRST_PHASE..FIRST_PHASE + phases {
+            let mut phase = model.clone();
+            phase.id = id;
+            phase.name = format!("Phase {id}");
+            phase.codename.clone_from(&phase.name);
+            phase.splits[0].id = id;
+            phase.splits[0].leaderboard = id;
+            seed.challenges[0].phases.push(phase);
+        }
+        Self::serve(scene, seed, 0).await
+    }
+
+    async fn serve(scene: &Scene, mut seed: Seed, throttle: usize) -> Self {
         seed.set_queue(&scene.cloud.queue);
         let config = Config {
             seed,
-            throttle: REQUESTS_PER_MINUTE,
+            throttle,
             queues: Arc::new(SqsQueues::new(&scene.cloud.endpoint)),
         };
         let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
@@ -51,6 +73,20 @@ impl Evalai {
     pub fn set_put_delay(&self, delay: Duration) {
         self.handle.set_knobs(Knobs {
             put_delay_ms: u64::try_from(delay.as_millis()).unwrap(),
+            ..Knobs::default()
+        });
+    }
+
+    /// The next requests to save final results fail so.
+    pub fn fail_finals(&self, answer: Failure, times: u32) {
+        self.handle.set_knobs(Knobs {
+            fail_next: vec![Fault {
+                method: Some("PUT".to_owned()),
+                path_prefix: Some("/api/jobs/challenge/1/update_submission/".to_owned()),
+                answer,
+                times,
+                when: When::Before,
+            }],
             ..Knobs::default()
         });
     }
@@ -72,8 +108,13 @@ impl Evalai {
 
     /// Cancels as the web page does: no message is sent.
     pub async fn cancel(&self, pk: u64) {
+        self.set_status(pk, Status::Cancelled).await;
+    }
+
+    /// Gives it a status by hand, as the web page can.
+    pub async fn set_status(&self, pk: u64, status: Status) {
         let path = format!("/api/jobs/challenges/1/submissions/{pk}/update_submission_meta/");
-        self.call(reqwest::Method::PATCH, &path, &json!({"status": "cancelled"}))
+        self.call(reqwest::Method::PATCH, &path, &json!({"status": status.as_str()}))
             .await;
     }
 

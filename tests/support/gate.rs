@@ -1,10 +1,11 @@
-//! A gate between the operator and the AWS stand-in that a test can shut: S3 is away, or SQS takes no deletion.
+//! A gate between the operator and a server that a test can shut: S3 or the API server is away, SQS takes no deletion, or
+//! DynamoDB gives no right to write.
 //!
-//! Bytes pass through it unread but for the search for a word. Knows nothing of HTTP.
+//! Bytes pass through it unread but for the search for a word. Of HTTP it knows one answer.
 
 use std::time::Duration;
 
-use tokio::io::{AsyncReadExt, AsyncWriteExt, copy};
+use tokio::io::{AsyncReadExt, AsyncWriteExt, copy, sink};
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
@@ -19,7 +20,13 @@ enum Mode {
     Shut,
     /// Connections break on which the client says this word.
     Without(&'static str),
+    /// Requests that hold this word are refused, as AWS refuses who has no right to them.
+    Denied(&'static str),
 }
+
+/// What AWS says to who has no right.
+const NO_RIGHT: &str =
+    r#"{"__type":"com.amazon.coral.service#AccessDeniedException","Message":"not authorized to perform this action"}"#;
 
 /// A running gate; it ends when this is dropped.
 pub struct Gate {
@@ -31,13 +38,13 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// Opens a gate at a free port of `host` to a server such as `http://10.0.0.1:4566`.
+    /// Opens a gate at a free port of `host` to a server such as `http://10.0.0.1:4566`. TLS goes through it as it is.
     pub async fn open(host: &str, server: &str) -> Self {
         let listener = TcpListener::bind((host, 0)).await.unwrap();
         let url = format!("http://{}", listener.local_addr().unwrap());
         let (mode, seen) = watch::channel(Mode::Open);
         let (count, kept_back) = watch::channel(0);
-        let server = server.trim_start_matches("http://").to_owned();
+        let server = server.split_once("://").map_or(server, |(_, server)| server).to_owned();
         let mut task = JoinSet::new();
         task.spawn(accept(listener, server, seen, count));
         Self {
@@ -56,6 +63,11 @@ impl Gate {
     /// Requests that hold this word never arrive.
     pub fn keep_back(&self, word: &'static str) {
         self.mode.send_replace(Mode::Without(word));
+    }
+
+    /// Requests that hold this word are answered that there is no right to them.
+    pub fn deny(&self, word: &'static str) {
+        self.mode.send_replace(Mode::Denied(word));
     }
 
     /// Everything passes again.
@@ -95,10 +107,14 @@ async fn pass(client: TcpStream, server: String, mut mode: watch::Receiver<Mode>
         let Ok(server) = TcpStream::connect(server).await else {
             return;
         };
-        let ((from_client, mut to_client), (mut from_server, to_server)) = (client.into_split(), server.into_split());
-        tokio::select! {
-            () = forward(from_client, to_server, &words, &kept_back) => {}
-            _ = copy(&mut from_server, &mut to_client) => {}
+        let ((mut from_client, mut to_client), (mut from_server, to_server)) =
+            (client.into_split(), server.into_split());
+        let denied = tokio::select! {
+            denied = forward(&mut from_client, to_server, &words, &kept_back) => denied,
+            _ = copy(&mut from_server, &mut to_client) => false,
+        };
+        if denied {
+            refuse(from_client, to_client).await;
         }
     };
     tokio::select! {
@@ -110,25 +126,38 @@ async fn pass(client: TcpStream, server: String, mut mode: watch::Receiver<Mode>
     }
 }
 
+/// Until the connection ends, or has to: whether the client is still owed the answer that it has no right.
 async fn forward(
-    mut from: OwnedReadHalf,
+    from: &mut OwnedReadHalf,
     mut to: OwnedWriteHalf,
     mode: &watch::Receiver<Mode>,
     kept_back: &watch::Sender<u32>,
-) {
+) -> bool {
     let mut bytes = vec![0; 64 << 10];
     while let Ok(count @ 1..) = from.read(&mut bytes).await {
         let mode = *mode.borrow();
-        if let Mode::Without(word) = mode
+        if let Mode::Without(word) | Mode::Denied(word) = mode
             && bytes[..count]
                 .windows(word.len())
                 .any(|window| window == word.as_bytes())
         {
             kept_back.send_modify(|count| *count += 1);
-            return;
+            return matches!(mode, Mode::Denied(_));
         }
         if to.write_all(&bytes[..count]).await.is_err() {
-            return;
+            return false;
         }
+    }
+    false
+}
+
+/// Answers, and hears the client out: a connection that is closed on a request under way would break the answer off too.
+async fn refuse(mut from: OwnedReadHalf, mut to: OwnedWriteHalf) {
+    let answer = format!(
+        "HTTP/1.1 400 Bad Request\r\nContent-Type: application/x-amz-json-1.0\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{NO_RIGHT}",
+        NO_RIGHT.len()
+    );
+    if to.write_all(answer.as_bytes()).await.is_ok() && to.shutdown().await.is_ok() {
+        _ = copy(&mut from, &mut sink()).await;
     }
 }

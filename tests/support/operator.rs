@@ -1,17 +1,19 @@
 //! The operator's programs as child processes of a test: each is limited to the test's namespace and has its own Lease, so
 //! that it can be killed, stopped and started again without anybody else's notice.
 
-use std::fs::File;
-use std::path::PathBuf;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use serde_json::Value;
 use tokio::process::{Child, Command};
 use tokio::time::timeout;
 
+use super::gate::Gate;
 use super::scene::Scene;
 
 /// What the programs log, unless `LEADERBOARD_TEST_LOG` says otherwise.
@@ -27,24 +29,31 @@ pub struct Process {
 
 /// Starts `leaderboard-operator controller`.
 pub fn controller(scene: &Scene) -> Process {
-    let arguments = [
-        "--image",
-        &scene.lab.image,
-        "--lease",
-        LEASE,
-        "--lease-namespace",
-        &scene.namespace,
-    ];
-    Process::start(scene, "controller", &arguments)
+    Process::start(scene, "controller", &controller_arguments(scene), None)
+}
+
+/// Starts one that reaches the API server through a gate. It ends by itself when the gate is shut for long.
+pub fn controller_through(scene: &Scene, gate: &Gate) -> Process {
+    let ours = std::env::var_os("KUBECONFIG").unwrap();
+    let mut config: Value = serde_json::from_str(&fs::read_to_string(ours).unwrap()).unwrap();
+    config["clusters"][0]["cluster"]["server"] = gate.url.replacen("http:", "https:", 1).into();
+    let path = scene.logs.join("kubeconfig");
+    fs::write(&path, config.to_string()).unwrap();
+    Process::start(scene, "controller", &controller_arguments(scene), Some(&path))
+}
+
+fn controller_arguments(scene: &Scene) -> [&str; 6] {
+    let (image, namespace) = (&scene.lab.image, &scene.namespace);
+    ["--image", image, "--lease", LEASE, "--lease-namespace", namespace]
 }
 
 /// Starts `leaderboard-operator bridge`.
 pub fn bridge(scene: &Scene) -> Process {
-    Process::start(scene, "bridge", &[])
+    Process::start(scene, "bridge", &[], None)
 }
 
 impl Process {
-    fn start(scene: &Scene, program: &str, arguments: &[&str]) -> Self {
+    fn start(scene: &Scene, program: &str, arguments: &[&str], kubeconfig: Option<&Path>) -> Self {
         static NUMBER: AtomicU32 = AtomicU32::new(1);
         let name = format!("{program}-{}", NUMBER.fetch_add(1, Ordering::Relaxed));
         let log = File::create(scene.logs.join(format!("{name}.log"))).unwrap();
@@ -67,6 +76,9 @@ impl Process {
             .stdout(log.try_clone().unwrap())
             .stderr(log)
             .kill_on_drop(true);
+        if let Some(path) = kubeconfig {
+            command.env("KUBECONFIG", path);
+        }
         let child = command
             .spawn()
             .unwrap_or_else(|error| panic!("{program} does not start: {error}"));

@@ -186,6 +186,9 @@ impl Worker<'_> {
             if stop.is_some() {
                 return Ok(Ending::Stopped);
             }
+            if self.faults.ends_early(leg.index + 1) {
+                break;
+            }
         }
         say("> Registering the global statistics");
         self.finish();

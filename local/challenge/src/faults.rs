@@ -34,6 +34,7 @@ pub const KNOBS: &[Known] = &[
     ("huge", Shape::At),
     ("nan", Shape::At),
     ("forge", Shape::Plain),
+    ("early", Shape::At),
     ("symlink", Shape::Value),
     ("fifo", Shape::Plain),
     ("mode0600", Shape::Plain),
@@ -115,6 +116,11 @@ impl Faults {
     /// Are the agent's sensors refused at this route?
     pub fn rejects(&self, number: usize) -> bool {
         self.knobs.fires("reject", number, &self.markers)
+    }
+
+    /// Does the agent leave out what comes after this route?
+    pub fn ends_early(&self, number: usize) -> bool {
+        self.knobs.fires("early", number, &self.markers)
     }
 
     /// Changes a finished record.

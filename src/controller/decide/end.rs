@@ -45,6 +45,7 @@ pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
         return cancelled(draft, reason, message);
     }
     let recorded = draft.status.failure.clone();
+    let recorded = recorded.filter(|found| !report.is_some_and(|r| failure::is_refusal(&draft.status, found, r)));
     let found = recorded.unwrap_or_else(|| cause(draft, report, complete, job_end));
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);

@@ -7,6 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::draft::Draft;
 use crate::api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
 use crate::controller::view::{ContainerView, EndView, JobEnd, NodeSight, PodView};
+use crate::pod::report::Report;
 use crate::pod::run::Stop;
 
 /// A failure that is the participant's.
@@ -105,6 +106,13 @@ pub(super) fn invalid_results(why: &str) -> Failure {
         reasons::INVALID_RESULTS,
         format!("The results cannot be used: {why} Check what the agent writes into its checkpoint, and submit again."),
     )
+}
+
+/// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
+/// results that can be read is tried again as one that crashed.
+pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &Report) -> bool {
+    let ended_by_itself = status.pairs.iter().any(|pair| last_word(pair) == Some("exited"));
+    found.reason == reasons::AGENT_CRASHED && ended_by_itself && report.is_final && report.why.is_some()
 }
 
 /// Results that are complete but do not count.

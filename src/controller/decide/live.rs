@@ -87,6 +87,8 @@ fn in_line(draft: &mut Draft<'_>) {
     draft.status.waiting = Some(Waiting { position, eta });
     draft.moves();
     draft.say(State::Pending, reason, message);
+    // Who waits in EvalAI's eyes too: only what it was told to be queued is looked for among the cancelled.
+    tell(draft);
     draft.requeue_in(BACKSTOP);
 }
 

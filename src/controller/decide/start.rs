@@ -37,8 +37,9 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
         return unschedulable(draft, job, words);
     }
     let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
-    let deadline = after(since, draft.deadlines().start_seconds);
-    let is_over = draft.now() >= deadline;
+    // Until the scheduler has spoken there is no node that could be late.
+    let deadline = pod.scheduled.map(|at| after(at, draft.deadlines().start_seconds));
+    let is_over = deadline.is_some_and(|deadline| draft.now() >= deadline);
     let has_started = pod.agent_started.is_some();
     match trouble::of_pod(pod) {
         Some(found) if found.is_hopeless || (is_over && found.is_start) => {
@@ -46,7 +47,7 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
         }
         Some(found) => {
             show_trouble(draft, &found, has_started);
-            if found.is_start {
+            if let Some(deadline) = deadline.filter(|_| found.is_start) {
                 draft.requeue_at(deadline);
             }
         }
@@ -54,7 +55,9 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
         None if is_over => draft.fail(start_deadline(pod, draft.deadlines().start_seconds)),
         None => {
             show_preparing(draft, pod, since);
-            draft.requeue_at(deadline);
+            if let Some(deadline) = deadline {
+                draft.requeue_at(deadline);
+            }
         }
     }
 }

@@ -335,6 +335,21 @@ fn refused_sensors_stop_the_run_and_a_restart_refuses_the_next() {
 }
 
 #[test]
+fn an_early_end_has_a_global_record_over_too_few_routes() {
+    let folder = Folder::new();
+    let carla = simulator(&folder, "");
+    let early = Agent {
+        knobs: "early@2",
+        ..agent(&folder, carla.port)
+    };
+    assert!(early.run().success());
+    assert_eq!(
+        state(&folder.checkpoint()),
+        (&json!("Finished"), &json!([2, 5]), 2, true)
+    );
+}
+
+#[test]
 fn files_an_uploader_must_survive() {
     let run = |knobs: &str| {
         let folder = Folder::new();

@@ -103,6 +103,33 @@ fn each_end_without_that_has_its_class_and_reason() {
 }
 
 #[test]
+fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_is_told_what_is_wrong_with_it() {
+    let refused = Report {
+        is_final: true,
+        why: Some("the records are not a list.".into()),
+        ..report(3)
+    };
+    for (word, told, reason) in [
+        ("exited", Some(refused.clone()), reasons::INVALID_RESULTS),
+        // A crash in the middle of a write leaves half a file; the crash is the cause then.
+        ("killed", Some(refused), reasons::AGENT_CRASHED),
+        ("exited", Some(report(3)), reasons::AGENT_CRASHED),
+        ("exited", None, reasons::AGENT_CRASHED),
+    ] {
+        let mut world = World::local().running();
+        world.leaderboard().retries.pair = 1;
+        world.see(ended("agent-1", 0, word, 1, 20));
+        world.pass_to(Running, reasons::STOPPING);
+        world.complete();
+        if let Some(told) = told {
+            world.report(told);
+        }
+        let failure = world.pass_to(Failed, reason).status.failure.unwrap();
+        assert!(failure.charged, "{word}: {failure:?}");
+    }
+}
+
+#[test]
 fn a_foreign_report_counts_for_nothing() {
     let mut world = World::local().running();
     world.leaderboard().retries.infrastructure = 0;

@@ -3,6 +3,7 @@
 use super::builders::*;
 use crate::api::State::{Cancelled, Pending};
 use crate::api::{Waiting, reasons};
+use crate::controller::decide::Tell;
 use crate::controller::view::{JobSight, Turn};
 
 #[test]
@@ -43,6 +44,17 @@ fn who_waits_sees_place_and_time() {
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert!(creates(&plan));
     assert_eq!(plan.status.waiting, None);
+}
+
+#[test]
+fn who_waits_is_queued_in_evalai_so_that_a_cancel_there_is_heard() {
+    for turn in [Turn::Wait { position: 1, eta: None }, Turn::Paused { position: 1 }] {
+        let mut world = World::evalai();
+        world.view.turn = turn;
+        assert_eq!(tells(&world.pass()), [Tell::Queued]);
+        world.in_evalai().cancelled = true;
+        world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    }
 }
 
 #[test]

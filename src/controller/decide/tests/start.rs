@@ -1,5 +1,7 @@
 //! From the Job to its first agent: every cause of waiting, and its end.
 
+use std::time::Duration;
+
 use super::builders::*;
 use crate::api::FailureClass::{self, Infrastructure, Participant};
 use crate::api::State::{Failed, Pending, Running};
@@ -186,6 +188,25 @@ fn a_prefix_in_use_fails_at_once_and_is_not_tried_again() {
         failure.message,
         "results/77/ holds another's. Apply it with attempt: 2."
     );
+}
+
+#[test]
+fn the_start_has_no_deadline_before_the_scheduler_has_spoken() {
+    let mut world = World::local().with_pod();
+    world.leaderboard().deadlines.start_seconds = 1;
+    (world.pod().scheduled, world.pod().node) = (None, None);
+    world.go_to(600);
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert!(
+        plan.requeue.is_none_or(|pause| pause > Duration::ZERO),
+        "{:?}",
+        plan.requeue
+    );
+    world.pod().scheduled = Some(at(600));
+    world.go_to(602);
+    world.leaderboard().retries.infrastructure = 0;
+    world.pass();
+    assert_eq!(world.status().failure.unwrap().reason, reasons::START_DEADLINE);
 }
 
 #[test]

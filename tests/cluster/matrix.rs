@@ -1,0 +1,214 @@
+//! The matrix of what can happen to a submission: one line a case, with what was done, what everybody was to see of it, what
+//! they saw, and how long it took until `kubectl get submissions` said so.
+//!
+//! A case is opened before its cause and closed when its end is known; one that is neither closed nor filtered out is told
+//! as failed. Each line is printed at once, and `make test` prints the table at its end. The cases are in the modules
+//! `matrix_*`, and in tests of their own that other modules have.
+
+use std::fs::OpenOptions;
+use std::io::Write as _;
+use std::panic::AssertUnwindSafe;
+use std::time::{Duration, Instant};
+
+use evalai_stand_in::model::Status;
+use futures::future::LocalBoxFuture;
+use futures::{FutureExt, StreamExt, stream};
+use jiff::Timestamp;
+use leaderboard_operator::api::{FailureClass, State, Submission};
+
+use crate::scene::{Scene, reason, say, state};
+
+/// How long a reason may take to be shown. It is a minute by design; a loaded machine takes longer.
+pub const SHOWN: Duration = Duration::from_mins(2);
+/// File that the lines go into, for whoever prints them.
+const VARIABLE: &str = "LEADERBOARD_MATRIX";
+
+/// Cases that no test makes happen here, and what stands in for them.
+const NOT_COVERED: [(&str, &str); 3] = [
+    (
+        "API server's process restarted",
+        "it serves all tests at once; see `API server out of reach`",
+    ),
+    (
+        "etcd's process restarted",
+        "it serves all tests at once; to the operator it looks like an API server out of reach",
+    ),
+    (
+        "kubelet of a node killed",
+        "the only node serves all tests at once; see `node lost`",
+    ),
+];
+
+/// An open case.
+pub struct Case {
+    name: &'static str,
+    expected: &'static str,
+    seen: Vec<String>,
+    /// When the cause happened whose reason is not shown yet.
+    cause: Option<Instant>,
+    /// From a cause until its reason was shown, the longest of them.
+    shown: Option<Duration>,
+    is_closed: bool,
+}
+
+impl Case {
+    /// Opens a case; `expected` is what [`Case::shows`] and [`Case::ends`] put together.
+    pub fn open(name: &'static str, expected: &'static str) -> Self {
+        Self {
+            name,
+            expected,
+            seen: Vec::new(),
+            cause: None,
+            shown: None,
+            is_closed: false,
+        }
+    }
+
+    /// Its cause happens now: the next reason that is shown is timed from here.
+    pub fn cause(&mut self) {
+        self.cause = Some(Instant::now());
+    }
+
+    /// Waits until the submission gives the reason, with these words in its message.
+    pub async fn shows(&mut self, scene: &Scene, name: &str, wanted: &'static str, words: &'static str) -> Submission {
+        let shows = move |s: &Submission| {
+            let message = s.status.as_ref().and_then(|status| status.message.as_deref());
+            reason(s) == wanted && message.unwrap_or_default().contains(words)
+        };
+        let what = format!("it says {wanted}: … {words} …");
+        let found = scene.submission(name, &what, SHOWN, shows).await;
+        if let Some(cause) = self.cause.take() {
+            self.is_shown(cause.elapsed());
+        }
+        let state = state(&found).map_or("", State::as_str);
+        self.seen.push(format!("{state} {}", reason(&found)));
+        found
+    }
+
+    /// Waits until the submission has come to its end everywhere. Without another cause the reason of a failure is timed
+    /// from the end of the container that decided it.
+    pub async fn ends(&mut self, scene: &Scene, name: &str, limit: Duration) -> Submission {
+        let finished = |s: &Submission| {
+            s.status
+                .as_ref()
+                .is_some_and(|status| status.state.is_some_and(State::is_terminal))
+        };
+        scene.submission(name, "it has ended", limit, finished).await;
+        let (now, since_cause) = (Timestamp::now(), self.cause.take().map(|cause| cause.elapsed()));
+        let settled = scene.settled(name, limit).await;
+        let since_crash = || now.duration_since(last_crash(&settled)?).try_into().ok();
+        if let Some(after) = since_cause.or_else(since_crash) {
+            self.is_shown(after);
+        }
+        self.seen.push(end(&settled));
+        settled
+    }
+
+    /// What EvalAI says at the end.
+    pub fn evalai(&mut self, status: Status) {
+        self.also(&format!("EvalAI {}", status.as_str()));
+    }
+
+    /// Something else that was seen.
+    pub fn also(&mut self, seen: &str) {
+        self.seen.push(seen.to_owned());
+    }
+
+    /// What was seen so far, with nothing that varies.
+    pub fn close(mut self) {
+        self.is_closed = true;
+        let seen = self.seen.join("; ");
+        let is_expected = seen == self.expected;
+        tell(
+            self.name,
+            self.expected,
+            if is_expected { "as expected" } else { &seen },
+            self.shown,
+        );
+        assert!(is_expected, "{}: {seen:?}, not {:?}", self.name, self.expected);
+        assert!(
+            self.shown.is_none_or(|shown| shown <= SHOWN),
+            "{}: shown too late",
+            self.name
+        );
+    }
+
+    fn is_shown(&mut self, after: Duration) {
+        self.shown = Some(self.shown.map_or(after, |known| known.max(after)));
+    }
+}
+
+impl Drop for Case {
+    fn drop(&mut self) {
+        if !self.is_closed {
+            let seen = format!("FAILED after {:?}", self.seen);
+            tell(self.name, self.expected, &seen, self.shown);
+        }
+    }
+}
+
+/// An end in the words of the table.
+fn end(submission: &Submission) -> String {
+    let state = state(submission).map_or("", State::as_str);
+    let failure = submission.status.as_ref().and_then(|status| status.failure.as_ref());
+    let Some(failure) = failure else {
+        let reason = reason(submission);
+        return if reason == state {
+            state.to_owned()
+        } else {
+            format!("{state} {reason}")
+        };
+    };
+    let class = match failure.class {
+        FailureClass::Participant => "participant",
+        FailureClass::Infrastructure => "infrastructure",
+    };
+    let charged = if failure.charged { "charged" } else { "not charged" };
+    format!("{state} {} ({class}, {charged})", reason(submission))
+}
+
+/// When the container ended whose end decided a failed run.
+fn last_crash(submission: &Submission) -> Option<Timestamp> {
+    let status = submission.status.as_ref().filter(|status| status.failure.is_some())?;
+    status
+        .pairs
+        .iter()
+        .filter_map(|pair| Some(pair.last.as_ref()?.time.as_ref()?.0))
+        .max()
+}
+
+/// Prints a line of the table.
+fn tell(name: &str, expected: &str, seen: &str, shown: Option<Duration>) {
+    let seconds = shown.map_or_else(|| "-".to_owned(), |shown| format!("{:.1}", shown.as_secs_f64()));
+    let line = format!("{name}\t{expected}\t{seen}\t{seconds}\n");
+    say(&format!("matrix: {}", line.trim_end().replace('\t', " | ")));
+    let Some(path) = std::env::var_os(VARIABLE) else { return };
+    let file = OpenOptions::new().create(true).append(true).open(&path);
+    // One write a line: tests that end at once must not mix theirs.
+    if let Err(error) = file.and_then(|mut file| file.write_all(line.as_bytes())) {
+        say(&format!("matrix: {} can't be written: {error}", path.display()));
+    }
+}
+
+/// Prints a measurement among the table's lines.
+pub fn measured(what: &str, took: Duration, aim: &str) {
+    tell(what, aim, "measured", Some(took));
+}
+
+/// Runs cases, so many at once, to the end of all of them; fails if one has failed.
+pub async fn together(width: usize, cases: Vec<LocalBoxFuture<'_, ()>>) {
+    let ends: Vec<_> = stream::iter(cases)
+        .map(|case| AssertUnwindSafe(case).catch_unwind())
+        .buffer_unordered(width)
+        .collect()
+        .await;
+    let failed = ends.iter().filter(|end| end.is_err()).count();
+    assert!(failed == 0, "{failed} of {} cases failed, see above", ends.len());
+}
+
+#[test]
+fn cases_that_are_not_covered_are_named() {
+    for (case, instead) in NOT_COVERED {
+        tell(case, instead, "not covered", None);
+    }
+}

@@ -1,0 +1,45 @@
+//! The matrix: the operator can't reach its API server, and the run goes on without it.
+
+use std::time::Duration;
+
+use kube::Config;
+use leaderboard_operator::api::Submission;
+use serde_json::json;
+
+use super::matrix::Case;
+use crate::gate::Gate;
+use crate::operator::controller_through;
+use crate::scene::{Scene, done, scenario};
+
+const LIMIT: Duration = Duration::from_mins(4);
+/// A Lease that can't be renewed runs out after 15 s, and the operator ends.
+const ENDED: Duration = Duration::from_mins(2);
+
+#[tokio::test]
+async fn an_api_server_out_of_reach_costs_nothing() {
+    scenario("matrix-outages", async |scene: &Scene| {
+        let mut case = Case::open("API server out of reach", "Finished; 1 Job");
+        let server = Config::infer().await.unwrap().cluster_url.to_string();
+        let api_server = Gate::open(&scene.lab.host, server.trim_end_matches('/')).await;
+        let slow = json!({"pairs": 1, "routes": 4, "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]}});
+        scene.leaderboard("lb", slow).await;
+        let mut cut_off = controller_through(scene, &api_server);
+        scene.submit("alone", "agent:standard").await;
+        let under_way = |s: &Submission| done(s) >= 1;
+        scene.submission("alone", "a route is done", LIMIT, under_way).await;
+        api_server.shut();
+        let status = cut_off.ended(ENDED).await;
+        assert!(
+            !status.success(),
+            "who can't renew the Lease ends with an error: {status}"
+        );
+        // As the kubelet would; this one waits for the API server.
+        let _again = controller_through(scene, &api_server);
+        api_server.reopen();
+
+        case.ends(scene, "alone", LIMIT).await;
+        case.also(&format!("{} Job", scene.jobs().await.len()));
+        case.close();
+    })
+    .await;
+}

@@ -1,0 +1,443 @@
+//! The matrix: what a submission waits for, said aloud, and that it goes on when it is mended. Also lost nodes, and other
+//! systems that are away: all of these take time and little of the machine, so they share a scene.
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, resume_unwind};
+use std::time::Duration;
+
+use evalai_stand_in::faults::Failure;
+use evalai_stand_in::model::Status;
+use futures::FutureExt;
+use k8s_openapi::api::core::v1::{Node, Pod, ResourceQuota};
+use kube::ResourceExt;
+use kube::api::{Api, DeleteParams, ListParams, Patch, PatchParams, PostParams};
+use leaderboard_operator::api::{State, Submission, conditions};
+use serde_json::{Value, json};
+
+use super::matrix::{Case, SHOWN, together};
+use crate::evalai::Evalai;
+use crate::operator::controller;
+use crate::registry::Registry;
+use crate::scene::{Scene, lay_over, scenario, state};
+
+const WIDTH: usize = 7;
+/// An unanswered request to EvalAI costs 75 s, a stuck node 91 s; the rest is patience with the machine.
+const LIMIT: Duration = Duration::from_mins(5);
+/// Of two routes and one pair: (100 + 70) / 2.
+const TWO_ROUTES: &str = "85.00";
+/// Only the nodes of one test have it.
+const NODE_LABEL: &str = "leaderboard.carla.org/matrix";
+/// The cluster's only machine.
+const REAL_NODE: &str = "leaderboard-local";
+
+#[tokio::test]
+async fn each_wait_says_why_and_goes_on_when_it_is_mended() {
+    scenario("matrix-waits", async |scene: &Scene| {
+        let _controller = controller(scene);
+        let cases = vec![
+            silent_registry(scene).boxed_local(),
+            node_lost(scene).boxed_local(),
+            evalai_away(scene, "EvalAI hangs", Failure::Hang).boxed_local(),
+            evalai_away(scene, "EvalAI says 503", Failure::Status(503)).boxed_local(),
+            evalai_away(scene, "EvalAI says 500 in HTML", Failure::Html500).boxed_local(),
+            evalai_away(scene, "EvalAI says 429", Failure::Status(429)).boxed_local(),
+            no_node(scene).boxed_local(),
+            no_node_in_time(scene).boxed_local(),
+            unknown_leaderboard(scene).boxed_local(),
+            unknown_track(scene).boxed_local(),
+            quota(scene).boxed_local(),
+            missing_secret(scene).boxed_local(),
+            contents_fail(scene).boxed_local(),
+            no_s3_in_the_pod(scene).boxed_local(),
+            table_denied(scene).boxed_local(),
+        ];
+        together(WIDTH, cases).await;
+    })
+    .await;
+}
+
+/// One pair, two routes, nothing is tried again; the name is the submission's too.
+async fn board(scene: &Scene, name: &str, change: Value) {
+    scene.leaderboard(name, small(change)).await;
+}
+
+fn small(change: Value) -> Value {
+    let mut base = json!({
+        "pairs": 1,
+        "routes": 2,
+        "retries": {"pair": 2, "infrastructure": 0},
+        "deadlines": {"cancelSeconds": 1},
+    });
+    lay_over(&mut base, change);
+    base
+}
+
+/// It has ended well, with the score of an undisturbed run.
+async fn finishes(case: &mut Case, scene: &Scene, name: &str) {
+    let submission = case.ends(scene, name, LIMIT).await;
+    assert_eq!(submission.status.unwrap().score.as_deref(), Some(TWO_ROUTES));
+}
+
+/// A start that can't succeed is given no more time.
+async fn give_up(scene: &Scene, board: &str) {
+    scene
+        .change_leaderboard(board, &json!({"deadlines": {"startSeconds": 1}}))
+        .await;
+}
+
+fn assert_not_accepted(submission: &Submission) {
+    let all = &submission.status.as_ref().unwrap().conditions;
+    let accepted = conditions::get(all, conditions::ACCEPTED).unwrap();
+    assert_eq!(accepted.status, "False", "{accepted:?}");
+}
+
+async fn unknown_leaderboard(scene: &Scene) {
+    let mut case = Case::open("unknown Leaderboard", "Pending LeaderboardNotFound; Finished");
+    case.cause();
+    scene.submit_to("board-later", "board-later", "agent:standard").await;
+    let words = "There is no Leaderboard board-later";
+    assert_not_accepted(&case.shows(scene, "board-later", "LeaderboardNotFound", words).await);
+    board(scene, "board-later", json!({})).await;
+    finishes(&mut case, scene, "board-later").await;
+    case.close();
+}
+
+async fn unknown_track(scene: &Scene) {
+    let mut case = Case::open("unknown track", "Pending TrackNotFound; Finished");
+    let (other, both) = (
+        json!({"name": "map", "codename": "MAP"}),
+        json!({"name": "sensors", "codename": "SENSORS"}),
+    );
+    board(scene, "track-later", json!({"tracks": [other]})).await;
+    case.cause();
+    scene.submit_to("track-later", "track-later", "agent:standard").await;
+    let words = "There is no track sensors";
+    assert_not_accepted(&case.shows(scene, "track-later", "TrackNotFound", words).await);
+    scene
+        .change_leaderboard("track-later", &json!({"tracks": [other, both]}))
+        .await;
+    finishes(&mut case, scene, "track-later").await;
+    case.close();
+}
+
+async fn quota(scene: &Scene) {
+    let mut case = Case::open("quota exceeded", "Pending QuotaExceeded; Finished");
+    // A resource that no other Pod here asks for: the quota is of the whole namespace.
+    let disk = json!({"requests": {"ephemeral-storage": "1Mi"}});
+    let none = json!({"metadata": {"name": "none"}, "spec": {"hard": {"requests.ephemeral-storage": "0"}}});
+    let none: ResourceQuota = serde_json::from_value(none).unwrap();
+    scene.api().create(&PostParams::default(), &none).await.unwrap();
+    // The API server counts a new quota's use first.
+    let counted = |quota: Option<&ResourceQuota>| {
+        quota.is_some_and(|quota| quota.status.as_ref().is_some_and(|status| status.hard.is_some()))
+    };
+    scene.wait("none", "it is counted", SHOWN, counted).await;
+    board(scene, "quota", json!({"agent": {"resources": disk}})).await;
+    case.cause();
+    scene.submit_to("quota", "quota", "agent:standard").await;
+    case.shows(scene, "quota", "QuotaExceeded", "exceeded quota: none")
+        .await;
+    let none = scene.api::<ResourceQuota>();
+    none.delete("none", &DeleteParams::default()).await.unwrap();
+    finishes(&mut case, scene, "quota").await;
+    case.close();
+}
+
+async fn missing_secret(scene: &Scene) {
+    let mut case = Case::open("missing Secret", "Pending ContainerConfig; Finished");
+    board(scene, "secret", json!({"podIdentity": {"secretRef": "aws-later"}})).await;
+    case.cause();
+    scene.submit_to("secret", "secret", "agent:standard").await;
+    case.shows(scene, "secret", "ContainerConfig", "secret \"aws-later\" not found")
+        .await;
+    let keys = ["AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"].map(|key| (key, "test"));
+    scene.secret("aws-later", &json!(BTreeMap::from(keys))).await;
+    finishes(&mut case, scene, "secret").await;
+    case.close();
+}
+
+async fn contents_fail(scene: &Scene) {
+    let mut case = Case::open(
+        "contents fail",
+        "Pending Preparing; Failed StartDeadline (infrastructure, not charged)",
+    );
+    let fails = json!({"contents": {"command": ["/bin/bash", "-c", "echo no such town >&2; exit 3"]}});
+    board(scene, "contents", fails).await;
+    case.cause();
+    scene.submit_to("contents", "contents", "agent:standard").await;
+    case.shows(scene, "contents", "Preparing", "contents fails").await;
+    give_up(scene, "contents").await;
+    case.ends(scene, "contents", LIMIT).await;
+    case.close();
+}
+
+async fn no_s3_in_the_pod(scene: &Scene) {
+    let mut case = Case::open(
+        "workspace can't reach S3",
+        "Pending Preparing; Failed StartDeadline (infrastructure, not charged)",
+    );
+    // On loopback, where the operator is and no Pod.
+    board(scene, "no-s3", json!({"storage": {"endpoint": scene.gate.url}})).await;
+    case.cause();
+    scene.submit_to("no-s3", "no-s3", "agent:standard").await;
+    case.shows(scene, "no-s3", "Preparing", "workspace fails").await;
+    give_up(scene, "no-s3").await;
+    case.ends(scene, "no-s3", LIMIT).await;
+    case.close();
+}
+
+/// A track whose nodes do not exist.
+fn nowhere() -> Value {
+    json!([{"name": "sensors", "codename": "SENSORS", "nodeSelector": {NODE_LABEL: "nowhere"}}])
+}
+
+async fn no_node(scene: &Scene) {
+    let mut case = Case::open("no node fits", "Pending Unschedulable; Pending; Cancelled");
+    board(
+        scene,
+        "no-node",
+        json!({"tracks": nowhere(), "deadlines": {"startSeconds": 1}}),
+    )
+    .await;
+    case.cause();
+    scene.submit_to("no-node", "no-node", "agent:standard").await;
+    case.shows(
+        scene,
+        "no-node",
+        "Unschedulable",
+        "didn't match Pod's node affinity/selector",
+    )
+    .await;
+    // The start has no deadline before there is a node: another submission's whole life later it still waits.
+    board(scene, "meanwhile", json!({})).await;
+    scene.submit_to("meanwhile", "meanwhile", "agent:standard").await;
+    scene.settled("meanwhile", LIMIT).await;
+    let still = scene.api::<Submission>().get("no-node").await.unwrap();
+    case.also(state(&still).unwrap().as_str());
+    scene.change_submission("no-node", &json!({"cancel": true})).await;
+    case.ends(scene, "no-node", LIMIT).await;
+    case.close();
+}
+
+async fn no_node_in_time(scene: &Scene) {
+    let mut case = Case::open(
+        "no node fits within scheduleSeconds",
+        "Pending Unschedulable; Failed ScheduleDeadline (infrastructure, not charged)",
+    );
+    board(scene, "no-node-yet", json!({"tracks": nowhere()})).await;
+    case.cause();
+    scene.submit_to("no-node-yet", "no-node-yet", "agent:standard").await;
+    case.shows(scene, "no-node-yet", "Unschedulable", "didn't match").await;
+    scene
+        .change_leaderboard("no-node-yet", &json!({"deadlines": {"scheduleSeconds": 1}}))
+        .await;
+    case.ends(scene, "no-node-yet", LIMIT).await;
+    case.close();
+}
+
+async fn silent_registry(scene: &Scene) {
+    let mut case = Case::open(
+        "registry that never answers",
+        "Pending Preparing; Failed StartDeadline (infrastructure, not charged); nothing stored later",
+    );
+    let silent = Registry::that_is_silent().await;
+    board(scene, "silent", json!({})).await;
+    let spec = json!({"leaderboard": "silent", "track": "sensors", "image": silent.image()});
+    case.cause();
+    scene.apply_submission("silent", spec).await;
+    // What it is at is told after a minute: a healthy Pod costs no write until then.
+    case.shows(scene, "silent", "Preparing", "images are pulled").await;
+    give_up(scene, "silent").await;
+    let ended = case.ends(scene, "silent", LIMIT).await;
+    // Now the node comes to itself.
+    drop(silent);
+    let gone = |pod: Option<&Pod>| pod.is_none();
+    for pod in pods_of(scene, "silent").await {
+        scene.wait(&pod, "it is gone", LIMIT, gone).await;
+    }
+    let later = scene.api::<Submission>().get("silent").await.unwrap();
+    assert_eq!(later.status, ended.status);
+    let keys = scene.cloud.keys("silent").await;
+    let results: Vec<_> = keys.keys().filter(|key| key.starts_with("agent/")).collect();
+    assert!(results.is_empty(), "{results:?}");
+    case.also("nothing stored later");
+    case.close();
+}
+
+async fn pods_of(scene: &Scene, submission: &str) -> Vec<String> {
+    let pods = scene.all::<Pod>().await.into_iter();
+    let ours = |pod: &Pod| {
+        pod.labels()
+            .get("leaderboard.carla.org/submission")
+            .is_some_and(|name| name == submission)
+    };
+    pods.filter(ours).map(|pod| pod.name_any()).collect()
+}
+
+async fn table_denied(scene: &Scene) {
+    let mut case = Case::open(
+        "DynamoDB denied and back",
+        "Finished; Recorded=False Refused; Recorded=True Written",
+    );
+    scene.gate.deny("DynamoDB_20120810.UpdateItem");
+    let table = json!({"name": scene.cloud.table, "region": crate::aws::REGION, "endpoint": scene.gate.url});
+    board(scene, "denied", json!({"table": table})).await;
+    scene.submit_to("denied", "denied", "agent:standard").await;
+    let recorded = |s: &Submission| {
+        let all = s
+            .status
+            .as_ref()
+            .map(|status| status.conditions.as_slice())
+            .unwrap_or_default();
+        let recorded = conditions::get(all, conditions::RECORDED).cloned();
+        recorded.map(|recorded| (recorded.status, recorded.reason, recorded.message))
+    };
+    let finished = |s: &Submission| state(s).is_some_and(State::is_terminal);
+    scene.submission("denied", "it has ended", LIMIT, finished).await;
+    case.cause();
+    let refused = move |s: &Submission| recorded(s).is_some_and(|(_, reason, _)| reason == "Refused");
+    let denied = scene
+        .submission("denied", "the table is said to refuse it", SHOWN, refused)
+        .await;
+    let (truth, reason, message) = recorded(&denied).unwrap();
+    assert!(message.contains("not authorized"), "{message}");
+    let said = format!("Recorded={truth} {reason}");
+    scene.gate.reopen();
+    finishes(&mut case, scene, "denied").await;
+    case.also(&said);
+    let settled = scene.api::<Submission>().get("denied").await.unwrap();
+    let (truth, reason, _) = recorded(&settled).unwrap();
+    case.also(&format!("Recorded={truth} {reason}"));
+    assert_eq!(
+        scene.cloud.row(&scene.cloud.table).await["submission_status"],
+        "FINISHED"
+    );
+    case.close();
+}
+
+/// EvalAI fails when the result is put, and is well again. Each has a server of its own, whose throttle it does not share.
+async fn evalai_away(scene: &Scene, name: &'static str, answer: Failure) {
+    let mut case = Case::open(name, "Finished; EvalAI finished; 1 row");
+    let evalai = Evalai::start(scene).await;
+    evalai.fail_finals(answer, 1);
+    let board = format!("lb-{}", evalai.url.rsplit(':').next().unwrap());
+    let prefix = format!("{}{board}/", scene.cloud.prefix);
+    let mut change = small(json!({"storage": {"prefix": prefix}}));
+    // The servers' first submissions have the same key: no table, and nobody reads the queue.
+    change["queue"] = Value::Null;
+    change["table"] = Value::Null;
+    scene.evalai_leaderboard(&board, &evalai, change).await;
+    let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+    let spec = json!({
+        "leaderboard": board,
+        "evalai": {"challenge": 1, "phase": 1, "submission": pk},
+        "image": scene.lab.challenge("agent:standard"),
+    });
+    scene.apply_submission(&board, spec).await;
+    finishes(&mut case, scene, &board).await;
+    assert_eq!(evalai.submission(pk).status, Status::Finished);
+    case.evalai(Status::Finished);
+    assert!(evalai.told("PUT", "finished") > 1, "nothing went wrong");
+    case.also(&format!("{} row", evalai.rows(pk).len()));
+    case.close();
+}
+
+/// A node that is no machine, whose kubelet is played, goes away with its Pod; the Job's next one runs on the real node.
+async fn node_lost(scene: &Scene) {
+    let mut case = Case::open(
+        "node lost",
+        "Running Running; Running Replacing; Finished; attempt 1, try 0, crashes 0",
+    );
+    let nodes: Api<Node> = Api::all(scene.client.clone());
+    let label = scene.namespace.as_str();
+    nodes.create(&PostParams::default(), &fake_node(label)).await.unwrap();
+    let outcome = AssertUnwindSafe(on_the_lost_node(&mut case, scene, &nodes, label))
+        .catch_unwind()
+        .await;
+    // Whatever came of it, other tests find the nodes as they were.
+    _ = nodes.delete(label, &DeleteParams::default()).await;
+    let labelled = ListParams::default().labels(&format!("{NODE_LABEL}={label}"));
+    for node in nodes.list(&labelled).await.unwrap() {
+        label_node(&nodes, &node.name_any(), Value::Null).await;
+    }
+    match outcome {
+        Ok(()) => case.close(),
+        Err(panic) => resume_unwind(panic),
+    }
+}
+
+async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, label: &str) {
+    let track = json!({
+        "name": "sensors",
+        "codename": "SENSORS",
+        "nodeSelector": {NODE_LABEL: label},
+        "tolerations": [{"key": NODE_LABEL, "operator": "Exists"}],
+    });
+    board(scene, "lost-node", json!({"tracks": [track], "retries": {"pair": 1}})).await;
+    scene.submit_to("lost-node", "lost-node", "agent:standard").await;
+    let pod = scene.first_pod("lost-node", LIMIT).await.name_any();
+    let scheduled = |pod: Option<&Pod>| pod.is_some_and(|pod| pod.spec.as_ref().is_some_and(|s| s.node_name.is_some()));
+    let pod = scene.wait(&pod, "it has a node", LIMIT, scheduled).await.unwrap();
+    play_kubelet(scene, &pod).await;
+    case.shows(scene, "lost-node", "Running", "").await;
+
+    case.cause();
+    nodes.delete(label, &DeleteParams::default()).await.unwrap();
+    case.shows(scene, "lost-node", "Replacing", "Its Pod was lost").await;
+    label_node(nodes, REAL_NODE, json!(label)).await;
+    finishes(case, scene, "lost-node").await;
+    let status = scene
+        .api::<Submission>()
+        .get("lost-node")
+        .await
+        .unwrap()
+        .status
+        .unwrap();
+    let crashes: i32 = status.pairs.iter().map(|pair| pair.crashes).sum();
+    let (attempt, retry) = (status.attempt.unwrap_or_default(), status.retry);
+    case.also(&format!("attempt {attempt}, try {retry}, crashes {crashes}"));
+}
+
+async fn label_node(nodes: &Api<Node>, name: &str, value: Value) {
+    let patch = Patch::Merge(json!({"metadata": {"labels": {NODE_LABEL: value}}}));
+    nodes.patch(name, &PatchParams::default(), &patch).await.unwrap();
+}
+
+fn fake_node(label: &str) -> Node {
+    let room = json!({"cpu": "4", "memory": "8Gi", "pods": "10", "ephemeral-storage": "10Gi"});
+    let node = json!({
+        "metadata": {"name": label, "labels": {NODE_LABEL: label}},
+        // Nobody else's Pod may come here.
+        "spec": {"taints": [{"key": NODE_LABEL, "effect": "NoSchedule"}]},
+        "status": {
+            "capacity": room,
+            "allocatable": room,
+            "conditions": [{"type": "Ready", "status": "True", "reason": "KubeletReady"}],
+        },
+    });
+    serde_json::from_value(node).unwrap()
+}
+
+/// Says of a Pod what its kubelet would: all of it runs.
+async fn play_kubelet(scene: &Scene, pod: &Pod) {
+    let spec = pod.spec.as_ref().unwrap();
+    let now = jiff::Timestamp::now();
+    let runs = |name: &str| {
+        let (ended, running) = (
+            json!({"terminated": {"exitCode": 0, "reason": "Completed"}}),
+            json!({"running": {"startedAt": now}}),
+        );
+        let is_over = ["contents", "workspace"].contains(&name);
+        let state = if is_over { ended } else { running };
+        json!({"name": name, "image": "", "imageID": "", "restartCount": 0, "ready": true, "started": !is_over, "state": state})
+    };
+    let first: Vec<_> = spec.init_containers.iter().flatten().map(|c| runs(&c.name)).collect();
+    let then: Vec<_> = spec.containers.iter().map(|c| runs(&c.name)).collect();
+    let status =
+        json!({"phase": "Running", "startTime": now, "initContainerStatuses": first, "containerStatuses": then});
+    let patch = Patch::Merge(json!({"status": status}));
+    let pods = scene.api::<Pod>();
+    pods.patch_status(&pod.name_any(), &PatchParams::default(), &patch)
+        .await
+        .unwrap();
+}
