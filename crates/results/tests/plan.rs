@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Drive, file, finished, merged, pod, read};
-use leaderboard_results::{Format, Merged, Outcome, Plan, Slice, Verify, render};
+use leaderboard_results::{Format, Merged, Outcome, Plan, Slice, Strictness, Verify, render};
 use serde_json::{Value, json};
 
 const V1: Format = Format::V1;
@@ -81,6 +81,20 @@ fn one_pair_can_not_stand_in_for_another() {
         swapped,
         "pair 1: the checkpoint is for 3 route runs, but this pair has 2"
     );
+}
+
+/// Only a pod refuses the file of a pair that did more than its share; elsewhere the sum alone must not make it final.
+#[test]
+fn one_pair_can_not_make_up_for_another() {
+    for format in [V1, V2] {
+        let (plan, _) = two_pairs(format);
+        let plan = Plan {
+            strictness: Strictness::Offline,
+            ..plan
+        };
+        let result = merged(&plan, &[Some(perfect(format, 0..=2)), Some(perfect(format, 3..=4))]).unwrap();
+        assert_eq!((result.done, result.total, result.is_final), (5, 5, false));
+    }
 }
 
 #[test]
