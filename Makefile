@@ -4,9 +4,10 @@ PROFILE ?= local
 TARGET := target/x86_64-unknown-linux-gnu
 STATIC := RUSTFLAGS="-C target-feature=+crt-static"
 LAB := ./local/lab
+FUZZ_SECONDS ?= 600
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale cluster down status build static image images crds fmt lint deny bench chart-test lab-test
+.PHONY: help demo test test-core measure-scale cluster down status build static image images crds fmt lint deny bench fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -67,6 +68,13 @@ chart-test: ## Lint the chart and check what it renders against the schemas
 
 bench: ## Measure the merge of results
 	cargo bench -p leaderboard-results
+
+fuzz: ## Fuzz the results code, FUZZ_SECONDS (600) for each target; needs cargo-fuzz and a C++ compiler
+	@cargo fuzz --version >/dev/null 2>&1 || { echo "cargo-fuzz is missing: cargo install --locked cargo-fuzz" >&2; exit 1; }
+	cd crates/results && for target in checkpoint merge; do \
+	    cargo fuzz run -s none $$target fuzz/corpus/$$target -- -dict=fuzz/json.dict -max_total_time=$(FUZZ_SECONDS) \
+	        -timeout=10 -rss_limit_mb=1024 -print_final_stats=1 || exit 1; \
+	done
 
 lab-test: ## Test local/ itself
 	python3 -m unittest discover -s local/tests -t local
