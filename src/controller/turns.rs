@@ -54,6 +54,7 @@ struct Teams {
     waiting: BTreeMap<String, VecDeque<InLine>>,
     load: HashMap<String, usize>,
     picked: HashMap<String, usize>,
+    picks: usize,
     served: HashMap<String, Timestamp>,
 }
 
@@ -111,6 +112,7 @@ impl Teams {
             waiting,
             load,
             picked: HashMap::new(),
+            picks: 0,
             served,
         }
     }
@@ -129,8 +131,8 @@ impl Teams {
         if line.is_empty() {
             self.waiting.remove(&team);
         }
-        let number = self.picked.values().max().copied().unwrap_or(0) + 1;
-        self.picked.insert(team.clone(), number);
+        self.picks += 1;
+        self.picked.insert(team.clone(), self.picks);
         let load = self.load.entry(team).or_default();
         let running = *load;
         *load += 1;

@@ -101,11 +101,20 @@ pub(super) fn results_not_stored() -> Failure {
 }
 
 pub(super) fn invalid_results(why: &str) -> Failure {
-    let why = sentence(why);
-    participant(
-        reasons::INVALID_RESULTS,
-        format!("The results cannot be used: {why} Check what the agent writes into its checkpoint, and submit again."),
-    )
+    let words = sentence(why);
+    let message = format!(
+        "The results cannot be used: {words} Check what the agent writes into its checkpoint, and submit again."
+    );
+    Failure {
+        pair: pair_named(why),
+        ..participant(reasons::INVALID_RESULTS, message)
+    }
+}
+
+/// The pair whose checkpoint logcopy speaks of: `pair 2: …` or `pair 2, record …`.
+fn pair_named(why: &str) -> Option<i32> {
+    let (number, _) = why.strip_prefix("pair ")?.split_once([':', ','])?;
+    number.parse().ok()
 }
 
 /// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without

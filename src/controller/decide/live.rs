@@ -286,7 +286,10 @@ fn watch_run(draft: &mut Draft<'_>) {
     if let Some(found) = evicted.or_else(|| failure::retries_used_up(draft)) {
         return draft.fail(found);
     }
-    let Some(since) = run_since(draft) else { return };
+    // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.
+    let Some(since) = run_since(draft).filter(|_| draft.leaderboard().is_some()) else {
+        return;
+    };
     let deadline = after(since, draft.deadlines().run_seconds);
     if draft.now() >= deadline {
         draft.fail(failure::time_limit(draft.deadlines().run_seconds));

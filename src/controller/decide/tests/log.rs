@@ -76,6 +76,29 @@ fn a_failure_of_the_whole_run_is_told_by_a_pair_that_was_not_done() {
         "pair 1 was done"
     );
 
+    let refused = Report {
+        is_final: true,
+        why: Some("pair 2, record 1: its score is no number.".into()),
+        ..report(1)
+    };
+    let mut world = World::local().running();
+    world.complete();
+    world.report(refused.clone());
+    let plan = world.pass_to(Failed, reasons::INVALID_RESULTS);
+    assert_eq!(plan.status.failure.as_ref().unwrap().pair, Some(2));
+    assert_eq!(places(&plan)[0], "s3 agent/agent2/leaderboard.log", "the refused one");
+    for why in [
+        "pairs 1 and 2 have different sensors",
+        "route 3 has more than one record",
+        "pair",
+    ] {
+        let why = Some(why.to_owned());
+        let mut world = World::local().running();
+        world.complete();
+        world.report(Report { why, ..refused.clone() });
+        assert_eq!(world.pass().status.failure.unwrap().pair, None);
+    }
+
     let ineligible = Report {
         eligible: false,
         entry_status: "Rejected".into(),

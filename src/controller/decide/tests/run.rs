@@ -112,6 +112,18 @@ fn the_run_deadline_counts_from_the_first_agent_to_the_second() {
 }
 
 #[test]
+fn a_run_that_outlives_its_leaderboard_meets_no_deadline_of_ours() {
+    let mut world = World::local().running();
+    world.leaderboard().deadlines.run_seconds = 200_000;
+    let leaderboard = world.view.leaderboard.take();
+    world.go_to(150_000);
+    world.pass_to(Running, reasons::RUNNING);
+    world.view.leaderboard = leaderboard;
+    world.go_to(200_010);
+    world.pass_to(Running, reasons::STOPPING);
+}
+
+#[test]
 fn time_lost_to_the_infrastructure_is_given_back() {
     let mut world = World::local().running();
     world.go_to(86_000);
