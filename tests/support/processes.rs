@@ -13,14 +13,12 @@ use super::scene::containers;
 /// Processes have no events for others: they are looked for this often.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// Those of all containers.
+/// Those of all containers; none if they have ended already.
 pub fn of_pod(pod: &Pod) -> Vec<Pid> {
     let ids = containers(pod)
         .into_iter()
         .filter_map(|container| container.container_id);
-    let found: Vec<_> = ids.flat_map(|id| of_container(&id)).collect();
-    assert!(!found.is_empty(), "no process of the Pod is on this machine");
-    found
+    ids.flat_map(|id| of_container(&id)).collect()
 }
 
 /// Waits for a container's process with this name.
