@@ -1,14 +1,15 @@
 //! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
 //!
 //! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes the merged file and EvalAI's texts
-//! there; knows no S3. A checkpoint that is torn, gone or refused leaves the last good one in place.
+//! there; knows no S3. A checkpoint that is torn, gone or refused leaves the last good one in place. What is to be stored is
+//! handed out from memory, so that no torn file and no full disk comes between the results and S3.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use leaderboard_results::{Checkpoint, Files, Format, Merged, Plan, Refusal, Slice, Strictness};
-use leaderboard_runner::protocol::{Member, Pair, Progress, Side};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Progress, Side};
 use sha2::{Digest, Sha256};
 
 use super::report::{ReportPair, StoredFile};
@@ -21,6 +22,9 @@ use crate::api::{ResultsFormat, Verify, effective};
 const CHECKPOINT_LIMIT: u64 = 64 << 20;
 /// The merged file, below the volume's root.
 pub const MERGED: &str = "agent/agent_results.json";
+
+/// The same text under EvalAI's name.
+const METADATA: &str = "evalai/metadata.json";
 
 /// The plan of the results, from the plan of the run.
 pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
@@ -59,6 +63,11 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
 /// The checkpoint of a pair, below the volume's root.
 pub fn checkpoint_path(pair: usize) -> String {
     format!("agent/agent{pair}/agent_results.json")
+}
+
+/// Its last whole copy, which the agent's runner keeps.
+fn kept_path(pair: usize) -> String {
+    format!("{STATUS_FOLDER}/{}-{pair}/{KEPT_CHECKPOINT}", Side::Agent)
 }
 
 /// The pairs and the round their status files are in.
@@ -104,6 +113,9 @@ struct Worker {
     refused: Option<String>,
 }
 
+/// Results by their keys below the run's prefix.
+pub type Objects = BTreeMap<String, Arc<[u8]>>;
+
 /// What one round found.
 #[derive(Clone, Debug)]
 pub struct Gathered {
@@ -111,6 +123,8 @@ pub struct Gathered {
     pub merged: Option<Arc<Merged>>,
     /// EvalAI's texts, of the same merge.
     pub files: Arc<Files>,
+    /// The last good checkpoints, the merged file and EvalAI's texts, as they are to be stored.
+    pub objects: Objects,
     /// Each pair from its status files.
     pub seen: Vec<PairSeen>,
     /// Each pair for the report.
@@ -131,6 +145,13 @@ impl Gathered {
     /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents say.
     pub fn is_complete(&self) -> bool {
         self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_final)
+    }
+
+    /// Whether every evaluator has come to its regular end. One whose simulator crashed in its last route has a record of each
+    /// and has not: it will repeat that route, as long as it is restarted.
+    pub fn has_ended(&self) -> bool {
+        let merged = self.merged.as_ref();
+        merged.is_some_and(|merged| merged.pairs.iter().all(|pair| pair.ended))
     }
 
     /// Digests of EvalAI's texts, by key.
@@ -156,9 +177,18 @@ pub fn texts(files: &Files) -> Vec<(&'static str, &str)> {
         files
             .metadata_json
             .as_deref()
-            .map(|text| ("evalai/metadata.json", text)),
+            .map(|text| (METADATA, text)),
     );
     texts
+}
+
+fn take_texts(objects: &mut Objects, files: &Files) {
+    for (key, text) in texts(files) {
+        objects.insert(key.to_owned(), text.as_bytes().into());
+    }
+    if let Some(metadata) = objects.get(METADATA).cloned() {
+        objects.insert(MERGED.to_owned(), metadata);
+    }
 }
 
 /// Reads the volume round by round.
@@ -170,14 +200,19 @@ pub struct Gatherer {
     workers: Vec<Worker>,
     merged: Option<Arc<Merged>>,
     files: Arc<Files>,
+    objects: Objects,
     unmerged: Option<String>,
     written: BTreeMap<&'static str, Arc<Files>>,
+    /// That something can't be written was said.
+    complained: bool,
 }
 
 impl Gatherer {
     /// For a plan that holds.
     pub fn new(plan: Plan, tree: Arc<Tree>) -> Result<Self, Refusal> {
         let files = Arc::new(leaderboard_results::render(&plan, None)?);
+        let mut objects = Objects::new();
+        take_texts(&mut objects, &files);
         Ok(Self {
             status: tree.path().join(STATUS_FOLDER),
             workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
@@ -185,8 +220,10 @@ impl Gatherer {
             tree,
             merged: None,
             files,
+            objects,
             unmerged: None,
             written: BTreeMap::new(),
+            complained: false,
         })
     }
 
@@ -196,7 +233,7 @@ impl Gatherer {
     }
 
     /// Looks at everything once and writes what follows from it. Blocks: not for an asynchronous thread.
-    pub fn round(&mut self) -> Result<Gathered, TreeError> {
+    pub fn round(&mut self) -> Gathered {
         // The agents' word is read before their results: who is done has written everything.
         let seen: Vec<PairSeen> = (1..=self.workers.len())
             .map(|number| PairSeen::read(&self.status, number))
@@ -204,20 +241,31 @@ impl Gatherer {
         let mut changed = false;
         for index in 0..self.workers.len() {
             changed |= self.read(index);
+            if self.workers[index].good.is_none() {
+                changed |= self.read_kept(index);
+            }
         }
         if changed {
             self.merge();
         }
-        self.write()?;
+        match self.write() {
+            Ok(()) => self.complained = false,
+            Err(error) if !self.complained => {
+                self.complained = true;
+                tracing::warn!("the merged results can't be written to the logs volume, S3 gets them all the same: {error}");
+            }
+            Err(_) => {}
+        }
         let pairs = self.pairs(&seen);
-        Ok(Gathered {
+        Gathered {
             merged: self.merged.clone(),
             files: Arc::clone(&self.files),
+            objects: self.objects.clone(),
             pairs,
             seen,
             refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
             unmerged: self.unmerged.clone(),
-        })
+        }
     }
 
     /// Reads one worker's checkpoint, if it is not the one of the last round. Returns whether there is something new.
@@ -244,6 +292,7 @@ impl Gatherer {
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
                 worker.good = Some(checkpoint);
+                self.objects.insert(path, bytes.into());
                 if let Some(why) = worker.refused.take() {
                     tracing::info!(pair = index + 1, "the checkpoint is good again; before: {why}");
                 }
@@ -254,6 +303,20 @@ impl Gatherer {
                 worker.refuse_with(words(&refusal))
             }
         }
+    }
+
+    /// Reads what the agent's runner has kept: a logcopy that begins while the file itself is being written knows no last good
+    /// one.
+    fn read_kept(&mut self, index: usize) -> bool {
+        let Ok(Some((bytes, _))) = self.tree.read(&kept_path(index + 1), CHECKPOINT_LIMIT) else {
+            return false;
+        };
+        let Ok(Some(checkpoint)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
+            return false;
+        };
+        self.workers[index].good = Some(checkpoint);
+        self.objects.insert(checkpoint_path(index + 1), bytes.into());
+        true
     }
 
     fn merge(&mut self) {
@@ -267,6 +330,7 @@ impl Gatherer {
         });
         match merged {
             Ok((merged, files)) => {
+                take_texts(&mut self.objects, &files);
                 self.merged = Some(Arc::new(merged));
                 self.files = Arc::new(files);
                 self.unmerged = None;
