@@ -110,7 +110,20 @@ impl PairSeen {
 struct Worker {
     good: Option<Checkpoint>,
     seen: Option<Stamp>,
+    /// The runner's copy as it was looked at last.
+    kept: Option<Stamp>,
     refused: Option<String>,
+}
+
+/// What a look at a checkpoint gave.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Look {
+    /// Another good one.
+    New,
+    /// Nothing that was not known.
+    Same,
+    /// None, or half of one.
+    Unusable,
 }
 
 /// Results by their keys below the run's prefix.
@@ -240,10 +253,11 @@ impl Gatherer {
             .collect();
         let mut changed = false;
         for index in 0..self.workers.len() {
-            changed |= self.read(index);
-            if self.workers[index].good.is_none() {
-                changed |= self.read_kept(index);
-            }
+            changed |= match self.read(index) {
+                Look::New => true,
+                Look::Same => false,
+                Look::Unusable => self.read_kept(index),
+            };
         }
         if changed {
             self.merge();
@@ -268,27 +282,27 @@ impl Gatherer {
         }
     }
 
-    /// Reads one worker's checkpoint, if it is not the one of the last round. Returns whether there is something new.
-    fn read(&mut self, index: usize) -> bool {
+    /// Reads one worker's checkpoint, if it is not the one of the last round.
+    fn read(&mut self, index: usize) -> Look {
         let path = checkpoint_path(index + 1);
         let worker = &mut self.workers[index];
         let (file, stamp) = match self.tree.file(&path) {
             Ok(Some(found)) => found,
-            Ok(None) => return false,
+            Ok(None) => return Look::Unusable,
             Err(error) => return worker.refuse(index, &error),
         };
         if worker.seen == Some(stamp) {
-            return false;
+            return Look::Same;
         }
         drop(file);
         let (bytes, stamp) = match self.tree.read(&path, CHECKPOINT_LIMIT) {
             Ok(Some(read)) => read,
             // The next round finds it whole.
-            Ok(None) | Err(TreeError::Changed) => return false,
+            Ok(None) | Err(TreeError::Changed) => return Look::Unusable,
             Err(error) => return worker.refuse(index, &error),
         };
         match leaderboard_results::read_worker(&self.plan, index, &bytes) {
-            Ok(None) => false,
+            Ok(None) => Look::Unusable,
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
                 worker.good = Some(checkpoint);
@@ -296,7 +310,7 @@ impl Gatherer {
                 if let Some(why) = worker.refused.take() {
                     tracing::info!(pair = index + 1, "the checkpoint is good again; before: {why}");
                 }
-                true
+                Look::New
             }
             Err(refusal) => {
                 worker.seen = Some(stamp);
@@ -305,16 +319,27 @@ impl Gatherer {
         }
     }
 
-    /// Reads what the agent's runner has kept: a logcopy that begins while the file itself is being written knows no last good
-    /// one.
+    /// Reads what the agent's runner has kept, when the file itself is being written: that is further than what this logcopy has
+    /// seen, if it looks seldom, or has begun just now.
     fn read_kept(&mut self, index: usize) -> bool {
-        let Ok(Some((bytes, _))) = self.tree.read(&kept_path(index + 1), CHECKPOINT_LIMIT) else {
+        let path = kept_path(index + 1);
+        let worker = &mut self.workers[index];
+        match self.tree.file(&path) {
+            Ok(Some((_, stamp))) if worker.kept != Some(stamp) => {}
+            _ => return false,
+        }
+        let Ok(Some((bytes, stamp))) = self.tree.read(&path, CHECKPOINT_LIMIT) else {
             return false;
         };
-        let Ok(Some(checkpoint)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
+        worker.kept = Some(stamp);
+        let Ok(Some(kept)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
             return false;
         };
-        self.workers[index].good = Some(checkpoint);
+        let reached = |checkpoint: &Checkpoint| (checkpoint.done(), checkpoint.ended());
+        if worker.good.as_ref().is_some_and(|good| reached(good) >= reached(&kept)) {
+            return false;
+        }
+        worker.good = Some(kept);
         self.objects.insert(checkpoint_path(index + 1), bytes.into());
         true
     }
@@ -392,7 +417,7 @@ impl Gatherer {
 }
 
 impl Worker {
-    fn refuse(&mut self, index: usize, error: &TreeError) -> bool {
+    fn refuse(&mut self, index: usize, error: &TreeError) -> Look {
         let words = format!(
             "pair {}: the checkpoint can't be read: {error}. Leave it to the evaluator.",
             index + 1
@@ -400,12 +425,12 @@ impl Worker {
         self.refuse_with(words)
     }
 
-    fn refuse_with(&mut self, words: String) -> bool {
+    fn refuse_with(&mut self, words: String) -> Look {
         if self.refused.as_ref() != Some(&words) {
             tracing::warn!("a checkpoint is refused, the last good one stays: {words}");
         }
         self.refused = Some(words);
-        false
+        Look::Same
     }
 }
 

@@ -247,6 +247,12 @@ mod seen_on_a_volume {
         let (gathered, _) = volume.round();
         assert_eq!(gathered.pairs[0].done, 1);
         assert!(gathered.objects.contains_key("agent/agent1/agent_results.json"));
+        // The copy is never a step back.
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        assert_eq!(volume.round().0.pairs[0].done, 2);
+        put_checkpoint(volume.folder.path(), 1, "");
+        fs::write(kept.join("checkpoint.json"), checkpoint(0, 1, 2) + " ").unwrap();
+        assert_eq!(volume.round().0.pairs[0].done, 2);
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
         assert_eq!(volume.round().0.pairs[0].done, 2);
     }

@@ -4,6 +4,7 @@ use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use leaderboard_operator::api::{ResultsFormat, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::places::Places;
@@ -61,7 +62,8 @@ pub struct Submission {
 impl Submission {
     /// A prefix and ports of its own, on an endpoint of S3.
     pub async fn on(endpoint: &str, bucket: &str, format: ResultsFormat, random: &mut fastrand::Rng) -> Self {
-        let id = format!("run-{:016x}", random.u64(..));
+        static NUMBER: AtomicU32 = AtomicU32::new(1);
+        let id = format!("run-{}", NUMBER.fetch_add(1, Ordering::Relaxed));
         let aws = ministack::aws(&server().await.endpoint()).await;
         let s3 = aws.s3(None, Some(&server().await.endpoint()));
         Self {
