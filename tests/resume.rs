@@ -19,8 +19,10 @@ mod support {
 mod resume {
     mod kills;
     mod kubelet;
+    mod measure;
     mod process;
     mod results;
     mod singles;
     mod submission;
+    mod volumes;
 }

@@ -18,7 +18,7 @@ use super::submission::{PAIRS, ROUTES_OF_PAIR, Submission};
 use crate::support::ministack::server;
 
 /// Runs of an ordinary test run.
-const RUNS: u64 = 40;
+const RUNS: u64 = 50;
 const MOST_KILLS: u32 = 3;
 /// No run takes so long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(3);

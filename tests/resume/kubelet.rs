@@ -12,7 +12,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use tokio::sync::mpsc;
 
-use super::process::{children, gone, kill_container};
+use super::process::{children, gone, kill_container, terminate};
 use super::submission::{PAIRS, Submission, make_volumes};
 
 /// A container of the Pod.
@@ -89,10 +89,21 @@ impl<'a> Kubelet<'a> {
 
     /// A new Pod with empty volumes.
     pub fn make_pod(&mut self) {
+        self.make_pod_on(|_| {});
+    }
+
+    /// The same on a node that mounts something of its own.
+    pub fn make_pod_on(&mut self, mount: impl FnOnce(&Path)) {
         self.pods += 1;
         self.root = self.folder.path().join(format!("pod-{}", self.pods));
         make_volumes(&self.root);
+        mount(&self.root);
         self.start(Name::Workspace);
+    }
+
+    /// Holds the Pods' volumes and the containers' logs.
+    pub fn folder(&self) -> &Path {
+        self.folder.path()
     }
 
     pub fn pod_uid(&self) -> String {
@@ -218,6 +229,11 @@ impl<'a> Kubelet<'a> {
         container.ended.is_none().then_some(container.pid)
     }
 
+    /// Sends a signal to a container's first process.
+    pub fn signal(&self, name: Name, signal: Signal) {
+        kill(self.pid(name).unwrap(), signal).unwrap();
+    }
+
     /// Kills the command behind a runner. Returns whether there was one.
     pub fn kill_command(&self, member: Member) -> bool {
         let commands = self.pid(Name::Of(member)).map(children).unwrap_or_default();
@@ -256,11 +272,15 @@ impl<'a> Kubelet<'a> {
 
     /// Ends everything as an eviction does: the sidecar last. Nothing is restarted.
     pub async fn evict(&mut self) {
-        let mains: Vec<Name> = members().map(Name::Of).chain([Name::Workspace]).collect();
+        // An init container has nothing to end in order.
+        if let Some(pid) = self.pid(Name::Workspace) {
+            let _ = kill(pid, Signal::SIGKILL);
+        }
+        let mains: Vec<Name> = members().map(Name::Of).collect();
         for names in [mains, vec![Name::Logcopy]] {
             for name in &names {
                 if let Some(pid) = self.pid(*name) {
-                    let _ = kill(pid, Signal::SIGTERM);
+                    terminate(pid).await;
                 }
             }
             for name in names {
@@ -288,7 +308,7 @@ impl<'a> Kubelet<'a> {
     /// SIGTERM to logcopy, whose Pod is complete. Returns its exit status.
     pub async fn end_logcopy(&mut self) -> ExitStatus {
         if let Some(pid) = self.pid(Name::Logcopy) {
-            kill(pid, Signal::SIGTERM).unwrap();
+            terminate(pid).await;
         }
         self.end_of(Name::Logcopy).await;
         self.containers[&Name::Logcopy].ended.unwrap()

@@ -44,3 +44,19 @@ pub async fn gone(pids: &[Pid]) {
         }
     }
 }
+
+/// SIGTERM as the first process of a container gets it: before its handler is there it would only be dropped, and the kubelet's
+/// patience be used up.
+pub async fn terminate(pid: Pid) {
+    while state(pid).is_some() && !handles_sigterm(pid) {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    let _ = kill(pid, Signal::SIGTERM);
+}
+
+fn handles_sigterm(pid: Pid) -> bool {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
+    let caught = caught.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    caught.is_some_and(|mask| mask & (1 << (Signal::SIGTERM as u64 - 1)) != 0)
+}

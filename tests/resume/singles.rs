@@ -4,12 +4,15 @@ use std::time::Duration;
 
 use fastrand::Rng;
 use leaderboard_operator::api::ResultsFormat;
-use leaderboard_runner::protocol::{Mark, StatusFile};
+use leaderboard_runner::protocol::{Mark, Side, StatusFile};
+use nix::sys::signal::Signal;
 
 use super::kubelet::{Kubelet, Name, members};
 use super::results::{report, results};
 use super::submission::Submission;
 use crate::support::ministack::server;
+
+const LIMIT: Duration = Duration::from_mins(1);
 
 /// A simulator that dies in its pair's last route leaves a record of each route and no regular end. While the pair is in its
 /// back-off, however long, nothing is final; then that route is run again.
@@ -20,27 +23,16 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
     let mut submission = Submission::new(&bucket, ResultsFormat::V2, &mut random).await;
     // The fifth route of a server is its pair's last; the next server has one route left.
     submission.simulator_knobs = "crash@5".to_owned();
+    submission.route_ms = 200;
     let mut kubelet = Kubelet::new(&submission);
     kubelet.held_back = members().collect();
     kubelet.make_pod();
-    let crashed = async |kubelet: &mut Kubelet<'_>| {
-        let mut left = members().count();
-        while left > 0 {
-            let (name, status) = kubelet.ended().await;
-            if let Name::Of(member) = name {
-                assert_eq!(status.code(), Some(1), "{member}: both sides count the crash");
-                left -= 1;
-            }
-            kubelet.handle(name, status);
-        }
-    };
-    tokio::time::timeout(Duration::from_mins(2), crashed(&mut kubelet)).await.unwrap();
-    for member in members() {
-        assert!(kubelet.has(StatusFile::Of(member, Mark::Crash(0))), "{member}");
-    }
+    let in_time = tokio::time::timeout(LIMIT, all_crash(&mut kubelet)).await;
+    assert!(in_time.is_ok(), "they do not all crash\n{}", kubelet.story());
     // As long as it waits for results that are complete, and as much again.
     let agent = "agent/agent1/agent_results.json";
-    until_reported(&submission, 20).await;
+    let in_time = tokio::time::timeout(LIMIT, until_reported(&submission, 20)).await;
+    assert!(in_time.is_ok(), "no report of it\n{}", kubelet.story());
     tokio::time::sleep(Duration::from_secs(3)).await;
     let waiting = report(&submission.archive).await.unwrap();
     assert!(!waiting.is_final && !kubelet.has(StatusFile::Stored), "{waiting:?}");
@@ -57,7 +49,8 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
             }
         }
     };
-    tokio::time::timeout(Duration::from_mins(2), to_the_end).await.unwrap();
+    let in_time = tokio::time::timeout(LIMIT, to_the_end).await;
+    assert!(in_time.is_ok(), "it does not end\n{}", kubelet.story());
     let last = report(&submission.archive).await.unwrap();
     assert!(last.is_final && last.eligible && last.entry_status == "Finished", "{last:?}");
     for begun in kubelet.begun() {
@@ -67,12 +60,41 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
     assert!(!results(&submission.archive).await["agent/agent_results.json"].contains("Simulation crashed"));
 }
 
-async fn until_reported(submission: &Submission, done: u32) {
-    let asking = async {
-        while report(&submission.archive).await.is_none_or(|report| report.done < done) {
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
+/// Runs the Pod until each container has crashed once. The simulators' runners sleep meanwhile, so that the evaluators find out
+/// by themselves and write their last record.
+async fn all_crash(kubelet: &mut Kubelet<'_>) {
+    let (name, status) = kubelet.ended().await;
+    assert!(name == Name::Workspace && status.success(), "{name} ends with {status}");
+    kubelet.handle(name, status);
+    let of = |side, mark| {
+        let members = members().filter(move |member| member.side == side);
+        members.map(move |member| StatusFile::Of(member, mark))
     };
-    tokio::time::timeout(Duration::from_mins(2), asking).await.unwrap();
+    for file in of(Side::Simulator, Mark::Start(0)) {
+        until(|| kubelet.has(file)).await;
+    }
+    let simulators: Vec<Name> = members().filter(|m| m.side == Side::Simulator).map(Name::Of).collect();
+    simulators.iter().for_each(|name| kubelet.signal(*name, Signal::SIGSTOP));
+    for file in of(Side::Agent, Mark::Crash(0)) {
+        until(|| kubelet.has(file)).await;
+    }
+    simulators.iter().for_each(|name| kubelet.signal(*name, Signal::SIGCONT));
+    for _ in members() {
+        let (name, status) = kubelet.ended().await;
+        assert_eq!(status.code(), Some(1), "{name}: both sides count the crash");
+        kubelet.handle(name, status);
+    }
+}
+
+async fn until(what: impl Fn() -> bool) {
+    while !what() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+async fn until_reported(submission: &Submission, done: u32) {
+    while report(&submission.archive).await.is_none_or(|report| report.done < done) {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
 }
 

@@ -10,7 +10,7 @@ use leaderboard_operator::api::{ResultsFormat, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::places::Places;
 use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run};
 use leaderboard_operator::services::archive::Archive;
-use leaderboard_runner::protocol::{Member, Side};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Side};
 use tokio::process::Command;
 
 use crate::support::ministack::{self, server};
@@ -154,6 +154,8 @@ impl Submission {
             .arg("--resume=$(RESUME)")
             .arg(format!("--checkpoint={}", checkpoint.display()))
             .env("ROUTE_MS", self.route_ms.to_string())
+            // Real routes take minutes. These take as long as the runner needs to keep a copy, however busy the machine is.
+            .env("ROUTE_COPY", places.status().join(member.to_string()).join(KEPT_CHECKPOINT))
             .env_remove("AGENT_KNOBS");
         match self.run.plan.results {
             ResultsFormat::V1 => {

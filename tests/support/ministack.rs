@@ -213,9 +213,7 @@ impl Proxy {
     pub fn sent(&self) -> u64 {
         self.sent.load(Ordering::Relaxed)
     }
-}
 
-impl Proxy {
     /// Requests that clients have sent.
     pub fn requests(&self) -> u64 {
         self.requests.load(Ordering::Relaxed)

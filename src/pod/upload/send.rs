@@ -115,30 +115,16 @@ impl Uploader {
             let known = self.known.get(*key);
             !known.is_some_and(|known| Arc::ptr_eq(known, bytes)) || !self.memory.0.contains_key(*key)
         });
-        let changed: Vec<(String, Arc<[u8]>)> = changed.map(|(k, b)| (k.clone(), Arc::clone(b))).collect();
-        let work = changed.iter().map(|(key, bytes)| {
-            let (archive, memory) = (&self.archive, &self.memory);
-            async move {
-                let stored = Stored {
-                    stamp: Stamp {
-                        size: bytes.len() as u64,
-                        ..Stamp::default()
-                    },
-                    etag: None,
-                    fingerprint: hex(&Sha256::digest(bytes)),
-                    at: now,
-                };
-                let before = memory.0.get(key);
-                if before.is_some_and(|b| b.stamp.size == stored.stamp.size && b.fingerprint == stored.fingerprint) {
-                    return (key.clone(), Fate::Stored(Box::new(stored), false));
-                }
-                let fate = match archive.put(key, bytes.to_vec()).await {
-                    Ok(etag) => Fate::Stored(Box::new(Stored { etag, ..stored }), true),
-                    Err(error) => Fate::Failed(error),
-                };
-                (key.clone(), fate)
-            }
-        });
+        let jobs: Vec<Put> = changed
+            .map(|(key, bytes)| Put {
+                archive: self.archive.clone(),
+                key: key.clone(),
+                bytes: Arc::clone(bytes),
+                known: self.memory.0.get(key).cloned(),
+                now,
+            })
+            .collect();
+        let work = jobs.into_iter().map(Put::store);
         let fates: Vec<(String, Fate)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
         for (key, fate) in &fates {
             let bytes = objects.get(key).filter(|_| matches!(fate, Fate::Stored(..)));
@@ -254,6 +240,40 @@ impl Uploader {
         if let Err(error) = self.memory.save(&self.tree) {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
+    }
+}
+
+/// One object of memory on its way.
+struct Put {
+    archive: Archive,
+    key: String,
+    bytes: Arc<[u8]>,
+    known: Option<Stored>,
+    now: Duration,
+}
+
+impl Put {
+    async fn store(self) -> (String, Fate) {
+        let size = self.bytes.len() as u64;
+        let stored = Stored {
+            stamp: Stamp {
+                size,
+                ..Stamp::default()
+            },
+            etag: None,
+            fingerprint: hex(&Sha256::digest(&self.bytes)),
+            at: self.now,
+        };
+        let known = self.known.filter(|known| known.stamp.size == size);
+        if let Some(known) = known.filter(|known| known.fingerprint == stored.fingerprint) {
+            let etag = known.etag;
+            return (self.key, Fate::Stored(Box::new(Stored { etag, ..stored }), false));
+        }
+        let fate = match self.archive.put(&self.key, self.bytes.to_vec()).await {
+            Ok(etag) => Fate::Stored(Box::new(Stored { etag, ..stored }), true),
+            Err(error) => Fate::Failed(error),
+        };
+        (self.key, fate)
     }
 }
 
