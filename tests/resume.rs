@@ -11,10 +11,9 @@
     reason = "clippy knows a test by its attribute; what tests call is a test too"
 )]
 
-mod support {
-    #[allow(dead_code, reason = "each test program uses its own part of it")]
-    pub mod ministack;
-}
+#[allow(dead_code, reason = "each test program uses its own part of it")]
+#[path = "support/ministack.rs"]
+mod ministack;
 
 mod resume {
     mod kills;

@@ -186,12 +186,7 @@ pub fn texts(files: &Files) -> Vec<(&'static str, &str)> {
         ("evalai/results.json", files.results_json.as_str()),
         ("evalai/stdout.txt", files.stdout_txt.as_str()),
     ];
-    texts.extend(
-        files
-            .metadata_json
-            .as_deref()
-            .map(|text| (METADATA, text)),
-    );
+    texts.extend(files.metadata_json.as_deref().map(|text| (METADATA, text)));
     texts
 }
 
@@ -266,7 +261,9 @@ impl Gatherer {
             Ok(()) => self.complained = false,
             Err(error) if !self.complained => {
                 self.complained = true;
-                tracing::warn!("the merged results can't be written to the logs volume, S3 gets them all the same: {error}");
+                tracing::warn!(
+                    "the merged results can't be written to the logs volume, S3 gets them all the same: {error}"
+                );
             }
             Err(_) => {}
         }

@@ -263,14 +263,21 @@ mod seen_on_a_volume {
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
         let crashed = checkpoint(2, 2, 2)
             .replacen(r#""index":-1,"status":"Completed""#, "", 1)
-            .replacen(r#""status":"Completed""#, r#""status":"Failed - Simulation crashed""#, 1);
+            .replacen(
+                r#""status":"Completed""#,
+                r#""status":"Failed - Simulation crashed""#,
+                1,
+            );
         put_checkpoint(volume.folder.path(), 2, &crashed);
         let (gathered, seen) = volume.round();
         assert_eq!(gathered.merged.as_ref().unwrap().entry_status, "Crashed");
         assert!(!gathered.has_ended() && seen.whole && seen.complete.is_none());
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
-        assert_eq!((seen.complete, gathered.merged.unwrap().eligible), (Some(Duration::ZERO), true));
+        assert_eq!(
+            (seen.complete, gathered.merged.unwrap().eligible),
+            (Some(Duration::ZERO), true)
+        );
     }
 
     #[test]

@@ -15,7 +15,7 @@ use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFi
 use super::kubelet::{Kubelet, Name, all_done, members};
 use super::results::{Results, next_route, report, results};
 use super::submission::{PAIRS, ROUTES_OF_PAIR, Submission};
-use crate::support::ministack::server;
+use crate::ministack::server;
 
 /// Runs of an ordinary test run.
 const RUNS: u64 = 50;
@@ -165,9 +165,7 @@ impl Run<'_> {
         match kill.map(|kill| kill.moment) {
             None => future::pending().boxed(),
             Some(Moment::After(time)) => tokio::time::sleep(time).boxed(),
-            Some(Moment::AllDone(time)) => until_all_done(status)
-                .then(move |()| tokio::time::sleep(time))
-                .boxed(),
+            Some(Moment::AllDone(time)) => until_all_done(status).then(move |()| tokio::time::sleep(time)).boxed(),
             Some(Moment::Stored(routes)) => until_stored(archive, routes).boxed(),
         }
     }
@@ -254,7 +252,9 @@ impl Run<'_> {
             self.tally.repeated += u32::try_from(repeated).unwrap();
             if repeated > allowed {
                 let pair = pair + 1;
-                return Err(format!("pair {pair} has run {repeated} routes again, {allowed} at most: {begun:?}"));
+                return Err(format!(
+                    "pair {pair} has run {repeated} routes again, {allowed} at most: {begun:?}"
+                ));
             }
         }
         Ok(results(&self.submission.archive).await)
@@ -293,7 +293,10 @@ fn number(variable: &str) -> Option<u64> {
 async fn undisturbed(bucket: &str, format: ResultsFormat, random: &mut Rng) -> (Results, Duration) {
     let began = Instant::now();
     let (results, _) = one(bucket, format, random, &[], &mut Tally::default()).await;
-    (results.unwrap_or_else(|story| panic!("without a kill: {story}")), began.elapsed())
+    (
+        results.unwrap_or_else(|story| panic!("without a kill: {story}")),
+        began.elapsed(),
+    )
 }
 
 /// One run; its story where it goes wrong.
@@ -331,7 +334,10 @@ async fn whatever_is_killed_whenever_the_score_stays_and_no_route_is_lost() {
         expected.push(undisturbed(&bucket, format, &mut Rng::with_seed(first)).await);
     }
     assert_standard(&expected[0].0);
-    println!("kills: {runs} runs from LEADERBOARD_TEST_SEED={first}; undisturbed: {:?}", expected[0].1);
+    println!(
+        "kills: {runs} runs from LEADERBOARD_TEST_SEED={first}; undisturbed: {:?}",
+        expected[0].1
+    );
     let (mut tally, began) = (Tally::default(), Instant::now());
     for seed in first..first + runs {
         let mut random = Rng::with_seed(seed);
@@ -339,15 +345,22 @@ async fn whatever_is_killed_whenever_the_score_stays_and_no_route_is_lost() {
         let version = usize::from(random.u8(..4) == 0);
         let (undisturbed, usual) = &expected[version];
         let number = random.u32(1..=MOST_KILLS);
-        let kills: Vec<Kill> = (0..number).map(|_| Kill::random(&mut random, *usual / number)).collect();
+        let kills: Vec<Kill> = (0..number)
+            .map(|_| Kill::random(&mut random, *usual / number))
+            .collect();
         let (results, took) = one(&bucket, FORMATS[version], &mut random, &kills, &mut tally).await;
         if std::env::var_os("LEADERBOARD_KILL_STORY").is_some() {
             println!("kills: {seed} took {took:?}: {kills:?}");
         }
-        let again = format!("LEADERBOARD_TEST_SEED={seed} LEADERBOARD_KILL_RUNS=1 repeats it, as far as time does: {kills:?}");
+        let again =
+            format!("LEADERBOARD_TEST_SEED={seed} LEADERBOARD_KILL_RUNS=1 repeats it, as far as time does: {kills:?}");
         let results = results.unwrap_or_else(|story| panic!("{again}\n{story}"));
         for (key, text) in undisturbed {
-            assert!(&results[key] == text, "{again}\n{key} is\n{}\nnot\n{text}", results[key]);
+            assert!(
+                &results[key] == text,
+                "{again}\n{key} is\n{}\nnot\n{text}",
+                results[key]
+            );
         }
     }
     tally.print(runs, began.elapsed());
@@ -355,7 +368,8 @@ async fn whatever_is_killed_whenever_the_score_stays_and_no_route_is_lost() {
 
 /// The run without a kill has the score that a calculator gives.
 fn assert_standard(results: &Results) {
-    let expected: serde_json::Value = serde_json::from_str(include_str!("../../local/challenge/expected.json")).unwrap();
+    let expected: serde_json::Value =
+        serde_json::from_str(include_str!("../../local/challenge/expected.json")).unwrap();
     let found: serde_json::Value = serde_json::from_str(&results["evalai/results.json"]).unwrap();
     assert_eq!(found[0]["accuracies"], expected["metrics"]);
 }
@@ -363,7 +377,10 @@ fn assert_standard(results: &Results) {
 impl Tally {
     fn print(&self, runs: u64, took: Duration) {
         let kills: u32 = self.kills.values().sum();
-        println!("kills: {runs} runs in {took:?}, {kills} kills, {} more found nothing to kill", self.missed);
+        println!(
+            "kills: {runs} runs in {took:?}, {kills} kills, {} more found nothing to kill",
+            self.missed
+        );
         for (kind, count) in &self.kills {
             println!("kills:   {kind:?} {count}");
         }

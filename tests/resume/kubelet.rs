@@ -191,13 +191,20 @@ impl<'a> Kubelet<'a> {
     }
 
     fn note(&mut self, name: Name, life: u64, status: ExitStatus) -> bool {
-        let container = self.containers.get_mut(&name).filter(|container| container.life == life);
+        let container = self
+            .containers
+            .get_mut(&name)
+            .filter(|container| container.life == life);
         container.map(|container| container.ended = Some(status)).is_some()
     }
 
     /// Waits for the end of one container's present life, and leaves what else ends to [`Self::ended`].
     async fn end_of(&mut self, name: Name) {
-        while self.containers.get(&name).is_some_and(|container| container.ended.is_none()) {
+        while self
+            .containers
+            .get(&name)
+            .is_some_and(|container| container.ended.is_none())
+        {
             let (other, life, status) = self.ends.recv().await.unwrap();
             if self.note(other, life, status) && other != name {
                 self.backlog.push_back((other, status));
@@ -323,7 +330,9 @@ impl<'a> Kubelet<'a> {
 
     /// The tails of all logs, for a failure.
     pub fn story(&self) -> String {
-        let names = [Name::Workspace, Name::Logcopy].into_iter().chain(members().map(Name::Of));
+        let names = [Name::Workspace, Name::Logcopy]
+            .into_iter()
+            .chain(members().map(Name::Of));
         let tail = |name: Name| {
             let log = self.log(name);
             let from = log.lines().count().saturating_sub(40);
@@ -347,7 +356,9 @@ impl Drop for Kubelet<'_> {
 }
 
 fn begun(log: &str) -> Vec<String> {
-    let routes = log.lines().filter_map(|line| line.strip_prefix("route ")?.split_once(" begins"));
+    let routes = log
+        .lines()
+        .filter_map(|line| line.strip_prefix("route ")?.split_once(" begins"));
     routes.map(|(route, _)| route.to_owned()).collect()
 }
 

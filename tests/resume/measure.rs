@@ -15,7 +15,7 @@ use leaderboard_operator::api::ResultsFormat;
 
 use super::kubelet::Kubelet;
 use super::submission::{Submission, make_volumes};
-use crate::support::ministack::server;
+use crate::ministack::server;
 
 const LOG: u64 = 5 << 30;
 const GROWTH: u64 = 10 << 20;
@@ -77,9 +77,18 @@ async fn a_log_of_5_gb_is_stored_in_bounded_memory() {
     make_volumes(&root);
     let path = root.join("logs/agent/agent1/leaderboard.log");
     fs::create_dir_all(path.parent().unwrap()).unwrap();
-    let log = OpenOptions::new().write(true).create(true).truncate(true).open(&path).unwrap();
+    let log = OpenOptions::new()
+        .write(true)
+        .create(true)
+        .truncate(true)
+        .open(&path)
+        .unwrap();
     let began = Instant::now();
-    let mut logcopy = submission.own("logcopy", &root, "pod-1").kill_on_drop(true).spawn().unwrap();
+    let mut logcopy = submission
+        .own("logcopy", &root, "pod-1")
+        .kill_on_drop(true)
+        .spawn()
+        .unwrap();
     for (size, joins) in [(LOG, 1), (LOG + GROWTH, 2)] {
         let before = sink.bytes.load(Ordering::Relaxed);
         log.set_len(size).unwrap();

@@ -10,7 +10,7 @@ use nix::sys::signal::Signal;
 use super::kubelet::{Kubelet, Name, members};
 use super::results::{report, results};
 use super::submission::Submission;
-use crate::support::ministack::server;
+use crate::ministack::server;
 
 const LIMIT: Duration = Duration::from_mins(1);
 
@@ -36,7 +36,11 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
     tokio::time::sleep(Duration::from_secs(3)).await;
     let waiting = report(&submission.archive).await.unwrap();
     assert!(!waiting.is_final && !kubelet.has(StatusFile::Stored), "{waiting:?}");
-    assert!(std::fs::read_to_string(kubelet.path(agent)).unwrap().contains("Simulation crashed"));
+    assert!(
+        std::fs::read_to_string(kubelet.path(agent))
+            .unwrap()
+            .contains("Simulation crashed")
+    );
 
     for member in std::mem::take(&mut kubelet.held_back) {
         kubelet.start(Name::Of(member));
@@ -52,7 +56,10 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
     let in_time = tokio::time::timeout(LIMIT, to_the_end).await;
     assert!(in_time.is_ok(), "it does not end\n{}", kubelet.story());
     let last = report(&submission.archive).await.unwrap();
-    assert!(last.is_final && last.eligible && last.entry_status == "Finished", "{last:?}");
+    assert!(
+        last.is_final && last.eligible && last.entry_status == "Finished",
+        "{last:?}"
+    );
     for begun in kubelet.begun() {
         assert_eq!(begun.len(), 6, "one route again: {begun:?}");
     }
@@ -74,11 +81,15 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
         until(|| kubelet.has(file)).await;
     }
     let simulators: Vec<Name> = members().filter(|m| m.side == Side::Simulator).map(Name::Of).collect();
-    simulators.iter().for_each(|name| kubelet.signal(*name, Signal::SIGSTOP));
+    simulators
+        .iter()
+        .for_each(|name| kubelet.signal(*name, Signal::SIGSTOP));
     for file in of(Side::Agent, Mark::Crash(0)) {
         until(|| kubelet.has(file)).await;
     }
-    simulators.iter().for_each(|name| kubelet.signal(*name, Signal::SIGCONT));
+    simulators
+        .iter()
+        .for_each(|name| kubelet.signal(*name, Signal::SIGCONT));
     for _ in members() {
         let (name, status) = kubelet.ended().await;
         assert_eq!(status.code(), Some(1), "{name}: both sides count the crash");
@@ -93,8 +104,10 @@ async fn until(what: impl Fn() -> bool) {
 }
 
 async fn until_reported(submission: &Submission, done: u32) {
-    while report(&submission.archive).await.is_none_or(|report| report.done < done) {
+    while report(&submission.archive)
+        .await
+        .is_none_or(|report| report.done < done)
+    {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
 }
-

@@ -13,7 +13,7 @@ use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Side};
 use tokio::process::Command;
 
-use crate::support::ministack::{self, server};
+use crate::ministack::{self, server};
 
 pub const PAIRS: u16 = 4;
 pub const ROUTES_OF_PAIR: u16 = 5;
@@ -53,9 +53,10 @@ pub struct Submission {
     pub archive: Archive,
     pub run: Run,
     pub route_ms: u32,
+    /// Real routes take minutes. These take as long as the runner needs to keep a copy, however busy the machine is.
+    pub route_waits_for_copy: bool,
     /// Knobs of the simulators.
     pub simulator_knobs: String,
-    /// Seconds that storing may take at the end.
     ports: Vec<u16>,
 }
 
@@ -70,6 +71,7 @@ impl Submission {
             archive: Archive::new(s3, bucket, format!("runs/{id}/")),
             run: run(endpoint, bucket, &id, format),
             route_ms: 20,
+            route_waits_for_copy: true,
             simulator_knobs: String::new(),
             ports: free_ports(random),
         }
@@ -104,7 +106,10 @@ impl Submission {
             .args([member.side.name(), &format!("--pair={}", member.pair)])
             .arg(format!("--status={}", places.status().display()))
             .args(["--grace-seconds=5", "--ready-seconds=60", "--peer-seconds=60"])
-            .env("LEADERBOARD_TERMINATION_LOG", root.join(format!("{member}.termination")))
+            .env(
+                "LEADERBOARD_TERMINATION_LOG",
+                root.join(format!("{member}.termination")),
+            )
             .env_remove("RESUME")
             .env_remove("CHALLENGE_FORMAT");
         match member.side {
@@ -149,21 +154,29 @@ impl Submission {
             .arg(format!("--port={}", self.port(member)))
             .arg(format!("--agent={}", team_agent.display()))
             .args(["--agent-config=", "--track=SENSORS", "--record=/nowhere", "--debug=0"])
-            .arg(format!("--routes={}", contents("leaderboard/data/routes_testing.xml").display()))
+            .arg(format!(
+                "--routes={}",
+                contents("leaderboard/data/routes_testing.xml").display()
+            ))
             .args([format!("--routes-subset={slice}"), "--repetitions=1".to_owned()])
             .arg("--resume=$(RESUME)")
             .arg(format!("--checkpoint={}", checkpoint.display()))
             .env("ROUTE_MS", self.route_ms.to_string())
-            // Real routes take minutes. These take as long as the runner needs to keep a copy, however busy the machine is.
-            .env("ROUTE_COPY", places.status().join(member.to_string()).join(KEPT_CHECKPOINT))
             .env_remove("AGENT_KNOBS");
+        if self.route_waits_for_copy {
+            let copy = places.status().join(member.to_string()).join(KEPT_CHECKPOINT);
+            command.env("ROUTE_COPY", copy);
+        }
         match self.run.plan.results {
             ResultsFormat::V1 => {
                 let scenarios = contents("leaderboard/data/all_towns_traffic_scenarios_private.json");
                 command.arg(format!("--scenarios={}", scenarios.display()));
             }
             ResultsFormat::V2 => {
-                command.arg(format!("--debug-checkpoint={}", work.join("live_results.txt").display()));
+                command.arg(format!(
+                    "--debug-checkpoint={}",
+                    work.join("live_results.txt").display()
+                ));
             }
         }
     }

@@ -54,19 +54,32 @@ impl Keeper {
         }
     }
 
-    /// Before the command starts: what is whole is kept, and what is torn or gone is replaced by what was kept.
-    pub(crate) fn prepare(&mut self) {
+    /// Before the command starts: what is whole is kept, and what is torn or gone is replaced by what was kept. An error says why
+    /// that cannot be: the command would start at the first route.
+    pub(crate) fn prepare(&mut self) -> Result<(), String> {
         let torn = match checkpoint::read(&self.checkpoint) {
             Err(Unreadable::Missing) => "is gone",
             Err(Unreadable::Malformed { .. }) => "was left half written",
-            _ => return self.keep(),
+            _ => {
+                self.keep();
+                return Ok(());
+            }
         };
         let Ok(kept) = checkpoint::open(&self.kept).and_then(whole) else {
-            return;
+            return Ok(());
         };
+        // Half of a file is of no use, and on a full disk its room is.
+        let _ = fs::remove_file(&self.checkpoint);
         match replace(&self.checkpoint, kept) {
-            Ok(()) => crate::say(format_args!("the checkpoint {torn}; the last whole one is back in its place")),
-            Err(error) => crate::say(format_args!("the checkpoint {torn}, and cannot be replaced: {error}")),
+            Ok(()) => {
+                crate::say(format_args!(
+                    "the checkpoint {torn}; the last whole one is back in its place"
+                ));
+                Ok(())
+            }
+            Err(error) => Err(format!(
+                "the checkpoint {torn}, and the last whole one cannot be put back: {error}"
+            )),
         }
     }
 
@@ -214,7 +227,10 @@ mod tests {
     impl Folder {
         fn new() -> Self {
             let folder = tempfile::tempdir().unwrap();
-            let keeper = Keeper::new(folder.path().join("agent_results.json"), folder.path().join("checkpoint.json"));
+            let keeper = Keeper::new(
+                folder.path().join("agent_results.json"),
+                folder.path().join("checkpoint.json"),
+            );
             Self { folder, keeper }
         }
 
@@ -225,7 +241,7 @@ mod tests {
         /// The same container after its runner has died.
         fn restart(&mut self) -> String {
             self.keeper = Keeper::new(self.keeper.checkpoint.clone(), self.keeper.kept.clone());
-            self.keeper.prepare();
+            self.keeper.prepare().unwrap();
             fs::read_to_string(&self.keeper.checkpoint).unwrap_or_default()
         }
 
@@ -248,7 +264,10 @@ mod tests {
         folder.written(SECOND);
         for torn in ["", &SECOND[..20]] {
             folder.written(torn);
-            assert_eq!((folder.kept(), folder.restart()), (SECOND.to_owned(), SECOND.to_owned()));
+            assert_eq!(
+                (folder.kept(), folder.restart()),
+                (SECOND.to_owned(), SECOND.to_owned())
+            );
         }
         fs::remove_file(&folder.keeper.checkpoint).unwrap();
         assert_eq!(folder.restart(), SECOND);
@@ -257,11 +276,29 @@ mod tests {
     }
 
     #[test]
+    fn what_cannot_be_put_back_keeps_the_command_from_starting_over() {
+        let mut folder = Folder::new();
+        folder.written(FIRST);
+        fs::remove_file(&folder.keeper.checkpoint).unwrap();
+        // A folder in the way, as good as a full disk.
+        fs::create_dir(folder.folder.path().join(".agent_results.json.tmp")).unwrap();
+        let why = folder.keeper.prepare().unwrap_err();
+        assert!(
+            why.starts_with("the checkpoint is gone, and the last whole one cannot be put back: "),
+            "{why}"
+        );
+        assert_eq!(folder.kept(), FIRST);
+    }
+
+    #[test]
     fn a_whole_one_that_was_never_copied_stays_and_is_kept() {
         let mut folder = Folder::new();
         folder.written(FIRST);
         folder.write(SECOND);
-        assert_eq!((folder.restart(), folder.kept()), (SECOND.to_owned(), SECOND.to_owned()));
+        assert_eq!(
+            (folder.restart(), folder.kept()),
+            (SECOND.to_owned(), SECOND.to_owned())
+        );
     }
 
     #[test]
@@ -281,7 +318,10 @@ mod tests {
         folder.keeper.follow(true);
         assert_eq!(folder.kept(), "");
         fs::remove_file(&folder.keeper.checkpoint).unwrap();
-        File::create(&folder.keeper.checkpoint).unwrap().set_len(10 << 30).unwrap();
+        File::create(&folder.keeper.checkpoint)
+            .unwrap()
+            .set_len(10 << 30)
+            .unwrap();
         folder.keeper.follow(true);
         assert_eq!(folder.kept(), "");
         fs::remove_file(&folder.keeper.checkpoint).unwrap();
@@ -290,7 +330,10 @@ mod tests {
         symlink(&outside, &temporary).unwrap();
         symlink(&outside, &folder.keeper.kept).unwrap();
         folder.written(SECOND);
-        assert_eq!((folder.kept(), fs::read_to_string(&outside).unwrap()), (SECOND.to_owned(), FIRST.to_owned()));
+        assert_eq!(
+            (folder.kept(), fs::read_to_string(&outside).unwrap()),
+            (SECOND.to_owned(), FIRST.to_owned())
+        );
     }
 
     #[test]

@@ -28,6 +28,8 @@ const SLOW_POLL: Duration = Duration::from_secs(1);
 const PROBE_EVERY: Duration = Duration::from_millis(100);
 /// Shortest pause between two tries of the port. The pauses grow with the time the server takes.
 const FIRST_PROBE: Duration = Duration::from_millis(2);
+/// Exit code when the command could not go on where it was (EX_CANTCREAT).
+const CODE_NOT_RESUMED: i32 = 73;
 /// After SIGKILL, and for the last output: then the rest is given up.
 const LAST_WAIT: Duration = Duration::from_secs(10);
 
@@ -203,8 +205,9 @@ impl Runner {
         if self.me.side == Side::Agent {
             self.mark(Mark::Start(self.round))?;
         }
-        if let Some(keeper) = &mut self.keeper {
-            keeper.prepare();
+        if let Some(Err(why)) = self.keeper.as_mut().map(Keeper::prepare) {
+            self.detail = Some(why);
+            return Err(Cause::CannotStart(CODE_NOT_RESUMED));
         }
         self.since = Instant::now();
         match launch::launch(&self.job, self.round) {

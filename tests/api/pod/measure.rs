@@ -51,7 +51,10 @@ async fn what_storing_the_reference_costs() {
         let stored = pod.stored(&key).await.unwrap();
         size += stored.len();
         if key.starts_with("simulator/") {
-            assert!(stored == fs::read(pod.path(&key)).unwrap(), "{key} reads back otherwise");
+            assert!(
+                stored == fs::read(pod.path(&key)).unwrap(),
+                "{key} reads back otherwise"
+            );
         }
     }
     let sent = usize::try_from(proxy.sent() - sent).unwrap();
