@@ -13,12 +13,13 @@ use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, all_done, members};
+use super::process::say;
 use super::results::{Results, next_route, report, results};
 use super::submission::{PAIRS, ROUTES_OF_PAIR, Submission};
 use crate::ministack::server;
 
 /// Runs of an ordinary test run.
-const RUNS: u64 = 50;
+const RUNS: u64 = 40;
 const MOST_KILLS: u32 = 3;
 /// No run takes so long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(3);
@@ -334,10 +335,10 @@ async fn whatever_is_killed_whenever_the_score_stays_and_no_route_is_lost() {
         expected.push(undisturbed(&bucket, format, &mut Rng::with_seed(first)).await);
     }
     assert_standard(&expected[0].0);
-    println!(
+    say(&format!(
         "kills: {runs} runs from LEADERBOARD_TEST_SEED={first}; undisturbed: {:?}",
         expected[0].1
-    );
+    ));
     let (mut tally, began) = (Tally::default(), Instant::now());
     for seed in first..first + runs {
         let mut random = Rng::with_seed(seed);
@@ -350,7 +351,7 @@ async fn whatever_is_killed_whenever_the_score_stays_and_no_route_is_lost() {
             .collect();
         let (results, took) = one(&bucket, FORMATS[version], &mut random, &kills, &mut tally).await;
         if std::env::var_os("LEADERBOARD_KILL_STORY").is_some() {
-            println!("kills: {seed} took {took:?}: {kills:?}");
+            say(&format!("kills: {seed} took {took:?}: {kills:?}"));
         }
         let again =
             format!("LEADERBOARD_TEST_SEED={seed} LEADERBOARD_KILL_RUNS=1 repeats it, as far as time does: {kills:?}");
@@ -377,17 +378,17 @@ fn assert_standard(results: &Results) {
 impl Tally {
     fn print(&self, runs: u64, took: Duration) {
         let kills: u32 = self.kills.values().sum();
-        println!(
+        say(&format!(
             "kills: {runs} runs in {took:?}, {kills} kills, {} more found nothing to kill",
             self.missed
-        );
+        ));
         for (kind, count) in &self.kills {
-            println!("kills:   {kind:?} {count}");
+            say(&format!("kills:   {kind:?} {count}"));
         }
-        println!(
+        say(&format!(
             "kills:   {} of them between the last agent's .done and logcopy.done; {} routes run again; {} finished routes of \
              lost Pods were not stored yet",
             self.in_between, self.repeated, self.unstored
-        );
+        ));
     }
 }

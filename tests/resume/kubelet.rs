@@ -370,7 +370,7 @@ fn files_below(folder: &Path) -> String {
             text.push_str(&files_below(&path));
         } else {
             let size = entry.metadata().map_or(0, |metadata| metadata.len());
-            text.push_str(&format!("{} {size}\n", path.display()));
+            text = format!("{text}{} {size}\n", path.display());
         }
     }
     text

@@ -111,3 +111,31 @@ async fn until_reported(submission: &Submission, done: u32) {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
 }
+
+/// While S3 is away, SIGTERM ends logcopy when its time is over and not before, and it says what that means.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_last_flush_that_finds_no_s3_ends_in_time_and_says_so() {
+    let bucket = server().await.bucket().await;
+    let proxy = server().await.proxy().await;
+    let mut submission = Submission::on(&proxy.endpoint(), &bucket, ResultsFormat::V2, &mut Rng::new()).await;
+    submission.run.flush_seconds = 3;
+    let mut kubelet = Kubelet::new(&submission);
+    kubelet.make_pod();
+    let begun = async {
+        let (name, status) = kubelet.ended().await;
+        assert!(name == Name::Workspace && status.success(), "{name} ends with {status}");
+        kubelet.start(Name::Logcopy);
+        until_reported(&submission, 0).await;
+        proxy.set_away(true);
+        kubelet.end_logcopy().await
+    };
+    let status = tokio::time::timeout(LIMIT, begun).await.unwrap();
+    let said = kubelet.log(Name::Logcopy);
+    assert!(status.success(), "{said}");
+    assert!(said.contains("the last changes are not stored yet: "), "{said}");
+    let last = said.lines().last().unwrap();
+    assert!(
+        last.contains("the last changes are not stored: ") && last.contains(r#""seconds":3"#),
+        "{last}"
+    );
+}

@@ -57,6 +57,8 @@ pub struct Submission {
     pub route_waits_for_copy: bool,
     /// Knobs of the simulators.
     pub simulator_knobs: String,
+    /// Knobs of the agents.
+    pub agent_knobs: String,
     ports: Vec<u16>,
 }
 
@@ -73,6 +75,7 @@ impl Submission {
             route_ms: 20,
             route_waits_for_copy: true,
             simulator_knobs: String::new(),
+            agent_knobs: String::new(),
             ports: free_ports(random),
         }
     }
@@ -162,7 +165,7 @@ impl Submission {
             .arg("--resume=$(RESUME)")
             .arg(format!("--checkpoint={}", checkpoint.display()))
             .env("ROUTE_MS", self.route_ms.to_string())
-            .env_remove("AGENT_KNOBS");
+            .env("AGENT_KNOBS", &self.agent_knobs);
         if self.route_waits_for_copy {
             let copy = places.status().join(member.to_string()).join(KEPT_CHECKPOINT);
             command.env("ROUTE_COPY", copy);

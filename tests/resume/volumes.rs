@@ -10,9 +10,10 @@ use std::time::Duration;
 use fastrand::Rng;
 use leaderboard_operator::api::ResultsFormat;
 use leaderboard_operator::pod::run::Stop;
-use leaderboard_runner::protocol::StatusFile;
+use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, all_done, members};
+use super::process::say;
 use super::results::{next_route, report};
 use super::submission::Submission;
 use crate::ministack::server;
@@ -38,7 +39,9 @@ fn is_inside(name: &str) -> bool {
     };
     let probe = unshare().args(["mount", "-t", "tmpfs", "none", "/mnt"]).output();
     if !probe.is_ok_and(|probe| probe.status.success()) {
-        println!("{name}: left out, as this machine lets nobody mount anything here");
+        say(&format!(
+            "{name}: left out, as this machine lets nobody mount anything here"
+        ));
         return false;
     }
     let again = std::env::current_exe().unwrap();
@@ -90,17 +93,18 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
     }
     let bucket = server().await.bucket().await;
     let mut submission = Submission::new(&bucket, ResultsFormat::V2, &mut Rng::new()).await;
-    (submission.route_ms, submission.route_waits_for_copy) = (300, false);
+    submission.route_waits_for_copy = false;
+    // Nobody writes anything while the disk is filled.
+    submission.agent_knobs = "hang@3:once".to_owned();
     let mut kubelet = Kubelet::new(&submission);
     kubelet.make_pod_on(|root| {
         let logs = root.join("logs");
         mount(&["-t", "tmpfs", "-o", "size=2m", "none", logs.to_str().unwrap()]);
     });
-    // Everything works until each pair has a route behind it.
     let begun = async {
         while report(&submission.archive)
             .await
-            .is_none_or(|report| report.pairs.iter().any(|pair| pair.done == 0))
+            .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
         {
             let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
             if let Ok((name, status)) = ended {
@@ -112,9 +116,17 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
     assert!(in_time.is_ok(), "it does not begin\n{}", kubelet.story());
     let filler = kubelet.path("simulator/filler");
     fill(&filler);
+    let agents = || members().filter(|member| member.side == Side::Agent);
+    for agent in agents() {
+        assert!(kubelet.kill_command(agent), "{agent} hangs in its third route");
+    }
     run_to_the_end(&mut kubelet, |kubelet| {
         fill(&filler);
-        members().all(|member| kubelet.log(Name::Of(member)).contains("round 1:"))
+        agents().all(|agent| {
+            [Mark::Crash(1), Mark::Done]
+                .iter()
+                .any(|mark| kubelet.has(StatusFile::Of(agent, *mark)))
+        })
     })
     .await;
     assert!(kubelet.has(StatusFile::Stored));
@@ -165,11 +177,8 @@ async fn a_read_only_log_folder_costs_its_pair_and_nothing_else() {
         mount(&["-o", "remount,bind,ro", folder]);
     });
     let rest_done = |kubelet: &Kubelet<'_>| {
-        let done = members()
-            .filter(|member| member.side == leaderboard_runner::protocol::Side::Agent)
-            .skip(1);
-        let done = done.map(|agent| StatusFile::Of(agent, leaderboard_runner::protocol::Mark::Done));
-        done.into_iter().all(|file| kubelet.has(file))
+        let mut rest = members().filter(|member| member.side == Side::Agent).skip(1);
+        rest.all(|agent| kubelet.has(StatusFile::Of(agent, Mark::Done)))
     };
     run_to_the_end(&mut kubelet, rest_done).await;
     assert!(!all_done(&kubelet.places().status()));

@@ -58,13 +58,14 @@ async fn what_storing_the_reference_costs() {
         }
     }
     let sent = usize::try_from(proxy.sent() - sent).unwrap();
-    let hours = (ROUNDS - 1) as f64 * PERIOD as f64 / 3600.0;
+    let (seconds, hundredths) = ((ROUNDS as u64 - 1) * PERIOD, sent * 100 / size);
     println!(
-        "upload: {:.1} MB sent for {:.1} MB: {:.2}x; {:.0} requests an hour",
-        sent as f64 / 1e6,
-        size as f64 / 1e6,
-        sent as f64 / size as f64,
-        (proxy.requests() - requests) as f64 / hours
+        "upload: {} kB sent for {} kB: {}.{:02}x; {} requests an hour",
+        sent / 1000,
+        size / 1000,
+        hundredths / 100,
+        hundredths % 100,
+        (proxy.requests() - requests) * 3600 / seconds
     );
     assert!(sent < 2 * size, "{sent} bytes for {size}");
 }
