@@ -81,15 +81,15 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
         until(|| kubelet.has(file)).await;
     }
     let simulators: Vec<Name> = members().filter(|m| m.side == Side::Simulator).map(Name::Of).collect();
-    simulators
-        .iter()
-        .for_each(|name| kubelet.signal(*name, Signal::SIGSTOP));
+    for name in &simulators {
+        kubelet.signal(*name, Signal::SIGSTOP);
+    }
     for file in of(Side::Agent, Mark::Crash(0)) {
         until(|| kubelet.has(file)).await;
     }
-    simulators
-        .iter()
-        .for_each(|name| kubelet.signal(*name, Signal::SIGCONT));
+    for name in &simulators {
+        kubelet.signal(*name, Signal::SIGCONT);
+    }
     for _ in members() {
         let (name, status) = kubelet.ended().await;
         assert_eq!(status.code(), Some(1), "{name}: both sides count the crash");
