@@ -230,6 +230,10 @@ impl<'a> Kubelet<'a> {
         members().all(|member| ended(member).is_some_and(|status| status.success()))
     }
 
+    pub fn runs(&self, name: Name) -> bool {
+        self.pid(name).is_some()
+    }
+
     /// The pid of a container that runs.
     fn pid(&self, name: Name) -> Option<Pid> {
         let container = self.containers.get(&name)?;
