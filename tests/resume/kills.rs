@@ -346,19 +346,21 @@ async fn whatever_is_killed_whenever_the_score_stays_and_no_route_is_lost() {
         let mut random = Rng::with_seed(seed);
         // Every fourth run is one of Leaderboard 1.0.
         let version = usize::from(random.u8(..4) == 0);
-        let (undisturbed, usual) = &expected[version];
+        let (undisturbed, usual) = &mut expected[version];
         let number = random.u32(1..=MOST_KILLS);
         let kills: Vec<Kill> = (0..number)
             .map(|_| Kill::random(&mut random, *usual / number))
             .collect();
         let (results, took) = one(&bucket, FORMATS[version], &mut random, &kills, &mut tally).await;
+        // A machine that was busy at first would have most kills come too late.
+        *usual = took.min(*usual);
         if std::env::var_os("LEADERBOARD_KILL_STORY").is_some() {
             say(&format!("kills: {seed} took {took:?}: {kills:?}"));
         }
         let again =
             format!("LEADERBOARD_TEST_SEED={seed} LEADERBOARD_KILL_RUNS=1 repeats it, as far as time does: {kills:?}");
         let results = results.unwrap_or_else(|story| panic!("{again}\n{story}"));
-        for (key, text) in undisturbed {
+        for (key, text) in &*undisturbed {
             assert!(
                 &results[key] == text,
                 "{again}\n{key} is\n{}\nnot\n{text}",
