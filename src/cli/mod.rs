@@ -27,9 +27,9 @@ enum Command {
     /// Makes a Submission from each message of the Leaderboards' queues.
     Bridge(Server),
     /// Prepares the volumes of a submission's Pod (an init container).
-    Workspace,
+    Workspace(InPod),
     /// Merges, uploads and reports the results of a submission's Pod (a sidecar).
-    Logcopy,
+    Logcopy(InPod),
     /// Prints the custom resource definitions.
     Crd,
     /// Merges and renders checkpoint files without a cluster.
@@ -78,6 +78,17 @@ struct Controller {
     pod_uid: String,
 }
 
+/// How to run a Pod's program outside of a Pod. In one, all of it is as it is by default.
+#[derive(Args, Debug)]
+struct InPod {
+    /// Folder below which the Pod's mounts lie.
+    #[arg(long, default_value = "/", hide = true)]
+    root: std::path::PathBuf,
+    /// Divides the times it waits for what cannot be seen.
+    #[arg(long, default_value_t = 1, hide = true)]
+    faster: u32,
+}
+
 /// Runs what the command line asks for.
 pub fn run() -> ExitCode {
     let cli = Cli::parse();
@@ -86,7 +97,7 @@ pub fn run() -> ExitCode {
         Command::Results(results) => results.run(),
         Command::Controller(options) => serve::controller(options),
         Command::Bridge(options) => serve::bridge(options),
-        Command::Workspace => serve::workspace(),
-        Command::Logcopy => serve::logcopy(),
+        Command::Workspace(options) => serve::workspace(&options),
+        Command::Logcopy(options) => serve::logcopy(&options),
     }
 }

@@ -2,12 +2,11 @@
 //! stop signal, then enters a room.
 
 use std::future::Future;
-use std::path::Path;
 use std::process::ExitCode;
 
 use kube::{Client, Config};
 
-use super::{Controller, Server};
+use super::{Controller, InPod, Server};
 use crate::bridge::{self, Health};
 use crate::controller::context::Settings;
 use crate::controller::leader::{self, Identity};
@@ -17,8 +16,7 @@ use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
 use crate::observability::shutdown::on_signals;
 use crate::observability::{Observability, text};
-use crate::pod::places::Setting;
-use crate::pod::run::LOGS;
+use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
 
@@ -33,24 +31,29 @@ pub(super) fn bridge(options: Server) -> ExitCode {
     start(options.log_format, || serve_bridge(options))
 }
 
-pub(super) fn workspace() -> ExitCode {
+pub(super) fn workspace(options: &InPod) -> ExitCode {
     ownlog::start(None);
     start_quiet(|| async {
-        let setting = Setting::in_pod().map_err(|e| e.to_string())?;
+        let setting = setting(options)?;
         workspace_program::main(setting).await.map_err(|e| e.to_string())
     })
 }
 
-pub(super) fn logcopy() -> ExitCode {
+pub(super) fn logcopy(options: &InPod) -> ExitCode {
     // Its log is one of the results as well.
-    ownlog::start(Some(Path::new(LOGS)));
+    ownlog::start(Some(&Places::below(&options.root).logs));
     start_quiet(|| async {
-        let setting = Setting::in_pod().map_err(|e| e.to_string())?;
+        let setting = setting(options)?;
         let stop = on_signals().map_err(|e| e.to_string())?;
         Box::pin(logcopy_program::main(setting, async move { stop.wait().await }))
             .await
             .map_err(|e| e.to_string())
     })
+}
+
+fn setting(options: &InPod) -> Result<Setting, String> {
+    let pace = Pace::default().faster(options.faster);
+    Setting::read(Places::below(&options.root), pace).map_err(|e| e.to_string())
 }
 
 /// Logs, then works until the end; an error is said once and is the exit code.

@@ -1,14 +1,15 @@
 //! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
 //!
 //! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes the merged file and EvalAI's texts
-//! there; knows no S3. A checkpoint that is torn, gone or refused leaves the last good one in place.
+//! there; knows no S3. A checkpoint that is torn, gone or refused leaves the last good one in place. What is to be stored is
+//! handed out from memory, so that no torn file and no full disk comes between the results and S3.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use leaderboard_results::{Checkpoint, Files, Format, Merged, Plan, Refusal, Slice, Strictness};
-use leaderboard_runner::protocol::{Member, Pair, Progress, Side};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Progress, Side};
 use sha2::{Digest, Sha256};
 
 use super::report::{ReportPair, StoredFile};
@@ -21,6 +22,9 @@ use crate::api::{ResultsFormat, Verify, effective};
 const CHECKPOINT_LIMIT: u64 = 64 << 20;
 /// The merged file, below the volume's root.
 pub const MERGED: &str = "agent/agent_results.json";
+
+/// The same text under EvalAI's name.
+const METADATA: &str = "evalai/metadata.json";
 
 /// The plan of the results, from the plan of the run.
 pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
@@ -59,6 +63,11 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
 /// The checkpoint of a pair, below the volume's root.
 pub fn checkpoint_path(pair: usize) -> String {
     format!("agent/agent{pair}/agent_results.json")
+}
+
+/// Its last whole copy, which the agent's runner keeps.
+fn kept_path(pair: usize) -> String {
+    format!("{STATUS_FOLDER}/{}-{pair}/{KEPT_CHECKPOINT}", Side::Agent)
 }
 
 /// The pairs and the round their status files are in.
@@ -101,8 +110,24 @@ impl PairSeen {
 struct Worker {
     good: Option<Checkpoint>,
     seen: Option<Stamp>,
+    /// The runner's copy as it was looked at last.
+    kept: Option<Stamp>,
     refused: Option<String>,
 }
+
+/// What a look at a checkpoint gave.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Look {
+    /// Another good one.
+    New,
+    /// Nothing that was not known.
+    Same,
+    /// None, or half of one.
+    Unusable,
+}
+
+/// Results by their keys below the run's prefix.
+pub type Objects = BTreeMap<String, Arc<[u8]>>;
 
 /// What one round found.
 #[derive(Clone, Debug)]
@@ -111,6 +136,8 @@ pub struct Gathered {
     pub merged: Option<Arc<Merged>>,
     /// EvalAI's texts, of the same merge.
     pub files: Arc<Files>,
+    /// The last good checkpoints, the merged file and EvalAI's texts, as they are to be stored.
+    pub objects: Objects,
     /// Each pair from its status files.
     pub seen: Vec<PairSeen>,
     /// Each pair for the report.
@@ -133,6 +160,13 @@ impl Gathered {
         self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_final)
     }
 
+    /// Whether every evaluator has come to its regular end. One whose simulator crashed in its last route has a record of each
+    /// and has not: it will repeat that route, as long as it is restarted.
+    pub fn has_ended(&self) -> bool {
+        let merged = self.merged.as_ref();
+        merged.is_some_and(|merged| merged.pairs.iter().all(|pair| pair.ended))
+    }
+
     /// Digests of EvalAI's texts, by key.
     pub fn digests(&self) -> BTreeMap<String, StoredFile> {
         let of = |(key, text): (&'static str, &str)| {
@@ -152,13 +186,17 @@ pub fn texts(files: &Files) -> Vec<(&'static str, &str)> {
         ("evalai/results.json", files.results_json.as_str()),
         ("evalai/stdout.txt", files.stdout_txt.as_str()),
     ];
-    texts.extend(
-        files
-            .metadata_json
-            .as_deref()
-            .map(|text| ("evalai/metadata.json", text)),
-    );
+    texts.extend(files.metadata_json.as_deref().map(|text| (METADATA, text)));
     texts
+}
+
+fn take_texts(objects: &mut Objects, files: &Files) {
+    for (key, text) in texts(files) {
+        objects.insert(key.to_owned(), text.as_bytes().into());
+    }
+    if let Some(metadata) = objects.get(METADATA).cloned() {
+        objects.insert(MERGED.to_owned(), metadata);
+    }
 }
 
 /// Reads the volume round by round.
@@ -170,14 +208,19 @@ pub struct Gatherer {
     workers: Vec<Worker>,
     merged: Option<Arc<Merged>>,
     files: Arc<Files>,
+    objects: Objects,
     unmerged: Option<String>,
     written: BTreeMap<&'static str, Arc<Files>>,
+    /// That something can't be written was said.
+    complained: bool,
 }
 
 impl Gatherer {
     /// For a plan that holds.
     pub fn new(plan: Plan, tree: Arc<Tree>) -> Result<Self, Refusal> {
         let files = Arc::new(leaderboard_results::render(&plan, None)?);
+        let mut objects = Objects::new();
+        take_texts(&mut objects, &files);
         Ok(Self {
             status: tree.path().join(STATUS_FOLDER),
             workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
@@ -185,8 +228,10 @@ impl Gatherer {
             tree,
             merged: None,
             files,
+            objects,
             unmerged: None,
             written: BTreeMap::new(),
+            complained: false,
         })
     }
 
@@ -196,64 +241,104 @@ impl Gatherer {
     }
 
     /// Looks at everything once and writes what follows from it. Blocks: not for an asynchronous thread.
-    pub fn round(&mut self) -> Result<Gathered, TreeError> {
+    pub fn round(&mut self) -> Gathered {
         // The agents' word is read before their results: who is done has written everything.
         let seen: Vec<PairSeen> = (1..=self.workers.len())
             .map(|number| PairSeen::read(&self.status, number))
             .collect();
         let mut changed = false;
         for index in 0..self.workers.len() {
-            changed |= self.read(index);
+            changed |= match self.read(index) {
+                Look::New => true,
+                Look::Same => false,
+                Look::Unusable => self.read_kept(index),
+            };
         }
         if changed {
             self.merge();
         }
-        self.write()?;
+        match self.write() {
+            Ok(()) => self.complained = false,
+            Err(error) if !self.complained => {
+                self.complained = true;
+                tracing::warn!(
+                    "the merged results can't be written to the logs volume, S3 gets them all the same: {error}"
+                );
+            }
+            Err(_) => {}
+        }
         let pairs = self.pairs(&seen);
-        Ok(Gathered {
+        Gathered {
             merged: self.merged.clone(),
             files: Arc::clone(&self.files),
+            objects: self.objects.clone(),
             pairs,
             seen,
             refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
             unmerged: self.unmerged.clone(),
-        })
+        }
     }
 
-    /// Reads one worker's checkpoint, if it is not the one of the last round. Returns whether there is something new.
-    fn read(&mut self, index: usize) -> bool {
+    /// Reads one worker's checkpoint, if it is not the one of the last round.
+    fn read(&mut self, index: usize) -> Look {
         let path = checkpoint_path(index + 1);
         let worker = &mut self.workers[index];
         let (file, stamp) = match self.tree.file(&path) {
             Ok(Some(found)) => found,
-            Ok(None) => return false,
+            Ok(None) => return Look::Unusable,
             Err(error) => return worker.refuse(index, &error),
         };
         if worker.seen == Some(stamp) {
-            return false;
+            return Look::Same;
         }
         drop(file);
         let (bytes, stamp) = match self.tree.read(&path, CHECKPOINT_LIMIT) {
             Ok(Some(read)) => read,
             // The next round finds it whole.
-            Ok(None) | Err(TreeError::Changed) => return false,
+            Ok(None) | Err(TreeError::Changed) => return Look::Unusable,
             Err(error) => return worker.refuse(index, &error),
         };
         match leaderboard_results::read_worker(&self.plan, index, &bytes) {
-            Ok(None) => false,
+            Ok(None) => Look::Unusable,
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
                 worker.good = Some(checkpoint);
+                self.objects.insert(path, bytes.into());
                 if let Some(why) = worker.refused.take() {
                     tracing::info!(pair = index + 1, "the checkpoint is good again; before: {why}");
                 }
-                true
+                Look::New
             }
             Err(refusal) => {
                 worker.seen = Some(stamp);
                 worker.refuse_with(words(&refusal))
             }
         }
+    }
+
+    /// Reads what the agent's runner has kept, when the file itself is being written: that is further than what this logcopy has
+    /// seen, if it looks seldom, or has begun just now.
+    fn read_kept(&mut self, index: usize) -> bool {
+        let path = kept_path(index + 1);
+        let worker = &mut self.workers[index];
+        match self.tree.file(&path) {
+            Ok(Some((_, stamp))) if worker.kept != Some(stamp) => {}
+            _ => return false,
+        }
+        let Ok(Some((bytes, stamp))) = self.tree.read(&path, CHECKPOINT_LIMIT) else {
+            return false;
+        };
+        worker.kept = Some(stamp);
+        let Ok(Some(kept)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
+            return false;
+        };
+        let reached = |checkpoint: &Checkpoint| (checkpoint.done(), checkpoint.ended());
+        if worker.good.as_ref().is_some_and(|good| reached(good) >= reached(&kept)) {
+            return false;
+        }
+        worker.good = Some(kept);
+        self.objects.insert(checkpoint_path(index + 1), bytes.into());
+        true
     }
 
     fn merge(&mut self) {
@@ -267,6 +352,7 @@ impl Gatherer {
         });
         match merged {
             Ok((merged, files)) => {
+                take_texts(&mut self.objects, &files);
                 self.merged = Some(Arc::new(merged));
                 self.files = Arc::new(files);
                 self.unmerged = None;
@@ -328,7 +414,7 @@ impl Gatherer {
 }
 
 impl Worker {
-    fn refuse(&mut self, index: usize, error: &TreeError) -> bool {
+    fn refuse(&mut self, index: usize, error: &TreeError) -> Look {
         let words = format!(
             "pair {}: the checkpoint can't be read: {error}. Leave it to the evaluator.",
             index + 1
@@ -336,12 +422,12 @@ impl Worker {
         self.refuse_with(words)
     }
 
-    fn refuse_with(&mut self, words: String) -> bool {
+    fn refuse_with(&mut self, words: String) -> Look {
         if self.refused.as_ref() != Some(&words) {
             tracing::warn!("a checkpoint is refused, the last good one stays: {words}");
         }
         self.refused = Some(words);
-        false
+        Look::Same
     }
 }
 

@@ -44,7 +44,9 @@ pub enum Step {
 /// What one round saw, with the times since when.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Situation {
-    /// The results are complete for this long.
+    /// No route is missing.
+    pub whole: bool,
+    /// No route is missing and every evaluator has come to its regular end, for this long.
     pub complete: Option<Duration>,
     /// All agents say that they are done.
     pub all_done: bool,
@@ -62,7 +64,8 @@ pub struct Situation {
 
 /// What to do next.
 pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
-    let settled = seen.complete.is_some_and(|since| seen.all_done || since >= pace.settle);
+    // Who has a record of each route without a regular end will repeat the last one, if only its container comes back.
+    let settled = (seen.whole && seen.all_done) || seen.complete.is_some_and(|since| since >= pace.settle);
     if let (true, None) = (settled, seen.stop) {
         return Step::Finish(Ending::Complete);
     }
@@ -115,7 +118,8 @@ impl Judge {
     /// Takes in one round.
     pub fn see(&mut self, gathered: &Gathered, outside: Outside) -> Situation {
         let now = outside.now;
-        self.complete = gathered.is_complete().then(|| self.complete.unwrap_or(now));
+        let whole = gathered.is_complete();
+        self.complete = (whole && gathered.has_ended()).then(|| self.complete.unwrap_or(now));
         self.spoiled = spoiled(gathered).map(|why| {
             let since = self.spoiled.as_ref().map_or(now, |(_, since)| *since);
             (why, since)
@@ -127,6 +131,7 @@ impl Judge {
         }
         let since = |then: Duration| now.saturating_sub(then);
         Situation {
+            whole,
             complete: self.complete.map(since),
             all_done: gathered.seen.iter().all(|pair| pair.agent.done),
             any_started: gathered

@@ -24,12 +24,30 @@ fn complete_results_end_a_run_as_soon_as_the_agents_are_done_or_after_a_while() 
     ];
     for (complete, all_done, expected) in table {
         let seen = Situation {
+            whole: complete.is_some(),
             complete,
             all_done,
             ..running()
         };
         assert_eq!(decide(&seen, &Pace::default(), CANCEL), expected, "{seen:?}");
     }
+}
+
+#[test]
+fn a_route_that_will_be_repeated_is_waited_for() {
+    let crashed_in_the_last_route = Situation {
+        whole: true,
+        ..running()
+    };
+    assert_eq!(decide(&crashed_in_the_last_route, &Pace::default(), CANCEL), Step::GoOn);
+    let retries_used_up = Situation {
+        stop: Some(Stop::Retries),
+        cancelled: Some(secs(5)),
+        quiet: secs(5),
+        ..crashed_in_the_last_route
+    };
+    let end = Step::Finish(Ending::Stopped(Stop::Retries));
+    assert_eq!(decide(&retries_used_up, &Pace::default(), CANCEL), end);
 }
 
 #[test]
@@ -133,7 +151,7 @@ mod seen_on_a_volume {
 
         fn round(&mut self) -> (Gathered, Situation) {
             self.now += 10;
-            let gathered = self.gatherer.round().unwrap();
+            let gathered = self.gatherer.round();
             let outside = Outside {
                 stop: None,
                 cancelled: false,
@@ -197,6 +215,80 @@ mod seen_on_a_volume {
         }
         fs::remove_file(volume.folder.path().join("agent/agent1/agent_results.json")).unwrap();
         assert_eq!(volume.round().0.pairs[0].done, 1);
+    }
+
+    #[test]
+    fn what_is_stored_is_the_last_good_one_and_no_torn_file() {
+        let mut volume = Volume::new();
+        let good = checkpoint(0, 1, 2);
+        put_checkpoint(volume.folder.path(), 1, &good);
+        volume.round();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2)[..100]);
+        let (gathered, _) = volume.round();
+        assert_eq!(&*gathered.objects["agent/agent1/agent_results.json"], good.as_bytes());
+        let stored: Vec<&str> = gathered.objects.keys().map(String::as_str).collect();
+        let expected = [
+            "agent/agent1/agent_results.json",
+            "agent/agent_results.json",
+            "evalai/metadata.json",
+            "evalai/results.json",
+            "evalai/stdout.txt",
+        ];
+        assert_eq!(stored, expected);
+    }
+
+    #[test]
+    fn a_logcopy_that_begins_while_a_checkpoint_is_written_takes_what_the_runner_kept() {
+        let mut volume = Volume::new();
+        let kept = volume.folder.path().join("containers-status/agent-1");
+        fs::create_dir_all(&kept).unwrap();
+        fs::write(kept.join("checkpoint.json"), checkpoint(0, 1, 2)).unwrap();
+        put_checkpoint(volume.folder.path(), 1, "{\"_checkpoint\"");
+        let (gathered, _) = volume.round();
+        assert_eq!(gathered.pairs[0].done, 1);
+        assert!(gathered.objects.contains_key("agent/agent1/agent_results.json"));
+        // The copy is never a step back.
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        assert_eq!(volume.round().0.pairs[0].done, 2);
+        put_checkpoint(volume.folder.path(), 1, "");
+        fs::write(kept.join("checkpoint.json"), checkpoint(0, 1, 2) + " ").unwrap();
+        assert_eq!(volume.round().0.pairs[0].done, 2);
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        assert_eq!(volume.round().0.pairs[0].done, 2);
+    }
+
+    #[test]
+    fn a_crash_in_the_last_route_is_whole_and_not_complete() {
+        let mut volume = Volume::new();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        let crashed = checkpoint(2, 2, 2)
+            .replacen(r#""index":-1,"status":"Completed""#, "", 1)
+            .replacen(
+                r#""status":"Completed""#,
+                r#""status":"Failed - Simulation crashed""#,
+                1,
+            );
+        put_checkpoint(volume.folder.path(), 2, &crashed);
+        let (gathered, seen) = volume.round();
+        assert_eq!(gathered.merged.as_ref().unwrap().entry_status, "Crashed");
+        assert!(!gathered.has_ended() && seen.whole && seen.complete.is_none());
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
+        let (gathered, seen) = volume.round();
+        assert_eq!(
+            (seen.complete, gathered.merged.unwrap().eligible),
+            (Some(Duration::ZERO), true)
+        );
+    }
+
+    #[test]
+    fn a_volume_that_takes_nothing_keeps_no_result_back() {
+        let mut volume = Volume::new();
+        // A file where a folder is needed, as good as a full disk for who writes.
+        fs::write(volume.folder.path().join("evalai"), "").unwrap();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        let (gathered, _) = volume.round();
+        assert_eq!(gathered.pairs[0].done, 2);
+        assert!(gathered.objects["evalai/stdout.txt"].starts_with(b"Here is a summary"));
     }
 
     #[test]

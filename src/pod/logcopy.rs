@@ -179,15 +179,33 @@ async fn keep_going(mut rounds: Rounds, shutdown: impl Future<Output = ()>) -> R
         }
     }
     tracing::info!("asked to end; storing what is left");
-    let began = Instant::now();
     let longest = LAST_FLUSH.min(rounds.flush());
-    match tokio::time::timeout(longest, rounds.round(Why::Shutdown)).await {
-        Ok(Ok(_)) => tracing::info!(milliseconds = began.elapsed().as_millis(), "stored"),
-        Ok(Err(error)) => tracing::error!("the last changes are not stored: {error}"),
-        Err(_) => tracing::error!(
+    last_flush(&mut rounds, longest).await;
+    Ok(())
+}
+
+/// Stores what is left, again and again while that fails: S3 may be back before the Pod's grace is over.
+async fn last_flush(rounds: &mut Rounds, longest: Duration) {
+    let began = Instant::now();
+    let mut last = None;
+    let flush = async {
+        let mut failures: u32 = 0;
+        while let Err(error) = rounds.round(Why::Shutdown).await {
+            failures = failures.saturating_add(1);
+            if failures.is_power_of_two() {
+                tracing::warn!(failures, "the last changes are not stored yet: {error}");
+            }
+            last = Some(error);
+            tokio::time::sleep(rounds.after_failures(failures)).await;
+        }
+    };
+    let in_time = tokio::time::timeout(longest, flush).await.is_ok();
+    match last {
+        _ if in_time => tracing::info!(milliseconds = began.elapsed().as_millis(), "stored"),
+        Some(error) => tracing::error!(seconds = longest.as_secs(), "the last changes are not stored: {error}"),
+        None => tracing::error!(
             "the last changes are not stored: it took more than {} s",
             longest.as_secs()
         ),
     }
-    Ok(())
 }

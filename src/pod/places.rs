@@ -2,7 +2,7 @@
 //!
 //! Made by the programs' entry points from [`super::run`]'s constants, and by tests from temporary folders.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::run::{
@@ -28,15 +28,16 @@ pub struct Places {
 }
 
 impl Places {
-    /// The mounts of a Pod.
-    pub fn in_pod() -> Self {
+    /// The mounts of a Pod below a folder: `/` in a container.
+    pub fn below(root: &Path) -> Self {
+        let at = |path: &str| root.join(path.trim_start_matches('/'));
         Self {
-            logs: LOGS.into(),
-            tools: TOOLS.into(),
-            runner: RUNNER_IN_IMAGE.into(),
-            podinfo: PODINFO.into(),
-            token: PathBuf::from(IDENTITY).join(IDENTITY_TOKEN_FILE),
-            termination_log: "/dev/termination-log".into(),
+            logs: at(LOGS),
+            tools: at(TOOLS),
+            runner: at(RUNNER_IN_IMAGE),
+            podinfo: at(PODINFO),
+            token: at(IDENTITY).join(IDENTITY_TOKEN_FILE),
+            termination_log: at("/dev/termination-log"),
         }
     }
 
@@ -83,6 +84,21 @@ impl Default for Pace {
     }
 }
 
+impl Pace {
+    /// All times divided: for runs that take seconds.
+    #[must_use]
+    pub fn faster(self, times: u32) -> Self {
+        let times = times.max(1);
+        Self {
+            settle: self.settle / times,
+            quiet: self.quiet / times,
+            grace: self.grace / times,
+            least: self.least / times,
+            backoff: self.backoff / times,
+        }
+    }
+}
+
 /// All that a program in the Pod is given.
 #[derive(Clone, Debug)]
 pub struct Setting {
@@ -111,14 +127,14 @@ pub enum SettingError {
 
 impl Setting {
     /// Reads the environment of a Pod.
-    pub fn in_pod() -> Result<Self, SettingError> {
+    pub fn read(places: Places, pace: Pace) -> Result<Self, SettingError> {
         let variable = |name| std::env::var(name).map_err(|_| SettingError::Missing(name));
         Ok(Self {
             run: serde_json::from_str(&variable(ENV_RUN)?)?,
             pod_uid: variable(ENV_POD_UID)?,
             role_arn: std::env::var(ENV_ROLE_ARN).ok().filter(|arn| !arn.is_empty()),
-            places: Places::in_pod(),
-            pace: Pace::default(),
+            places,
+            pace,
         })
     }
 }

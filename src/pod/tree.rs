@@ -104,11 +104,15 @@ impl Tree {
 
     /// Opens a regular file for reading; `None` if there is none.
     pub fn file(&self, relative: &str) -> Result<Option<(File, Stamp)>, TreeError> {
-        let file = match self.at(relative, OFlag::O_RDONLY | OFlag::O_NONBLOCK) {
+        let opened = self
+            .look(relative)
+            .and_then(|()| self.at(relative, OFlag::O_RDONLY | OFlag::O_NONBLOCK));
+        let file = match opened {
             Ok(fd) => File::from(fd),
             Err(TreeError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(error),
         };
+        // Looked at again, because it may have been swapped.
         let metadata = file.metadata()?;
         if !metadata.is_file() {
             return Err(TreeError::NotRegular);
@@ -230,6 +234,26 @@ impl Tree {
         let folder = self.folder(folder)?;
         nix::fcntl::renameat(&folder, temporary.as_str(), &folder, name)?;
         Ok(())
+    }
+
+    /// Looks at a file before it is opened: opening a device can act, and a pipe lets its writer go on.
+    fn look(&self, relative: &str) -> Result<(), TreeError> {
+        if !is_plain(relative) {
+            return Err(TreeError::Path);
+        }
+        let inner;
+        let (folder, name) = match relative.rsplit_once('/') {
+            None => (&self.root, relative),
+            Some((folder, name)) => {
+                inner = self.at(folder, OFlag::O_RDONLY | OFlag::O_DIRECTORY)?;
+                (&inner, name)
+            }
+        };
+        let stat = fstatat(folder, name, AtFlags::AT_SYMLINK_NOFOLLOW)?;
+        match SFlag::from_bits_truncate(stat.st_mode & SFlag::S_IFMT.bits()) {
+            SFlag::S_IFREG => Ok(()),
+            _ => Err(TreeError::NotRegular),
+        }
     }
 
     fn at(&self, relative: &str, flags: OFlag) -> Result<OwnedFd, TreeError> {

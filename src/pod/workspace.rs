@@ -1,5 +1,5 @@
-//! The init container that prepares a Pod: the runner for all containers, the folders, what earlier Pods stored, and at last
-//! the fence that makes this Pod the one whose writes count.
+//! The init container that prepares a Pod: the runner for all containers, the folders, the fence that makes this Pod the one
+//! whose writes count, and what earlier Pods stored.
 //!
 //! Called by `leaderboard-operator workspace`. Knows S3 and the volumes. Everything it does may be done again: the kubelet
 //! restarts it when it fails.
@@ -169,14 +169,19 @@ pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), Workspa
 /// Takes the prefix for this Pod.
 async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
     let run = &setting.run;
+    let owner = setting.pod_uid.clone().into_bytes();
     match claim(run, archive).await? {
         Claim::Fresh => {
             // Says whose prefix it is before anything else is in it, so that a Pod that is lost early can be replaced.
             let report = first_report(run, &setting.pod_uid)?;
             let bytes = serde_json::to_vec(&report).unwrap_or_default();
             archive.put(REPORT_KEY, bytes).await?;
+            archive.put(OWNER_KEY, owner).await?;
         }
         Claim::TakeUp => {
+            // The fence first: what a Pod before this one still stores, it stores before its next look at the fence, and what is
+            // restored is then the last of it.
+            archive.put(OWNER_KEY, owner).await?;
             let restored = restore::restore(run, archive, tree).await?;
             tracing::info!(
                 files = restored.files,
@@ -185,7 +190,6 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
             );
         }
     }
-    archive.put(OWNER_KEY, setting.pod_uid.clone().into_bytes()).await?;
     let noted = tree.write(PREPARED, setting.pod_uid.as_bytes());
     noted.map_err(|error| WorkspaceError::Volume {
         path: PREPARED.to_owned(),

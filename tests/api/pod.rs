@@ -3,6 +3,8 @@
 
 mod archives;
 mod cloudwatch;
+mod hostile;
+mod measure;
 mod preparing;
 mod role;
 mod sidecar;

@@ -162,6 +162,8 @@ pub struct Proxy {
     address: SocketAddr,
     away: watch::Sender<bool>,
     sent: Arc<AtomicU64>,
+    requests: Arc<AtomicU64>,
+    refused: Arc<AtomicU64>,
     task: tokio::task::JoinHandle<()>,
 }
 
@@ -171,14 +173,18 @@ impl Proxy {
         let address = listener.local_addr().unwrap();
         let (away, is_away) = watch::channel(false);
         let sent = Arc::new(AtomicU64::new(0));
-        let counter = Arc::clone(&sent);
+        let requests = Arc::new(AtomicU64::new(0));
+        let counters = (Arc::clone(&sent), Arc::clone(&requests));
+        let refused = Arc::new(AtomicU64::new(0));
+        let refusals = Arc::clone(&refused);
         let task = tokio::spawn(async move {
             while let Ok((client, _)) = listener.accept().await {
-                let (mut away, counter) = (is_away.clone(), Arc::clone(&counter));
+                let (mut away, counters) = (is_away.clone(), counters.clone());
+                refusals.fetch_add(u64::from(*away.borrow()), Ordering::Relaxed);
                 tokio::spawn(async move {
                     tokio::select! {
                         _ = away.wait_for(|away| *away) => {}
-                        () = forward(client, to, &counter) => {}
+                        () = forward(client, to, &counters) => {}
                     }
                 });
             }
@@ -187,6 +193,8 @@ impl Proxy {
             address,
             away,
             sent,
+            requests,
+            refused,
             task,
         }
     }
@@ -205,6 +213,16 @@ impl Proxy {
     pub fn sent(&self) -> u64 {
         self.sent.load(Ordering::Relaxed)
     }
+
+    /// Requests that clients have sent.
+    pub fn requests(&self) -> u64 {
+        self.requests.load(Ordering::Relaxed)
+    }
+
+    /// Connections that were closed at once, since it was away.
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
 }
 
 impl Drop for Proxy {
@@ -213,7 +231,10 @@ impl Drop for Proxy {
     }
 }
 
-async fn forward(mut client: TcpStream, to: SocketAddr, counter: &AtomicU64) {
+/// Ends the first line of each request, and nothing that the tests store.
+const REQUEST: &[u8] = b" HTTP/1.1\r\n";
+
+async fn forward(mut client: TcpStream, to: SocketAddr, (bytes, requests): &(Arc<AtomicU64>, Arc<AtomicU64>)) {
     let Ok(mut server) = TcpStream::connect(to).await else {
         return;
     };
@@ -221,11 +242,17 @@ async fn forward(mut client: TcpStream, to: SocketAddr, counter: &AtomicU64) {
     let (mut from_server, mut to_server) = server.split();
     let requests = async {
         let mut buffer = vec![0; 64 << 10];
+        let mut seen: Vec<u8> = Vec::new();
         loop {
             match from_client.read(&mut buffer).await {
                 Ok(0) | Err(_) => break,
                 Ok(len) => {
-                    counter.fetch_add(len as u64, Ordering::Relaxed);
+                    bytes.fetch_add(len as u64, Ordering::Relaxed);
+                    seen.extend(&buffer[..len]);
+                    let lines = seen.windows(REQUEST.len()).filter(|window| *window == REQUEST);
+                    requests.fetch_add(lines.count() as u64, Ordering::Relaxed);
+                    // The beginning of a line's end that the next read may complete.
+                    seen.drain(..seen.len().saturating_sub(REQUEST.len() - 1));
                     if to_server.write_all(&buffer[..len]).await.is_err() {
                         break;
                     }

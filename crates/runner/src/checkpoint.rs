@@ -43,7 +43,11 @@ pub(crate) enum Unreadable {
 
 /// Reads the checkpoint at `path`.
 pub(crate) fn read(path: &Path) -> Result<Checkpoint, Unreadable> {
-    let file = open(path)?;
+    parse(open(path)?)
+}
+
+/// Reads the checkpoint in an open file.
+pub(crate) fn parse(file: File) -> Result<Checkpoint, Unreadable> {
     if file.metadata().map_err(Unreadable::Io)?.len() > MAX_BYTES {
         return Err(Unreadable::TooLarge);
     }
@@ -71,7 +75,8 @@ pub(crate) fn make_readable(path: &Path) {
     }
 }
 
-fn open(path: &Path) -> Result<File, Unreadable> {
+/// Opens a regular file for reading, following nothing.
+pub(crate) fn open(path: &Path) -> Result<File, Unreadable> {
     let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
     // Looked at first, because opening a device can act; looked at again below, because it may have been swapped.
     match fs::symlink_metadata(path) {

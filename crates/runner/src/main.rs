@@ -5,6 +5,7 @@
 mod checkpoint;
 mod decide;
 mod group;
+mod keep;
 mod launch;
 mod memory;
 mod report;

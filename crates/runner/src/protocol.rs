@@ -16,6 +16,10 @@ use thiserror::Error;
 /// The sub-folder that only `logcopy` writes.
 pub const LOGCOPY_FOLDER: &str = "logcopy";
 
+/// In an agent's sub-folder: the last whole checkpoint, kept by the agent's runner. No message; it is the one file there that
+/// is not empty.
+pub const KEPT_CHECKPOINT: &str = "checkpoint.json";
+
 /// Rounds a pair may count. Far above any `retries.pair`; it bounds what a reader looks up for a folder full of forgeries.
 pub const MAX_ROUNDS: u32 = 1000;
 

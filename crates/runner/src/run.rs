@@ -7,7 +7,7 @@ use std::io;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
 use leaderboard_runner::verdict::Verdict;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
@@ -15,6 +15,7 @@ use nix::sys::signal::Signal;
 
 use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Phase, Seen, Skip};
 use crate::group::{Group, spawn_code};
+use crate::keep::Keeper;
 use crate::launch;
 use crate::tee::Tee;
 use crate::wake::{Folders, Signals};
@@ -23,7 +24,12 @@ use leaderboard_runner::args::{Job, Role};
 
 /// Behind inotify, for whatever it misses.
 const SLOW_POLL: Duration = Duration::from_secs(1);
+/// Longest pause between two tries of the server's port, and between two looks at what does not tell its end.
 const PROBE_EVERY: Duration = Duration::from_millis(100);
+/// Shortest pause between two tries of the port. The pauses grow with the time the server takes.
+const FIRST_PROBE: Duration = Duration::from_millis(2);
+/// Exit code when the command could not go on where it was (EX_CANTCREAT).
+const CODE_NOT_RESUMED: i32 = 73;
 /// After SIGKILL, and for the last output: then the rest is given up.
 const LAST_WAIT: Duration = Duration::from_secs(10);
 
@@ -42,6 +48,8 @@ pub(crate) struct Runner {
     terminated: bool,
     group: Option<Group>,
     tee: Option<Tee>,
+    /// An agent's.
+    keeper: Option<Keeper>,
     memory_kills: u64,
     detail: Option<String>,
 }
@@ -51,7 +59,14 @@ impl Runner {
     pub(crate) fn new(job: Job, signals: Signals) -> Self {
         let me = job.member();
         let logcopy = StatusFile::Stored.folder();
-        let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy]);
+        let checkpoint = match &job.role {
+            Role::Agent { checkpoint, .. } => Some(checkpoint),
+            Role::Simulator { .. } => None,
+        };
+        let watched = checkpoint.map(std::path::PathBuf::as_path);
+        let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy], watched);
+        let kept = job.status.join(me.to_string()).join(KEPT_CHECKPOINT);
+        let keeper = checkpoint.map(|checkpoint| Keeper::new(checkpoint.clone(), kept));
         let round = Progress::read(&job.status, me).crashes;
         let now = Instant::now();
         Self {
@@ -66,6 +81,7 @@ impl Runner {
             terminated: false,
             group: None,
             tee: None,
+            keeper,
             memory_kills: memory::kills(),
             detail: None,
         }
@@ -132,7 +148,7 @@ impl Runner {
         if let (Phase::Booting, Role::Simulator { port, .. }) = (self.phase, &self.job.role)
             && Instant::now() >= self.next_probe
         {
-            self.next_probe = Instant::now() + PROBE_EVERY;
+            self.next_probe = Instant::now() + (self.since.elapsed() / 8).clamp(FIRST_PROBE, PROBE_EVERY);
             if launch::answers(*port) {
                 return Child::Ready;
             }
@@ -159,8 +175,10 @@ impl Runner {
     }
 
     fn patience(&self) -> Duration {
-        let probe = (self.phase == Phase::Booting).then_some(PROBE_EVERY);
-        [probe, self.idle_left(), self.ready_left()]
+        let probe = self.next_probe.saturating_duration_since(Instant::now());
+        let probe = (self.phase == Phase::Booting).then_some(probe);
+        let copy = self.keeper.as_ref().and_then(Keeper::pause);
+        [probe, copy, self.idle_left(), self.ready_left()]
             .into_iter()
             .flatten()
             .fold(SLOW_POLL, Duration::min)
@@ -186,6 +204,10 @@ impl Runner {
     fn launch(&mut self) -> Result<(), Cause> {
         if self.me.side == Side::Agent {
             self.mark(Mark::Start(self.round))?;
+        }
+        if let Some(Err(why)) = self.keeper.as_mut().map(Keeper::prepare) {
+            self.detail = Some(why);
+            return Err(Cause::CannotStart(CODE_NOT_RESUMED));
         }
         self.since = Instant::now();
         match launch::launch(&self.job, self.round) {
@@ -358,7 +380,10 @@ impl Runner {
             false
         });
         self.terminated |= self.signals.drain();
-        self.folders.drain();
+        let written = self.folders.drain();
+        if let Some(keeper) = self.keeper.as_mut().filter(|_| self.group.is_some()) {
+            keeper.follow(written);
+        }
         if let Some(tee) = &mut self.tee {
             if readable {
                 tee.read();

@@ -1,14 +1,15 @@
-//! What wakes the runner: signals (SIGCHLD among them) and changes in the folders of its peer and of `logcopy`. Called by
-//! `run` only. It says that something may have changed, never what: the caller looks again.
+//! What wakes the runner: signals (SIGCHLD among them), changes in the folders of its peer and of `logcopy`, and a checkpoint
+//! that was written. Called by `run` only. It says that something may have changed, never what: the caller looks again.
 
 use std::env;
+use std::ffi::OsString;
 use std::io::{self, Read};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 
 use nix::errno::Errno;
-use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
+use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify, InotifyEvent, WatchDescriptor};
 use signal_hook::consts::{SIGCHLD, SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1, SIGUSR2};
 use signal_hook::low_level::pipe;
 
@@ -63,12 +64,21 @@ fn drain(stream: &mut UnixStream) -> bool {
 pub(crate) struct Folders {
     inotify: Option<Inotify>,
     missing: Vec<PathBuf>,
+    written: Option<Written>,
+}
+
+/// A file whose writers are watched, through its folder: it is replaced, or not there yet.
+#[derive(Debug)]
+struct Written {
+    folder: PathBuf,
+    name: OsString,
+    watch: Option<WatchDescriptor>,
 }
 
 impl Folders {
-    /// Watches `root` and `folders` in it. Without inotify (`LEADERBOARD_INOTIFY=off`, or the node has none left) the
-    /// caller's slow poll does alone.
-    pub(crate) fn watch(root: &Path, folders: &[String]) -> Self {
+    /// Watches `root` and `folders` in it, and whoever has written `file`. Without inotify (`LEADERBOARD_INOTIFY=off`, or the
+    /// node has none left) the caller's slow poll does alone.
+    pub(crate) fn watch(root: &Path, folders: &[String], file: Option<&Path>) -> Self {
         let inotify = if env::var_os("LEADERBOARD_INOTIFY").is_some_and(|value| value == "off") {
             None
         } else {
@@ -80,7 +90,18 @@ impl Folders {
             .into_iter()
             .chain(folders.iter().map(|folder| root.join(folder)))
             .collect();
-        let mut watched = Self { inotify, missing };
+        let written = file.and_then(|file| {
+            Some(Written {
+                folder: file.parent()?.to_owned(),
+                name: file.file_name()?.to_owned(),
+                watch: None,
+            })
+        });
+        let mut watched = Self {
+            inotify,
+            missing,
+            written,
+        };
         watched.refresh();
         watched
     }
@@ -91,18 +112,31 @@ impl Folders {
         let flags = AddWatchFlags::IN_CREATE | AddWatchFlags::IN_MOVED_TO | AddWatchFlags::IN_ONLYDIR;
         self.missing
             .retain(|folder| inotify.add_watch(folder.as_path(), flags).is_err());
+        if let Some(written) = self.written.as_mut().filter(|written| written.watch.is_none()) {
+            let flags = AddWatchFlags::IN_CLOSE_WRITE | AddWatchFlags::IN_MOVED_TO | AddWatchFlags::IN_ONLYDIR;
+            written.watch = inotify.add_watch(written.folder.as_path(), flags).ok();
+        }
     }
 
-    /// Reads pending events. Bounded, so that a folder somebody floods with files cannot hold the runner here.
-    pub(crate) fn drain(&mut self) {
-        let Some(inotify) = &self.inotify else { return };
+    /// Reads pending events; whether somebody has come to the end of writing the file. Bounded, so that a folder somebody floods
+    /// with files cannot hold the runner here.
+    pub(crate) fn drain(&mut self) -> bool {
+        let Some(inotify) = &self.inotify else { return false };
+        let mut written = false;
         for _ in 0..64 {
             match inotify.read_events() {
-                Ok(_) | Err(Errno::EINTR) => {}
+                Ok(events) => written |= events.iter().any(|event| self.is_written(event)),
+                Err(Errno::EINTR) => {}
                 Err(_) => break,
             }
         }
         self.refresh();
+        written
+    }
+
+    fn is_written(&self, event: &InotifyEvent) -> bool {
+        let of_file = |written: &Written| written.watch == Some(event.wd) && event.name.as_ref() == Some(&written.name);
+        event.mask.contains(AddWatchFlags::IN_Q_OVERFLOW) || self.written.as_ref().is_some_and(of_file)
     }
 
     pub(crate) fn fd(&self) -> Option<BorrowedFd<'_>> {

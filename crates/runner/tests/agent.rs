@@ -185,6 +185,28 @@ fn partial_results_are_resumed_and_a_resume_from_outside_stays() {
 }
 
 #[test]
+fn a_checkpoint_torn_by_a_kill_is_whole_again_before_the_next_start() {
+    let pod = pod();
+    let kept = pod.status().join("agent-1/checkpoint.json");
+    let script = format!(
+        "echo '{PARTIAL}' > $CHECKPOINT; until [ -s {} ]; do sleep 0.02; done; ",
+        kept.display()
+    );
+    let mut agent = pod.agent(&(script + "printf '{' > $CHECKPOINT; exec sleep 1000"));
+    until("the checkpoint is torn", || {
+        fs::read_to_string(pod.checkpoint()).is_ok_and(|text| text == "{")
+    });
+    agent.kill_without_a_word();
+    pod.write(StatusFile::Of(SIMULATOR, Mark::Start(1)));
+    let mut agent = pod.agent("echo RESUME=[$RESUME]; cat $CHECKPOINT");
+    assert_eq!(agent.code(), 1);
+    assert_eq!(
+        fs::read_to_string(&agent.stdout).unwrap(),
+        format!("RESUME=[1]\n{PARTIAL}\n")
+    );
+}
+
+#[test]
 fn a_command_that_cannot_be_started_says_why() {
     let pod = pod();
     let not_executable = pod.path("text");

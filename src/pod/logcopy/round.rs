@@ -14,7 +14,7 @@ use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
 use super::{LogcopyError, cancel};
-use crate::pod::gather::{Gathered, Gatherer, MERGED, checkpoint_path, texts};
+use crate::pod::gather::{Gathered, Gatherer, checkpoint_path};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
 use crate::pod::ownlog::OWN_LOG;
 use crate::pod::places::Setting;
@@ -30,6 +30,8 @@ use crate::services::archive::{Archive, ArchiveError, Fetched};
 const AGENT_ENTRIES: usize = 5_000;
 /// Entries looked at in the simulators' folder.
 const SIMULATOR_ENTRIES: usize = 20_000;
+/// Ends the key of a refused checkpoint.
+const REFUSED: &str = ".refused";
 /// Bytes of the owner that are read.
 const OWNER_BYTES: u64 = 1024;
 /// Shortest time that logs get in a round of a running run.
@@ -184,10 +186,15 @@ impl Rounds {
             return Ok(self.period());
         }
         let at_end = self.ending.is_some() || why == Why::Shutdown;
-        self.store_results(&look.gathered).await?;
+        self.uploader.put(&look.gathered.objects).await?;
         self.store_statuses(&look.statuses).await?;
         if at_end {
             self.store_logs(look.logs, true).await?;
+            // Storing logs can take minutes, in which another Pod may have come.
+            if !self.owns_prefix().await? {
+                self.give_up();
+                return Ok(self.period());
+            }
             self.report(&look.gathered).await?;
         } else {
             // A long upload of logs must not keep the progress back.
@@ -206,19 +213,17 @@ impl Rounds {
         let status = self.setting.places.status();
         let pairs = self.pairs();
         let look = move || {
-            let gathered = reader.lock().unwrap_or_else(PoisonError::into_inner).round()?;
+            let gathered = reader.lock().unwrap_or_else(PoisonError::into_inner).round();
             let (files, activity) = logs(&tree, pairs);
-            Ok(Look {
+            Look {
+                logs: wanted(&files, &gathered),
                 gathered,
-                logs: files
-                    .iter()
-                    .map(|(path, stamp)| Wanted::new(path, *stamp, Haste::Soon))
-                    .collect(),
                 statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX)),
                 activity,
-            })
+            }
         };
-        tokio::task::spawn_blocking(look).await.map_err(std::io::Error::other)?
+        let looked = tokio::task::spawn_blocking(look).await;
+        Ok(looked.map_err(std::io::Error::other)?)
     }
 
     /// Draws the consequences of what was seen. Returns how long the next look may wait.
@@ -283,21 +288,6 @@ impl Rounds {
         if let Err(error) = StatusFile::Stored.create(&status) {
             tracing::error!("logcopy.done can't be written: {error}");
         }
-    }
-
-    /// Checkpoints, the merged file and EvalAI's texts.
-    async fn store_results(&mut self, gathered: &Gathered) -> Result<(), ArchiveError> {
-        let checkpoints = (1..=self.pairs()).map(checkpoint_path);
-        let texts = texts(&gathered.files).into_iter().map(|(path, _)| path.to_owned());
-        let files: Vec<Wanted> = checkpoints
-            .chain([MERGED.to_owned()])
-            .chain(texts)
-            .filter_map(|path| {
-                let (_, stamp) = self.tree.file(&path).ok()??;
-                Some(Wanted::new(&path, stamp, Haste::Now).essential())
-            })
-            .collect();
-        self.uploader.sync(&files, None).await.map(drop)
     }
 
     /// The status files, flat, as they have always been stored.
@@ -375,6 +365,27 @@ fn logs(tree: &Tree, pairs: usize) -> (BTreeMap<String, Stamp>, u64) {
         files.insert(OWN_LOG.to_owned(), stamp);
     }
     (files, activity.finish())
+}
+
+/// The logs to store. A checkpoint is none: it is stored from memory, whole. One that is refused is kept as evidence under
+/// another name, so that nothing is resumed from it.
+fn wanted(files: &BTreeMap<String, Stamp>, gathered: &Gathered) -> Vec<Wanted> {
+    let of_pair: BTreeMap<String, bool> = (1..)
+        .zip(&gathered.refused)
+        .map(|(pair, refused)| (checkpoint_path(pair), refused.is_some()))
+        .collect();
+    let wanted = files.iter().filter_map(|(path, stamp)| {
+        let wanted = Wanted::new(path, *stamp, Haste::Soon);
+        match of_pair.get(path) {
+            None => Some(wanted),
+            Some(true) => Some(Wanted {
+                key: format!("{path}{REFUSED}"),
+                ..wanted
+            }),
+            Some(false) => None,
+        }
+    });
+    wanted.collect()
 }
 
 /// What can't wait for the period: a container that tells something, or its new folder. A checkpoint can wait: an agent that

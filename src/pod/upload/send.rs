@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 
 use futures::StreamExt;
 
-use super::{Decision, Haste, Memory, Stored, decide_upload, fingerprint};
+use sha2::{Digest, Sha256};
+
+use super::{Decision, Haste, Memory, Stored, decide_upload, fingerprint, hex};
 use crate::pod::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART};
 
@@ -75,6 +77,8 @@ pub struct Uploader {
     limit: u64,
     epoch: Instant,
     complained: BTreeSet<String>,
+    /// The objects of memory that are stored, to see at a glance that they are still the same.
+    known: BTreeMap<String, Arc<[u8]>>,
 }
 
 /// One file's end.
@@ -95,12 +99,43 @@ impl Uploader {
             limit,
             epoch: Instant::now(),
             complained: BTreeSet::new(),
+            known: BTreeMap::new(),
         }
     }
 
     /// What is stored.
     pub fn memory(&self) -> &Memory {
         &self.memory
+    }
+
+    /// Stores results that are in memory, each that is not what is stored already. They are stored even beyond the limit.
+    pub async fn put(&mut self, objects: &BTreeMap<String, Arc<[u8]>>) -> Result<Sent, ArchiveError> {
+        let now = self.epoch.elapsed();
+        let changed = objects.iter().filter(|(key, bytes)| {
+            let known = self.known.get(*key);
+            !known.is_some_and(|known| Arc::ptr_eq(known, bytes)) || !self.memory.0.contains_key(*key)
+        });
+        let jobs: Vec<Put> = changed
+            .map(|(key, bytes)| Put {
+                archive: self.archive.clone(),
+                key: key.clone(),
+                bytes: Arc::clone(bytes),
+                known: self.memory.0.get(key).cloned(),
+                now,
+            })
+            .collect();
+        let work = jobs.into_iter().map(Put::store);
+        let fates: Vec<(String, Fate)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        for (key, fate) in &fates {
+            let bytes = objects.get(key).filter(|_| matches!(fate, Fate::Stored(..)));
+            self.known.extend(bytes.map(|bytes| (key.clone(), Arc::clone(bytes))));
+        }
+        let mut sent = Sent::default();
+        let failed = self.settle(fates, &mut sent);
+        if sent.objects > 0 || failed.is_some() {
+            self.remember();
+        }
+        failed.map_or(Ok(sent), Err)
     }
 
     /// Stores what is due, in the order given as far as several at once allow. After `until` no file is begun. The first
@@ -205,6 +240,40 @@ impl Uploader {
         if let Err(error) = self.memory.save(&self.tree) {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
+    }
+}
+
+/// One object of memory on its way.
+struct Put {
+    archive: Archive,
+    key: String,
+    bytes: Arc<[u8]>,
+    known: Option<Stored>,
+    now: Duration,
+}
+
+impl Put {
+    async fn store(self) -> (String, Fate) {
+        let size = self.bytes.len() as u64;
+        let stored = Stored {
+            stamp: Stamp {
+                size,
+                ..Stamp::default()
+            },
+            etag: None,
+            fingerprint: hex(&Sha256::digest(&self.bytes)),
+            at: self.now,
+        };
+        let known = self.known.filter(|known| known.stamp.size == size);
+        if let Some(known) = known.filter(|known| known.fingerprint == stored.fingerprint) {
+            let etag = known.etag;
+            return (self.key, Fate::Stored(Box::new(Stored { etag, ..stored }), false));
+        }
+        let fate = match self.archive.put(&self.key, self.bytes.to_vec()).await {
+            Ok(etag) => Fate::Stored(Box::new(Stored { etag, ..stored }), true),
+            Err(error) => Fate::Failed(error),
+        };
+        (self.key, fate)
     }
 }
 

@@ -105,3 +105,25 @@ async fn odd_names_are_stored_and_appended_to() {
     sync(&pod, &mut uploader, path).await;
     assert_eq!(pod.stored(path).await.unwrap(), fs::read(pod.path(path)).unwrap());
 }
+
+#[tokio::test]
+async fn results_from_memory_are_sent_when_they_change_and_not_again_after_a_restart() {
+    let bucket = server().await.bucket().await;
+    let proxy = server().await.proxy().await;
+    let pod = Pod::on(&proxy.endpoint(), &bucket, run(&bucket)).await;
+    let object = |text: &str| BTreeMap::from([("agent/agent1/agent_results.json".to_owned(), text.as_bytes().into())]);
+    let first = object("first");
+    let mut uploader = pod.uploader();
+    assert_eq!(uploader.put(&first).await.unwrap().objects, 1);
+    let before = proxy.sent();
+    for same in [&first, &object("first")] {
+        assert_eq!(uploader.put(same).await.unwrap(), Sent::default());
+        assert_eq!(pod.uploader().put(same).await.unwrap(), Sent::default());
+    }
+    assert_eq!(proxy.sent(), before);
+    proxy.set_away(true);
+    assert!(uploader.put(&object("second")).await.is_err());
+    proxy.set_away(false);
+    assert_eq!(uploader.put(&object("second")).await.unwrap().objects, 1);
+    assert_eq!(pod.stored("agent/agent1/agent_results.json").await.unwrap(), b"second");
+}

@@ -12,7 +12,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Mark, Member, Pair, Side, StatusFile};
 use leaderboard_runner::verdict::Verdict;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
@@ -172,7 +172,7 @@ impl Pod {
         until_exists(&file.path(&self.status()));
     }
 
-    /// The names of all status files a member wrote, sorted.
+    /// The names of all status files a member wrote, sorted; the kept checkpoint is none.
     pub fn files(&self, member: Member) -> Vec<String> {
         let folder = self.status().join(member.to_string());
         let Ok(entries) = fs::read_dir(folder) else {
@@ -180,6 +180,7 @@ impl Pod {
         };
         let mut names: Vec<_> = entries
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .filter(|name| name != KEPT_CHECKPOINT)
             .collect();
         names.sort();
         names

@@ -53,6 +53,7 @@ fn environment(invocation: &Invocation) -> Result<Environment, String> {
     let python_path = env::split_paths(&env::var_os("PYTHONPATH").unwrap_or_default()).collect();
     Ok(Environment {
         route_time: Duration::from_millis(route_time),
+        route_copy: env::var_os("ROUTE_COPY").map(Into::into),
         knobs,
         python_path,
     })

@@ -1,0 +1,27 @@
+//! A submission of 20 routes on 4 pairs as plain processes, killed in every part at every moment: the final score is always that
+//! of a run nobody touched. The programs are the real ones (runner, workspace, logcopy) and the stand-ins for simulator and
+//! agent, the test plays the kubelet, and S3 is a stand-in.
+//!
+//! `LEADERBOARD_KILL_RUNS` says how many runs, `LEADERBOARD_TEST_SEED` repeats one that failed.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "clippy knows a test by its attribute; what tests call is a test too"
+)]
+
+#[allow(dead_code, reason = "each test program uses its own part of it")]
+#[path = "support/ministack.rs"]
+mod ministack;
+
+mod resume {
+    mod kills;
+    mod kubelet;
+    mod measure;
+    mod process;
+    mod results;
+    mod singles;
+    mod submission;
+    mod volumes;
+}

@@ -1,0 +1,112 @@
+//! The memory that storing a log of 5 GB takes. Asked for by name:
+//! `cargo test --profile local --test resume -- --ignored --nocapture a_log_of_5_gb`.
+
+use std::fs::{self, OpenOptions};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use axum::extract::Request;
+use axum::http::{Method, StatusCode};
+use axum::response::{IntoResponse, Response};
+use fastrand::Rng;
+use futures::StreamExt;
+use leaderboard_operator::api::ResultsFormat;
+
+use super::kubelet::Kubelet;
+use super::submission::{Submission, make_volumes};
+use crate::ministack::server;
+
+const LOG: u64 = 5 << 30;
+const GROWTH: u64 = 10 << 20;
+const LIMIT: Duration = Duration::from_mins(10);
+
+/// An S3 that takes everything, keeps nothing and counts.
+#[derive(Default)]
+struct Sink {
+    bytes: AtomicU64,
+    largest: AtomicU64,
+    joined: AtomicU64,
+}
+
+async fn answer(sink: Arc<Sink>, request: Request) -> Response {
+    const JOINED: &str = "<CompleteMultipartUploadResult><ETag>\"x\"</ETag></CompleteMultipartUploadResult>";
+    const BEGUN: &str = "<InitiateMultipartUploadResult><UploadId>1</UploadId></InitiateMultipartUploadResult>";
+    const COPIED: &str = "<CopyPartResult><ETag>\"x\"</ETag></CopyPartResult>";
+    const NONE: &str = "<Error><Code>NoSuchKey</Code></Error>";
+    let query = request.uri().query().unwrap_or_default().to_owned();
+    let is_owner = request.uri().path().ends_with("/logcopy/owner");
+    let is_copy = request.headers().contains_key("x-amz-copy-source");
+    let method = request.method().clone();
+    let mut body = request.into_body().into_data_stream();
+    let mut size = 0;
+    while let Some(Ok(chunk)) = body.next().await {
+        size += chunk.len() as u64;
+    }
+    sink.bytes.fetch_add(size, Ordering::Relaxed);
+    sink.largest.fetch_max(size, Ordering::Relaxed);
+    match method {
+        Method::GET if is_owner => "pod-1".into_response(),
+        Method::GET => (StatusCode::NOT_FOUND, NONE).into_response(),
+        Method::POST if query.contains("uploadId=") => {
+            sink.joined.fetch_add(1, Ordering::Relaxed);
+            JOINED.into_response()
+        }
+        Method::POST => BEGUN.into_response(),
+        _ if is_copy => COPIED.into_response(),
+        _ => ([("etag", "\"x\"")], "").into_response(),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "measures for minutes"]
+async fn a_log_of_5_gb_is_stored_in_bounded_memory() {
+    let sink = Arc::new(Sink::default());
+    let counting = Arc::clone(&sink);
+    let router = axum::Router::new().fallback(move |request: Request| answer(Arc::clone(&counting), request));
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let serving = tokio::spawn(async move { axum::serve(listener, router).await.unwrap() });
+
+    let bucket = server().await.bucket().await;
+    let mut submission = Submission::on(&endpoint, &bucket, ResultsFormat::V2, &mut Rng::new()).await;
+    submission.run.plan.storage.limit = 8 << 30;
+    submission.run.period_seconds = 1;
+    let kubelet = Kubelet::new(&submission);
+    let root = kubelet.folder().join("pod-1");
+    make_volumes(&root);
+    let path = root.join("logs/agent/agent1/leaderboard.log");
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let log = OpenOptions::new()
+        .write(true)
+        .create(true)
+        .truncate(true)
+        .open(&path)
+        .unwrap();
+    let began = Instant::now();
+    let mut logcopy = submission
+        .own("logcopy", &root, "pod-1")
+        .kill_on_drop(true)
+        .spawn()
+        .unwrap();
+    for (size, joins) in [(LOG, 1), (LOG + GROWTH, 2)] {
+        let before = sink.bytes.load(Ordering::Relaxed);
+        log.set_len(size).unwrap();
+        while sink.joined.load(Ordering::Relaxed) < joins {
+            assert!(began.elapsed() < LIMIT && logcopy.try_wait().unwrap().is_none());
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        let status = fs::read_to_string(format!("/proc/{}/status", logcopy.id().unwrap())).unwrap();
+        let most = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
+        println!(
+            "5 GB: {} MiB sent in {:?}, largest body {} MiB; {most}",
+            (sink.bytes.load(Ordering::Relaxed) - before) >> 20,
+            began.elapsed(),
+            sink.largest.load(Ordering::Relaxed) >> 20
+        );
+        let kib: u64 = most.split_whitespace().nth(1).unwrap().parse().unwrap();
+        assert!(kib < 256 << 10, "{most}");
+    }
+    logcopy.kill().await.unwrap();
+    serving.abort();
+}
