@@ -104,7 +104,7 @@ async fn measure(size: &Size) {
 
     let (cancelled, others) = pks.split_at(size.cancels);
     let times = world.cancel(cancelled, size.cancel_over).await;
-    let undone = world.settle(size, cancelled).await;
+    let mut undone = world.settle(size, cancelled).await;
     let stopped = world.player.seen().told_to_stop;
     let waits = cancelled
         .iter()
@@ -118,6 +118,14 @@ async fn measure(size: &Size) {
     world.explain(&undone, &times);
 
     world.player.fall_the_curtain();
+    world
+        .until(size, "all have ended", |seen| {
+            all.iter().all(|name| seen.terminal.contains_key(name))
+        })
+        .await;
+    // A list may have shown a cancel that was being written over.
+    let stopped = world.player.seen().told_to_stop;
+    undone.retain(|pk| !stopped.contains_key(&name(*pk)));
     let rest: BTreeSet<String> = others.iter().chain(&undone).map(|pk| name(*pk)).collect();
     world
         .until(size, "all are published", |seen| {
