@@ -10,7 +10,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures::StreamExt;
+use futures::future::FusedFuture;
+use futures::{FutureExt, StreamExt};
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Pod, PodTemplateSpec};
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
@@ -331,18 +332,24 @@ impl Parts {
         let context = Arc::new(Context::new(self.client, self.settings, stores, sync, self.aws, events));
         self.watches.feed(&touched);
         let mut leadership = leader.leadership();
-        let mut passes = std::pin::pin!(passes::run(context, inbox, self.seen.clone()));
+        let mut passes = std::pin::pin!(passes::run(context, inbox, self.seen.clone()).fuse());
         tokio::select! {
             () = self.seen.stop.wait() => {}
             why = lost(&mut leadership) => return Err(RunError::LostLease(why)),
             () = &mut passes => if !self.seen.stop.is_set() { return Err(RunError::PartEnded) },
         }
-        // Passes end by the same stop; what they have begun is finished.
-        let _ = tokio::time::timeout(DRAIN, passes).await;
+        finish(passes).await;
         if hub.drain().await {
             leader.drained();
         }
         Ok(())
+    }
+}
+
+/// Passes end by the stop; what they have begun is finished. They may have ended already, in the very moment of the stop.
+async fn finish(passes: impl FusedFuture<Output = ()>) {
+    if !passes.is_terminated() {
+        let _ = tokio::time::timeout(DRAIN, passes).await;
     }
 }
 
@@ -468,4 +475,23 @@ fn serving<'a>(all: &'a [Arc<Leaderboard>], row: &SweepRow) -> Option<&'a Arc<Le
     all.iter()
         .filter(serves)
         .min_by_key(|l| (l.metadata.creation_timestamp.as_ref().map(|t| t.0), l.name_any()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn passes_that_ended_in_the_moment_of_the_stop_are_not_waited_for() {
+        let began = Instant::now();
+        let mut passes = std::pin::pin!(async {}.fuse());
+        passes.as_mut().await;
+        finish(passes).await;
+        assert_eq!(began.elapsed(), Duration::ZERO);
+        let mut passes = std::pin::pin!(tokio::time::sleep(Duration::from_secs(3)).fuse());
+        finish(passes.as_mut()).await;
+        assert_eq!(began.elapsed(), Duration::from_secs(3));
+        finish(std::pin::pin!(std::future::pending::<()>().fuse())).await;
+        assert_eq!(began.elapsed(), Duration::from_secs(3) + DRAIN);
+    }
 }
