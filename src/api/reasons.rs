@@ -63,6 +63,7 @@ pub const NODE_LOST: &str = "NodeLost";
 
 // Of the other conditions.
 pub const NOT_WANTED: &str = "NotWanted";
+pub const OVERTAKEN: &str = "Overtaken";
 pub const STORED: &str = "Stored";
 pub const NOT_STORED: &str = "NotStored";
 pub const WRITTEN: &str = "Written";

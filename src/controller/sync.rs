@@ -231,6 +231,7 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
                 image: seen.image.as_ref().and_then(|i| i.as_ref().ok().cloned()),
             }),
         cancelled: ended.is_some(),
+        overtaken: ended.is_some() && seen.overtaken,
         end: seen
             .end
             .as_ref()

@@ -171,6 +171,8 @@ pub struct EvalaiView {
     pub info: Option<EvalaiInfo>,
     /// It was cancelled there, after this attempt was announced.
     pub cancelled: bool,
+    /// A write of ours may have undone that cancel in EvalAI.
+    pub overtaken: bool,
     /// What became of the final result of this attempt.
     pub end: Option<EvalaiEnd>,
     /// Why the last request failed.

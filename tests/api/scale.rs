@@ -17,7 +17,7 @@ use jiff::{SignedDuration, Timestamp};
 use kube::api::Api;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, State, Submission, conditions};
+use leaderboard_operator::api::{Leaderboard, State, Submission, conditions, reasons};
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::time::{Instant, timeout_at};
@@ -131,6 +131,7 @@ async fn measure(size: &Size) {
         .until(size, "all are published", |seen| {
             all.iter().all(|name| seen.terminal.contains_key(name))
                 && rest.iter().all(|name| seen.published.contains(name))
+                && all.iter().all(|name| seen.settled.contains(name))
         })
         .await;
     world.report_ends(&rest);
@@ -179,6 +180,8 @@ struct Seen {
     states: BTreeMap<String, State>,
     terminal: BTreeMap<String, Timestamp>,
     published: BTreeSet<String>,
+    /// Nothing more is to be said of them to EvalAI.
+    settled: BTreeSet<String>,
 }
 
 impl Seen {
@@ -193,8 +196,14 @@ impl Seen {
         if conditions::is_true(&status.conditions, conditions::FINISHED) {
             self.terminal.entry(name.clone()).or_insert_with(Timestamp::now);
         }
-        if conditions::is_true(&status.conditions, conditions::PUBLISHED) {
-            self.published.insert(name);
+        let Some(published) = conditions::get(&status.conditions, conditions::PUBLISHED) else {
+            return;
+        };
+        if published.status == "True" {
+            self.published.insert(name.clone());
+        }
+        if published.status == "True" || published.reason == reasons::NOT_WANTED {
+            self.settled.insert(name);
         }
     }
 }
@@ -399,22 +408,25 @@ impl World {
         println!("{partials} partial results");
     }
 
-    /// What was stopped is Cancelled, and nothing more was written for it; what was on its way just then may have arrived
-    /// after the cancel.
+    /// What was stopped is Cancelled in EvalAI too, also where a write that was on its way just then had undone that.
     fn check_cancelled<'a>(&self, pks: impl Iterator<Item = &'a u64>, log: &[Entry]) {
-        let stopped = self.player.seen().told_to_stop;
         let state = self.evalai.state();
-        let mut overtaken = 0;
+        let mut told_again = 0;
         for pk in pks {
             assert!(self.submissions.is(&name(*pk), State::Cancelled), "submission {pk}");
-            if state.submissions[pk].status != Stored::Cancelled {
-                let mut writes = log.iter().filter(|entry| entry.body["submission"] == json!(pk));
-                let last = writes.next_back().unwrap();
-                assert!(last.time <= stopped[&name(*pk)], "written after the stop: {last:?}");
-                overtaken += 1;
-            }
+            assert_eq!(
+                state.submissions[pk].status,
+                Stored::Cancelled,
+                "submission {pk} in EvalAI"
+            );
+            let is_again = |entry: &&Entry| entry.method == "PUT" && entry.body["submission"] == json!(pk);
+            told_again += usize::from(
+                log.iter()
+                    .filter(is_again)
+                    .any(|entry| entry.body["submission_status"] == json!("cancelled")),
+            );
         }
-        println!("{overtaken} cancels were overtaken in EvalAI by a write that was on its way");
+        println!("{told_again} cancels were told again after a write of ours that was on its way");
     }
 }
 

@@ -13,6 +13,8 @@ use crate::controller::view::{EvalaiEnd, JobSight, JobView};
 
 /// How often an unpublished end is looked at again.
 const AGAIN: Duration = Duration::from_secs(30);
+const TOLD_AGAIN: &str =
+    "A request that was under way may have undone EvalAI's own end; EvalAI is asked, and told again.";
 
 /// Decides for a submission in a terminal state.
 pub(super) fn decide(draft: &mut Draft<'_>) {
@@ -76,7 +78,8 @@ fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Sync {
 fn publish(draft: &mut Draft<'_>) -> Sync {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
-    if draft.spec().evalai.is_none() || is_evalais {
+    let is_overtaken = is_evalais && is_overtaken(draft);
+    if draft.spec().evalai.is_none() || (is_evalais && !is_overtaken) {
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
         return Sync::Done;
     }
@@ -111,14 +114,27 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
                 _ => Tell::Failed,
             };
             draft.act(Action::Tell(wish));
-            let message = view
-                .error
-                .map(|e| format!("The last request failed: {}", sentence(&e)))
-                .unwrap_or_default();
-            draft.condition(conditions::PUBLISHED, Truth::False, reasons::WAITING, &message);
+            let failed = view.error.map(|e| format!("The last request failed: {}", sentence(&e)));
+            let (reason, message) = if is_overtaken {
+                (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
+            } else {
+                (reasons::WAITING, failed)
+            };
+            draft.condition(
+                conditions::PUBLISHED,
+                Truth::False,
+                reason,
+                &message.unwrap_or_default(),
+            );
             Sync::Waiting
         }
     }
+}
+
+/// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
+fn is_overtaken(draft: &Draft<'_>) -> bool {
+    let published = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
+    draft.view.evalai.as_ref().is_some_and(|e| e.overtaken) || published.is_some_and(|c| c.reason == reasons::OVERTAKEN)
 }
 
 fn refused(draft: &mut Draft<'_>, message: &str) {

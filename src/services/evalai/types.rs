@@ -94,6 +94,8 @@ pub struct View {
     pub progress: Option<Progress>,
     /// EvalAI has ended this attempt, by somebody else's hand.
     pub ended: Option<Status>,
+    /// A write of ours was under way when EvalAI ended it, and may have undone that there.
+    pub overtaken: bool,
     /// What became of the wish for an end.
     pub end: Option<Ended>,
     /// When partial results were last taken.

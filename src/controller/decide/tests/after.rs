@@ -57,6 +57,24 @@ fn evalai_first_then_the_table_then_rest() {
 }
 
 #[test]
+fn a_cancel_that_our_own_write_may_have_undone_is_told_again() {
+    let mut world = World::evalai().running();
+    (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
+    world.pass();
+    world.job_gone();
+    world.view.report = ReportSight::Absent;
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert_eq!(tells(&plan), [Tell::Cancelled]);
+    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::OVERTAKEN.into()));
+    // Also by a controller that has seen nothing of it.
+    world.in_evalai().overtaken = false;
+    assert_eq!(tells(&world.pass()), [Tell::Cancelled]);
+    world.published();
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert_eq!((tells(&plan), condition(&plan, PUBLISHED).0), (vec![], "True".into()));
+}
+
+#[test]
 fn evalais_end_wins_until_ours_is_answered_and_not_after() {
     for mut world in [finished(), failed()] {
         world.in_evalai().end = Some(EvalaiEnd::Ended {

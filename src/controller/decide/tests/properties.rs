@@ -207,13 +207,18 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         Some(EvalaiEnd::Refused { message: "no".into() }),
     ];
     let error = select(vec![None, Some("away".to_owned())]);
-    (select(infos), prop::bool::weighted(0.1), select(ends), error).prop_map(|(info, cancelled, end, error)| {
-        EvalaiView {
-            info,
-            cancelled,
-            end,
-            error,
-        }
+    let cancels = select(
+        vec![(false, false); 18]
+            .into_iter()
+            .chain([(true, false), (true, true)])
+            .collect::<Vec<_>>(),
+    );
+    (select(infos), cancels, select(ends), error).prop_map(|(info, (cancelled, overtaken), end, error)| EvalaiView {
+        info,
+        cancelled,
+        overtaken,
+        end,
+        error,
     })
 }
 

@@ -166,7 +166,7 @@ impl Sub {
         if outdated {
             // A cancel may since have been overwritten by one of our writes: it still was one.
             if let Start::Drop(status @ (Status::Cancelled | Status::Archived | Status::Ignored)) = start {
-                self.stop(status);
+                self.stop(status, !calm || requested < self.wrote_at);
             }
             return self.view != before;
         }
@@ -195,7 +195,7 @@ impl Sub {
             }
             Start::Drop(status) => {
                 self.answer(requested);
-                self.stop(status);
+                self.stop(status, !calm);
             }
         }
         self.settle(now);
@@ -229,9 +229,9 @@ impl Sub {
         }
     }
 
-    fn stop(&mut self, status: Status) {
+    fn stop(&mut self, status: Status, overtaken: bool) {
         if self.end.is_none() && !self.is_over() {
-            self.view.ended = Some(status);
+            (self.view.ended, self.view.overtaken) = (Some(status), overtaken);
         }
         (self.live, self.progress, self.partial) = (None, None, None);
     }

@@ -22,6 +22,61 @@ fn a_cancellation_is_found_by_the_next_list() {
 }
 
 #[test]
+fn a_cancellation_that_a_write_under_way_may_undo_is_told_again() {
+    let (mut bench, write) = partial_under_way();
+    let list = next_list(&mut bench);
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![row(7, Status::Cancelled)])));
+    bench.answer(&write, Reply::Written(Answer::Done(())));
+    let view = bench.view(7);
+    assert_eq!((view.ended, view.overtaken), (Some(Status::Cancelled), true));
+    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(41.0)));
+    bench.get(7, row(7, Status::PartiallyEvaluated));
+    bench.write("cancelled 7");
+    assert!(matches!(
+        bench.view(7).end,
+        Some(Ended::Published {
+            outcome: Outcome::Cancelled,
+            ..
+        })
+    ));
+}
+
+#[test]
+fn a_list_that_was_asked_for_before_a_write_may_tell_of_what_that_undid() {
+    let (mut bench, write) = partial_under_way();
+    let list = next_list(&mut bench);
+    bench.answer(&write, Reply::Written(Answer::Done(())));
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![row(7, Status::Cancelled)])));
+    assert!(bench.view(7).overtaken);
+}
+
+#[test]
+fn a_cancellation_after_our_last_write_stands() {
+    let (mut bench, write) = partial_under_way();
+    bench.answer(&write, Reply::Written(Answer::Done(())));
+    let list = next_list(&mut bench);
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![row(7, Status::Cancelled)])));
+    let view = bench.view(7);
+    assert_eq!((view.ended, view.overtaken), (Some(Status::Cancelled), false));
+}
+
+/// A running submission whose partial results EvalAI is working on.
+fn partial_under_way() -> (Bench, Ticket) {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wait(10.0);
+    bench.list("list of cancelled", vec![]);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    let write = bench.expect("partial 7");
+    (bench, write)
+}
+
+fn next_list(bench: &mut Bench) -> Ticket {
+    bench.wait(10.0);
+    bench.expect("list of cancelled")
+}
+
+#[test]
 fn lists_reach_back_to_the_first_live_submission_only() {
     let mut bench = Bench::new();
     for (pk, submitted) in [(7, -60), (8, -900), (9, -30)] {
