@@ -127,7 +127,7 @@ pub struct EndView {
     pub reason: String,
     pub exit_code: i32,
     pub at: Option<Timestamp>,
-    /// The runner's word for it, `exited`, `idle`, `peerCrashed`, …
+    /// The runner's word for it, `exited`, `idle`, `peerCrashed`, …; `incomplete` if the command ended well by itself.
     pub what: Option<String>,
     /// The runner's or Kubernetes' sentence.
     pub why: Option<String>,

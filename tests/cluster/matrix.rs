@@ -24,7 +24,7 @@ pub const SHOWN: Duration = Duration::from_mins(2);
 const VARIABLE: &str = "LEADERBOARD_MATRIX";
 
 /// Cases that no test makes happen here, and what stands in for them.
-const NOT_COVERED: [(&str, &str); 4] = [
+const NOT_COVERED: [(&str, &str); 3] = [
     (
         "API server's process restarted",
         "it serves all tests at once; see `API server out of reach`",
@@ -32,10 +32,6 @@ const NOT_COVERED: [(&str, &str); 4] = [
     (
         "etcd's process restarted",
         "it serves all tests at once; to the operator it looks like an API server out of reach",
-    ),
-    (
-        "results malformed",
-        "the agent is started again before its checkpoint is judged, or after; see `results implausible`",
     ),
     (
         "kubelet of a node killed",

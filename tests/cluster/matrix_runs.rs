@@ -134,6 +134,11 @@ fn of_agents() -> Vec<Row> {
             )
         },
         row(
+            "results malformed",
+            with(agent("nonsense@1"), json!({"retries": {"pair": 1}})),
+            "Failed InvalidResults (participant, charged); EvalAI failed",
+        ),
+        row(
             "sensors refused",
             agent("reject@2"),
             "Failed NotEligible (participant, charged); EvalAI failed",

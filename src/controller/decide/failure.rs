@@ -120,8 +120,9 @@ fn pair_named(why: &str) -> Option<i32> {
 /// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
 /// results that can be read is tried again as one that crashed.
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &Report) -> bool {
-    let ended_by_itself = status.pairs.iter().any(|pair| last_word(pair) == Some("exited"));
-    found.reason == reasons::AGENT_CRASHED && ended_by_itself && report.is_final && report.why.is_some()
+    let by_itself = |pair: &PairStatus| matches!(last_word(pair), Some("exited" | "incomplete"));
+    let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
+    is_of_results && status.pairs.iter().any(by_itself) && report.is_final && report.why.is_some()
 }
 
 /// Results that are complete but do not count.
@@ -237,10 +238,13 @@ pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
     let limit = draft.retries().pair.max(1);
     let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
     let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
-    let worn = crashed().find(|p| p.crashes >= limit);
+    let worn = crashed().find(|p| p.crashes >= limit && last_word(p) != Some(UNSEEN));
     let pair = hopeless.or(worn)?;
     Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
 }
+
+/// The word for an agent's crash that only its simulator has told of: the agent's own end is seen moments later.
+const UNSEEN: &str = "unseen";
 
 fn last_word(pair: &PairStatus) -> Option<&str> {
     pair.last.as_ref().map(|last| last.reason.as_str())
@@ -296,6 +300,13 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
             format!(
                 "Agent {id} ended too early {times}, the last time because it printed nothing for too long. Look for a \
                  dead end in its code."
+            ),
+        ),
+        "incomplete" => (
+            reasons::INVALID_RESULTS,
+            format!(
+                "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
+                 no global record. Look at agent/agent{id}/leaderboard.log of the results, mend it and submit again."
             ),
         ),
         "cannotStart" | "startError" => (
@@ -372,8 +383,7 @@ fn word(side: Side, end: &EndView) -> &str {
     let what = end.what.as_deref();
     if side == Side::Simulator {
         return match what {
-            // Its agent crashed; how is not seen.
-            Some("peerCrashed") => "killed",
+            Some("peerCrashed") => UNSEEN,
             Some("notReady") => "notReady",
             _ => "simulator",
         };

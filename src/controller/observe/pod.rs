@@ -140,15 +140,16 @@ fn end(terminated: &ContainerStateTerminated, may_speak: bool) -> EndView {
         at: terminated.finished_at.as_ref().map(|t| t.0),
         what: verdict
             .as_ref()
-            .map(|v| word(v.what).to_owned())
+            .map(|v| word(v).to_owned())
             .or_else(|| foreign.and_then(foreign_word)),
         why: verdict.map(|v| short(&v.why)).or_else(|| foreign.and_then(foreign_why)),
     }
 }
 
 /// The runner's words as the failure policy knows them.
-fn word(what: What) -> &'static str {
-    match what {
+fn word(verdict: &Verdict) -> &'static str {
+    match verdict.what {
+        What::Exited if verdict.exit_code == Some(0) => "incomplete",
         What::Exited => "exited",
         What::Killed => "killed",
         What::Idle => "idle",
@@ -214,6 +215,15 @@ mod tests {
         assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
         let kubelets = seen("agent-1", "StartError", "exec: no such file");
         assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
+    }
+
+    #[test]
+    fn a_command_that_ended_well_without_results_has_a_word_of_its_own() {
+        for (code, word) in [("0", "incomplete"), ("1", "exited"), ("null", "exited")] {
+            let verdict = format!(r#"{{"what":"exited","exitCode":{code},"signal":null,"why":"it exited"}}"#);
+            let end = seen("agent-1", "Error", &verdict);
+            assert_eq!(end.what.as_deref(), Some(word), "{code}");
+        }
     }
 
     #[test]

@@ -2,8 +2,9 @@
 
 use super::builders::*;
 use crate::api::FailureClass::{Infrastructure, Participant};
-use crate::api::State::{Finished, Running};
+use crate::api::State::{Failed, Finished, Running};
 use crate::api::reasons;
+use crate::controller::view::{JobEnd, ReportSight};
 use crate::pod::run::Stop;
 
 /// How often each side of pair 1 ends how, and what comes of it.
@@ -25,10 +26,10 @@ fn a_pair_that_always_fails_ends_the_run_by_its_cause() {
             Participant,
         ),
         (
-            "agent crashes unseen",
-            None,
+            "agent ends without results",
+            Some("incomplete"),
             Some("peerCrashed"),
-            reasons::AGENT_CRASHED,
+            reasons::INVALID_RESULTS,
             Participant,
         ),
         (
@@ -159,6 +160,29 @@ fn a_count_without_a_cause_waits_for_it() {
     assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass_to(Running, reasons::STOPPING);
+}
+
+#[test]
+fn a_crash_that_only_the_simulator_has_told_of_waits_for_the_agents_own_word() {
+    let mut world = World::local().running();
+    world.see(ended("simulator-1", 3, "peerCrashed", 1, 100));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    let mut late = world.clone();
+    world.see(ended("agent-1", 3, "idle", 1, 100));
+    let plan = world.pass_to(Running, reasons::STOPPING);
+    assert_eq!(plan.status.failure.unwrap().reason, reasons::IDLE);
+
+    // Its Pod has gone with it: that it crashed is all that will ever be known.
+    late.view.pod = None;
+    late.job().end = Some(JobEnd::Failed {
+        at: None,
+        reason: "BackoffLimitExceeded".into(),
+        message: "no more".into(),
+    });
+    late.view.report = ReportSight::Absent;
+    let failure = late.pass_to(Failed, reasons::AGENT_CRASHED).status.failure;
+    assert_eq!(failure.unwrap().class, Participant);
 }
 
 #[test]

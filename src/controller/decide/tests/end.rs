@@ -111,6 +111,8 @@ fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_is_told_what_is_wrong_
     };
     for (word, told, reason) in [
         ("exited", Some(refused.clone()), reasons::INVALID_RESULTS),
+        ("incomplete", Some(refused.clone()), reasons::INVALID_RESULTS),
+        ("incomplete", None, reasons::INVALID_RESULTS),
         // A crash in the middle of a write leaves half a file; the crash is the cause then.
         ("killed", Some(refused), reasons::AGENT_CRASHED),
         ("exited", Some(report(3)), reasons::AGENT_CRASHED),
