@@ -3,6 +3,7 @@
 //! Written by `controller::job_spec`, read by `workspace` and `logcopy`. Pure.
 
 use serde::{Deserialize, Serialize};
+use std::fmt::Display;
 
 use crate::api::{LogGroup, RunPlan, Verify};
 
@@ -30,6 +31,16 @@ pub const IDENTITY: &str = "/var/run/secrets/leaderboard";
 pub const IDENTITY_TOKEN_FILE: &str = "token";
 /// Environment variable with the role of `podIdentity.roleArn`, in `workspace` and `logcopy`.
 pub const ENV_ROLE_ARN: &str = "LEADERBOARD_ROLE_ARN";
+
+/// Name of the file in the simulators' folder with what a pair's server has printed.
+pub fn console_name(pair: impl Display) -> String {
+    format!("console-{pair}.log")
+}
+
+/// The same below the `logs` volume, and below the run's prefix.
+pub fn console(pair: impl Display) -> String {
+    format!("simulator/{}", console_name(pair))
+}
 
 /// One attempt of one submission, as its Pod needs to know it.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]

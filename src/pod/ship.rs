@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use super::ownlog::OWN_LOG;
+use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
 use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, cut};
@@ -59,7 +60,9 @@ impl Shipper {
     /// Goes on where the last one was. What a Pod before this one has stored was also sent by it.
     pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &str, pairs: usize, restored: &Memory) -> Self {
         let agents = (1..=pairs).map(|n| (format!("agent/agent{n}/leaderboard.log"), format!("{run_id}/agent-{n}")));
+        let simulators = (1..=pairs).map(|n| (console(n), format!("{run_id}/simulator-{n}")));
         let streams: BTreeMap<String, String> = agents
+            .chain(simulators)
             .chain([(OWN_LOG.to_owned(), format!("{run_id}/logcopy"))])
             .collect();
         let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();

@@ -61,6 +61,7 @@ fn assert_layout(keys: &BTreeMap<String, i64>) {
             format!("containers-status/simulator-{pair}.start0"),
             format!("containers-status/simulator-{pair}.done"),
             format!("simulator/Logs/CarlaUE4-{}.log", 1900 + 100 * pair),
+            format!("simulator/console-{pair}.log"),
         ]);
     }
     // The sidecar's own log is stored once it has something to say.

@@ -19,11 +19,12 @@ Runs CMD as one container of a simulator-agent pair and speaks the status-file p
 both:       --ready-seconds 3600   how long a server may take until its port answers
             --grace-seconds 20     between SIGTERM and SIGKILL
             --peer-seconds 600     how long to wait for the other side's end of a round
+            --log-limit 2147483648 bytes of output that are kept in the log
 simulator:  --flush-seconds 1800   how long to hold the exit until the results are stored
             --cancel-seconds 120   the same after a cancel
+            --log FILE             where output is kept, too
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
-            --log-limit 2147483648 bytes of leaderboard.log in the work folder
             --python-path A:B:C    put in front of the image's own PYTHONPATH
 ";
 
@@ -38,6 +39,8 @@ pub struct Job {
     pub ready: Duration,
     pub grace: Duration,
     pub peer: Duration,
+    /// Bytes of output that are kept in the log.
+    pub log_limit: u64,
     pub role: Role,
     /// The command and its arguments; never empty.
     pub command: Vec<OsString>,
@@ -50,12 +53,12 @@ pub enum Role {
         port: u16,
         flush: Duration,
         cancel: Duration,
+        log: Option<PathBuf>,
     },
     Agent {
         work: PathBuf,
         checkpoint: PathBuf,
         idle: Duration,
-        log_limit: u64,
         python_path: Option<OsString>,
     },
 }
@@ -122,6 +125,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         ready: options.seconds("--ready-seconds", 3600)?,
         grace: options.seconds("--grace-seconds", 20)?,
         peer: options.seconds("--peer-seconds", 600)?,
+        log_limit: options.optional("--log-limit", "a number of bytes")?.unwrap_or(2 << 30),
         role: role(side, &mut options)?,
         command,
     };
@@ -140,12 +144,15 @@ fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
                 .get(),
             flush: options.seconds("--flush-seconds", 1800)?,
             cancel: options.seconds("--cancel-seconds", 120)?,
+            log: options
+                .take("--log")?
+                .filter(|path| !path.is_empty())
+                .map(PathBuf::from),
         },
         Side::Agent => Role::Agent {
             work: options.take("--work")?.map_or_else(|| WORK.into(), PathBuf::from),
             checkpoint: options.path("--checkpoint")?,
             idle: options.seconds("--idle-seconds", 800)?,
-            log_limit: options.optional("--log-limit", "a number of bytes")?.unwrap_or(2 << 30),
             python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
         },
     })
@@ -257,9 +264,11 @@ mod tests {
             Role::Simulator {
                 port: 2100,
                 flush,
-                cancel: Duration::from_mins(2)
+                cancel: Duration::from_mins(2),
+                log: None,
             }
         );
+        assert_eq!(job.log_limit, 2 << 30);
         assert_eq!(
             [job.ready, job.grace, job.peer].map(|time| time.as_secs()),
             [3600, 20, 600]
@@ -274,10 +283,9 @@ mod tests {
             Role::Agent {
                 work,
                 idle,
-                log_limit,
                 python_path,
                 ..
-            } => (work, idle.as_secs(), log_limit, python_path),
+            } => (work, idle.as_secs(), job.log_limit, python_path),
             Role::Simulator { .. } => panic!("an agent's line"),
         };
         assert_eq!(role(job(&format!("{line} -- a"))), (WORK.into(), 800, 2 << 30, None));

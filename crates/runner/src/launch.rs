@@ -5,8 +5,8 @@ use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io;
 use std::net::{SocketAddr, TcpStream};
-use std::path::Path;
-use std::process::Stdio;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::checkpoint;
@@ -15,17 +15,17 @@ use crate::tee::Tee;
 use leaderboard_runner::args::{Job, Role};
 use leaderboard_runner::expand::expand;
 
-/// Starts the command; an agent's with the tee of its output. `round`: crashes so far.
+/// Starts the command, with the tee of its output if that is kept. `round`: crashes so far.
 pub(crate) fn launch(job: &Job, round: u32) -> io::Result<(Group, Option<Tee>)> {
     match &job.role {
-        Role::Simulator { .. } => {
+        Role::Simulator { log: None, .. } => {
             let mut command = group::command(&job.command, &[]);
             Ok((Group::spawn(command.stdin(no_input()))?, None))
         }
+        Role::Simulator { log: Some(log), .. } => teed(group::command(&job.command, &[]), log.clone(), job.log_limit),
         Role::Agent {
             work,
             checkpoint,
-            log_limit,
             python_path,
             ..
         } => {
@@ -36,12 +36,16 @@ pub(crate) fn launch(job: &Job, round: u32) -> io::Result<(Group, Option<Tee>)> 
                 environment.push(("PYTHONPATH", in_front(front, own("PYTHONPATH"))));
             }
             let words = expand_all(&job.command, &environment);
-            let (tee, writer) = Tee::open(work, *log_limit)?;
-            let mut command = group::command(&words, &environment);
-            command.stdin(no_input()).stdout(writer.try_clone()?).stderr(writer);
-            Ok((Group::spawn(&mut command)?, Some(tee)))
+            let log = work.join("leaderboard.log");
+            teed(group::command(&words, &environment), log, job.log_limit)
         }
     }
+}
+
+fn teed(mut command: Command, log: PathBuf, limit: u64) -> io::Result<(Group, Option<Tee>)> {
+    let (tee, writer) = Tee::open(log, limit)?;
+    command.stdin(no_input()).stdout(writer.try_clone()?).stderr(writer);
+    Ok((Group::spawn(&mut command)?, Some(tee)))
 }
 
 /// Nothing to read. A container's own stdin is that already, so one without /dev/null goes on with it.

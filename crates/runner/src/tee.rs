@@ -1,5 +1,5 @@
-//! The agent's output: one pipe for stdout and stderr, copied byte for byte to our own stdout and to
-//! `leaderboard.log`. Called by `run` when `poll` says so; it never blocks on the container's stdout, and holds
+//! The command's output: one pipe for stdout and stderr, copied byte for byte to our own stdout and to
+//! a log. Called by `run` when `poll` says so; it never blocks on the container's stdout, and holds
 //! at most one buffer.
 
 use std::fs::{File, OpenOptions};
@@ -30,15 +30,15 @@ pub(crate) struct Tee {
 }
 
 impl Tee {
-    /// Opens the pipe and `leaderboard.log` in `work`. The write end is for the command, which holds the only copies.
-    pub(crate) fn open(work: &Path, limit: u64) -> io::Result<(Self, PipeWriter)> {
+    /// Opens the pipe and the log. The write end is for the command, which holds the only copies.
+    pub(crate) fn open(log: PathBuf, limit: u64) -> io::Result<(Self, PipeWriter)> {
         let (reader, writer) = io::pipe()?;
         let tee = Self {
             input: Some(reader),
             buffer: vec![0; BUFFER].into_boxed_slice(),
             pending: 0..0,
             stdout_open: true,
-            log: Log::open(work.join("leaderboard.log"), limit),
+            log: Log::open(log, limit),
             last_output: Instant::now(),
         };
         Ok((tee, writer))
@@ -108,7 +108,7 @@ impl Tee {
     }
 }
 
-/// `leaderboard.log`, until its limit or its first error.
+/// The log, until its limit or its first error.
 #[derive(Debug)]
 struct Log {
     path: PathBuf,

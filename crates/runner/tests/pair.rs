@@ -90,6 +90,19 @@ fn a_hold_ends_by_itself_after_its_limit() {
 }
 
 #[test]
+fn what_a_server_prints_is_kept_over_its_rounds() {
+    let pod = Pod::new();
+    let console = pod.path("console.log");
+    let log = format!("--log={}", console.display());
+    let server = ["sh", "-c", "echo up; echo broken >&2; exit 3"];
+    for _ in 0..2 {
+        let mut simulator = pod.simulator_running(&server, &[&log, "--peer-seconds=0"]);
+        assert_eq!(simulator.code(), 1);
+    }
+    assert_eq!(std::fs::read_to_string(console).unwrap(), "up\nbroken\nup\nbroken\n");
+}
+
+#[test]
 fn a_server_that_dies_brings_its_agent_down_and_the_next_round_resumes() {
     let pod = Pod::new();
     let (mut simulator, mut agent) = (pod.simulator(), pod.agent(&patient_agent(&pod)));

@@ -7,6 +7,7 @@ use super::draft::Draft;
 use super::{Action, trouble};
 use crate::api::{FailureClass, SubmissionStatus, conditions, names, reasons};
 use crate::controller::view::PodView;
+use crate::pod::run::console;
 
 /// A place where a log may be.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -65,9 +66,10 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     };
     let pair = failure.pair.unwrap_or_else(|| unfinished(status));
     let agent = || stored(&format!("agent-{pair}"), format!("agent/agent{pair}/leaderboard.log"));
+    let simulator = format!("simulator-{pair}");
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.as_str() {
-        reasons::SIMULATION_CRASHED => vec![on_node(&format!("simulator-{pair}")), Some(agent())],
+        reasons::SIMULATION_CRASHED => vec![on_node(&simulator), Some(stored(&simulator, console(pair)))],
         reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
         reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
             on_node(names::CONTAINER_LOGCOPY),

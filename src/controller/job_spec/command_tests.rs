@@ -305,9 +305,11 @@ fn the_runner_is_told_the_deadlines() {
         args::Role::Simulator {
             port: 2200,
             flush: seconds(50),
-            cancel: seconds(40)
+            cancel: seconds(40),
+            log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
         }
     );
+    assert_eq!(simulator.log_limit, 64 << 20);
     assert_eq!(
         command,
         [
@@ -327,10 +329,9 @@ fn the_runner_is_told_the_deadlines() {
         work: "/tmp/agent".into(),
         checkpoint: "/tmp/agent/agent_results.json".into(),
         idle: seconds(30),
-        log_limit: 2_097_152,
         python_path: Some(FRONT.into()),
     };
-    assert_eq!(agent.role, role);
+    assert_eq!((agent.role, agent.log_limit), (role, 2_097_152));
 }
 
 #[test]

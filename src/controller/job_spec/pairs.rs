@@ -1,12 +1,12 @@
 //! The simulator and the agent of each pair: strangers' images behind our runner. Pure.
 //!
-//! What they see (mounts, variables, flags) is the original's, version by version; docs/participants.md tells it.
+//! What they see (mounts, variables, flags) is the original's, version by version.
 
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 
 use super::{JobInput, commands, init, variable, volumes};
 use crate::api::{ResultsFormat, names};
-use crate::pod::run::{RUNNER, TOOLS};
+use crate::pod::run::{RUNNER, TOOLS, console_name};
 
 pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
 pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
@@ -16,6 +16,8 @@ const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
 const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
 const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
+/// A server prints little; one that floods must not fill the disk. In bytes.
+const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
 
 /// Variables of simulators and agents that follow from the plan: nobody else may set them.
 pub(in crate::controller) const FIXED_ENV: [&str; 12] = [
@@ -52,6 +54,8 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         seconds("ready", deadlines.ready_seconds),
         seconds("flush", deadlines.flush_seconds),
         seconds("cancel", deadlines.cancel_seconds),
+        format!("--log={}/{}", volumes::SAVED, console_name(pair)),
+        format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
     ];
     let host = spec
         .command

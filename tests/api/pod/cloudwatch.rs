@@ -65,8 +65,10 @@ async fn logcopy_sends_the_logs_of_its_run() {
     let logcopy = pod.logcopy();
     pod.reported(|report| report.round >= 1).await;
     pod.append("agent/agent1/leaderboard.log", b"last");
+    pod.append("simulator/console-1.log", b"listening\n");
     logcopy.end().await;
     assert_eq!(all(&logs, &group, "77/agent-1").await, ["first", "last"]);
+    assert_eq!(all(&logs, &group, "77/simulator-1").await, ["listening"]);
 }
 
 async fn all(logs: &aws_sdk_cloudwatchlogs::Client, group: &str, stream: &str) -> Vec<String> {

@@ -125,11 +125,8 @@ fn a_simulators_log_is_kept_while_its_pod_lives() {
         ["last simulator-1"],
         "what runs now has not crashed"
     );
-    // The Pod's end took it along; the agent saw the crash too.
-    assert_eq!(
-        places(&end_without_pod(&mut world)),
-        ["s3 agent/agent1/leaderboard.log"]
-    );
+    // The Pod's end took it along.
+    assert_eq!(places(&end_without_pod(&mut world)), ["s3 simulator/console-1.log"]);
 }
 
 #[test]
