@@ -58,6 +58,12 @@ pub fn kill_container(pod: &Pod, container: &str) {
     }
 }
 
+/// The same for one that may have ended; says whether anything was killed.
+pub fn kill_if_running(pod: &Pod, container: &str) -> bool {
+    let processes = of_container(&id_of(pod, container)).into_iter();
+    processes.flat_map(|process| kill(process, Signal::SIGKILL)).count() > 0
+}
+
 fn id_of(pod: &Pod, container: &str) -> String {
     let all = containers(pod).into_iter();
     let found = all

@@ -262,7 +262,6 @@ impl Worker<'_> {
             say("The sensor's configuration used is invalid");
             (scenario::rejected(format, leg), Some("Rejected"))
         } else if drive(&mut self.link, &self.faults, self.invocation, self.route_time, leg) {
-            self.await_copy();
             let mut record = outcome.record(format, leg);
             self.faults.falsify(number, &mut record);
             (record, None)
@@ -270,6 +269,7 @@ impl Worker<'_> {
             say("> The simulation crashed");
             (outcome.broken_off(format, leg), Some("Crashed"))
         };
+        self.await_copy();
         say("> Registering the route statistics");
         self.file.routes.records.truncate(leg.index);
         self.file.routes.records.push(record);
