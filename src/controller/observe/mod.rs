@@ -76,8 +76,9 @@ fn children(context: &Context, submission: &Submission, namespace: &str, name: &
     if !is_owned_by(&found, submission) {
         return (JobSight::Foreign, None);
     }
-    let pod = context.stores.newest_pod(&found).map(|p| pod::view(&p));
-    (JobSight::Ours(job::view(&found)), pod)
+    let pod = context.stores.newest_pod(&found);
+    let job = job::view(&found, pod.as_deref());
+    (JobSight::Ours(job), pod.map(|pod| pod::view(&pod)))
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {
