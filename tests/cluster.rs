@@ -1,7 +1,7 @@
 //! The whole system on a real cluster: the operator's own programs, real Pods, and stand-ins for AWS and EvalAI.
 //!
 //! Each test has a namespace, queues, a table and a prefix in the bucket of its own, and runs the operator as child processes
-//! that it may kill and stop. Three tests run at once; each prints its seconds.
+//! that it may kill and stop. Two tests run at once; each prints its seconds.
 
 #![allow(
     clippy::unwrap_used,
