@@ -30,6 +30,9 @@ use round::{Rounds, Why};
 
 /// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.
 const LAST_FLUSH: Duration = Duration::from_mins(5);
+/// What a round under way has to land after SIGTERM. A request that is dropped may still be served, and then replace the newer
+/// results that the last flush has stored meanwhile.
+const LANDING: Duration = Duration::from_secs(3);
 /// How often the stop file is read where inotify says nothing.
 const STOP_POLL: Duration = Duration::from_secs(2);
 /// Time between two passes over the logs for CloudWatch.
@@ -153,9 +156,8 @@ async fn keep_going(mut rounds: Rounds, shutdown: impl Future<Output = ()>) -> R
     tokio::pin!(shutdown);
     let mut failures: u32 = 0;
     loop {
-        let outcome = tokio::select! {
-            () = &mut shutdown => break,
-            outcome = rounds.round(Why::Period) => outcome,
+        let Some(outcome) = unless_stopped(rounds.round(Why::Period), &mut shutdown).await else {
+            break;
         };
         let pause = match outcome {
             Ok(pause) => {
@@ -184,6 +186,20 @@ async fn keep_going(mut rounds: Rounds, shutdown: impl Future<Output = ()>) -> R
     Ok(())
 }
 
+/// A round's outcome; `None` after SIGTERM, when the round has landed or its time to land is over.
+async fn unless_stopped<T>(round: impl Future<Output = T>, shutdown: impl Future<Output = ()>) -> Option<T> {
+    tokio::pin!(round);
+    tokio::select! {
+        biased;
+        () = shutdown => {
+            // Whatever it comes to, the last flush looks at everything once more.
+            let _ = tokio::time::timeout(LANDING, &mut round).await;
+            None
+        }
+        outcome = &mut round => Some(outcome),
+    }
+}
+
 /// Stores what is left, again and again while that fails: S3 may be back before the Pod's grace is over.
 async fn last_flush(rounds: &mut Rounds, longest: Duration) {
     let began = Instant::now();
@@ -207,5 +223,36 @@ async fn last_flush(rounds: &mut Rounds, longest: Duration) {
             "the last changes are not stored: it took more than {} s",
             longest.as_secs()
         ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::{pending, ready};
+
+    use super::*;
+
+    async fn round_of(seconds: u64) -> u64 {
+        tokio::time::sleep(Duration::from_secs(seconds)).await;
+        seconds
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_round_under_way_lands_before_the_last_flush() {
+        let landed = std::cell::Cell::new(false);
+        let round = async {
+            round_of(2).await;
+            landed.set(true);
+        };
+        assert_eq!(unless_stopped(round, ready(())).await, None);
+        assert!(landed.get());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_round_that_hangs_takes_little_of_the_last_flush() {
+        let began = tokio::time::Instant::now();
+        assert_eq!(unless_stopped(round_of(3600), ready(())).await, None);
+        assert_eq!(began.elapsed(), LANDING);
+        assert_eq!(unless_stopped(round_of(3600), pending()).await, Some(3600));
     }
 }
