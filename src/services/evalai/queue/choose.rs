@@ -213,7 +213,7 @@ impl Queue {
                 if within(sub.clear_at, window, now) {
                     return Some((Priority::Rest, partial.since, true, Step::Partial));
                 }
-                if self.lists_are_late(sub) {
+                if self.lists_are_late(sub, window) {
                     return Some((Priority::Rest, partial.since, true, Step::GetForEnd));
                 }
             }
@@ -251,7 +251,7 @@ impl Queue {
         if lane.unsure || sub.outdated || verdict.is_none() {
             return get;
         }
-        let late = self.lists_are_late(sub);
+        let late = self.lists_are_late(sub, self.timing.slow_list);
         let seen = if late {
             sub.read.map(|read| read.answered)
         } else {
@@ -270,8 +270,8 @@ impl Queue {
 
     /// Whether lists take so long that somebody may have cancelled since they were asked for: a read of one's own tells of
     /// a past that is nearer.
-    fn lists_are_late(&self, sub: &Sub) -> bool {
-        let late = |challenge: &Challenge| challenge.cancel.is_late_for(self.timing.window);
+    fn lists_are_late(&self, sub: &Sub, window: Duration) -> bool {
+        let late = |challenge: &Challenge| challenge.cancel.is_late_for(window);
         sub.live.is_some() && self.challenges.get(&sub.challenge).is_some_and(late)
     }
 

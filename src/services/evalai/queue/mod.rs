@@ -51,8 +51,10 @@ pub struct Now {
 pub struct Timing {
     /// Nothing for a submission after a write without an answer: the server's own limit of 60 s, and a margin.
     pub hold: Duration,
-    /// Partial results follow a list or read by no more.
+    /// Partial results follow a list or read by no more: a cancel in between is lost.
     pub window: Duration,
+    /// Progress follows a list that takes no more than half of this; else a read of its own.
+    pub slow_list: Duration,
     /// An end and progress follow a read by no more, plus what two requests cost.
     pub fresh: Duration,
     /// Between two lists of new submissions.
@@ -71,7 +73,8 @@ impl Default for Timing {
     fn default() -> Self {
         Self {
             hold: Duration::from_secs(75),
-            window: Duration::from_secs(2),
+            window: Duration::from_millis(500),
+            slow_list: Duration::from_secs(2),
             fresh: Duration::from_secs(5),
             accept: Duration::from_secs(5),
             lost: Duration::from_mins(2),

@@ -258,7 +258,7 @@ impl World {
             let cleared = self.cleared.get(&pk).expect("a partial before any list");
             let age = at.saturating_sub(*cleared);
             assert!(
-                age <= Duration::from_millis(2001),
+                age <= Duration::from_millis(501),
                 "a partial {age:?} after the last list: {ticket:?}"
             );
         }
@@ -388,7 +388,7 @@ impl World {
                     .contains(&format!("submission-{}-{}", work.pk, work.attempt)))
         {
             // Whoever cancels while we write, or in the moments since our last read, is overwritten; nobody else.
-            let window = if work.kind == "partial" { 2.0 } else { 7.3 };
+            let window = if work.kind == "partial" { 0.5 } else { 7.3 };
             let since = work.sent.saturating_sub(Duration::from_secs_f64(window + 0.6));
             assert!(
                 at >= since,

@@ -185,7 +185,7 @@ fn partials_follow_a_list_by_two_seconds_at_most() {
     bench.wish(7, 1, Wish::Partial(results(41.0)));
     bench.wait(7.9);
     bench.list("list of cancelled", vec![]);
-    bench.wait(1.9);
+    bench.wait(0.4);
     let ticket = bench.write("partial 7");
     assert!(
         matches!(&ticket.request, Request::Partial(_, payload) if *payload == results(41.0)),
@@ -247,7 +247,7 @@ fn a_slow_list_is_too_old_for_partials_and_a_read_takes_its_place() {
     bench.wait(3.0);
     bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
     bench.get(7, row(7, Status::Running));
-    bench.wait(1.9);
+    bench.wait(0.4);
     bench.write("partial 7");
     bench.wish(7, 1, Wish::Partial(results(42.0)));
     bench.wait(0.2);
@@ -266,9 +266,9 @@ fn the_time_that_a_list_takes_is_taken_off_its_window() {
     bench.running(7);
     bench.wait(10.0);
     let list = bench.expect("list of cancelled");
-    bench.wait(0.9);
+    bench.wait(0.2);
     bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
-    bench.wait(1.0);
+    bench.wait(0.2);
     bench.wish(7, 1, Wish::Partial(results(41.0)));
     bench.write("partial 7");
     bench.wish(7, 1, Wish::Partial(results(42.0)));
