@@ -89,6 +89,8 @@ pub struct PodView {
     /// When its first agent started.
     pub agent_started: Option<Timestamp>,
     pub logcopy_running: bool,
+    /// When the last of its agents and simulators ended, once all of them have ended well.
+    pub run_ended: Option<Timestamp>,
     pub containers: Vec<ContainerView>,
     /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
     pub ended_by_node: Option<(String, String)>,
@@ -126,6 +128,8 @@ pub struct EndView {
     /// Kubernetes' reason: `Completed`, `Error`, `OOMKilled`, `StartError`, …
     pub reason: String,
     pub exit_code: i32,
+    /// When this life of it began.
+    pub began: Option<Timestamp>,
     pub at: Option<Timestamp>,
     /// The runner's word for it, `exited`, `idle`, `peerCrashed`, …; `incomplete` if the command ended well by itself.
     pub what: Option<String>,

@@ -99,6 +99,9 @@ impl Runner {
     }
 
     fn live(&mut self) -> Cause {
+        if self.round >= MAX_ROUNDS {
+            return self.too_many_crashes();
+        }
         loop {
             let seen = self.look();
             let done = match decide::next(self.me.side, self.phase, &seen) {
@@ -192,7 +195,7 @@ impl Runner {
             Skip::CatchUp => "the other side crashed in this round before this one started; on to the next",
         });
         if round + 1 >= MAX_ROUNDS {
-            return Err(self.mute("the status folder holds more crashes than can be counted".to_owned()));
+            return Err(self.too_many_crashes());
         }
         self.round = round + 1;
         if self.me.side == Side::Agent {
@@ -236,6 +239,15 @@ impl Runner {
         ));
         self.phase = Phase::Running;
         Ok(())
+    }
+
+    /// Nobody crashes so often: an agent has made the files itself, and its simulator must not answer for it.
+    fn too_many_crashes(&mut self) -> Cause {
+        let of_peer = StatusFile::Of(self.me.peer(), Mark::Crash(MAX_ROUNDS - 1));
+        if self.me.side == Side::Simulator && of_peer.exists(&self.job.status) {
+            return Cause::PeerCrashed;
+        }
+        self.mute("the status folder holds more crashes than can be counted".to_owned())
     }
 
     fn mark(&mut self, mark: Mark) -> Result<(), Cause> {

@@ -342,6 +342,28 @@ fn files_that_an_agent_forges_in_its_own_folder_mean_nothing() {
 }
 
 #[test]
+fn crashes_that_an_agent_forges_are_never_its_simulators() {
+    let pod = Pod::new();
+    let forge = "i=0; while [ $i -lt 1000 ]; do : > agent-1.crash$i; i=$((i + 1)); done";
+    let script = format!(
+        "cd {}/agent-1 && {forge}; {}",
+        pod.status().display(),
+        patient_agent(&pod)
+    );
+    let (mut simulator, mut agent) = (pod.simulator(), pod.agent(&script));
+    assert_eq!((simulator.code(), agent.code()), (1, 1));
+    assert_eq!(
+        [simulator.verdict().what, agent.verdict().what],
+        [What::PeerCrashed, What::PeerCrashed],
+        "each blames the other, which happens to no honest pair"
+    );
+    let mut simulator = pod.simulator();
+    assert_eq!((simulator.code(), simulator.verdict().what), (1, What::PeerCrashed));
+    let mut agent = pod.agent(&script);
+    assert_eq!((agent.code(), agent.verdict().what), (74, What::CannotStart));
+}
+
+#[test]
 fn a_status_folder_that_cannot_be_written_is_said_and_ends_the_container() {
     let pod = Pod::new();
     fs::write(pod.status().join("simulator-1"), "").unwrap();

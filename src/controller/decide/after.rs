@@ -46,7 +46,9 @@ enum Sync {
 /// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
 pub(super) fn leave_job(draft: &mut Draft<'_>) {
     let JobSight::Ours(job) = &draft.view.job else { return };
-    if job.end.is_some() {
+    // A Pod whose run has ended is only saying its farewell.
+    let ends_by_itself = draft.view.pod.as_ref().is_some_and(|pod| pod.run_ended.is_some());
+    if job.end.is_some() || ends_by_itself {
         return keep_job_for_its_time(draft, job);
     }
     if job.deleting {

@@ -9,7 +9,7 @@ use super::draft::{Draft, after};
 use super::failure::{self, sentence};
 use crate::api::conditions::{self, Truth};
 use crate::api::{Failure, FailureClass, State, reasons};
-use crate::controller::view::{JobEnd, JobSight, ReportSight, View};
+use crate::controller::view::{JobEnd, ReportSight, View};
 use crate::pod::report::Report;
 
 /// First delay before a new Job after an infrastructure failure; doubles with each.
@@ -51,6 +51,21 @@ pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
         return retry(draft, &found);
     }
     failed(draft, found);
+}
+
+/// Finishes a run whose agents and simulators have ended well and whose complete results are stored and count: nothing that its
+/// Pod still does can change them. Returns whether it did. Every other end waits for the Job.
+pub(super) fn of_complete_run(draft: &mut Draft<'_>) -> bool {
+    let view = draft.view;
+    let Some(pod) = view.pod.as_ref().filter(|pod| pod.run_ended.is_some()) else {
+        return false;
+    };
+    let report = view.report.ours().filter(|r| r.pod_uid == pod.uid);
+    let Some(report) = report.filter(|r| is_complete(r) && r.eligible) else {
+        return false;
+    };
+    finished(draft, report);
+    true
 }
 
 fn is_complete(report: &Report) -> bool {
@@ -164,7 +179,7 @@ fn failed(draft: &mut Draft<'_>, found: Failure) {
 }
 
 fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
-    let ended = draft.view.job_ended_at().unwrap_or(draft.now());
+    let ended = draft.view.ended_at().unwrap_or(draft.now());
     draft.status.times.finished = Some(Time(ended.min(draft.now())));
     draft.status.waiting = None;
     draft.status.next_try = None;
@@ -188,12 +203,10 @@ fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
 }
 
 impl View {
-    fn job_ended_at(&self) -> Option<Timestamp> {
-        match &self.job {
-            JobSight::Ours(job) => match job.end.as_ref()? {
-                JobEnd::Complete { at } | JobEnd::Failed { at, .. } => *at,
-            },
-            _ => None,
+    fn ended_at(&self) -> Option<Timestamp> {
+        match self.job.ours()?.end.as_ref() {
+            Some(JobEnd::Complete { at } | JobEnd::Failed { at, .. }) => *at,
+            None => self.pod.as_ref()?.run_ended,
         }
     }
 }

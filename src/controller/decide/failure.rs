@@ -212,25 +212,40 @@ fn last_end(pod: &PodView, id: i32) -> Option<LastEnd> {
     };
     let agent = end_of(Side::Agent);
     let simulator = end_of(Side::Simulator);
-    let (side, end) = match (agent, simulator) {
-        (Some(agent), Some(simulator)) if is_followed(simulator, agent) => (Side::Simulator, simulator),
-        (Some(agent), _) => (Side::Agent, agent),
-        (None, simulator) => (Side::Simulator, simulator?),
+    let (word, end) = match (agent, simulator) {
+        (Some(agent), Some(simulator)) if blame_each_other(simulator, agent) => (FORGED, agent),
+        (Some(agent), Some(simulator)) if is_followed(simulator, agent) => {
+            (word(Side::Simulator, simulator), simulator)
+        }
+        (Some(agent), _) => (word(Side::Agent, agent), agent),
+        (None, simulator) => (word(Side::Simulator, simulator?), simulator?),
     };
     Some(LastEnd {
-        reason: word(side, end).into(),
+        reason: word.into(),
         exit_code: Some(end.exit_code),
         time: end.at.map(Time),
     })
 }
 
+/// Whether a simulator that crashed of itself is the last word: it took this agent along, or did so in a later round.
 fn is_followed(simulator: &EndView, agent: &EndView) -> bool {
-    const SAME_ROUND_SECONDS: i64 = 60;
-    let is_earlier_round = match (simulator.at, agent.at) {
-        (Some(simulator), Some(agent)) => agent.duration_since(simulator).as_secs() > SAME_ROUND_SECONDS,
-        _ => false,
-    };
-    simulator.what.as_deref() != Some("peerCrashed") && !is_earlier_round
+    !says_peer_crashed(simulator) && !is_before(simulator, agent)
+}
+
+/// Either side writes down its own crash before the other can see it, so one of them has a cause of its own. Where neither has,
+/// the agent has written a crash into its folder of the status files.
+fn blame_each_other(simulator: &EndView, agent: &EndView) -> bool {
+    let is_same_round = !is_before(simulator, agent) && !is_before(agent, simulator);
+    says_peer_crashed(simulator) && says_peer_crashed(agent) && is_same_round
+}
+
+fn says_peer_crashed(end: &EndView) -> bool {
+    end.what.as_deref() == Some("peerCrashed")
+}
+
+/// Whether a life was over before the other began, and so belongs to an earlier round: those of one round overlap.
+fn is_before(end: &EndView, other: &EndView) -> bool {
+    end.at.zip(other.began).is_some_and(|(at, began)| at < began)
 }
 
 /// Whether a pair has crashed as often as it may, or cannot start at all. A count whose cause is not seen yet waits for it.
@@ -245,6 +260,8 @@ pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
 
 /// The word for an agent's crash that only its simulator has told of: the agent's own end is seen moments later.
 const UNSEEN: &str = "unseen";
+/// The word for a crash that an agent has made up.
+const FORGED: &str = "forged";
 
 fn last_word(pair: &PairStatus) -> Option<&str> {
     pair.last.as_ref().map(|last| last.reason.as_str())
@@ -300,6 +317,13 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
             format!(
                 "Agent {id} ended too early {times}, the last time because it printed nothing for too long. Look for a \
                  dead end in its code."
+            ),
+        ),
+        FORGED => (
+            reasons::AGENT_CRASHED,
+            format!(
+                "Agent {id} ended {times} by a status file that says it crashed, which it has not. Leave the folder of the \
+                 status files to the evaluator's runner, and submit again."
             ),
         ),
         "incomplete" => (

@@ -198,6 +198,9 @@ fn with_job(draft: &mut Draft<'_>, job: &JobView) {
     if let Some(job_end) = &job.end {
         return end::decide(draft, Some(job_end));
     }
+    if end::of_complete_run(draft) {
+        return;
+    }
     if job.deleting {
         return stop::being_deleted(draft);
     }

@@ -16,12 +16,13 @@ use crate::controller::view::{JobView, PodView};
 /// What is said of a Pod that does as it should.
 pub(super) const PREPARED: &str = "Its Pod is being prepared.";
 const LOST: &str = "Its Pod was lost; the Job makes another one, which goes on from S3.";
-/// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then.
-const SILENCE: i64 = 60;
+/// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then. Less than the minute
+/// in which people want to see a cause.
+const SILENCE: i64 = 45;
 /// The minutes of silence that are told: a count of every one would be a write each.
 const TOLD_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
 /// How long a Job may take to make its Pod before that is shown.
-const POD_SECONDS: i64 = 120;
+const POD_SECONDS: i64 = 45;
 
 /// Says how far a Job's Pod is, and fails the attempt when a start has taken too long.
 pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
@@ -99,7 +100,7 @@ fn show_preparing(draft: &mut Draft<'_>, pod: &PodView, since: Timestamp) {
     draft.moves();
     let silent = draft.now().duration_since(since).as_secs();
     let message = if silent < SILENCE {
-        draft.requeue_in(Duration::from_secs(SILENCE.unsigned_abs()));
+        draft.requeue_at(after(since, SILENCE));
         PREPARED.to_owned()
     } else {
         let told = TOLD_MINUTES.iter().rev().find(|m| silent >= **m * 60);

@@ -39,7 +39,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         Some(pod) if pod.delete_by.is_some() => node::sight(context, pod).await,
         _ => NodeSight::Unknown,
     };
-    let report = report::read(context, &submission, &job, now).await;
+    let report = report::read(context, &submission, &job, pod.as_ref(), now).await;
     let record = leaderboard
         .as_ref()
         .and_then(|l| context.sync.record_view(l, &submission));

@@ -28,6 +28,7 @@ pub fn view(pod: &Pod) -> PodView {
         deleted: deleted(pod),
         agent_started: agent_started(&status),
         logcopy_running: running(names::CONTAINER_LOGCOPY),
+        run_ended: run_ended(pod, &status),
         ended_by_node: ended_by_node(&status),
         stop: pod
             .annotations()
@@ -73,6 +74,25 @@ fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
         .flatten()
         .filter(|c| c.name.starts_with("agent-"));
     agents.flat_map(started_times).min()
+}
+
+/// The simulators leave once the final report is stored; logcopy's farewell and the kubelet's last word come seconds later.
+fn run_ended(pod: &Pod, status: &PodStatus) -> Option<jiff::Timestamp> {
+    let containers = pod.spec.iter().flat_map(|spec| &spec.containers);
+    let of_pairs = containers.filter(|c| ["agent-", "simulator-"].iter().any(|start| c.name.starts_with(start)));
+    let ends: Option<Vec<jiff::Timestamp>> = of_pairs
+        .map(|wanted| {
+            let mut statuses = status.container_statuses.iter().flatten();
+            let end = statuses
+                .find(|s| s.name == wanted.name)?
+                .state
+                .as_ref()?
+                .terminated
+                .as_ref()?;
+            end.finished_at.as_ref().filter(|_| end.exit_code == 0).map(|at| at.0)
+        })
+        .collect();
+    ends?.into_iter().max()
 }
 
 fn started_times(status: &ContainerStatus) -> impl Iterator<Item = jiff::Timestamp> {
@@ -137,6 +157,7 @@ fn end(terminated: &ContainerStateTerminated, may_speak: bool) -> EndView {
     EndView {
         reason: if out_of_memory { "OOMKilled".into() } else { reason },
         exit_code: terminated.exit_code,
+        began: terminated.started_at.as_ref().map(|t| t.0),
         at: terminated.finished_at.as_ref().map(|t| t.0),
         what: verdict
             .as_ref()
@@ -224,6 +245,36 @@ mod tests {
             let end = seen("agent-1", "Error", &verdict);
             assert_eq!(end.what.as_deref(), Some(word), "{code}");
         }
+    }
+
+    #[test]
+    fn a_run_has_ended_once_every_agent_and_simulator_has_ended_well() {
+        let ended = |name: &str, code: i32, at: &str| {
+            json!({"name": name, "image": "i", "imageID": "", "ready": false, "restartCount": 0,
+                   "state": {"terminated": {"exitCode": code, "finishedAt": at}}})
+        };
+        let seen = |statuses: Vec<serde_json::Value>| {
+            let pod = json!({"metadata": {"name": "p"},
+                "spec": {"containers": [{"name": "simulator-1"}, {"name": "agent-1"}, {"name": "extra"}]},
+                "status": {"containerStatuses": statuses}});
+            view(&serde_json::from_value(pod).unwrap())
+                .run_ended
+                .map(|at| at.to_string())
+        };
+        let agent = ended("agent-1", 0, "2026-01-01T00:00:07Z");
+        let simulator = ended("simulator-1", 0, "2026-01-01T00:00:09Z");
+        assert_eq!(
+            seen(vec![agent.clone(), simulator]),
+            Some("2026-01-01T00:00:09Z".into())
+        );
+        assert_eq!(
+            seen(vec![agent.clone(), ended("simulator-1", 1, "2026-01-01T00:00:09Z")]),
+            None
+        );
+        let running = json!({"name": "simulator-1", "image": "i", "imageID": "", "ready": true, "restartCount": 1,
+            "state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}});
+        assert_eq!(seen(vec![agent.clone(), running]), None);
+        assert_eq!((seen(vec![agent]), seen(vec![])), (None, None), "not all are known yet");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The report of a run: read from S3 once a period with If-None-Match, and always when its Job has ended.
+//! The report of a run: read from S3 once a period with If-None-Match, and always when its run or its Job has ended.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,7 +10,7 @@ use kube::ResourceExt;
 use super::{report_matters, uid_of};
 use crate::api::{Submission, SubmissionStatus};
 use crate::controller::context::Context;
-use crate::controller::view::{JobSight, ReportSight};
+use crate::controller::view::{JobSight, PodView, ReportSight};
 use crate::pod::report::{MAX_BYTES, REPORT_KEY, Report};
 use crate::services::archive::Fetched;
 
@@ -56,7 +56,13 @@ impl Reports {
 }
 
 /// Reads the report if this pass needs it.
-pub async fn read(context: &Context, submission: &Submission, job: &JobSight, now: Timestamp) -> ReportSight {
+pub async fn read(
+    context: &Context,
+    submission: &Submission,
+    job: &JobSight,
+    pod: Option<&PodView>,
+    now: Timestamp,
+) -> ReportSight {
     if !report_matters(submission, job) {
         return ReportSight::NotRead;
     }
@@ -65,7 +71,8 @@ pub async fn read(context: &Context, submission: &Submission, job: &JobSight, no
     };
     let uid = uid_of(submission);
     let known = context.reports.get(&uid);
-    let live = job.ours().is_some_and(|j| j.end.is_none());
+    let has_ended = pod.is_some_and(|pod| pod.run_ended.is_some());
+    let live = !has_ended && job.ours().is_some_and(|j| j.end.is_none());
     if live && status.times.scheduled.is_none() {
         return ReportSight::NotRead;
     }

@@ -290,6 +290,7 @@ pub fn ended(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64)
         last: Some(EndView {
             reason: if exit_code == 0 { "Completed" } else { "Error" }.into(),
             exit_code,
+            began: Some(at(second - 50)),
             at: Some(at(second)),
             what: (!what.is_empty()).then(|| what.into()),
             why: None,

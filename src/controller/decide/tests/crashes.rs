@@ -61,6 +61,13 @@ fn a_pair_that_always_fails_ends_the_run_by_its_cause() {
             Infrastructure,
         ),
         (
+            "agent says that it crashed, and runs on",
+            Some("peerCrashed"),
+            Some("peerCrashed"),
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
             "simulator cannot start",
             None,
             Some("cannotStart"),
@@ -149,6 +156,23 @@ fn a_simulators_crash_of_an_earlier_round_does_not_excuse_the_agent() {
     world.see(ended("agent-1", 3, "exited", 1, 900));
     let failure = world.pass().status.failure.unwrap();
     assert_eq!(failure.reason, reasons::AGENT_CRASHED);
+}
+
+#[test]
+fn ends_of_different_rounds_explain_nothing_of_each_other() {
+    for (agent, simulator, reason) in [
+        // The agent's is the later: its simulator of that round runs still.
+        (("peerCrashed", 900), ("peerCrashed", 100), reasons::SIMULATION_CRASHED),
+        (("exited", 900), ("exited", 100), reasons::AGENT_CRASHED),
+        (("exited", 140), ("exited", 100), reasons::SIMULATION_CRASHED),
+        (("exited", 160), ("exited", 100), reasons::AGENT_CRASHED),
+    ] {
+        let mut world = World::local().running();
+        world.see(ended("agent-1", 3, agent.0, 1, agent.1));
+        world.see(ended("simulator-1", 3, simulator.0, 1, simulator.1));
+        let failure = world.pass().status.failure.unwrap();
+        assert_eq!(failure.reason, reason, "{agent:?} {simulator:?}");
+    }
 }
 
 #[test]

@@ -33,6 +33,61 @@ fn complete_results_that_count_finish() {
     assert!(has(&plan, |a| matches!(a, Action::SetJobTtl { seconds: 86_400, .. })));
 }
 
+/// The Pod's agents and simulators have ended well at this second; its Job knows nothing of it yet.
+fn run_ends(world: &mut World, second: i64) {
+    world.go_to(second + 1);
+    world.pod().run_ended = Some(at(second));
+}
+
+#[test]
+fn a_complete_run_waits_neither_for_logcopys_farewell_nor_for_its_job() {
+    let mut world = World::local().running();
+    run_ends(&mut world, 500);
+    world.report(final_report());
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(plan.status.times.finished.clone().unwrap().0, at(500));
+    assert_eq!(condition(&plan, ARCHIVED), ("True".into(), reasons::STORED.into()));
+    assert!(has(&plan, |a| matches!(a, Action::SetJobTtl { .. })));
+    assert!(
+        !has(&plan, |a| matches!(a, Action::DeleteJob { .. })),
+        "it ends by itself"
+    );
+    world.complete();
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn every_other_end_of_a_run_waits_for_its_job() {
+    let foreign = Report {
+        pod_uid: "an earlier Pod".into(),
+        ..final_report()
+    };
+    let ineligible = Report {
+        eligible: false,
+        entry_status: "Rejected".into(),
+        ..final_report()
+    };
+    for told in [foreign, ineligible, report(4), report(3)] {
+        let mut world = World::local().running();
+        run_ends(&mut world, 500);
+        world.report(told);
+        world.pass_to(Running, reasons::RUNNING);
+    }
+    let mut world = World::local().running();
+    run_ends(&mut world, 500);
+    world.view.report = ReportSight::Unreadable("away".into());
+    world.pass_to(Running, reasons::RUNNING);
+}
+
+#[test]
+fn results_that_are_complete_win_over_a_cancel_that_comes_with_them() {
+    let mut world = World::local().running();
+    world.submission().spec.cancel = true;
+    run_ends(&mut world, 500);
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
 #[test]
 fn each_end_without_that_has_its_class_and_reason() {
     let is_final = true;

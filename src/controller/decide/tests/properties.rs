@@ -142,18 +142,20 @@ fn pod_view() -> impl Strategy<Value = PodView> {
         select(vec![None, None, Some(at(30)), Some(at(900))]),
         select(ends),
         any::<bool>(),
+        select(vec![None, None, Some(at(400))]),
     );
     let stop = select(vec![None, Some(Stop::Cancel), Some(Stop::Retries)]);
     let containers = prop::collection::vec(container(), 0..5);
     let uid = select(vec!["pod-uid", "pod-2"]);
     (times, fate, stop, containers, uid).prop_map(|(times, fate, stop, containers, uid)| {
         let (scheduled, agent_started, logcopy_running) = times;
-        let (delete_by, ended_by_node, unschedulable) = fate;
+        let (delete_by, ended_by_node, unschedulable, run_ended) = fate;
         PodView {
             uid: uid.into(),
             scheduled,
             agent_started,
             logcopy_running,
+            run_ended,
             delete_by,
             deleted: delete_by.map(|by| by.min(at(300))),
             ended_by_node,

@@ -277,9 +277,9 @@ fn a_quota_or_a_refusal_is_said_and_goes_on_when_mended() {
 #[test]
 fn a_job_without_a_pod_is_shown_when_it_lasts() {
     let mut world = World::local().with_job();
-    world.go_to(119);
+    world.go_to(44);
     assert_eq!(condition(&world.pass(), STALLED).0, "False");
-    world.go_to(120);
+    world.go_to(45);
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert_eq!(condition(&plan, STALLED).0, "True");
     assert!(plan.status.message.unwrap().contains("controller manager"));
