@@ -13,6 +13,7 @@ use kube::runtime::events::{Event as KubeEvent, EventType};
 use kube::{Api, Resource, ResourceExt};
 use serde_json::json;
 
+use super::bucket::BucketError;
 use super::context::{CALL_TIMEOUT, Context};
 use super::decide::{Action, Event, Plan};
 use super::failure_log;
@@ -22,7 +23,6 @@ use super::significance::{Change, change, patience};
 use super::view::View;
 use crate::api::{Submission, SubmissionStatus, names};
 use crate::pod::report::OWNER_KEY;
-use crate::services::archive::ArchiveError;
 
 /// What a pass could not carry out.
 #[derive(thiserror::Error, Debug)]
@@ -36,12 +36,17 @@ pub enum ActError {
     #[error("{what} of {object}: the API server did not answer within {} s", CALL_TIMEOUT.as_secs())]
     Silent { what: &'static str, object: String },
     #[error("the fence of {object} could not be written: {source}")]
-    Fence { object: String, source: Box<ArchiveError> },
+    Fence { object: String, source: Box<BucketError> },
     #[error("{object} has no plan although its Job is to be made; its Leaderboard may have been deleted just now")]
     NoPlan { object: String },
 }
 
 impl ActError {
+    /// Whether a bucket that hangs is all that is in the way.
+    pub fn is_of_a_silent_bucket(&self) -> bool {
+        matches!(self, Self::Fence { source, .. } if matches!(source.as_ref(), BucketError::Silent(_)))
+    }
+
     /// One word for metrics.
     pub fn label(&self) -> &'static str {
         match self {
@@ -302,14 +307,12 @@ impl Actor<'_> {
             "controller-{}",
             status.times.stopping.as_ref().map_or(0, |t| t.0.as_second())
         );
-        archive
-            .put(OWNER_KEY, mark.into_bytes())
-            .await
-            .map(|_| ())
-            .map_err(|source| ActError::Fence {
-                object: self.name(),
-                source: Box::new(source),
-            })
+        let write = archive.put(OWNER_KEY, mark.into_bytes());
+        let written = self.context.buckets.call(&plan.storage, CALL_TIMEOUT, write).await;
+        written.map(|_| ()).map_err(|source| ActError::Fence {
+            object: self.name(),
+            source: Box::new(source),
+        })
     }
 
     async fn patch<K>(&self, what: &'static str, name: &str, patch: &serde_json::Value) -> Result<(), ActError>

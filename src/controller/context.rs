@@ -11,6 +11,7 @@ use kube::runtime::events::Recorder;
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::{Api, Client, ResourceExt};
 
+use super::bucket::{self, Buckets};
 use super::failure_log::FailureLogs;
 use super::leaderboards::Desk;
 use super::memory::Memory;
@@ -74,6 +75,7 @@ pub struct Context {
     pub desk: Desk,
     pub sync: Sync,
     pub aws: Aws,
+    pub buckets: Buckets,
     pub recorder: Recorder,
     archives: Mutex<HashMap<String, Archive>>,
 }
@@ -91,17 +93,17 @@ impl Context {
             desk: Desk::default(),
             sync,
             aws,
+            buckets: Buckets::default(),
             recorder,
             archives: Mutex::default(),
         }
     }
 
-    /// The prefix of a run; clients are kept by region and endpoint.
+    /// The prefix of a run; clients are kept by region and endpoint. A pass calls it through `buckets`.
     pub fn archive(&self, storage: &Storage, run_id: &str) -> Archive {
-        let key = format!("{:?}/{:?}/{}", storage.region, storage.endpoint, storage.bucket);
         let mut archives = self.archives.lock().unwrap_or_else(PoisonError::into_inner);
         let shared = archives
-            .entry(key)
+            .entry(bucket::id(storage))
             .or_insert_with(|| Archive::of_run(&self.aws, storage, run_id));
         shared.at_prefix(crate::api::effective::key_prefix(storage, run_id))
     }

@@ -134,13 +134,14 @@ async fn look(context: &Context, view: &View, status: &SubmissionStatus, places:
             match &place.at {
                 LogAt::Node { pod, previous } => {
                     let namespace = view.submission.namespace().unwrap_or_default();
-                    of_node(&context.client, &namespace, pod, &place.container, *previous).await
+                    let read = of_node(&context.client, &namespace, pod, &place.container, *previous);
+                    let read = tokio::time::timeout(TRY, read).await;
+                    read.unwrap_or_else(|_| Err("no answer in time".into()))
                 }
                 LogAt::Bucket { key } => of_bucket(context, status, key).await,
             }
         };
-        let read = tokio::time::timeout(TRY, read).await;
-        match read.unwrap_or_else(|_| Err("no answer in time".into())) {
+        match read.await {
             Ok(Some(bytes)) => {
                 let text = tail(&heading(status, place), &bytes);
                 if let Some(text) = text {
@@ -199,7 +200,9 @@ async fn of_node(
 async fn of_bucket(context: &Context, status: &SubmissionStatus, key: &str) -> Result<Option<Vec<u8>>, String> {
     let Some(plan) = &status.plan else { return Ok(None) };
     let archive = context.archive(&plan.storage, &plan.run_id);
-    archive.tail(key, STORED_BYTES).await.map_err(|error| error.to_string())
+    let read = archive.tail(key, STORED_BYTES);
+    let read = context.buckets.call(&plan.storage, TRY, read).await;
+    read.map_err(|error| error.to_string())
 }
 
 /// True when there is nothing left to store.
@@ -209,10 +212,8 @@ async fn store(context: &Context, view: &View, status: &SubmissionStatus, tail: 
     };
     let archive = context.archive(&plan.storage, &plan.run_id);
     let put = archive.put(FAILURE_LOG_KEY, tail.text.clone().into_bytes());
-    let why = match tokio::time::timeout(TRY, put).await {
-        Ok(Ok(_)) => return true,
-        Ok(Err(error)) => error.to_string(),
-        Err(_) => "no answer in time".to_owned(),
+    let Err(why) = context.buckets.call(&plan.storage, TRY, put).await else {
+        return true;
     };
     tracing::warn!(submission = %view.submission.name_any(), %why, "the log of a failure was not stored");
     false

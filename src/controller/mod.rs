@@ -1,14 +1,18 @@
 //! The controller: drives Submissions through their states and keeps everything they own.
 //!
-//! A pass observes (`observe`: caches, memory, one short read from S3), decides (`decide`: pure) and acts (`act`).
+//! A pass observes (`observe`: caches, memory, one short read from S3), decides (`decide`: pure) and acts (`act`). Its way to
+//! S3 is `bucket`.
 //! `job_spec`, `pod_overlay` and `network_policy` build what is created in the cluster; they know no client and no clock.
 //! `run` wires it all together for the replica that leads.
 
 pub mod act;
 pub mod backoff;
+pub mod bucket;
 pub mod context;
 pub mod decide;
 pub mod failure_log;
+#[cfg(test)]
+mod fixtures;
 pub mod job_spec;
 pub mod leader;
 pub mod leaderboards;

@@ -1,6 +1,8 @@
 //! The texts of a result: what EvalAI shows, and the row of the table. Numbers come from the report alone, never printed
 //! again; texts from S3 count only with the digest that the report names.
 
+use std::time::Duration;
+
 use leaderboard_results::{Format, metrics, number_text};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
@@ -15,14 +17,16 @@ use crate::services::table::Row;
 
 /// Largest text that is passed on to EvalAI, in bytes.
 const MAX_TEXT: u64 = 16 << 20;
+/// Time a text may take to be read.
+const TEXT_TIMEOUT: Duration = Duration::from_secs(20);
 /// Where logcopy puts the texts, below the run's prefix.
 const STDOUT_KEY: &str = "evalai/stdout.txt";
 const METADATA_KEY: &str = "evalai/metadata.json";
 
 /// The payload of a partial or final result.
 pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, String> {
-    let stdout = stored(context, view, report, STDOUT_KEY).await?;
-    let metadata = stored(context, view, report, METADATA_KEY).await?;
+    let text = |key| stored(context, view, report, key);
+    let (stdout, metadata) = futures::future::try_join(text(STDOUT_KEY), text(METADATA_KEY)).await?;
     Ok(Payload {
         phase: phase(view),
         result: report.results.clone(),
@@ -75,7 +79,9 @@ async fn stored(context: &Context, view: &View, report: &Report, key: &str) -> R
         return Ok(String::new());
     };
     let archive = context.archive(&plan.storage, &plan.run_id);
-    let object = archive.get(key, MAX_TEXT).await.map_err(|e| e.to_string())?;
+    let read = archive.get(key, MAX_TEXT);
+    let object = context.buckets.call(&plan.storage, TEXT_TIMEOUT, read).await;
+    let object = object.map_err(|e| e.to_string())?;
     let bytes = object
         .ok_or_else(|| format!("{key} is missing although the report names it"))?
         .bytes;

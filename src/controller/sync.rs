@@ -3,7 +3,6 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::ResourceExt;
@@ -17,9 +16,6 @@ use crate::api::{Leaderboard, Submission, SubmissionStatus, names};
 use crate::services::ObjectKey;
 use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
-
-/// Time the texts of a result may take to be read.
-const TEXTS_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct Sync {
@@ -193,17 +189,11 @@ async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, o
 }
 
 async fn texts(context: &Context, view: &View, report: &crate::pod::report::Report) -> Option<Payload> {
-    match tokio::time::timeout(TEXTS_TIMEOUT, result_texts::payload(context, view, report)).await {
-        Ok(Ok(payload)) => Some(payload),
-        Ok(Err(why)) => {
-            tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of the result wait to be read");
-            None
-        }
-        Err(_) => {
-            tracing::warn!(submission = %view.submission.name_any(), "the bucket does not answer; the result waits");
-            None
-        }
-    }
+    let read = result_texts::payload(context, view, report).await;
+    let unread = |why: &String| {
+        tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of the result wait to be read");
+    };
+    read.inspect_err(unread).ok()
 }
 
 fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {

@@ -15,7 +15,7 @@ use crate::pod::report::{MAX_BYTES, REPORT_KEY, Report};
 use crate::services::archive::Fetched;
 
 /// Time one read may take; the pass goes on without it.
-const READ_TIMEOUT: Duration = Duration::from_secs(10);
+pub const READ_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What was last read, by UID of the Submission.
 #[derive(Default)]
@@ -108,10 +108,9 @@ async fn fetch(
     let archive = context.archive(&plan.storage, &plan.run_id);
     let etag = known.as_ref().and_then(|k| k.etag.clone());
     let read = archive.get_if_none_match(REPORT_KEY, etag.as_deref(), MAX_BYTES as u64);
-    let fetched = match tokio::time::timeout(READ_TIMEOUT, read).await {
-        Ok(Ok(fetched)) => fetched,
-        Ok(Err(error)) => return ReportSight::Unreadable(error.to_string()),
-        Err(_) => return ReportSight::Unreadable(format!("the bucket {} did not answer in time", plan.storage.bucket)),
+    let fetched = match context.buckets.call(&plan.storage, READ_TIMEOUT, read).await {
+        Ok(fetched) => fetched,
+        Err(error) => return ReportSight::Unreadable(error.to_string()),
     };
     let known = match (fetched, known) {
         (Fetched::NotModified, Some(known)) => Known { read_at: now, ..known },

@@ -23,6 +23,8 @@ use crate::observability::Observability;
 const PASS_LIMIT: Duration = Duration::from_secs(90);
 /// Events of one object that come together are one pass.
 const DEBOUNCE: Duration = Duration::from_millis(50);
+/// A pass that could not write to a bucket which hangs is made again so soon.
+const BUCKET_AGAIN: Duration = Duration::from_secs(10);
 /// An object without any other cause is looked at this often.
 const RESYNC: Duration = Duration::from_mins(10);
 
@@ -205,6 +207,14 @@ fn jittered_resync() -> Duration {
     RESYNC.mul_f64(0.8 + 0.4 * fastrand::f64())
 }
 
-fn after_error(object: &impl Resource, _error: &PassError, shared: &Shared) -> Action {
+fn after_error(object: &impl Resource, error: &PassError, shared: &Shared) -> Action {
+    // It fails at once, so that the pauses would be minutes long before the bucket is back.
+    if matches!(error, PassError::Act(error) if error.is_of_a_silent_bucket()) {
+        return Action::requeue(BUCKET_AGAIN);
+    }
     Action::requeue(shared.backoff.failed(&uid_of(object)))
 }
+
+#[cfg(test)]
+#[path = "passes_tests.rs"]
+mod tests;

@@ -1,0 +1,223 @@
+//! A controller's surroundings without a cluster, for the tests of this room: caches that a test fills, an API server that takes
+//! everything, AWS wherever the test says.
+
+use std::collections::HashMap;
+
+use aws_config::{BehaviorVersion, Region};
+use aws_credential_types::Credentials;
+use http::{Method, Request, Response};
+use jiff::Timestamp;
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
+use kube::client::Body;
+use kube::runtime::events::{Recorder as EventRecorder, Reporter};
+use kube::runtime::reflector::store::Writer;
+use kube::runtime::reflector::{Lookup, Store};
+use kube::runtime::watcher::Event;
+use kube::{Client, ResourceExt};
+use serde_json::{Value, json};
+use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
+use tower_test::mock::{Handle, pair};
+
+use super::context::{Context, Settings, Stores};
+use super::sync::Sync;
+use crate::api::{Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use crate::services::aws::Aws;
+use crate::services::evalai::{Hub, Options, Timeouts, Timing};
+use crate::services::meter::Meter;
+use crate::services::table::Recorder;
+
+/// Namespace of everything here.
+pub const NAMESPACE: &str = "one";
+
+/// What the caches show.
+#[derive(Default)]
+pub struct Cluster {
+    pub leaderboards: Vec<Leaderboard>,
+    pub submissions: Vec<Submission>,
+    pub jobs: Vec<Job>,
+}
+
+/// A request that the API server got.
+#[derive(Debug)]
+pub struct Arrived {
+    pub at: Instant,
+    pub method: Method,
+    pub path: String,
+}
+
+/// What is to be kept while a context is used.
+pub struct Surroundings {
+    pub context: Context,
+    /// What the API server gets.
+    pub requests: mpsc::UnboundedReceiver<Arrived>,
+    _stop: watch::Sender<bool>,
+}
+
+/// A way to an endpoint on loopback, without TLS.
+pub async fn aws(endpoint: &str) -> Aws {
+    let config = aws_config::defaults(BehaviorVersion::latest())
+        .http_client(aws_smithy_http_client::Builder::new().build_http())
+        .region(Region::new("us-east-1"))
+        .credentials_provider(Credentials::new("test", "test", None, None, "tests"))
+        .endpoint_url(endpoint)
+        .load()
+        .await;
+    Aws::from_config(config)
+}
+
+/// Everything a pass shares.
+pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
+    let aws = aws(endpoint).await;
+    let (tell, requests) = mpsc::unbounded_channel();
+    let (service, handle) = pair::<Request<Body>, Response<Body>>();
+    let known = cluster.submissions.iter().map(|s| (s.name_any(), json!(s))).collect();
+    tokio::spawn(serve(handle, known, tell));
+    let client = Client::new(service, NAMESPACE);
+    let (stop, stopped) = watch::channel(false);
+    let (changed, sweep, wake) = (
+        mpsc::unbounded_channel().0,
+        mpsc::unbounded_channel().0,
+        mpsc::unbounded_channel().0,
+    );
+    let hub = Hub::new(Options {
+        fence: std::sync::Arc::new(|| true),
+        not_before: Instant::now(),
+        changed,
+        sweep,
+        timing: Timing::default(),
+        timeouts: Timeouts::default(),
+        meter: Meter::default(),
+    });
+    let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, stopped));
+    let stores = Stores {
+        leaderboards: store(cluster.leaderboards),
+        submissions: store(cluster.submissions),
+        jobs: store(cluster.jobs),
+        pods: store(Vec::new()),
+    };
+    let settings = Settings {
+        image: "operator:1".into(),
+        image_pull_policy: None,
+        region: None,
+        namespace: None,
+        concurrency: 16,
+    };
+    let reporter = Reporter {
+        controller: "test".into(),
+        instance: None,
+    };
+    let events = EventRecorder::new(client.clone(), reporter);
+    Surroundings {
+        context: Context::new(client, settings, stores, sync, aws, events),
+        requests,
+        _stop: stop,
+    }
+}
+
+fn store<K>(objects: Vec<K>) -> Store<K>
+where
+    K: Lookup + Clone + 'static,
+    K::DynamicType: Default + Clone + Eq + std::hash::Hash,
+{
+    let mut writer = Writer::new(K::DynamicType::default());
+    writer.apply_watcher_event(&Event::Init);
+    for object in objects {
+        writer.apply_watcher_event(&Event::InitApply(object));
+    }
+    writer.apply_watcher_event(&Event::InitDone);
+    writer.as_reader()
+}
+
+async fn serve(
+    mut handle: Handle<Request<Body>, Response<Body>>,
+    known: HashMap<String, Value>,
+    tell: mpsc::UnboundedSender<Arrived>,
+) {
+    while let Some((request, answer)) = handle.next_request().await {
+        let (method, path) = (request.method().clone(), request.uri().path().to_owned());
+        let body = request.into_body().collect_bytes().await.unwrap();
+        let body = serde_json::from_slice(&body).unwrap_or_default();
+        let reply = reply(&method, &path, body, &known);
+        let at = Instant::now();
+        let _ = tell.send(Arrived { at, method, path });
+        answer.send_response(Response::new(Body::from(reply.to_string().into_bytes())));
+    }
+}
+
+/// A write of an object is answered with the object; nothing is ever refused, and nothing is listed.
+fn reply(method: &Method, path: &str, body: Value, known: &HashMap<String, Value>) -> Value {
+    match *method {
+        Method::GET => json!({"apiVersion": "v1", "kind": "List", "metadata": {}, "items": []}),
+        Method::DELETE => json!({"apiVersion": "v1", "kind": "Status", "metadata": {}, "status": "Success"}),
+        _ => {
+            let name = path
+                .split("/submissions/")
+                .nth(1)
+                .and_then(|rest| rest.split('/').next());
+            let Some(mut object) = name.and_then(|name| known.get(name)).cloned() else {
+                return body;
+            };
+            if let Some(status) = body.get("status") {
+                object["status"] = status.clone();
+            }
+            object
+        }
+    }
+}
+
+/// A Leaderboard whose results go to a bucket at this endpoint.
+pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
+    let spec = json!({
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2", "routes": 4, "pairs": 2,
+        "contents": {"image": "c"}, "simulator": {"image": "s"},
+        "storage": {"bucket": format!("{name}-bucket"), "endpoint": endpoint},
+        "table": {"name": "rows", "endpoint": endpoint, "partitionKey": "team_id", "sortKey": "submission_id"},
+    });
+    let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
+    object.metadata.namespace = Some(NAMESPACE.into());
+    object.metadata.uid = Some(format!("uid-of-{name}"));
+    object
+}
+
+/// A submission whose Job was made, and that Job. Nothing says yet that it was scheduled.
+pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
+    let board_name = board.name_any();
+    let spec = json!({"leaderboard": board_name, "image": "agent:1", "track": "sensors", "team": {"id": "t1"}});
+    let mut submission = Submission::new(name, serde_json::from_value(spec).unwrap());
+    let uid = format!("uid-of-{name}");
+    let now = Time(Timestamp::now());
+    submission.metadata.namespace = Some(NAMESPACE.into());
+    submission.metadata.uid = Some(uid.clone());
+    submission.metadata.resource_version = Some("1".into());
+    submission.metadata.generation = Some(1);
+    submission.metadata.creation_timestamp = Some(now.clone());
+    submission.metadata.finalizers = Some(vec![names::FINALIZER_SUBMISSION.into()]);
+    let (track, image) = (&board.spec.tracks[0], "agent:1".to_owned());
+    let plan = effective::plan(&board.spec, track, name.into(), image, false);
+    let job_name = names::job(name, 1, 0);
+    submission.status = Some(SubmissionStatus {
+        state: Some(State::Pending),
+        attempt: Some(1),
+        team: submission.spec.team.clone(),
+        plan: Some(plan),
+        job: Some(job_name.clone()),
+        times: Times {
+            submitted: Some(now.clone()),
+            accepted: Some(now.clone()),
+            ..Times::default()
+        },
+        ..SubmissionStatus::default()
+    });
+    let mut job = Job::default();
+    job.metadata.name = Some(job_name.clone());
+    job.metadata.namespace = Some(NAMESPACE.into());
+    job.metadata.uid = Some(format!("uid-of-{job_name}"));
+    job.metadata.creation_timestamp = Some(now);
+    job.metadata.owner_references = Some(vec![OwnerReference {
+        uid,
+        ..OwnerReference::default()
+    }]);
+    (submission, job)
+}

@@ -1,0 +1,63 @@
+//! Passes against caches of the test's own, under a paused clock.
+
+use http::Method;
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::*;
+use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
+use crate::controller::observe::report::READ_TIMEOUT;
+use crate::observability::shutdown::Stop;
+
+/// Passes that run into a bucket which takes connections and never answers.
+const BEHIND: usize = 300;
+/// Cancels of others. The queue takes who waits in no order, so that one of them may be lucky.
+const CANCELS: usize = 6;
+
+#[tokio::test(start_paused = true)]
+async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("http://{}", silent.local_addr().unwrap());
+    let (hanging, other) = (leaderboard("hanging", &endpoint), leaderboard("other", &endpoint));
+    let mut cluster = Cluster::default();
+    for number in 0..BEHIND {
+        let (mut submission, job) = with_job(&format!("behind-{number}"), &hanging);
+        let status = submission.status.as_mut().unwrap();
+        status.times.scheduled = Some(Time(Timestamp::now()));
+        cluster.submissions.push(submission);
+        cluster.jobs.push(job);
+    }
+    for number in 0..CANCELS {
+        let (mut cancelled, job) = with_job(&format!("cancelled-{number}"), &other);
+        cancelled.spec.cancel = true;
+        cluster.submissions.push(cancelled);
+        cluster.jobs.push(job);
+    }
+    cluster.leaderboards = vec![hanging, other];
+
+    let (touched, inbox) = mpsc::unbounded_channel();
+    let touch = |submission: &ObjectRef<Submission>| touched.send(Touched::Submission(submission.clone())).unwrap();
+    let mut all: Vec<_> = cluster.submissions.iter().map(ObjectRef::from_obj).collect();
+    let cancelled = all.split_off(BEHIND);
+    let mut around = surroundings(cluster, &endpoint).await;
+    let (_stop, signal) = Stop::new();
+    let passes = tokio::spawn(run(Arc::new(around.context), inbox, Observability::new(signal)));
+    all.iter().for_each(touch);
+    // As many passes as there may be at once have begun, and the others wait.
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    let began = tokio::time::Instant::now();
+    cancelled.iter().for_each(touch);
+    let mut stopped = Vec::new();
+    while stopped.len() < CANCELS {
+        let request = around.requests.recv().await.unwrap();
+        if request.method == Method::DELETE && request.path.contains("/jobs/cancelled-") {
+            stopped.push(request.at - began);
+        }
+    }
+    passes.abort();
+    let limit = READ_TIMEOUT * 2 + Duration::from_secs(1);
+    assert!(
+        stopped.iter().all(|took| *took <= limit),
+        "their Jobs were deleted after {stopped:?}"
+    );
+}
