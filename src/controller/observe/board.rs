@@ -1,30 +1,56 @@
-//! The waiting line of each Leaderboard, worked out again only when something has changed.
+//! The waiting line of each Leaderboard, worked out once for all who wait, and again only when something has changed.
 //!
 //! Holds the slots that were granted and whose Jobs the caches do not show yet, so that two passes at once never start
-//! more than `running.total`.
+//! more than `running.total`. Called by `observe`; the watch of Submissions tells it what has `moved`.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
+use jiff::Timestamp;
 use kube::ResourceExt;
+use tokio::time::Instant;
 
 use super::uid_of;
 use crate::api::{Leaderboard, Submission, SubmissionStatus, conditions};
 use crate::controller::turns::{InLine, Limits, Past, turns};
 use crate::controller::view::Turn;
 
+#[cfg(test)]
+#[path = "board_histories.rs"]
+mod histories;
+
+/// A standing is worked out anew after this long: of what changes to and fro between two looks nothing is told.
+const MAX_AGE: Duration = Duration::from_mins(1);
+
+/// Namespace and name of a Leaderboard.
+type Key = (String, String);
+
 /// Lines by namespace and name of their Leaderboard.
 #[derive(Default)]
-pub struct Board {
-    granted: Mutex<HashSet<String>>,
+pub struct Board(Mutex<Lines>);
+
+#[derive(Default)]
+struct Lines {
+    /// Whose slot was granted, by UID, and on which Leaderboard.
+    granted: HashMap<String, Key>,
+    standings: HashMap<Key, Standing>,
+}
+
+/// Everyone in one line, as it was worked out last.
+struct Standing {
+    limits: Limits,
+    since: Instant,
+    turns: HashMap<String, Turn>,
 }
 
 impl Board {
     /// Whether a submission without a Job may start. `Go` takes the slot, if EvalAI's word on it is known (`is_asked`): before,
-    /// nothing is started on it, and nobody is to wait for that.
+    /// nothing is started on it, and nobody is to wait for that. `all` is asked only where the line has changed.
     pub fn turn(
         &self,
-        all: &[Arc<Submission>],
+        all: impl FnOnce() -> Vec<Arc<Submission>>,
         submission: &Submission,
         leaderboard: Option<&Leaderboard>,
         is_asked: bool,
@@ -34,27 +60,27 @@ impl Board {
             return Turn::Go;
         };
         let uid = uid_of(submission);
-        let spec = &leaderboard.spec;
-        let limits = Limits {
-            total: spec.running.total.and_then(|n| usize::try_from(n).ok()),
-            per_team: spec.running.per_team.and_then(|n| usize::try_from(n).ok()),
-            paused: spec.paused,
-        };
+        let limits = limits(leaderboard);
         if limits == Limits::default() {
             return Turn::Go;
         }
-        let mut granted = self.lock();
-        if (granted.contains(&uid) || is_between_tries(submission)) && !limits.paused {
+        let mut lines = self.lock();
+        if (lines.granted.contains_key(&uid) || is_between_tries(submission)) && !limits.paused {
             return Turn::Go;
         }
-        let (line, past) = line_of(all, leaderboard, &granted, &uid);
-        let turn = turns(line, past, limits)
-            .remove(&uid)
-            .unwrap_or(Turn::Wait { position: 0, eta: None });
+        let key = (leaderboard.namespace().unwrap_or_default(), leaderboard.name_any());
+        let turn = lines.turn(all, &key, &uid, limits);
         if turn == Turn::Go {
-            granted.insert(uid);
+            lines.standings.remove(&key);
+            lines.granted.insert(uid, key);
         }
         turn
+    }
+
+    /// Something in the line of this Leaderboard is not as it was.
+    pub fn moved(&self, namespace: &str, leaderboard: &str) {
+        let key = (namespace.to_owned(), leaderboard.to_owned());
+        self.lock().standings.remove(&key);
     }
 
     /// Gives the slot back of a submission that did not start after all, or has come to its end: a later attempt stands in
@@ -68,64 +94,190 @@ impl Board {
 
     /// Drops what is known of an object that is gone.
     pub fn release(&self, uid: &str) {
-        self.lock().remove(uid);
+        let mut lines = self.lock();
+        if let Some(key) = lines.granted.remove(uid) {
+            lines.standings.remove(&key);
+        }
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashSet<String>> {
-        self.granted.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, Lines> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Who waits for a slot of a Leaderboard, and what it runs and has run.
-fn line_of(
+impl Lines {
+    fn turn(&mut self, all: impl FnOnce() -> Vec<Arc<Submission>>, key: &Key, uid: &str, limits: Limits) -> Turn {
+        let now = Instant::now();
+        self.standings
+            .retain(|_, known| now.duration_since(known.since) < MAX_AGE);
+        let known = self.standings.get(key).filter(|known| known.limits == limits);
+        if let Some(turn) = known.and_then(|known| known.turns.get(uid)) {
+            return turn.clone();
+        }
+        let is_known = known.is_some();
+        let all = all();
+        if !is_known {
+            let turns = standing(&all, key, &self.granted, None, limits);
+            let turn = turns.get(uid).cloned();
+            let since = now;
+            let standing = Standing { limits, since, turns };
+            self.standings.insert(key.clone(), standing);
+            if let Some(turn) = turn {
+                return turn;
+            }
+        }
+        // Who is not in line, or is not yet, is shown the place that it would have.
+        standing(&all, key, &self.granted, Some(uid), limits)
+            .remove(uid)
+            .unwrap_or(Turn::Wait { position: 0, eta: None })
+    }
+}
+
+fn limits(leaderboard: &Leaderboard) -> Limits {
+    let spec = &leaderboard.spec;
+    Limits {
+        total: spec.running.total.and_then(|n| usize::try_from(n).ok()),
+        per_team: spec.running.per_team.and_then(|n| usize::try_from(n).ok()),
+        paused: spec.paused,
+    }
+}
+
+/// The turn of everyone who waits for a slot of a Leaderboard, and of `own`, who may not be in line.
+fn standing(
     all: &[Arc<Submission>],
-    leaderboard: &Leaderboard,
-    granted: &HashSet<String>,
-    own: &str,
-) -> (Vec<InLine>, Past) {
-    let (name, namespace) = (leaderboard.name_any(), leaderboard.namespace());
+    (namespace, name): &Key,
+    granted: &HashMap<String, Key>,
+    own: Option<&str>,
+    limits: Limits,
+) -> HashMap<String, Turn> {
     let mut line = Vec::new();
     let mut past = Past::default();
-    for other in all {
-        if other.spec.leaderboard != name || other.metadata.namespace != namespace {
-            continue;
-        }
-        note_past(&mut past, other);
-        if is_over(other) {
-            continue;
-        }
-        let uid = uid_of(other.as_ref());
-        let has_job = other.status.as_ref().is_some_and(|s| s.job.is_some());
-        if uid == own {
-            line.push(in_line(uid, other));
-        } else if granted.contains(&uid) || has_job || is_between_tries(other) {
-            past.occupied.push(team(other).to_owned());
-        } else if can_start(other) {
-            line.push(in_line(uid, other));
+    let is_of_it = |s: &&Arc<Submission>| {
+        s.spec.leaderboard == *name && s.metadata.namespace.as_deref().unwrap_or_default() == namespace
+    };
+    for place in all.iter().filter(is_of_it).map(|s| Place::of(s)) {
+        place.note(&mut past);
+        match place.stand {
+            Stand::Over => {}
+            _ if own == Some(place.uid) => line.push(place.in_line()),
+            _ if granted.contains_key(place.uid) => past.occupied.push(place.team.to_owned()),
+            Stand::Runs => past.occupied.push(place.team.to_owned()),
+            Stand::Waits => line.push(place.in_line()),
+            Stand::Aside => {}
         }
     }
-    (line, past)
+    turns(line, past, limits)
 }
 
-/// When its team was last served, and how long a run took that has ended.
-fn note_past(past: &mut Past, submission: &Submission) {
-    let Some(status) = &submission.status else { return };
-    let times = &status.times;
-    let Some(began) = times.scheduled.as_ref().or(times.started.as_ref()).map(|t| t.0) else {
-        return;
-    };
-    let team = team(submission);
-    match past.served.get_mut(team) {
-        Some(served) => *served = began.max(*served),
-        None => _ = past.served.insert(team.to_owned(), began),
-    }
-    // What never ran says nothing of how long a run takes.
-    if let (Some(track), Some(_), Some(ended)) = (&status.track, &times.started, &times.finished) {
-        let run = (ended.0, ended.0.duration_since(began).as_secs().max(0));
-        match past.runs.get_mut(track) {
-            Some(runs) => runs.push(run),
-            None => _ = past.runs.insert(track.clone(), vec![run]),
+/// What of a Submission counts in the line of its Leaderboard; all of it, and nothing else.
+#[derive(Hash)]
+struct Place<'a> {
+    uid: &'a str,
+    team: &'a str,
+    track: &'a str,
+    priority: i32,
+    submitted: Timestamp,
+    stand: Stand,
+    /// When its present or last run began.
+    began: Option<Timestamp>,
+    /// The track and the end of a run that has ended.
+    run: Option<(&'a str, Timestamp)>,
+}
+
+#[derive(Clone, Copy, Hash)]
+enum Stand {
+    /// It has a slot.
+    Runs,
+    /// It waits for nothing but a slot.
+    Waits,
+    /// It waits for something else.
+    Aside,
+    Over,
+}
+
+impl<'a> Place<'a> {
+    fn of(submission: &'a Submission) -> Self {
+        let status = submission.status.as_ref();
+        let times = status.map(|s| &s.times);
+        let submitted = times.and_then(|t| t.submitted.as_ref());
+        let created = submission.metadata.creation_timestamp.as_ref();
+        let known = status.and_then(|s| s.track.as_deref());
+        let began = times.and_then(|t| t.scheduled.as_ref().or(t.started.as_ref()));
+        let run = times.and_then(|t| {
+            // What never ran says nothing of how long a run takes.
+            t.started.as_ref()?;
+            Some((known?, t.finished.as_ref()?.0))
+        });
+        Self {
+            uid: submission.metadata.uid.as_deref().unwrap_or_default(),
+            team: team(submission),
+            track: known.or(submission.spec.track.as_deref()).unwrap_or_default(),
+            priority: submission.spec.priority,
+            submitted: submitted.or(created).map(|t| t.0).unwrap_or_default(),
+            stand: Stand::of(submission),
+            began: began.map(|t| t.0),
+            run,
         }
+    }
+
+    /// When its team was last served, and how long a run took that has ended.
+    fn note(&self, past: &mut Past) {
+        let Some(began) = self.began else { return };
+        match past.served.get_mut(self.team) {
+            Some(served) => *served = began.max(*served),
+            None => _ = past.served.insert(self.team.to_owned(), began),
+        }
+        if let Some((track, ended)) = self.run {
+            let run = (ended, ended.duration_since(began).as_secs().max(0));
+            match past.runs.get_mut(track) {
+                Some(runs) => runs.push(run),
+                None => _ = past.runs.insert(track.to_owned(), vec![run]),
+            }
+        }
+    }
+
+    fn in_line(&self) -> InLine {
+        InLine {
+            uid: self.uid.to_owned(),
+            team: self.team.to_owned(),
+            track: self.track.to_owned(),
+            priority: self.priority,
+            submitted: self.submitted,
+        }
+    }
+}
+
+impl Stand {
+    fn of(submission: &Submission) -> Self {
+        let has_job = submission.status.as_ref().is_some_and(|s| s.job.is_some());
+        if is_over(submission) {
+            Self::Over
+        } else if has_job || is_between_tries(submission) {
+            Self::Runs
+        } else if can_start(submission) {
+            Self::Waits
+        } else {
+            Self::Aside
+        }
+    }
+}
+
+/// Tells which changes of Submissions concern a line, by what was last seen of each.
+#[derive(Default)]
+pub struct Places(HashMap<String, u64>);
+
+impl Places {
+    /// Whether the line of its Leaderboard is no longer as it was.
+    pub fn moved(&mut self, submission: &Submission, is_gone: bool) -> bool {
+        if is_gone {
+            // It may have come and gone between two looks, and been in a line all the same.
+            self.0.remove(&uid_of(submission));
+            return true;
+        }
+        let mut hasher = DefaultHasher::new();
+        Place::of(submission).hash(&mut hasher);
+        let mark = hasher.finish();
+        self.0.insert(uid_of(submission), mark) != Some(mark)
     }
 }
 
@@ -134,21 +286,6 @@ fn is_between_tries(submission: &Submission) -> bool {
     let is_finished = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::FINISHED);
     let status = submission.status.as_ref();
     status.is_some_and(|s| s.retry > 0 && s.job.is_none() && !is_finished(s))
-}
-
-fn in_line(uid: String, submission: &Submission) -> InLine {
-    let submitted = submission.status.as_ref().and_then(|s| s.times.submitted.as_ref());
-    let created = submission.metadata.creation_timestamp.as_ref();
-    let known = submission.status.as_ref().and_then(|s| s.track.clone());
-    let track = known.or_else(|| submission.spec.track.clone());
-    let submitted = submitted.or(created).map(|t| t.0).unwrap_or_default();
-    InLine {
-        uid,
-        team: team(submission).to_owned(),
-        track: track.unwrap_or_default(),
-        priority: submission.spec.priority,
-        submitted,
-    }
 }
 
 fn team(submission: &Submission) -> &str {
@@ -227,7 +364,7 @@ mod tests {
     }
 
     fn turn(board: &Board, all: &[Arc<Submission>], which: usize, running: &Value) -> Turn {
-        board.turn(all, &all[which], Some(&leaderboard(running)), true)
+        board.turn(|| all.to_vec(), &all[which], Some(&leaderboard(running)), true)
     }
 
     fn shared(all: Vec<Submission>) -> Vec<Arc<Submission>> {
@@ -286,7 +423,7 @@ mod tests {
             of_evalai(submission("a", "x", 1, asking)),
             submission("b", "y", 2, json!({})),
         ]);
-        let asked = board.turn(&all, &all[0], Some(&leaderboard(&ONE())), false);
+        let asked = board.turn(|| all.clone(), &all[0], Some(&leaderboard(&ONE())), false);
         assert_eq!(asked, Turn::Go, "its pass says that EvalAI is asked");
         assert_eq!(turn(&board, &all, 1, &ONE()), Turn::Go);
         assert!(matches!(turn(&board, &all, 0, &ONE()), Turn::Wait { position: 1, .. }));
@@ -310,7 +447,7 @@ mod tests {
                 ..paused.spec
             },
         );
-        let turn = board.turn(&all, &all[0], Some(&paused), true);
+        let turn = board.turn(|| all.clone(), &all[0], Some(&paused), true);
         assert!(
             matches!(turn, Turn::Paused { .. }),
             "a paused Leaderboard makes no Job: {turn:?}"
@@ -346,6 +483,7 @@ mod tests {
         other.spec.leaderboard = "another".into();
         let mut all = all;
         all[0] = Arc::new(other);
+        board.moved("", "lb");
         assert_eq!(turn(&board, &all, 3, &ONE()), Turn::Wait { position: 1, eta: None });
     }
 }

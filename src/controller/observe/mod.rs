@@ -45,8 +45,8 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         .and_then(|l| context.sync.record_view(l, &submission));
     let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission);
     let is_asked = evalai.as_ref().is_none_or(|e| e.info.is_some());
-    let all = context.stores.submissions.state();
-    let turn = context.board.turn(&all, &submission, leaderboard.as_deref(), is_asked);
+    let all = || context.stores.submissions.state();
+    let turn = context.board.turn(all, &submission, leaderboard.as_deref(), is_asked);
     let partial_told = context.memory.partial_told(&submission);
     View {
         now,

@@ -4,9 +4,9 @@
 //! starts it again with empty hands.
 
 mod counts;
+mod marks;
 mod passes;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -23,6 +23,7 @@ use tokio::time::Instant;
 
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
+use super::observe::board::Places;
 use super::observe::children_selector;
 use super::sync::Sync;
 use super::watches::preflight::{Need, await_kinds, watch_access};
@@ -34,6 +35,7 @@ use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::table::Recorder;
+use marks::{Fingerprints, standing};
 
 /// Passes in hand may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -163,7 +165,7 @@ impl Watches {
     }
 
     /// Tells everything that is there now, then everything that is touched.
-    fn feed(&self, touched: &mpsc::UnboundedSender<Touched>) {
+    fn feed(&self, touched: &mpsc::UnboundedSender<Touched>, context: &Arc<Context>) {
         let mut boards = Fingerprints::default();
         forward(
             self.leaderboards.subscribe(),
@@ -181,13 +183,19 @@ impl Watches {
                     .collect()
             },
         );
-        let mut submissions = Fingerprints::default();
+        let (mut submissions, mut places) = (Fingerprints::default(), Places::default());
+        let context = Arc::clone(context);
         forward(
             self.submissions.subscribe(),
             touched,
             move |touch: Touch<Submission>| {
                 let object = touch.object.as_ref();
-                let board = ObjectRef::new(&object.spec.leaderboard).within(&object.namespace().unwrap_or_default());
+                let namespace = object.namespace().unwrap_or_default();
+                let board = ObjectRef::new(&object.spec.leaderboard).within(&namespace);
+                // Before anybody is woken by it.
+                if places.moved(object, touch.is_gone) {
+                    context.board.moved(&namespace, &object.spec.leaderboard);
+                }
                 if touch.is_gone {
                     return vec![Touched::Gone(submissions.drop(object)), Touched::Leaderboard(board)];
                 }
@@ -222,44 +230,6 @@ fn trim_pod(pod: &mut Pod) {
         spec.containers = Vec::new();
         spec.init_containers = None;
         spec.volumes = None;
-    }
-}
-
-/// What of a Submission's status matters to the others in line and to its Leaderboard's counts.
-fn standing(submission: &Submission) -> String {
-    let status = submission.status.as_ref();
-    let state = status.and_then(|s| s.state).map(crate::api::State::as_str);
-    format!("{state:?} {}", status.is_some_and(|s| s.job.is_some()))
-}
-
-/// What was last seen of each object, to tell our own status writes from what others did.
-#[derive(Default)]
-struct Fingerprints(HashMap<String, (String, String)>);
-
-struct Moved {
-    by_others: bool,
-    in_line: bool,
-}
-
-impl Fingerprints {
-    fn moved(&mut self, object: &impl ResourceExt, standing: &str) -> Moved {
-        let meta = object.meta();
-        let mark = format!(
-            "{:?} {:?} {:?} {:?}",
-            meta.generation, meta.deletion_timestamp, meta.finalizers, meta.annotations
-        );
-        let old = self
-            .0
-            .insert(object.uid().unwrap_or_default(), (mark.clone(), standing.to_owned()));
-        Moved {
-            by_others: old.as_ref().is_none_or(|(known, _)| *known != mark),
-            in_line: old.is_none_or(|(_, known)| known != standing),
-        }
-    }
-
-    fn drop(&mut self, object: &impl ResourceExt) -> ObjectKey {
-        self.0.remove(&object.uid().unwrap_or_default());
-        key(object)
     }
 }
 
@@ -330,7 +300,7 @@ impl Parts {
         ));
         let stores = self.watches.stores();
         let context = Arc::new(Context::new(self.client, self.settings, stores, sync, self.aws, events));
-        self.watches.feed(&touched);
+        self.watches.feed(&touched, &context);
         let mut leadership = leader.leadership();
         let mut passes = std::pin::pin!(passes::run(context, inbox, self.seen.clone()).fuse());
         tokio::select! {
