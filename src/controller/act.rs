@@ -141,7 +141,8 @@ impl Actor<'_> {
                 Ok(())
             }
             Action::Record { end } => {
-                self.context.sync.record(self.view, status, *end);
+                let sync = &self.context.sync;
+                sync.record(self.context, self.view, status, *end).await;
                 Ok(())
             }
         }

@@ -99,8 +99,8 @@ fn hex(bytes: &[u8]) -> String {
     })
 }
 
-/// The row of a submission as it stands; none before it has a team.
-pub(super) fn row(view: &View, status: &SubmissionStatus) -> Option<Row> {
+/// The row of a submission as it stands, with the metrics of a report; none before it has a team.
+pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<Row> {
     let team = status.team.as_ref()?;
     let plan = status.plan.as_ref()?;
     let text = |time: Option<&k8s_openapi::apimachinery::pkg::apis::meta::v1::Time>| {
@@ -120,11 +120,7 @@ pub(super) fn row(view: &View, status: &SubmissionStatus) -> Option<Row> {
         end_time: text(status.times.finished.as_ref()),
         results: status.results.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
-        metrics: view
-            .report
-            .ours()
-            .map(|r| columns(&r.results, plan.results))
-            .unwrap_or_default(),
+        metrics: report.map(|r| columns(&r.results, plan.results)).unwrap_or_default(),
     })
 }
 

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use kube::ResourceExt;
 
 use super::context::Context;
@@ -16,6 +16,9 @@ use crate::api::{Leaderboard, Submission, SubmissionStatus, names};
 use crate::services::ObjectKey;
 use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
+
+/// How long the row of an end waits for a result that cannot be read: as long as the end itself.
+const ROW_WAITS: SignedDuration = SignedDuration::from_hours(24);
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct Sync {
@@ -117,13 +120,26 @@ impl Sync {
         self.hub.forget(&object_key(submission));
     }
 
-    /// Writes the row, or lets the next write carry it.
-    pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
-        let Some(leaderboard) = &view.leaderboard else { return };
-        let (Some(table), Some(row)) = (&leaderboard.spec.table, result_texts::row(view, status)) else {
-            return;
+    /// Writes the row, or lets the next write carry it. The last one of an attempt shows what was stored last, which no pass may
+    /// have seen while the attempt went on.
+    pub async fn record(&self, context: &Context, view: &View, status: &SubmissionStatus, end: bool) {
+        let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
+        let Some(table) = table else { return };
+        let sight = if end {
+            last_report(context, view).await
+        } else {
+            view.report.clone()
         };
-        self.recorder.record(table, &object_key(&view.submission), row, end);
+        if let ReportSight::Unreadable(why) = &sight
+            && end
+            && row_may_wait(view, status)
+        {
+            tracing::warn!(submission = %view.submission.name_any(), %why, "the row of the end waits for the result");
+            return;
+        }
+        if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
+            self.recorder.record(table, &object_key(&view.submission), row, end);
+        }
     }
 
     /// Drops everything of an object that is gone.
@@ -161,12 +177,22 @@ async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     Some(Arc::new(payload))
 }
 
-async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
-    let known = view.report.ours().cloned();
-    let sight = match known {
-        Some(report) => ReportSight::Ours(report),
+/// The report as it is stored at the end; passes after the end read none.
+async fn last_report(context: &Context, view: &View) -> ReportSight {
+    match view.report.ours() {
+        Some(report) => ReportSight::Ours(Arc::clone(report)),
         None => report::read_now(context, &view.submission, view.now).await,
-    };
+    }
+}
+
+/// Whether a row that is never written again waits for its result. One that is being deleted has no time for it.
+fn row_may_wait(view: &View, status: &SubmissionStatus) -> bool {
+    let ended = status.times.finished.as_ref().map_or(view.now, |t| t.0);
+    view.submission.metadata.deletion_timestamp.is_none() && view.now.duration_since(ended) < ROW_WAITS
+}
+
+async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
+    let sight = last_report(context, view).await;
     let mut payload = match &sight {
         ReportSight::Ours(report) => texts(context, view, report).await?,
         ReportSight::Unreadable(why) => {
@@ -259,3 +285,7 @@ fn object_key(submission: &Submission) -> ObjectKey {
         uid: uid_of(submission),
     }
 }
+
+#[cfg(test)]
+#[path = "sync_tests.rs"]
+mod tests;

@@ -1,0 +1,171 @@
+//! Rows of an end, against stand-ins for S3 and DynamoDB of the test's own.
+
+use std::collections::BTreeMap;
+
+use axum::body::Bytes;
+use axum::extract::State as Shared;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde_json::{Value, json};
+use tokio::sync::mpsc;
+
+use super::*;
+use crate::api::State;
+use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
+use crate::controller::view::{JobSight, NodeSight, Turn};
+
+/// Longer than a write takes on a busy machine.
+const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
+
+type Item = BTreeMap<String, String>;
+
+/// One object in one bucket, one row in one table.
+#[derive(Clone)]
+struct Stored {
+    report: Arc<Mutex<String>>,
+    item: Arc<Mutex<Item>>,
+    /// Told each row that was written.
+    written: mpsc::UnboundedSender<Item>,
+}
+
+impl Stored {
+    fn update(&self, request: &Value) {
+        let mut item = self.item.lock().unwrap();
+        let update = request["UpdateExpression"].as_str().unwrap();
+        for set in update.trim_start_matches("SET ").split(", ") {
+            let (name, value) = set.split_once(" = ").unwrap();
+            let column = request["ExpressionAttributeNames"][name].as_str().unwrap();
+            let value = &request["ExpressionAttributeValues"][value];
+            let text = value["S"].as_str().or(value["N"].as_str()).unwrap();
+            item.insert(column.to_owned(), text.to_owned());
+        }
+        self.written.send(item.clone()).unwrap();
+    }
+}
+
+async fn answer(Shared(stored): Shared<Stored>, headers: HeaderMap, body: Bytes) -> Response {
+    let Some(target) = headers.get("x-amz-target") else {
+        return stored.report.lock().unwrap().clone().into_response();
+    };
+    if target.to_str().unwrap().ends_with("UpdateItem") {
+        stored.update(&serde_json::from_slice(&body).unwrap());
+        return "{}".into_response();
+    }
+    let denied = json!({"__type": "AccessDeniedException", "message": "no"});
+    (StatusCode::BAD_REQUEST, denied.to_string()).into_response()
+}
+
+struct Bench {
+    around: Surroundings,
+    stored: Stored,
+    written: mpsc::UnboundedReceiver<Item>,
+    view: View,
+    status: SubmissionStatus,
+}
+
+/// A submission that has come to its end, whose row has the metrics of a partial result.
+async fn bench() -> Bench {
+    let (sender, written) = mpsc::unbounded_channel();
+    let partial = BTreeMap::from([("driving_score".to_owned(), "10.5".to_owned())]);
+    let stored = Stored {
+        report: Arc::default(),
+        item: Arc::new(Mutex::new(partial)),
+        written: sender,
+    };
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let router = axum::Router::new().fallback(answer).with_state(stored.clone());
+    tokio::spawn(async move { axum::serve(listener, router).await });
+    let board = leaderboard("one", &endpoint);
+    let (mut submission, _) = with_job("sub", &board);
+    let now = Timestamp::now();
+    let status = submission.status.as_mut().unwrap();
+    status.state = Some(State::Cancelled);
+    status.times.finished = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(now));
+    let status = status.clone();
+    let view = View {
+        now,
+        submission: Arc::new(submission),
+        leaderboard: Some(Arc::new(board)),
+        turn: Turn::Go,
+        job: JobSight::Absent,
+        pod: None,
+        node: NodeSight::Unknown,
+        report: ReportSight::NotRead,
+        evalai: None,
+        record: Some(RecordView::default()),
+        partial_told: None,
+    };
+    Bench {
+        around: surroundings(Cluster::default(), &endpoint).await,
+        stored,
+        written,
+        view,
+        status,
+    }
+}
+
+impl Bench {
+    fn stores(&self, report: &str) {
+        report.clone_into(&mut self.stored.report.lock().unwrap());
+    }
+
+    async fn records_the_end(&self) {
+        let context = &self.around.context;
+        context.sync.record(context, &self.view, &self.status, true).await;
+    }
+
+    async fn row(&mut self) -> Item {
+        let row = tokio::time::timeout(LIMIT, self.written.recv()).await;
+        row.expect("a row is written").unwrap()
+    }
+
+    fn is_handed_in(&self) -> bool {
+        let recorder = &self.around.context.sync.recorder;
+        recorder.view(&object_key(&self.view.submission)).is_some()
+    }
+}
+
+fn last() -> String {
+    let results = json!([{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]);
+    json!({
+        "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
+        "pairs": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": results.to_string(),
+    })
+    .to_string()
+}
+
+#[tokio::test]
+async fn the_row_of_an_end_has_the_metrics_of_the_last_report() {
+    let mut bench = bench().await;
+    bench.stores(&last());
+    bench.records_the_end().await;
+    let row = bench.row().await;
+    assert_eq!(row["submission_status"], "CANCELLED");
+    assert_eq!(row["driving_score"], "43.125", "not those of a partial result");
+}
+
+#[tokio::test]
+async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ever() {
+    let mut bench = bench().await;
+    bench.stores("torn");
+    bench.records_the_end().await;
+    assert!(!bench.is_handed_in());
+    bench.stores(&last());
+    bench.records_the_end().await;
+    assert_eq!(bench.row().await["driving_score"], "43.125");
+
+    let mut bench = self::bench().await;
+    bench.stores("torn");
+    bench.view.now = bench.view.now.checked_add(ROW_WAITS).unwrap();
+    bench.records_the_end().await;
+    assert_eq!(bench.row().await["submission_status"], "CANCELLED");
+
+    let mut bench = self::bench().await;
+    bench.stores("torn");
+    let mut submission = bench.view.submission.as_ref().clone();
+    submission.metadata.deletion_timestamp = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(bench.view.now));
+    bench.view.submission = Arc::new(submission);
+    bench.records_the_end().await;
+    assert_eq!(bench.row().await["submission_status"], "CANCELLED");
+}
