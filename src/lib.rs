@@ -8,5 +8,6 @@ pub mod cli;
 pub mod controller;
 pub mod crds;
 pub mod observability;
+pub mod plugin;
 pub mod pod;
 pub mod services;

@@ -20,6 +20,7 @@ mod api {
     mod leader;
     mod objects;
     mod operator;
+    mod plugin;
     mod pod;
     mod queue;
     mod rule_cases;

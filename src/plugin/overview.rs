@@ -1,0 +1,173 @@
+//! All submissions of a namespace that are not simply running or finished well, one line each.
+//!
+//! Called by `mod` for `why` without a name. Pure: the time is handed in.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use kube::ResourceExt;
+
+use super::board::{self, Sight};
+use super::text::{Page, WIDTH, clean, cut, join, span};
+use super::why;
+use crate::api::conditions;
+use crate::api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
+
+/// How long an end may wait for another system before that is trouble.
+const PATIENCE_SECONDS: i64 = 300;
+
+/// A line of the table.
+struct Row {
+    order: (u8, i64),
+    name: String,
+    state: &'static str,
+    since: String,
+    why: String,
+}
+
+/// The lines of a namespace. No Leaderboards: this person may not read them.
+pub fn lines(
+    namespace: &str,
+    submissions: &[Submission],
+    leaderboards: Option<&[Leaderboard]>,
+    now: Timestamp,
+) -> Vec<String> {
+    let mut page = Page::default();
+    for words in of_leaderboards(submissions, leaderboards) {
+        page.say(&words);
+    }
+    page.gap();
+    let mut rows: Vec<Row> = submissions.iter().filter_map(|s| row(s, now)).collect();
+    rows.sort_by(|a, b| a.order.cmp(&b.order).then_with(|| a.name.cmp(&b.name)));
+    if rows.is_empty() {
+        let count = submissions.len();
+        let words =
+            format!("Nothing waits, has failed or is in trouble in namespace {namespace} ({count} submissions).");
+        page.say(&words);
+        return page.into_lines();
+    }
+    let mut lines = page.into_lines();
+    lines.extend(table(&rows));
+    lines.push(String::new());
+    lines.push("`kubectl leaderboard why NAME` says more, and what to do next.".to_owned());
+    lines
+}
+
+/// What is wrong with the Leaderboards that there are, and with those that submissions name.
+fn of_leaderboards(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> Vec<String> {
+    let Some(leaderboards) = leaderboards else {
+        return vec!["You may not read Leaderboards, so whether one is paused or not Ready is left out.".to_owned()];
+    };
+    let mut sights: BTreeMap<String, Sight<'_>> = BTreeMap::new();
+    let live = submissions.iter().filter(|s| !why::has_ended(s));
+    sights.extend(live.map(|s| (s.spec.leaderboard.clone(), Sight::Missing)));
+    sights.extend(leaderboards.iter().map(|l| (l.name_any(), Sight::There(l))));
+    let troubles = sights.iter().flat_map(|(name, sight)| board::troubles(name, *sight));
+    troubles.map(|trouble| trouble.words).collect()
+}
+
+/// The line of a submission, unless all is well with it.
+fn row(submission: &Submission, now: Timestamp) -> Option<Row> {
+    let unseen = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&unseen);
+    let others = other_systems(status, now);
+    let doubt = is_false(status, conditions::PLAUSIBLE);
+    let is_deleting = submission.metadata.deletion_timestamp.is_some();
+    let own = own_words(submission, status);
+    if own.is_none() && others.is_none() && doubt.is_none() && !is_deleting {
+        return None;
+    }
+    let deleting = if is_deleting { "Being deleted." } else { "" };
+    let doubt = doubt.map(|c| format!("{}.", c.reason)).unwrap_or_default();
+    let since = why::since(submission);
+    let age = since.map_or(0, |at| now.duration_since(at).as_secs());
+    let place = status.waiting.as_ref().map(|w| i64::from(w.position));
+    Some(Row {
+        order: match status.state {
+            Some(State::Running | State::Resumed) => (0, age),
+            None | Some(State::Pending) => (1, place.unwrap_or(0)),
+            Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
+        },
+        name: clean(&submission.name_any()),
+        state: status.state.map_or("(new)", State::as_str),
+        since: since.map(|_| span(age)).unwrap_or_default(),
+        why: join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
+    })
+}
+
+/// Why a submission is where it is; nothing if it runs, has finished, or was cancelled as wished.
+fn own_words(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
+    let reason = status.reason.as_deref().unwrap_or_default();
+    let message = status.message.as_deref().unwrap_or_default();
+    if why::is_attempt_wished(submission) {
+        let wanted = submission.spec.attempt;
+        return Some(format!(
+            "Attempt {wanted} is wished; the operator has not taken it up yet."
+        ));
+    }
+    match status.state {
+        None => Some("The operator has not looked at it yet.".to_owned()),
+        Some(State::Pending) => Some(match &status.waiting {
+            Some(waiting) => {
+                let eta = waiting.eta.as_ref().map(|eta| format!(", {eta}")).unwrap_or_default();
+                format!("{reason}: place {}{eta}", waiting.position)
+            }
+            None => format!("{reason}: {message}"),
+        }),
+        Some(State::Running | State::Resumed) => {
+            let is_well = [reasons::RUNNING, reasons::RESUMED].contains(&reason);
+            let stalled = conditions::get(&status.conditions, conditions::STALLED).filter(|c| c.status == "True");
+            match stalled {
+                Some(stalled) => Some(format!("{}: {}", stalled.reason, stalled.message)),
+                None => (!is_well).then(|| format!("{reason}: {message}")),
+            }
+        }
+        Some(State::Failed) => {
+            let class = status.failure.as_ref().map(|f| format!(" ({})", why::class(f)));
+            Some(format!("{reason}{}: {message}", class.unwrap_or_default()))
+        }
+        Some(State::Finished | State::Cancelled) => None,
+    }
+}
+
+/// What keeps EvalAI, or after it DynamoDB, from knowing the end: the row follows EvalAI's word, so the first says it all.
+fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
+    let late = |c: &&Condition| {
+        let age = now.duration_since(c.last_transition_time.0).as_secs();
+        match c.reason.as_str() {
+            reasons::NOT_WANTED => false,
+            reasons::WAITING => !c.message.is_empty() || age > PATIENCE_SECONDS,
+            _ => true,
+        }
+    };
+    let systems = [(conditions::PUBLISHED, "EvalAI"), (conditions::RECORDED, "DynamoDB")];
+    systems.iter().find_map(|(type_, system)| {
+        let condition = is_false(status, type_).filter(late)?;
+        Some(format!("{system}: {}.", condition.reason))
+    })
+}
+
+fn is_false<'a>(status: &'a SubmissionStatus, type_: &str) -> Option<&'a Condition> {
+    conditions::get(&status.conditions, type_).filter(|c| c.status == "False")
+}
+
+fn table(rows: &[Row]) -> Vec<String> {
+    let width = |head: &str, cell: fn(&Row) -> &str| {
+        let cells = rows.iter().map(|row| cell(row).chars().count());
+        cells.chain([head.len()]).max().unwrap_or(0) + 2
+    };
+    let (name, state, since) = (
+        width("NAME", |row| &row.name),
+        width("STATE", |row| row.state),
+        width("SINCE", |row| &row.since),
+    );
+    let left = WIDTH.saturating_sub(name + state + since);
+    let line = |a: &str, b: &str, c: &str, d: &str| {
+        let line = format!("{a:<name$}{b:<state$}{c:<since$}{}", cut(d, left));
+        line.trim_end().to_owned()
+    };
+    let mut lines = vec![line("NAME", "STATE", "SINCE", "WHY")];
+    lines.extend(rows.iter().map(|row| line(&row.name, row.state, &row.since, &row.why)));
+    lines
+}

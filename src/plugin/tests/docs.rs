@@ -1,0 +1,86 @@
+//! What docs/plugin.md shows is what the plugin prints.
+
+use jiff::Timestamp;
+use serde_json::json;
+
+use super::{
+    cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
+};
+use crate::api::Submission;
+use crate::plugin::board::Sight;
+use crate::plugin::change::{Wish, plan};
+use crate::plugin::error::Error;
+use crate::plugin::transitions::Waiting;
+use crate::plugin::{overview, why};
+
+const DOCS: &str = include_str!("../../../docs/plugin.md");
+
+fn assert_shown(lines: &[String]) {
+    let block = format!("```\n{}\n```\n", lines.join("\n"));
+    assert!(DOCS.contains(&block), "docs/plugin.md does not show\n{block}");
+}
+
+fn planned(wish: Wish, submission: &Submission) -> Result<Vec<String>, String> {
+    let plan = plan(wish, submission, Sight::There(&leaderboard()), now());
+    plan.map(|plan| plan.says)
+}
+
+#[test]
+fn why() {
+    for status in [crashed(), waiting()] {
+        let board = leaderboard();
+        assert_shown(&why::explain(&submission(&status), Sight::There(&board), now()));
+    }
+}
+
+#[test]
+fn why_of_all() {
+    let mut paused = leaderboard();
+    paused.spec.paused = true;
+    let stalled = with(
+        running(),
+        &json!({"conditions": [condition("Running", "True", "Running", ""),
+                               condition("Stalled", "True", "NotStored", "Its results cannot be read: 503.")]}),
+    );
+    let refused = with(
+        finished(),
+        &json!({"conditions": [condition("Finished", "True", "Finished", ""),
+                               condition("Published", "False", "Refused", "")]}),
+    );
+    let submissions = [
+        named("submission-38", &refused),
+        named("submission-39", &node_lost()),
+        named("submission-40", &stalled),
+        named("submission-41", &running()),
+        named("submission-42", &crashed()),
+        named("submission-43", &with(waiting(), &json!({"waiting": {"position": 1}}))),
+        named("submission-45", &waiting()),
+    ];
+    let lines = overview::lines("carla", &submissions, Some(&[paused]), now());
+    assert_shown(&lines);
+}
+
+#[test]
+fn cancel_and_resume() {
+    assert_shown(&planned(Wish::Cancel, &submission(&running())).unwrap());
+    assert_shown(&planned(Wish::Resume, &submission(&crashed())).unwrap());
+    let why_not = planned(Wish::Resume, &submission(&running())).unwrap_err();
+    assert_shown(&[format!("kubectl leaderboard: {}", Error::Unfit(why_not))]);
+}
+
+#[test]
+fn the_states_on_the_way() {
+    let stopping =
+        json!({"reason": "Stopping", "message": "It is being stopped as wished; what it has reached is kept."});
+    let mut wait = Waiting::new(1);
+    let mut lines = Vec::new();
+    for (time, status) in [
+        ("2026-11-01T12:00:00Z", running()),
+        ("2026-11-01T12:00:01Z", with(running(), &stopping)),
+        ("2026-11-01T12:00:07Z", cancelled()),
+    ] {
+        let now: Timestamp = time.parse().unwrap();
+        lines.extend(wait.see(&submission(&status), now).says);
+    }
+    assert_shown(&lines);
+}

@@ -1,0 +1,153 @@
+//! What the plugin says and decides, as tables: objects in, lines out.
+
+mod change;
+mod docs;
+mod overview;
+mod why;
+
+use jiff::Timestamp;
+use serde_json::{Value, json};
+
+use super::text::WIDTH;
+use crate::api::{Leaderboard, Submission};
+
+/// The moment of every test.
+fn now() -> Timestamp {
+    "2026-11-01T12:00:00Z".parse().unwrap()
+}
+
+/// A submission of EvalAI with this status; made two hours ago.
+fn submission(status: &Value) -> Submission {
+    named("submission-42", status)
+}
+
+fn named(name: &str, status: &Value) -> Submission {
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+        "metadata": {"name": name, "namespace": "carla", "creationTimestamp": "2026-11-01T10:00:00Z",
+                     "resourceVersion": "17"},
+        "spec": {"leaderboard": "carla-20", "evalai": {"challenge": 3, "phase": 7, "submission": 42}},
+        "status": status,
+    });
+    serde_json::from_value(object).unwrap()
+}
+
+/// A Leaderboard that is Ready, with two slots.
+fn leaderboard() -> Leaderboard {
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
+        "metadata": {"name": "carla-20", "namespace": "carla"},
+        "spec": {
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 7}], "results": "V2",
+            "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+            "storage": {"bucket": "results"}, "running": {"total": 2},
+        },
+        "status": {
+            "counts": {"pending": 4, "running": 2, "finished": 0, "failed": 0, "cancelled": 0},
+            "conditions": [condition("Ready", "True", "Ready", "")],
+        },
+    });
+    serde_json::from_value(object).unwrap()
+}
+
+fn condition(type_: &str, truth: &str, reason: &str, message: &str) -> Value {
+    json!({"type": type_, "status": truth, "reason": reason, "message": message,
+           "lastTransitionTime": "2026-11-01T11:00:00Z"})
+}
+
+/// In line, third.
+fn waiting() -> Value {
+    json!({
+        "state": "Pending", "attempt": 1, "reason": "WaitingForSlot", "track": "sensors",
+        "message": "All slots of the Leaderboard are in use; running.total and running.perTeam set their number.",
+        "team": {"id": "7", "name": "Team Seven"}, "waiting": {"position": 3, "eta": "20-35 min"},
+        "conditions": [condition("Finished", "False", "Preparing", ""), condition("Accepted", "True", "Accepted", "")],
+    })
+}
+
+/// Two agents run.
+fn running() -> Value {
+    json!({
+        "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
+        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "job": "submission-42-1",
+        "node": "gpu-3", "results": "s3://results/v2/42", "times": {"started": "2026-11-01T11:00:00Z"},
+        "conditions": [condition("Finished", "False", "Preparing", ""), condition("Running", "True", "Running", ""),
+                       condition("Stalled", "False", "Ok", "")],
+    })
+}
+
+/// Its agent crashed; EvalAI does not know yet.
+fn crashed() -> Value {
+    let message =
+        "Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results, mend it and submit again.";
+    json!({
+        "state": "Failed", "attempt": 1, "reason": "AgentCrashed", "message": message, "track": "sensors",
+        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "job": "submission-42-1",
+        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "failure": {"class": "participant", "reason": "AgentCrashed", "message": message, "charged": true, "pair": 2},
+        "pairs": [
+            {"id": 1, "done": 10, "total": 10, "crashes": 0, "state": "Done"},
+            {"id": 2, "done": 2, "total": 10, "crashes": 4, "state": "Crashed",
+             "last": {"reason": "exited", "exitCode": 1, "time": "2026-11-01T11:55:00Z"}},
+        ],
+        "conditions": [
+            condition("Finished", "True", "AgentCrashed", message), condition("Archived", "True", "Stored", ""),
+            condition("Published", "False", "Waiting", "The last request failed: 503."),
+            condition("Recorded", "False", "Waiting", ""),
+        ],
+    })
+}
+
+/// Its node was lost too often.
+fn node_lost() -> Value {
+    let message =
+        "Node gpu-3 was lost and its Pod with it; finished routes are kept. Look at the node, then resume it.";
+    json!({
+        "state": "Failed", "attempt": 1, "retry": 2, "reason": "NodeLost", "message": message, "track": "sensors",
+        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "failure": {"class": "infrastructure", "reason": "NodeLost", "message": message, "charged": false},
+        "conditions": [condition("Finished", "True", "NodeLost", message), condition("Published", "True", "Written", "")],
+    })
+}
+
+/// All is done.
+fn finished() -> Value {
+    json!({
+        "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": "43.13",
+        "message": "20 of 20 routes, driving score 43.13.", "progress": {"done": 20, "total": 20, "text": "20/20"},
+        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "conditions": [
+            condition("Finished", "True", "Finished", ""), condition("Archived", "True", "Stored", ""),
+            condition("Published", "True", "Written", ""), condition("Recorded", "True", "Written", ""),
+        ],
+    })
+}
+
+/// A person has cancelled it.
+fn cancelled() -> Value {
+    let message = "It was cancelled; what it had reached is kept.";
+    json!({
+        "state": "Cancelled", "attempt": 1, "reason": "Cancelled", "message": message,
+        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "conditions": [condition("Finished", "True", "Cancelled", message), condition("Published", "True", "Written", "")],
+    })
+}
+
+/// A status with other fields laid over it.
+fn with(mut status: Value, fields: &Value) -> Value {
+    for (key, value) in fields.as_object().unwrap() {
+        status[key] = value.clone();
+    }
+    status
+}
+
+fn assert_width(lines: &[String]) {
+    for line in lines {
+        assert!(
+            line.chars().count() <= WIDTH,
+            "{} columns: {line}",
+            line.chars().count()
+        );
+        assert_eq!(line.trim_end(), line, "nothing is behind the last word");
+    }
+}

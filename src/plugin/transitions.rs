@@ -1,0 +1,71 @@
+//! What is said of a submission while somebody waits for its end.
+//!
+//! Called by `mod` for each change that the watch brings. Pure: the time is handed in.
+
+use jiff::Timestamp;
+use kube::ResourceExt;
+
+use super::text::wrap;
+use crate::api::conditions;
+use crate::api::{State, Submission};
+
+/// Columns before the words of a transition.
+const INDENT: usize = 10;
+
+/// A wait for the end of an attempt.
+pub struct Waiting {
+    attempt: i64,
+    last: Option<(State, String)>,
+}
+
+/// What a change of the object means to who waits.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Seen {
+    /// What is new, in lines.
+    pub says: Vec<String>,
+    /// The state, if it is the end.
+    pub end: Option<State>,
+}
+
+impl Waiting {
+    /// Waits for the end of this attempt, or of a later one.
+    pub fn new(attempt: i64) -> Self {
+        Self { attempt, last: None }
+    }
+
+    /// Looks at the object as it is now.
+    pub fn see(&mut self, submission: &Submission, now: Timestamp) -> Seen {
+        let nothing = Seen {
+            says: Vec::new(),
+            end: None,
+        };
+        let status = submission.status.as_ref().filter(|s| s.attempt >= Some(self.attempt));
+        let Some((status, state)) = status.and_then(|s| Some((s, s.state?))) else {
+            return nothing;
+        };
+        let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
+        let end = is_over.then_some(state);
+        let reason = status.reason.clone().unwrap_or_default();
+        if self.last.as_ref() == Some(&(state, reason.clone())) {
+            return Seen { end, ..nothing };
+        }
+        let message = status.message.as_deref().unwrap_or_default();
+        let colon = if message.is_empty() { "" } else { ":" };
+        let name = submission.name_any();
+        let words = format!("{name} is {} ({reason}){colon} {message}", state.as_str());
+        self.last = Some((state, reason));
+        Seen {
+            says: hang(&now.strftime("%H:%M:%S").to_string(), &words),
+            end,
+        }
+    }
+}
+
+fn hang(label: &str, words: &str) -> Vec<String> {
+    let lines = wrap(words, super::text::WIDTH - INDENT);
+    let labels = std::iter::once(label).chain(std::iter::repeat(""));
+    labels
+        .zip(lines)
+        .map(|(label, line)| format!("{label:<INDENT$}{line}"))
+        .collect()
+}

@@ -1,0 +1,196 @@
+//! How the plugin finds its cluster and its person, and which rights it needs.
+
+use std::ffi::OsString;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+use tokio::process::Command;
+use tokio::time::timeout;
+
+use super::desk::{Desk, PLUGIN, Said, Waits, assert_has, end, ended, running, waiting};
+use crate::api::bridge::LIMIT;
+use crate::api::objects::{Kind, merge};
+
+const DOCS: &str = include_str!("../../../docs/plugin.md");
+/// Rights are known to the API server a moment after they were given.
+const POLL: Duration = Duration::from_millis(50);
+
+#[tokio::test]
+async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
+    let desk = Desk::new().await;
+    desk.submission("a", &json!({}), &waiting()).await;
+    let bin = Path::new(PLUGIN).parent().unwrap();
+    let mut path = OsString::from(bin);
+    path.push(":");
+    path.push(std::env::var_os("PATH").unwrap_or_default());
+    let mut kubectl = Command::from(desk.server.kubectl());
+    kubectl
+        .env("PATH", path)
+        .args(["leaderboard", "why", "a", "-n", &desk.namespace]);
+    let words = Said::of(&ended(&mut kubectl).await).well();
+    assert!(words.starts_with("a is Pending since "), "{words}");
+
+    let (folder, file) = person(&desk, &json!({}));
+    let mut command = Command::new(PLUGIN);
+    command
+        .env("KUBECONFIG", &file)
+        .args(["why", "a", "--context", "person"]);
+    assert!(
+        Said::of(&ended(&mut command).await)
+            .well()
+            .starts_with("a is Pending since ")
+    );
+    let mut command = Command::new(PLUGIN);
+    command
+        .env("KUBECONFIG", &file)
+        .args(["why", "a", "--context", "nobody"]);
+    let words = Said::of(&ended(&mut command).await).refused();
+    assert_has(&words, &["no cluster is configured: ", "nobody", "Set KUBECONFIG"]);
+    drop(folder);
+}
+
+#[tokio::test]
+async fn a_cluster_that_is_not_there_is_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let missing = folder.path().join("missing");
+    let mut command = Command::new(PLUGIN);
+    command.arg("why").arg("--kubeconfig").arg(&missing);
+    let words = Said::of(&ended(&mut command).await).refused();
+    assert_has(&words, &["no cluster is configured: ", "Set KUBECONFIG"]);
+
+    let broken = folder.path().join("broken");
+    std::fs::write(&broken, "users: [secret-token\nclusters: {").unwrap();
+    for set in [&["--kubeconfig"][..], &[]] {
+        let mut command = Command::new(PLUGIN);
+        command.arg("why").args(set).env("KUBECONFIG", &broken);
+        if !set.is_empty() {
+            command.arg(&broken);
+        }
+        let words = Said::of(&ended(&mut command).await).refused();
+        assert_has(&words, &["no cluster is configured: ", "not YAML"]);
+        assert!(!words.contains("secret-token"), "{words}");
+    }
+
+    let desk = Desk::new().await;
+    let (_folder, file) = person(
+        &desk,
+        &json!({"exec": {
+            "apiVersion": "client.authentication.k8s.io/v1", "command": "sh", "interactiveMode": "Never",
+            "args": ["-c", "echo secret-token; echo 'log in first' >&2; exit 3"],
+        }}),
+    );
+    let words = desk.run_as(&file, &["why"]).await.refused();
+    assert_has(&words, &["the cluster does not let you in: ", "log in first"]);
+    assert!(!words.contains("secret-token"), "{words}");
+}
+
+/// The rights that the documentation lists are enough, and without them it is said what is missing.
+#[tokio::test]
+async fn the_documented_rights_are_enough() {
+    let desk = Desk::new().await;
+    desk.leaderboard(&json!({})).await;
+    desk.submission("runs", &json!({}), &running()).await;
+    let name = format!("person-of-{}", desk.namespace);
+    let (_folder, file) = person(&desk, &json!({"as": name}));
+    for arguments in [&["why"][..], &["why", "runs"], &["cancel", "runs"]] {
+        let words = desk.run_as(&file, arguments).await.refused();
+        assert_has(&words, &["you may not do that: ", "is forbidden", "docs/plugin.md"]);
+    }
+
+    give(&desk, &name, "submissions");
+    until_allowed(&desk, &name, "submissions").await;
+    let words = desk.run_as(&file, &["why", "runs"]).await.well();
+    assert_has(&words, &["You may not read Leaderboard local"]);
+    let words = desk.run_as(&file, &["why"]).await.well();
+    assert_has(&words, &["You may not read Leaderboards"]);
+
+    give(&desk, &name, "leaderboards");
+    until_allowed(&desk, &name, "leaderboards").await;
+    assert!(!desk.run_as(&file, &["why", "runs"]).await.well().contains("may not"));
+    let mut command = desk.command(&["cancel", "runs", "--wait"]);
+    let mut waits = Waits::start(command.arg("--kubeconfig").arg(&file));
+    waits.until("runs is Running").await;
+    desk.status(Kind::Submission, "runs", &end("Cancelled", "Cancelled"))
+        .await;
+    assert_eq!(waits.code().await, Some(0));
+}
+
+/// The kubeconfig of a person whose context names the namespace.
+fn person(desk: &Desk, user: &Value) -> (TempDir, PathBuf) {
+    let text = std::fs::read_to_string(&desk.kubeconfig).unwrap();
+    let mut config: Value = serde_json::from_str(&text).unwrap();
+    if user.get("exec").is_some() {
+        config["users"][0]["user"] = user.clone();
+    } else {
+        merge(&mut config["users"][0]["user"], user);
+    }
+    config["contexts"][0]["name"] = json!("person");
+    config["contexts"][0]["context"]["namespace"] = json!(desk.namespace);
+    config["current-context"] = json!("person");
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("config");
+    let mut out = std::fs::File::create(&file).unwrap();
+    out.write_all(config.to_string().as_bytes()).unwrap();
+    (folder, file)
+}
+
+/// Gives a person the rights on one kind that docs/plugin.md lists.
+fn give(desk: &Desk, person: &str, resource: &str) {
+    let (_, rest) = DOCS.split_once("```yaml\n").unwrap();
+    let (role, _) = rest.split_once("```").unwrap();
+    let role: Value = serde_saphyr::from_str(role).unwrap();
+    let rules = role["rules"].as_array().unwrap();
+    let rule = rules
+        .iter()
+        .find(|rule| rule["resources"] == json!([resource]))
+        .unwrap();
+    let meta = json!({"name": resource, "namespace": desk.namespace});
+    let role = json!({"apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role", "metadata": meta, "rules": [rule]});
+    let binding = json!({
+        "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "RoleBinding", "metadata": meta,
+        "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "Role", "name": resource},
+        "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "User", "name": person}],
+    });
+    let list = json!({"apiVersion": "v1", "kind": "List", "items": [role, binding]});
+    let mut kubectl = desk.server.kubectl();
+    let mut child = kubectl
+        .args(["apply", "-f", "-"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    child
+        .stdin
+        .take()
+        .unwrap()
+        .write_all(list.to_string().as_bytes())
+        .unwrap();
+    assert!(child.wait().unwrap().success());
+}
+
+/// Waits until the API server knows of a person's right.
+async fn until_allowed(desk: &Desk, person: &str, resource: &str) {
+    let review = json!({
+        "apiVersion": "authorization.k8s.io/v1", "kind": "SubjectAccessReview",
+        "spec": {"user": person, "resourceAttributes": {
+            "group": "leaderboard.carla.org", "resource": resource, "verb": "list", "namespace": desk.namespace,
+        }},
+    });
+    let allowed = async {
+        loop {
+            let request = http::Request::post("/apis/authorization.k8s.io/v1/subjectaccessreviews");
+            let request = request.header("content-type", "application/json");
+            let request = request.body(review.to_string().into_bytes()).unwrap();
+            let answer: Value = desk.client.request(request).await.unwrap();
+            if answer["status"]["allowed"] == json!(true) {
+                return;
+            }
+            tokio::time::sleep(POLL).await;
+        }
+    };
+    timeout(LIMIT, allowed).await.expect("the right is known");
+}
