@@ -245,7 +245,7 @@ async fn silent_registry(scene: &Scene) {
     let spec = json!({"leaderboard": "silent", "track": "sensors", "image": silent.image()});
     case.cause();
     scene.apply_submission("silent", spec).await;
-    // What it is at is told after a minute: a healthy Pod costs no write until then.
+    // What it is at is told after 45 s: a healthy Pod costs no write until then.
     case.shows(scene, "silent", "Preparing", "images are pulled").await;
     give_up(scene, "silent").await;
     let ended = case.ends(scene, "silent", LIMIT).await;
