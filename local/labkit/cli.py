@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from . import aws, charttest, cluster, demo, image, pythonenv, testrun, tools
+from . import aws, charttest, cluster, crash, demo, image, pythonenv, testrun, tools
 from .console import say
 from .errors import LabError
 from .settings import API_SERVICE_ADDRESS, HOST_ADDRESS, PORTS, Settings, client_environment, load
@@ -23,6 +23,10 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     commands.add_parser("up", help="start the cluster, or repair it; prints what to put into the environment")
     commands.add_parser("down", help="end the cluster and remove its data")
+    crashed = commands.add_parser("crash", help="kill a part of the running cluster and start it again")
+    # Not `choices`: its error is two lines and names no next step.
+    crashed.add_argument("part", metavar="PART", help=f"one of {', '.join(crash.PARTS)}")
+    crashed.add_argument("--away", type=int, default=0, metavar="SECONDS", help="stay away so long (default: 0)")
     commands.add_parser("status", help="what runs; exits with 1 unless everything does")
     commands.add_parser("env", help='print shell exports: `eval "$(local/lab env)"`')
     named = commands.add_parser("tools", help="build the pinned tools that are missing; prints their folder")
@@ -68,6 +72,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             print(f"export KUBECONFIG={shlex.quote(str(settings.kubeconfig))}")
         case "down":
             cluster.down(settings)
+        case "crash":
+            crash.crash(settings, arguments.part, arguments.away)
         case "status":
             return 0 if cluster.status(settings) else 1
         case "env":

@@ -57,12 +57,16 @@ def up(settings: Settings) -> None:
         pki.ensure(settings)
         network.up(settings)
         leftovers.make_cgroup()
-        containerd = shutil.which("containerd") or "containerd"
-        parts = components.all_components(settings, folder, python, containerd, str(packages.cni_folder()))
-        changed = start_all(settings, folder, parts)
+        changed = start_all(settings, folder, parts_of(settings, folder, python))
     took = seconds(time.monotonic() - started)
     news = f"started {', '.join(changed)}" if changed else "everything was running"
     say(f"the cluster is up ({took}; {news})")
+
+
+def parts_of(settings: Settings, folder: Path, python: Path) -> list[Component]:
+    """Every part as this machine runs it, with the tools in `folder`."""
+    containerd = shutil.which("containerd") or "containerd"
+    return components.all_components(settings, folder, python, containerd, str(packages.cni_folder()))
 
 
 def check_machine(settings: Settings) -> None:

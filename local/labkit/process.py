@@ -113,6 +113,16 @@ def start(
 
 def stop(identity: Identity | None, patience: float) -> bool:
     """Asks the process to end, kills it after `patience` seconds, and returns when it is gone. False: it was not running."""
+    return end(identity, patience)
+
+
+def kill(identity: Identity | None) -> bool:
+    """Kills the process, which has no moment to prepare, and returns when it is gone. False: it was not running."""
+    return end(identity, None)
+
+
+def end(identity: Identity | None, patience: float | None) -> bool:
+    """Ends the process and returns when it is gone; without a request before if `patience` is None."""
     if identity is None:
         return False
     try:
@@ -123,8 +133,9 @@ def stop(identity: Identity | None, patience: float) -> bool:
         # The handle is taken first: from here on the pid can't become someone else's unnoticed.
         if not running(identity):
             return False
-        signal.pidfd_send_signal(handle, signal.SIGTERM)
-        if not ended(handle, patience):
+        if patience is not None:
+            signal.pidfd_send_signal(handle, signal.SIGTERM)
+        if patience is None or not ended(handle, patience):
             signal.pidfd_send_signal(handle, signal.SIGKILL)
             if not ended(handle, 20):
                 raise LabError(

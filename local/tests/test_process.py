@@ -81,6 +81,20 @@ class Lifecycle(unittest.TestCase):
         self.assertTrue(process.stop(identity, 0.1))
         self.assertFalse(process.running(identity))
 
+    def test_one_that_is_killed_has_no_moment_to_prepare(self) -> None:
+        ready, asked = self.folder / "ready", self.folder / "asked"
+        code = f"""import signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: (open({str(asked)!r}, 'w'), sys.exit()))
+open({str(ready)!r}, 'w')
+time.sleep(600)"""
+        identity = self.start(code)
+        self.assertTrue(process.wait_until(ready.exists, 20))
+        self.assertTrue(process.kill(identity))
+        self.assertFalse(process.running(identity))
+        self.assertFalse(asked.exists())
+        self.assertFalse(process.kill(identity))
+        self.assertFalse(process.kill(None))
+
     def test_a_process_with_another_start_time_is_left_alone(self) -> None:
         identity = self.start("import time; time.sleep(600)")
         self.assertFalse(process.stop(replace(identity, start=identity.start + 1), 0))
