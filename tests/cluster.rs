@@ -1,7 +1,8 @@
 //! The whole system on a real cluster: the operator's own programs, real Pods, and stand-ins for AWS and EvalAI.
 //!
 //! Each test has a namespace, queues, a table and a prefix in the bucket of its own, and runs the operator as child processes
-//! that it may kill and stop. Two tests run at once; each prints its seconds.
+//! that it may kill and stop. Four tests run at once, begun in the order of their names, so that those that take longest come
+//! first; each prints its seconds.
 
 #![allow(
     clippy::unwrap_used,
@@ -26,13 +27,14 @@ mod registry;
 mod scene;
 
 mod cluster {
+    mod abrupt;
     mod audit;
     mod bridge;
+    mod bucket;
     mod crashes;
     mod edits;
     mod expected;
     mod failures;
-    mod kills;
     mod losses;
     mod matrix;
     mod matrix_outages;
@@ -42,5 +44,4 @@ mod cluster {
     mod publish;
     mod runs;
     mod stops;
-    mod storage;
 }

@@ -21,6 +21,8 @@ from .toolsets import ENVTEST_TOOLS
 # Test programs of cargo with a layer of their own, as they need an API server or a node.
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
+# Tests of the cluster that run at once: they wait for the kubelet most of their time.
+AT_ONCE = 4
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,7 @@ def in_cluster(plan: Plan) -> None:
         # What Pods run beside the participant's image; the test starts controller and bridge itself, to kill them.
         "LEADERBOARD_OPERATOR_IMAGE": images[demo.OPERATOR],
         "LEADERBOARD_OPERATOR_BIN": str(build.program(plan.settings, OPERATOR)),
+        "RUST_TEST_THREADS": str(AT_ONCE),
     }
     lines = plan.settings.logs / "matrix.tsv"
     lines.unlink(missing_ok=True)
