@@ -2,7 +2,7 @@
 //!
 //! Each test has a namespace, queues, a table and a prefix in the bucket of its own, and runs the operator as child processes
 //! that it may kill and stop. Four tests run at once, begun in the order of their names, so that those that take longest come
-//! first; each prints its seconds.
+//! first; each prints its seconds. What `restarts` has disturbs all others and runs alone, after them.
 
 #![allow(
     clippy::unwrap_used,
@@ -42,6 +42,7 @@ mod cluster {
     mod matrix_stops;
     mod matrix_waits;
     mod publish;
+    mod restarts;
     mod runs;
     mod stops;
 }

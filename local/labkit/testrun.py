@@ -23,6 +23,8 @@ APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
 # Tests of the cluster that run at once: they wait for the kubelet most of their time.
 AT_ONCE = 4
+# Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
+ALONE = "cluster::restarts::"
 
 
 @dataclass(frozen=True)
@@ -140,15 +142,42 @@ def in_cluster(plan: Plan) -> None:
         # What Pods run beside the participant's image; the test starts controller and bridge itself, to kill them.
         "LEADERBOARD_OPERATOR_IMAGE": images[demo.OPERATOR],
         "LEADERBOARD_OPERATOR_BIN": str(build.program(plan.settings, OPERATOR)),
-        "RUST_TEST_THREADS": str(AT_ONCE),
     }
     lines = plan.settings.logs / "matrix.tsv"
     lines.unlink(missing_ok=True)
     try:
-        cargo_test(plan, ["--test=cluster"], {**env, "LEADERBOARD_MATRIX": str(lines)})
+        run_cluster_tests(plan, {**env, "LEADERBOARD_MATRIX": str(lines)})
     finally:
         if lines.exists():
             print(matrix(lines.read_text()), flush=True)
+
+
+def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
+    """Most at once, then one by one those that kill what the others need; these too if others have failed."""
+    target = ["--test=cluster"]
+    passed = cargo_passes(plan, target, {**env, "RUST_TEST_THREADS": str(AT_ONCE)}, [plan.filter])
+    alone = names_alone(ignored_tests(plan, target, env), plan.filter)
+    if alone:
+        say("now, one by one, the tests that disturb every other one")
+        passed &= cargo_passes(plan, target, {**env, "RUST_TEST_THREADS": "1"}, ["--ignored", "--exact", *alone])
+    if not passed:
+        raise LabError("cargo test found failures, see above")
+
+
+def ignored_tests(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> str:
+    """What the test program says of its ignored tests."""
+    argv = [*cargo_argv(targets), "--", "--ignored", "--list", "--format=terse"]
+    whole = {**os.environ, **env}
+    done = subprocess.run(argv, cwd=plan.settings.repository, env=whole, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise LabError(f"cargo test --list failed: {done.stderr.strip()[-300:]}")
+    return done.stdout
+
+
+def names_alone(listed: str, name_filter: str) -> list[str]:
+    """Of a terse list of ignored tests those that run alone and have the filter's text in their names, as cargo's would."""
+    names = [line.removesuffix(": test") for line in listed.splitlines() if line.endswith(": test")]
+    return [name for name in names if name.startswith(ALONE) and name_filter in name]
 
 
 def matrix(lines: str) -> str:
@@ -168,10 +197,18 @@ def test_environment(settings: Settings) -> dict[str, str]:
 
 
 def cargo_test(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> None:
-    build.check_cargo()
-    argv = ["cargo", "test", "--workspace", "--profile", build.PROFILE, "--no-fail-fast", *targets]
-    if call(plan, argv + ([plan.filter] if plan.filter else []), env) != 0:
+    if not cargo_passes(plan, targets, env, [plan.filter]):
         raise LabError("cargo test found failures, see above")
+
+
+def cargo_passes(plan: Plan, targets: Sequence[str], env: dict[str, str], harness: Sequence[str]) -> bool:
+    """Runs tests; `harness` is said to the test programs: options and parts of names."""
+    build.check_cargo()
+    return call(plan, [*cargo_argv(targets), "--", *filter(None, harness)], env) == 0
+
+
+def cargo_argv(targets: Sequence[str]) -> list[str]:
+    return ["cargo", "test", "--workspace", "--profile", build.PROFILE, "--no-fail-fast", *targets]
 
 
 def call(plan: Plan, argv: Sequence[str], env: dict[str, str]) -> int:

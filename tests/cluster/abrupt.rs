@@ -93,7 +93,7 @@ impl Running<'_> {
 }
 
 /// One Submission, one Job, one Pod, one row here and there, and the standard score.
-async fn assert_untouched(scene: &Scene, evalai: &Evalai, submission: &Submission, pk: u64) {
+pub async fn assert_untouched(scene: &Scene, evalai: &Evalai, submission: &Submission, pk: u64) {
     assert_finished(submission);
     assert_eq!(names(&scene.all::<Submission>().await), [format!("submission-{pk}")]);
     assert_eq!(scene.jobs().await, [format!("submission-{pk}-1")]);

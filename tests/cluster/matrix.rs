@@ -23,22 +23,6 @@ pub const SHOWN: Duration = Duration::from_mins(2);
 /// File that the lines go into, for whoever prints them.
 const VARIABLE: &str = "LEADERBOARD_MATRIX";
 
-/// Cases that no test makes happen here, and what stands in for them.
-const NOT_COVERED: [(&str, &str); 3] = [
-    (
-        "API server's process restarted",
-        "it serves all tests at once; see `API server out of reach`",
-    ),
-    (
-        "etcd's process restarted",
-        "it serves all tests at once; to the operator it looks like an API server out of reach",
-    ),
-    (
-        "kubelet of a node killed",
-        "the only node serves all tests at once; see `node lost`",
-    ),
-];
-
 /// An open case.
 pub struct Case {
     name: &'static str,
@@ -204,11 +188,4 @@ pub async fn together(width: usize, cases: Vec<LocalBoxFuture<'_, ()>>) {
         .await;
     let failed = ends.iter().filter(|end| end.is_err()).count();
     assert!(failed == 0, "{failed} of {} cases failed, see above", ends.len());
-}
-
-#[test]
-fn cases_that_are_not_covered_are_named() {
-    for (case, instead) in NOT_COVERED {
-        tell(case, instead, "not covered", None);
-    }
 }

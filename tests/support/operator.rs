@@ -1,6 +1,7 @@
 //! The operator's programs as child processes of a test: each is limited to the test's namespace and has its own Lease, so
 //! that it can be killed, stopped and started again without anybody else's notice.
 
+use std::convert::Infallible;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
@@ -11,15 +12,17 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 use tokio::process::{Child, Command};
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 
 use super::gate::Gate;
-use super::scene::Scene;
+use super::scene::{Scene, say};
 
 /// What the programs log, unless `LEADERBOARD_TEST_LOG` says otherwise.
 const LOG: &str = "info,leaderboard_operator=debug";
 /// Name of each test's Lease, in its namespace.
 pub const LEASE: &str = "operator";
+/// Between the end of a program and its next start, as the kubelet has it.
+const BACK_OFF: Duration = Duration::from_secs(1);
 
 /// A running program. It is killed when this is dropped.
 pub struct Process {
@@ -50,6 +53,20 @@ fn controller_arguments(scene: &Scene) -> [&str; 6] {
 /// Starts `leaderboard-operator bridge`.
 pub fn bridge(scene: &Scene) -> Process {
     Process::start(scene, "bridge", &[], None)
+}
+
+/// Keeps a program running: starts it again whenever it has ended by itself, as the kubelet would. It never returns; the
+/// program is killed when this is dropped.
+pub async fn kept(scene: &Scene, start: impl Fn(&Scene) -> Process) -> Infallible {
+    loop {
+        let mut program = start(scene);
+        let status = program.child.wait().await.unwrap();
+        say(&format!(
+            "{}: {} ended by itself, {status}",
+            scene.namespace, program.name
+        ));
+        sleep(BACK_OFF).await;
+    }
 }
 
 impl Process {

@@ -1,0 +1,109 @@
+//! The matrix: a part of the cluster dies while a submission runs, and comes back: the run does not notice.
+//!
+//! All other tests would. So these run alone and only when they are named, as `make test` does after the others.
+
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+use leaderboard_operator::api::Submission;
+use serde_json::json;
+use tokio::process::Command;
+use tokio::select;
+
+use super::abrupt::assert_untouched;
+use super::matrix::Case;
+use crate::evalai::Evalai;
+use crate::operator::{bridge, controller, kept};
+use crate::scene::{Scene, containers, done, say, scenario};
+
+const EXPECTED: &str = "Finished; EvalAI finished; one Job, one row; the same Pod, nothing in it restarted";
+/// How many seconds the part is away before it is started again.
+const AWAY: &str = "5";
+/// A run outlives what it is to get by without: each of four pairs drives five such routes.
+const ROUTE_MS: &str = "6000";
+/// A Lease runs out (15 s), EvalAI is left alone (75 s), and the machine is slow.
+const LIMIT: Duration = Duration::from_mins(4);
+const PAIRS: usize = 4;
+
+#[tokio::test]
+#[ignore = "it disturbs all other tests: make test runs it after them"]
+async fn a_killed_api_server_costs_nothing() {
+    crashed("API server's process killed", "kube-apiserver").await;
+}
+
+#[tokio::test]
+#[ignore = "it disturbs all other tests: make test runs it after them"]
+async fn a_killed_etcd_costs_nothing() {
+    crashed("etcd's process killed", "etcd").await;
+}
+
+#[tokio::test]
+#[ignore = "it disturbs all other tests: make test runs it after them"]
+async fn a_killed_kubelet_costs_nothing() {
+    crashed("kubelet of the node killed", "kubelet").await;
+}
+
+/// One line of the matrix.
+async fn crashed(case: &'static str, part: &str) {
+    scenario(&format!("crash-{part}"), async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        let slow = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": ROUTE_MS}]}});
+        scene.evalai_leaderboard("lb", &evalai, slow).await;
+        // Who loses the Lease to the outage ends, and the kubelet starts it again.
+        select! {
+            () = survives(scene, &evalai, case, part) => {}
+            never = kept(scene, controller) => match never {},
+            never = kept(scene, bridge) => match never {},
+        }
+    })
+    .await;
+}
+
+async fn survives(scene: &Scene, evalai: &Evalai, case: &'static str, part: &str) {
+    let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+    let name = format!("submission-{pk}");
+    let under_way = |s: &Submission| done(s) >= 1;
+    scene.submission(&name, "a route is done", LIMIT, under_way).await;
+    let before = scene.pod(&name).await;
+    assert_eq!(alive(&before), [PAIRS, PAIRS], "all agents and simulators run");
+
+    let mut case = Case::open(case, EXPECTED);
+    crash(part).await;
+    let submission = case.ends(scene, &name, LIMIT).await;
+    case.evalai(evalai.submission(pk).status);
+    assert_untouched(scene, evalai, &submission, pk).await;
+    assert_eq!(scene.cloud.rows(&scene.cloud.table).await.len(), 1);
+    case.also("one Job, one row");
+    let after = scene.pod(&name).await;
+    assert_eq!(after.uid(), before.uid(), "another Pod has run it");
+    let restarts: i32 = containers(&after).iter().map(|container| container.restart_count).sum();
+    assert_eq!(restarts, 0, "containers were restarted");
+    case.also("the same Pod, nothing in it restarted");
+    case.close();
+}
+
+/// How many of a Pod's agents and simulators run.
+fn alive(pod: &Pod) -> [usize; 2] {
+    let all = containers(pod);
+    ["agent-", "simulator-"].map(|kind| {
+        let running = all.iter().filter(|container| {
+            let state = container.state.as_ref();
+            container.name.starts_with(kind) && state.is_some_and(|state| state.running.is_some())
+        });
+        running.count()
+    })
+}
+
+/// Kills a part of the lab's cluster; it is back, and all that needs it, when this returns.
+async fn crash(part: &str) {
+    let lab = Path::new(env!("CARGO_MANIFEST_DIR")).join("local/lab");
+    let mut command = Command::new(lab);
+    command.args(["crash", part, "--away", AWAY]).stdin(Stdio::null());
+    let done = command.output().await.unwrap();
+    let told = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success(), "{part} was not crashed: {told}");
+    say(told.trim_end());
+}
