@@ -38,7 +38,7 @@ const ROUNDS: usize = 4;
 
 /// Why submissions wait or fail, and to cancel or resume them.
 #[derive(Parser, Debug)]
-#[command(name = "kubectl-leaderboard", bin_name = "kubectl leaderboard", version, about, long_about = None)]
+#[command(name = "kubectl-leaderboard", bin_name = "kubectl leaderboard", version, long_about = None)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
