@@ -10,6 +10,7 @@ use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use futures::FutureExt;
 use tokio::time::Instant;
 
 use crate::api::Storage;
@@ -42,23 +43,27 @@ pub fn id(storage: &Storage) -> String {
 
 impl Buckets {
     /// Makes a call, unless its bucket is known to hang.
-    pub async fn call<T>(
-        &self,
-        storage: &Storage,
+    pub fn call<'a, T: 'a>(
+        &'a self,
+        storage: &'a Storage,
         limit: Duration,
-        call: impl Future<Output = Result<T, ArchiveError>>,
-    ) -> Result<T, BucketError> {
-        let silent = || BucketError::Silent(storage.bucket.clone());
-        let mut under_way = UnderWay::begin(self, storage).ok_or_else(silent)?;
-        let began = Instant::now();
-        let result = tokio::time::timeout(limit, call).await;
-        let is_silent = match &result {
-            Ok(Ok(_)) => false,
-            Ok(Err(error)) => error.cause.is_transient() && began.elapsed() >= HANGS,
-            Err(_) => true,
-        };
-        under_way.end(is_silent);
-        Ok(result.map_err(|_| silent())??)
+        call: impl Future<Output = Result<T, ArchiveError>> + Send + 'a,
+    ) -> impl Future<Output = Result<T, BucketError>> {
+        // A request of the SDK is large, and would be held twice by every pass.
+        let call = call.boxed();
+        async move {
+            let silent = || BucketError::Silent(storage.bucket.clone());
+            let mut under_way = UnderWay::begin(self, storage).ok_or_else(silent)?;
+            let began = Instant::now();
+            let result = tokio::time::timeout(limit, call).await;
+            let is_silent = match &result {
+                Ok(Ok(_)) => false,
+                Ok(Err(error)) => error.cause.is_transient() && began.elapsed() >= HANGS,
+                Err(_) => true,
+            };
+            under_way.end(is_silent);
+            Ok(result.map_err(|_| silent())??)
+        }
     }
 
     fn ask(&self, id: &str) -> Option<Permit> {
@@ -143,8 +148,6 @@ impl Drop for UnderWay<'_> {
 #[cfg(test)]
 mod tests {
     use std::future::{pending, ready};
-
-    use futures::FutureExt;
 
     use super::*;
     use crate::services::archive::Cause;

@@ -69,7 +69,7 @@ pub async fn aws(endpoint: &str) -> Aws {
 
 /// Everything a pass shares.
 pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
-    let aws = aws(endpoint).await;
+    let aws = Box::pin(aws(endpoint)).await;
     let (tell, requests) = mpsc::unbounded_channel();
     let (service, handle) = pair::<Request<Body>, Response<Body>>();
     let known = cluster.submissions.iter().map(|s| (s.name_any(), json!(s))).collect();
