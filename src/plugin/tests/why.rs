@@ -121,7 +121,7 @@ fn a_leaderboard_that_keeps_it_waiting_is_named_first() {
     let (refused, unknown) = (not_ready("False"), not_ready("Unknown"));
     let unseen = changed(|l| l.status = None);
     let deleted = changed(|l| {
-        l.metadata.deletion_timestamp = l.status.as_ref().map(|s| s.conditions[0].last_transition_time.clone())
+        l.metadata.deletion_timestamp = l.status.as_ref().map(|s| s.conditions[0].last_transition_time.clone());
     });
     for (sight, first, next) in [
         (
