@@ -29,6 +29,8 @@ pub struct Memory {
 struct Entry {
     written: Option<Written>,
     partial: Option<(i64, u32)>,
+    /// Why its result could not be read.
+    unread: Option<String>,
     /// When its place may be written.
     place_at: Option<Instant>,
 }
@@ -116,6 +118,16 @@ impl Memory {
     /// Remembers a partial result.
     pub fn told_partial(&self, submission: &Submission, attempt: i64, done: u32) {
         self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
+    }
+
+    /// Why its result could not be read when it was to be told last; None if it could.
+    pub fn unread(&self, submission: &Submission) -> Option<String> {
+        self.lock().get(&uid_of(submission))?.unread.clone()
+    }
+
+    /// Remembers whether its result could be read.
+    pub fn note_unread(&self, submission: &Submission, why: Option<String>) {
+        self.lock().entry(uid_of(submission)).or_default().unread = why;
     }
 
     /// Drops an object that is gone.

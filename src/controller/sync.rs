@@ -130,11 +130,7 @@ impl Sync {
         } else {
             view.report.clone()
         };
-        if let ReportSight::Unreadable(why) = &sight
-            && end
-            && row_may_wait(view, status)
-        {
-            tracing::warn!(submission = %view.submission.name_any(), %why, "the row of the end waits for the result");
+        if end && matches!(sight, ReportSight::Unreadable(_)) && row_may_wait(view, status) {
             return;
         }
         if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
@@ -171,7 +167,11 @@ struct Way {
 
 async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
-    let payload = texts(context, view, report).await?;
+    let read = result_texts::payload(context, view, report).await;
+    let unread = |why: &String| {
+        tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of a partial result wait to be read");
+    };
+    let payload = read.inspect_err(unread).ok()?;
     let attempt = view.submission.spec.attempt;
     context.memory.told_partial(&view.submission, attempt, report.done);
     Some(Arc::new(payload))
@@ -179,10 +179,26 @@ async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
 
 /// The report as it is stored at the end; passes after the end read none.
 async fn last_report(context: &Context, view: &View) -> ReportSight {
-    match view.report.ours() {
+    let sight = match view.report.ours() {
         Some(report) => ReportSight::Ours(Arc::clone(report)),
         None => report::read_now(context, &view.submission, view.now).await,
+    };
+    let why = match &sight {
+        ReportSight::Unreadable(why) => Some(why.clone()),
+        _ => None,
+    };
+    note_unread(context, view, why);
+    sight
+}
+
+/// The status tells it until the result could be read, our own log once.
+fn note_unread(context: &Context, view: &View, why: Option<String>) {
+    if let Some(why) = &why
+        && view.unread.is_none()
+    {
+        tracing::warn!(submission = %view.submission.name_any(), %why, "the result cannot be read, so its end waits");
     }
+    context.memory.note_unread(&view.submission, why);
 }
 
 /// Whether a row that is never written again waits for its result. One that is being deleted has no time for it.
@@ -194,11 +210,14 @@ fn row_may_wait(view: &View, status: &SubmissionStatus) -> bool {
 async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
     let sight = last_report(context, view).await;
     let mut payload = match &sight {
-        ReportSight::Ours(report) => texts(context, view, report).await?,
-        ReportSight::Unreadable(why) => {
-            tracing::warn!(submission = %view.submission.name_any(), %why, "the result waits to be published");
-            return None;
-        }
+        ReportSight::Ours(report) => match result_texts::payload(context, view, report).await {
+            Ok(payload) => payload,
+            Err(why) => {
+                note_unread(context, view, Some(why));
+                return None;
+            }
+        },
+        ReportSight::Unreadable(_) => return None,
         _ => Payload {
             phase: result_texts::phase(view),
             result: "[]".into(),
@@ -212,14 +231,6 @@ async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, o
         result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
     }
     Some(Wish::Final(outcome, Arc::new(payload)))
-}
-
-async fn texts(context: &Context, view: &View, report: &crate::pod::report::Report) -> Option<Payload> {
-    let read = result_texts::payload(context, view, report).await;
-    let unread = |why: &String| {
-        tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of the result wait to be read");
-    };
-    read.inspect_err(unread).ok()
 }
 
 fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {

@@ -95,6 +95,7 @@ async fn bench() -> Bench {
         evalai: None,
         record: Some(RecordView::default()),
         partial_told: None,
+        unread: None,
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,
@@ -118,6 +119,10 @@ impl Bench {
     async fn row(&mut self) -> Item {
         let row = tokio::time::timeout(LIMIT, self.written.recv()).await;
         row.expect("a row is written").unwrap()
+    }
+
+    fn unread(&self) -> Option<String> {
+        self.around.context.memory.unread(&self.view.submission)
     }
 
     fn is_handed_in(&self) -> bool {
@@ -151,9 +156,11 @@ async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ev
     bench.stores("torn");
     bench.records_the_end().await;
     assert!(!bench.is_handed_in());
+    assert!(bench.unread().unwrap().contains("not one of ours"));
     bench.stores(&last());
     bench.records_the_end().await;
     assert_eq!(bench.row().await["driving_score"], "43.125");
+    assert_eq!(bench.unread(), None);
 
     let mut bench = self::bench().await;
     bench.stores("torn");

@@ -26,6 +26,8 @@ pub struct View {
     pub record: Option<RecordView>,
     /// Routes that the last partial result told EvalAI of, in this attempt.
     pub partial_told: Option<u32>,
+    /// Why its result could not be read when it was to be told last.
+    pub unread: Option<String>,
 }
 
 /// The Job that the present attempt should have.

@@ -117,6 +117,7 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             };
             draft.act(Action::Tell(wish));
             let failed = view.error.map(|e| format!("The last request failed: {}", sentence(&e)));
+            let failed = unread(draft).or(failed);
             let (reason, message) = if is_overtaken {
                 (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
             } else {
@@ -131,6 +132,15 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             Sync::Waiting
         }
     }
+}
+
+/// What keeps an end from being told before anybody was asked.
+fn unread(draft: &Draft<'_>) -> Option<String> {
+    let why = draft.view.unread.as_ref()?;
+    Some(format!(
+        "The stored result cannot be read: {} It is told when it can; look at the bucket.",
+        sentence(why)
+    ))
 }
 
 /// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
@@ -194,7 +204,7 @@ fn record(draft: &mut Draft<'_>) -> Sync {
                 sentence(&error)
             ),
         ),
-        None => (reasons::WAITING, String::new()),
+        None => (reasons::WAITING, unread(draft).unwrap_or_default()),
     };
     draft.condition(conditions::RECORDED, Truth::False, reason, &message);
     Sync::Waiting

@@ -48,6 +48,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let all = || context.stores.submissions.state();
     let turn = context.board.turn(all, &submission, leaderboard.as_deref(), is_asked);
     let partial_told = context.memory.partial_told(&submission);
+    let unread = context.memory.unread(&submission);
     View {
         now,
         submission,
@@ -60,6 +61,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         evalai,
         record,
         partial_told,
+        unread,
     }
 }
 

@@ -2,9 +2,9 @@
 
 use super::builders::*;
 use crate::api::State::{Cancelled, Failed, Finished};
-use crate::api::conditions::{PUBLISHED, RECORDED};
+use crate::api::conditions::{self, PUBLISHED, RECORDED};
 use crate::api::reasons;
-use crate::controller::decide::{Action, Tell};
+use crate::controller::decide::{Action, Plan, Tell};
 use crate::controller::view::{EvalaiEnd, ReportSight};
 
 fn finished() -> World {
@@ -54,6 +54,29 @@ fn evalai_first_then_the_table_then_rest() {
             (Some(state), [Action::ForgetEvalai].as_slice())
         );
     }
+}
+
+#[test]
+fn an_end_whose_result_cannot_be_read_says_why_it_waits() {
+    let mut world = finished();
+    world.view.unread = Some("the bucket results did not answer in time".into());
+    let told = |plan: &Plan, type_: &str| {
+        let condition = conditions::get(&plan.status.conditions, type_).unwrap();
+        (condition.reason.clone(), condition.message.clone())
+    };
+    let waits = (
+        reasons::WAITING.to_owned(),
+        "The stored result cannot be read: the bucket results did not answer in time. It is told when it can; look at the bucket."
+            .to_owned(),
+    );
+    assert_eq!(told(&world.pass(), PUBLISHED), waits);
+    world.published();
+    assert_eq!(told(&world.pass(), RECORDED), waits);
+    world.view.unread = None;
+    assert_eq!(
+        told(&world.pass(), RECORDED),
+        (reasons::WAITING.to_owned(), String::new())
+    );
 }
 
 #[test]

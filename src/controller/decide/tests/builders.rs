@@ -101,6 +101,7 @@ impl World {
                 evalai: evalai.then_some(known),
                 record: Some(RecordView::default()),
                 partial_told: None,
+                unread: None,
             },
         }
     }
