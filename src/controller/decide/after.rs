@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
@@ -9,10 +10,12 @@ use super::failure::sentence;
 use super::{Action, Tell, accept, log, stop};
 use crate::api::conditions::{self, Truth};
 use crate::api::{State, reasons};
-use crate::controller::view::{EvalaiEnd, JobSight, JobView};
+use crate::controller::view::{EvalaiEnd, JobSight, JobView, View};
 
 /// How often an unpublished end is looked at again.
 const AGAIN: Duration = Duration::from_secs(30);
+/// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
+const FAREWELL_SECONDS: i64 = 120;
 const TOLD_AGAIN: &str =
     "A request that was under way may have undone EvalAI's own end; EvalAI is asked, and told again.";
 
@@ -46,9 +49,11 @@ enum Sync {
 /// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
 pub(super) fn leave_job(draft: &mut Draft<'_>) {
     let JobSight::Ours(job) = &draft.view.job else { return };
-    // A Pod whose run has ended is only saying its farewell.
-    let ends_by_itself = draft.view.pod.as_ref().is_some_and(|pod| pod.run_ended.is_some());
-    if job.end.is_some() || ends_by_itself {
+    if job.end.is_some() {
+        return keep_job_for_its_time(draft, job);
+    }
+    if let Some(until) = farewell(draft.view) {
+        draft.requeue_at(until);
         return keep_job_for_its_time(draft, job);
     }
     if job.deleting {
@@ -57,6 +62,13 @@ pub(super) fn leave_job(draft: &mut Draft<'_>) {
         draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
     }
     draft.requeue_in(AGAIN);
+}
+
+/// Until when a Pod whose run has ended may take to say its farewell; None if nothing is to be waited for.
+fn farewell(view: &View) -> Option<Timestamp> {
+    let pod = view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
+    let until = after(pod.run_ended?, FAREWELL_SECONDS);
+    (view.now < until).then_some(until)
 }
 
 fn is_not_wanted(draft: &Draft<'_>, type_: &str) -> bool {

@@ -20,6 +20,8 @@ const MAX_DOUBLINGS: i32 = 8;
 pub(super) const LONGEST_RETRY_SECONDS: i64 = RETRY_SECONDS << MAX_DOUBLINGS;
 /// How long an end waits for a bucket that does not answer; what it stores can still be taken up by a resume.
 const READ_SECONDS: i64 = 86_400;
+/// The same of one that was cancelled, which has `deadlines.cancelSeconds`: a bucket that hung is left alone for up to half of it.
+const READ_AT_LEAST_SECONDS: i64 = 60;
 
 /// The Job is terminal, or gone because we ended it (`None`).
 pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
@@ -80,7 +82,7 @@ pub(super) fn is_verdict(report: &Report) -> bool {
 /// Whether the end still waits until the bucket can be read.
 fn wait_for_bucket(draft: &mut Draft<'_>, why: &str) -> bool {
     let limit = if draft.is_cancelled() {
-        draft.deadlines().cancel_seconds
+        draft.deadlines().cancel_seconds.max(READ_AT_LEAST_SECONDS)
     } else {
         READ_SECONDS
     };

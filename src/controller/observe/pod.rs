@@ -257,9 +257,10 @@ mod tests {
             let pod = json!({"metadata": {"name": "p"},
                 "spec": {"containers": [{"name": "simulator-1"}, {"name": "agent-1"}, {"name": "extra"}]},
                 "status": {"containerStatuses": statuses}});
-            view(&serde_json::from_value(pod).unwrap())
-                .run_ended
-                .map(|at| at.to_string())
+            let mut pod = serde_json::from_value(pod).unwrap();
+            // As the cache keeps it.
+            crate::controller::run::trim_pod(&mut pod);
+            view(&pod).run_ended.map(|at| at.to_string())
         };
         let agent = ended("agent-1", 0, "2026-01-01T00:00:07Z");
         let simulator = ended("simulator-1", 0, "2026-01-01T00:00:09Z");

@@ -13,7 +13,7 @@ use std::time::Duration;
 use futures::future::FusedFuture;
 use futures::{FutureExt, StreamExt};
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Pod, PodTemplateSpec};
+use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
@@ -224,10 +224,15 @@ fn trim_job(job: &mut Job) {
     }
 }
 
-/// Of a Pod, decisions read metadata, its node and status.
-fn trim_pod(pod: &mut Pod) {
+/// Of a Pod, decisions read metadata, its node, the names of its containers and status.
+pub(super) fn trim_pod(pod: &mut Pod) {
     if let Some(spec) = &mut pod.spec {
-        spec.containers = Vec::new();
+        for container in &mut spec.containers {
+            *container = Container {
+                name: std::mem::take(&mut container.name),
+                ..Container::default()
+            };
+        }
         spec.init_containers = None;
         spec.volumes = None;
     }

@@ -1,11 +1,13 @@
 //! The end of a Job: by report and by class, with retries, and with a bucket that does not answer.
 
+use std::time::Duration;
+
 use super::builders::*;
 use crate::api::FailureClass::{Infrastructure, Participant};
 use crate::api::State::{Cancelled, Failed, Finished, Pending, Running};
 use crate::api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
 use crate::api::reasons;
-use crate::controller::decide::Action;
+use crate::controller::decide::{Action, Plan};
 use crate::controller::view::{JobEnd, ReportSight};
 use crate::pod::report::Report;
 
@@ -54,6 +56,33 @@ fn a_complete_run_waits_neither_for_logcopys_farewell_nor_for_its_job() {
     );
     world.complete();
     world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn a_farewell_that_never_ends_does_not_keep_the_job() {
+    let mut world = World::local().running();
+    run_ends(&mut world, 500);
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    let deletes = |plan: &Plan| has(plan, |a| matches!(a, Action::DeleteJob { .. }));
+    world.recorded();
+    world.go_to(619);
+    let plan = world.pass();
+    assert!(!deletes(&plan));
+    assert!(
+        plan.requeue.is_some_and(|wait| wait <= Duration::from_secs(2)),
+        "{:?}",
+        plan.requeue
+    );
+    let mut lost = world.clone();
+    world.go_to(620);
+    assert!(deletes(&world.pass()));
+    // Its node is gone: nobody says farewell.
+    lost.pod().delete_by = Some(at(500));
+    let plan = lost.pass();
+    assert!(deletes(&plan));
+    lost.job().deleting = true;
+    assert!(has(&lost.pass(), |a| matches!(a, Action::ForceDeletePod { .. })));
 }
 
 #[test]
