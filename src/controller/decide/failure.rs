@@ -202,23 +202,32 @@ fn is_obedient(end: &EndView) -> bool {
     matches!(end.what.as_deref(), Some("stopped" | "cancelled" | "finished"))
 }
 
+/// How a side of a pair last ended.
+#[derive(Clone, Copy)]
+struct Ended<'a> {
+    end: &'a EndView,
+    /// It has been started again since.
+    runs: bool,
+}
+
 /// How a pair last crashed. Both sides of a round end within moments: a simulator that crashed of itself takes its agent
 /// along, whose own word says less then. One that only followed its agent says `peerCrashed`.
 fn last_end(pod: &PodView, id: i32) -> Option<LastEnd> {
     let end_of = |wanted: Side| {
         let of_pair = |c: &&ContainerView| pair_of(&c.name).is_some_and(|(side, pair)| side == wanted && pair == id);
-        let end = pod.containers.iter().find(of_pair)?.last.as_ref()?;
-        (end.exit_code != 0 && !is_obedient(end)).then_some(end)
+        let container = pod.containers.iter().find(of_pair)?;
+        let (end, runs) = (container.last.as_ref()?, container.running);
+        (end.exit_code != 0 && !is_obedient(end)).then_some(Ended { end, runs })
     };
     let agent = end_of(Side::Agent);
     let simulator = end_of(Side::Simulator);
     let (word, end) = match (agent, simulator) {
-        (Some(agent), Some(simulator)) if blame_each_other(simulator, agent) => (FORGED, agent),
-        (Some(agent), Some(simulator)) if is_followed(simulator, agent) => {
-            (word(Side::Simulator, simulator), simulator)
+        (Some(agent), Some(simulator)) if blame_each_other(simulator, agent) => (FORGED, agent.end),
+        (Some(agent), Some(simulator)) if is_followed(simulator.end, agent.end) => {
+            (word(Side::Simulator, simulator.end), simulator.end)
         }
-        (Some(agent), _) => (word(Side::Agent, agent), agent),
-        (None, simulator) => (word(Side::Simulator, simulator?), simulator?),
+        (Some(agent), _) => (word(Side::Agent, agent.end), agent.end),
+        (None, simulator) => (word(Side::Simulator, simulator?.end), simulator?.end),
     };
     Some(LastEnd {
         reason: word.into(),
@@ -229,18 +238,24 @@ fn last_end(pod: &PodView, id: i32) -> Option<LastEnd> {
 
 /// Whether a simulator that crashed of itself is the last word: it took this agent along, or did so in a later round.
 fn is_followed(simulator: &EndView, agent: &EndView) -> bool {
-    !says_peer_crashed(simulator) && !is_before(simulator, agent)
+    const SAME_ROUND_SECONDS: i64 = 60;
+    let is_long_before = match (simulator.at, agent.at) {
+        (Some(simulator), Some(agent)) => agent.duration_since(simulator).as_secs() > SAME_ROUND_SECONDS,
+        _ => false,
+    };
+    !says_peer_crashed(simulator) && !is_before(simulator, agent) && !is_long_before
 }
 
 /// Either side writes down its own crash before the other can see it, so one of them has a cause of its own. Where neither has,
-/// the agent has written a crash into its folder of the status files.
-fn blame_each_other(simulator: &EndView, agent: &EndView) -> bool {
-    let is_same_round = !is_before(simulator, agent) && !is_before(agent, simulator);
-    says_peer_crashed(simulator) && says_peer_crashed(agent) && is_same_round
+/// the agent has written a crash into its folder of the status files. A side that runs again has its last word still to say.
+fn blame_each_other(simulator: Ended<'_>, agent: Ended<'_>) -> bool {
+    let is_same_round = !is_before(simulator.end, agent.end) && !is_before(agent.end, simulator.end);
+    let has_said_so = |side: Ended<'_>| !side.runs && says_peer_crashed(side.end);
+    has_said_so(simulator) && has_said_so(agent) && is_same_round
 }
 
 fn says_peer_crashed(end: &EndView) -> bool {
-    end.what.as_deref() == Some("peerCrashed")
+    end.what.as_deref() == Some(FOLLOWED)
 }
 
 /// Whether a life was over before the other began, and so belongs to an earlier round: those of one round overlap.
@@ -248,20 +263,27 @@ fn is_before(end: &EndView, other: &EndView) -> bool {
     end.at.zip(other.began).is_some_and(|(at, began)| at < began)
 }
 
-/// Whether a pair has crashed as often as it may, or cannot start at all. A count whose cause is not seen yet waits for it.
+/// Whether a pair has crashed as often as it may, or cannot start at all. A count whose cause is not seen yet waits for it: an
+/// agent that followed its simulator is no cause, and the simulator's own end is seen moments later.
 pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
     let limit = draft.retries().pair.max(1);
     let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
     let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
-    let worn = crashed().find(|p| p.crashes >= limit && last_word(p) != Some(UNSEEN));
+    let worn = crashed().find(|p| p.crashes >= limit && !last_word(p).is_some_and(is_no_cause));
     let pair = hopeless.or(worn)?;
     Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
 }
 
 /// The word for an agent's crash that only its simulator has told of: the agent's own end is seen moments later.
 const UNSEEN: &str = "unseen";
+/// The word for an agent's end whose simulator's is not seen yet.
+const FOLLOWED: &str = "peerCrashed";
 /// The word for a crash that an agent has made up.
 const FORGED: &str = "forged";
+
+fn is_no_cause(word: &str) -> bool {
+    [UNSEEN, FOLLOWED].contains(&word)
+}
 
 fn last_word(pair: &PairStatus) -> Option<&str> {
     pair.last.as_ref().map(|last| last.reason.as_str())
@@ -340,7 +362,7 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
                  the image for linux/amd64."
             ),
         ),
-        "notReady" | "peerCrashed" | "simulator" => {
+        "notReady" | FOLLOWED | "simulator" => {
             let what = if word == "notReady" {
                 "was not ready in time"
             } else {
@@ -407,13 +429,13 @@ fn word(side: Side, end: &EndView) -> &str {
     let what = end.what.as_deref();
     if side == Side::Simulator {
         return match what {
-            Some("peerCrashed") => UNSEEN,
+            Some(FOLLOWED) => UNSEEN,
             Some("notReady") => "notReady",
             _ => "simulator",
         };
     }
     match what {
-        Some(word @ ("peerCrashed" | "notReady" | "idle" | "cannotStart")) => word,
+        Some(word @ (FOLLOWED | "notReady" | "idle" | "cannotStart")) => word,
         _ if end.reason == "OOMKilled" => "OOMKilled",
         Some(word) => word,
         None if matches!(end.reason.as_str(), "StartError" | "ContainerCannotRun") => "startError",

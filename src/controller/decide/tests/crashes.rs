@@ -124,7 +124,6 @@ fn memory_is_the_cause_only_of_the_agents_own_end() {
         ("agent-1", "silentDeath", reasons::OUT_OF_MEMORY),
         ("agent-1", "killed", reasons::OUT_OF_MEMORY),
         ("agent-1", "idle", reasons::IDLE),
-        ("agent-1", "peerCrashed", reasons::SIMULATION_CRASHED),
         ("simulator-1", "killed", reasons::SIMULATION_CRASHED),
     ];
     for (name, what, reason) in cases {
@@ -161,8 +160,6 @@ fn a_simulators_crash_of_an_earlier_round_does_not_excuse_the_agent() {
 #[test]
 fn ends_of_different_rounds_explain_nothing_of_each_other() {
     for (agent, simulator, reason) in [
-        // The agent's is the later: its simulator of that round runs still.
-        (("peerCrashed", 900), ("peerCrashed", 100), reasons::SIMULATION_CRASHED),
         (("exited", 900), ("exited", 100), reasons::AGENT_CRASHED),
         (("exited", 140), ("exited", 100), reasons::SIMULATION_CRASHED),
         (("exited", 160), ("exited", 100), reasons::AGENT_CRASHED),
@@ -173,6 +170,42 @@ fn ends_of_different_rounds_explain_nothing_of_each_other() {
         let failure = world.pass().status.failure.unwrap();
         assert_eq!(failure.reason, reason, "{agent:?} {simulator:?}");
     }
+    // The agent waited for its simulator and then ran for hours, in one life.
+    let mut world = World::local().running();
+    let mut booted = ended("simulator-1", 3, "exited", 1, 100);
+    booted.running = true;
+    world.see(booted);
+    let mut agent = ended("agent-1", 3, "exited", 1, 9000);
+    agent.last.as_mut().unwrap().began = Some(at(60));
+    world.see(agent);
+    assert_eq!(world.pass().status.failure.unwrap().reason, reasons::AGENT_CRASHED);
+}
+
+#[test]
+fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_word() {
+    // Its old life ended with the agent's crash of the round before, and the agent's present life had begun by then.
+    let mut old = ended("simulator-1", 2, "peerCrashed", 1, 60);
+    old.running = true;
+    let mut world = World::local().running();
+    world.see(old);
+    world.see(ended("agent-1", 3, "peerCrashed", 1, 100));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    let mut silent = world.clone();
+    world.see(ended("simulator-1", 3, "exited", 1, 100));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+
+    // It never comes: the Pod has gone with it.
+    silent.view.pod = None;
+    silent.leaderboard().retries.infrastructure = 0;
+    silent.job().end = Some(JobEnd::Failed {
+        at: None,
+        reason: "BackoffLimitExceeded".into(),
+        message: "no more".into(),
+    });
+    silent.view.report = ReportSight::Absent;
+    silent.pass_to(Failed, reasons::SIMULATION_CRASHED);
 }
 
 #[test]
