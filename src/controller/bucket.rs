@@ -66,6 +66,24 @@ impl Buckets {
         }
     }
 
+    /// The same for what may be large, and so slow, or has little time: not made either while its bucket is known to hang, but its
+    /// own silence says nothing of the bucket.
+    pub fn call_large<'a, T: 'a>(
+        &'a self,
+        storage: &'a Storage,
+        limit: Duration,
+        call: impl Future<Output = Result<T, ArchiveError>> + Send + 'a,
+    ) -> impl Future<Output = Result<T, BucketError>> {
+        let call = call.boxed();
+        async move {
+            let silent = || BucketError::Silent(storage.bucket.clone());
+            if self.lock().get(&id(storage)).is_some_and(Breaker::is_open) {
+                return Err(silent());
+            }
+            Ok(tokio::time::timeout(limit, call).await.map_err(|_| silent())??)
+        }
+    }
+
     fn ask(&self, id: &str) -> Option<Permit> {
         let now = Instant::now();
         match self.lock().get_mut(id) {
@@ -192,6 +210,22 @@ mod tests {
         assert_eq!(hang(&buckets, &one).await.0, Duration::ZERO, "one probe at a time");
         probe.await.unwrap();
         buckets.call(&one, LIMIT, ready(Ok(()))).await.unwrap();
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_is_large_opens_nothing_and_is_kept_from_a_bucket_that_hangs() {
+        let (buckets, one) = (Buckets::default(), storage("one"));
+        let error = buckets.call_large::<()>(&one, LIMIT, pending()).await.unwrap_err();
+        assert_eq!(error.to_string(), "the bucket one did not answer in time");
+        assert!(buckets.lock().is_empty());
+        hang(&buckets, &one).await;
+        let began = Instant::now();
+        buckets.call_large::<()>(&one, LIMIT, pending()).await.unwrap_err();
+        tokio::time::advance(Duration::from_secs(5)).await;
+        buckets.call_large(&one, LIMIT, ready(Ok(()))).await.unwrap_err();
+        assert_eq!(began.elapsed(), Duration::from_secs(5), "it is no probe");
+        buckets.call(&one, LIMIT, ready(Ok(()))).await.unwrap();
+        buckets.call_large(&one, LIMIT, ready(Ok(()))).await.unwrap();
     }
 
     #[tokio::test(start_paused = true)]

@@ -201,7 +201,7 @@ async fn of_bucket(context: &Context, status: &SubmissionStatus, key: &str) -> R
     let Some(plan) = &status.plan else { return Ok(None) };
     let archive = context.archive(&plan.storage, &plan.run_id);
     let read = archive.tail(key, STORED_BYTES);
-    let read = context.buckets.call(&plan.storage, TRY, read).await;
+    let read = context.buckets.call_large(&plan.storage, TRY, read).await;
     read.map_err(|error| error.to_string())
 }
 
@@ -212,7 +212,7 @@ async fn store(context: &Context, view: &View, status: &SubmissionStatus, tail: 
     };
     let archive = context.archive(&plan.storage, &plan.run_id);
     let put = archive.put(FAILURE_LOG_KEY, tail.text.clone().into_bytes());
-    let Err(why) = context.buckets.call(&plan.storage, TRY, put).await else {
+    let Err(why) = context.buckets.call_large(&plan.storage, TRY, put).await else {
         return true;
     };
     tracing::warn!(submission = %view.submission.name_any(), %why, "the log of a failure was not stored");

@@ -80,7 +80,7 @@ async fn stored(context: &Context, view: &View, report: &Report, key: &str) -> R
     };
     let archive = context.archive(&plan.storage, &plan.run_id);
     let read = archive.get(key, MAX_TEXT);
-    let object = context.buckets.call(&plan.storage, TEXT_TIMEOUT, read).await;
+    let object = context.buckets.call_large(&plan.storage, TEXT_TIMEOUT, read).await;
     let object = object.map_err(|e| e.to_string())?;
     let bytes = object
         .ok_or_else(|| format!("{key} is missing although the report names it"))?

@@ -84,6 +84,11 @@ impl Breaker {
         }
     }
 
+    /// Whether it is known to hang.
+    pub(super) fn is_open(&self) -> bool {
+        self.state != State::Closed
+    }
+
     /// A call was answered, whatever the answer says.
     pub(super) fn answered(&mut self, now: Instant) -> Option<Change> {
         if self.state == State::Closed {
