@@ -31,6 +31,8 @@ pub(super) enum Priority {
     Free,
     /// An end whose read has just been answered.
     EndNow,
+    /// A partial result whose read has: it would be worth nothing a moment later.
+    PartialNow,
     End,
     CancelList,
     Acceptance,
@@ -118,13 +120,13 @@ impl Queue {
         let reserved = u32::try_from(reserved).unwrap_or(u32::MAX);
         let count = match (&offer.what, offer.priority) {
             (_, Priority::Free) => return now.at,
-            (_, Priority::EndNow) => 1,
+            (_, Priority::EndNow | Priority::PartialNow) => 1,
             (What::Sub(_, Step::GetForEnd), _) => reserved.saturating_add(2),
             _ => reserved.saturating_add(1),
         };
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
         // A list that is due, and a write whose read is made, may use what the others leave.
-        let urgent = [Priority::EndNow, Priority::CancelList].contains(&offer.priority);
+        let urgent = [Priority::EndNow, Priority::PartialNow, Priority::CancelList].contains(&offer.priority);
         let keep = if urgent { 0 } else { self.budget.kept() };
         self.budget.ready_keeping(now.at, count, keep).max(token)
     }
@@ -211,9 +213,11 @@ impl Queue {
             let window = self.timing.window;
             if sub.partial_verdict() == Some(Verdict::Send) {
                 if within(sub.clear_at, window, now) {
-                    return Some((Priority::Rest, partial.since, true, Step::Partial));
+                    let is_read = within(sub.read.map(|read| read.answered), window, now);
+                    let priority = if is_read { Priority::PartialNow } else { Priority::Rest };
+                    return Some((priority, partial.since, true, Step::Partial));
                 }
-                if self.lists_are_late(sub, window) {
+                if self.lists_are_late(sub, window) || partial.since + self.timing.patience <= now.at {
                     return Some((Priority::Rest, partial.since, true, Step::GetForEnd));
                 }
             }

@@ -53,6 +53,8 @@ pub struct Timing {
     pub hold: Duration,
     /// Partial results follow a list or read by no more: a cancel in between is lost.
     pub window: Duration,
+    /// A partial result that has missed the lists for so long is worth a read of its own.
+    pub patience: Duration,
     /// Progress follows a list that takes no more than half of this; else a read of its own.
     pub slow_list: Duration,
     /// An end and progress follow a read by no more, plus what two requests cost.
@@ -74,6 +76,7 @@ impl Default for Timing {
         Self {
             hold: Duration::from_secs(75),
             window: Duration::from_millis(500),
+            patience: Duration::from_secs(45),
             slow_list: Duration::from_secs(2),
             fresh: Duration::from_secs(5),
             accept: Duration::from_secs(5),

@@ -261,6 +261,50 @@ fn a_slow_list_is_too_old_for_partials_and_a_read_takes_its_place() {
 }
 
 #[test]
+fn a_partials_own_read_is_followed_at_once_by_the_partial() {
+    let mut bench = Bench::new();
+    bench.all_running(&[7, 8]);
+    bench.wait(10.0);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    let list = bench.expect("list of cancelled");
+    bench.wait(3.0);
+    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
+    let read = bench.expect("submission 7");
+    // Meanwhile there is what would otherwise come first.
+    bench.ask(9, 1);
+    bench.wish(8, 1, Wish::Final(Outcome::Finished, results(50.0)));
+    bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Running))));
+    bench.write("partial 7");
+    bench.expect("submission 8");
+}
+
+#[test]
+fn a_partial_that_misses_every_list_gets_a_read_of_its_own() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wait(1.0);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    let begun = bench.at;
+    loop {
+        bench.wait(5.0);
+        match bench.next() {
+            None => {}
+            Some((name, list)) if name == "list of cancelled" => {
+                bench.answer(&list, Reply::Rows(Answer::Broken("EvalAI answered 500".into())));
+            }
+            Some((name, read)) => {
+                assert_eq!(name, "submission 7");
+                bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Running))));
+                break;
+            }
+        }
+    }
+    let waited = bench.at.checked_sub(begun).unwrap();
+    assert!((45..=55).contains(&waited.as_secs()), "{waited:?}");
+    bench.write("partial 7");
+}
+
+#[test]
 fn the_time_that_a_list_takes_is_taken_off_its_window() {
     let mut bench = Bench::new();
     bench.running(7);
