@@ -61,7 +61,13 @@ fn cancel(submission: &Submission, leaderboard: Sight<'_>, now: jiff::Timestamp)
     }
     page.say(&format!("`{}` takes it up again.", command("resume", submission)));
     Ok(Plan {
-        patch: (!is_told).then(|| json!({"spec": {"cancel": true}})),
+        // Decided on what was read: it may end, or be resumed, at the same time.
+        patch: (!is_told).then(|| {
+            json!({
+                "metadata": {"resourceVersion": submission.resource_version()},
+                "spec": {"cancel": true},
+            })
+        }),
         says: page.into_lines(),
         attempt: submission.spec.attempt,
     })
@@ -73,9 +79,6 @@ fn how_it_stops(submission: &Submission, leaderboard: Sight<'_>) -> String {
     if status.is_none_or(|s| s.job.is_none()) {
         return "It has no Job, so it ends at once.".to_owned();
     }
-    if status.is_none_or(|s| s.times.started.is_none()) {
-        return "None of its agents has started, so its Job is deleted at once.".to_owned();
-    }
     let seconds = match leaderboard {
         Sight::There(leaderboard) => Some(leaderboard.spec.deadlines.cancel_seconds),
         // What the operator takes then.
@@ -83,9 +86,15 @@ fn how_it_stops(submission: &Submission, leaderboard: Sight<'_>) -> String {
         Sight::Unread => None,
     };
     let grace = seconds.map_or_else(|| "deadlines.cancelSeconds".to_owned(), |s| format!("{s} s"));
+    if status.is_none_or(|s| s.times.started.is_none()) {
+        return format!(
+            "None of its agents has started. Its Job is deleted at once; if its Pod is up already, that is told first and \
+             has {grace}."
+        );
+    }
     format!(
-        "Its Pod is told, stores what it has and ends; after {grace} its Job is deleted, then its Pod by force. What it \
-         has reached is kept, and results that are complete by then count."
+        "Its Pod is told, stores what it has and ends; if it takes longer than {grace}, its Job is deleted, then its Pod by \
+         force. What it has reached is kept, and results that are complete by then count."
     )
 }
 

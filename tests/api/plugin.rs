@@ -110,7 +110,10 @@ async fn cancel_is_wished_once_and_not_of_what_has_ended() {
     desk.leaderboard(&json!({"deadlines": {"cancelSeconds": 77}})).await;
     desk.submission("runs", &json!({}), &running()).await;
     let words = desk.run(&["cancel", "runs"]).await.well();
-    assert_has(&words, &["runs is to be cancelled.", "after 77 s its Job is deleted"]);
+    assert_has(
+        &words,
+        &["runs is to be cancelled.", "if it takes longer than 77 s, its Job is"],
+    );
     assert_eq!(desk.wished("runs").await, (1, true));
     let words = desk.run(&["cancel", "runs"]).await.well();
     assert_has(&words, &["runs is being cancelled already."]);

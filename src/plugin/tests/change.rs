@@ -28,14 +28,11 @@ fn a_cancel_says_what_happens_at_its_stage() {
     for (status, expected) in [
         (Value::Null, "It has no Job, so it ends at once."),
         (waiting(), "It has no Job, so it ends at once."),
-        (
-            prepared,
-            "None of its agents has started, so its Job is deleted at once.",
-        ),
-        (running(), "after 120 s its Job is deleted"),
+        (prepared, "if its Pod is up already, that is told first"),
+        (running(), "if it takes longer than 120 s, its Job is deleted"),
     ] {
         let plan = planned(Wish::Cancel, &submission(&status)).unwrap();
-        assert_eq!(plan.patch, Some(json!({"spec": {"cancel": true}})));
+        assert_eq!(plan.patch.as_ref().map(|p| &p["spec"]), Some(&json!({"cancel": true})));
         assert_eq!(plan.attempt, 1);
         assert!(says(&plan).contains(expected), "{expected}: {}", says(&plan));
         assert!(says(&plan).contains("`kubectl leaderboard resume submission-42 -n carla` takes it up again."));
@@ -47,9 +44,9 @@ fn the_grace_is_the_leaderboards_of_this_moment() {
     let mut slow = leaderboard();
     slow.spec.deadlines.cancel_seconds = 900;
     for (sight, expected) in [
-        (Sight::There(&slow), "after 900 s its Job"),
-        (Sight::Missing, "after 120 s its Job"),
-        (Sight::Unread, "after deadlines.cancelSeconds its Job"),
+        (Sight::There(&slow), "longer than 900 s, its Job"),
+        (Sight::Missing, "longer than 120 s, its Job"),
+        (Sight::Unread, "longer than deadlines.cancelSeconds, its Job"),
     ] {
         let plan = plan(Wish::Cancel, &submission(&running()), sight, now()).unwrap();
         assert!(says(&plan).contains(expected), "{}", says(&plan));
