@@ -21,6 +21,8 @@ const LOST: &str = "Its Pod was lost; the Job makes another one, which goes on f
 const SILENCE: i64 = 45;
 /// The minutes of silence that are told: a count of every one would be a write each.
 const TOLD_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
+/// How long a new Pod may find no node before that is shown: the Pod whose slot it got may still be leaving.
+const SETTLE_SECONDS: i64 = 5;
 /// How long a Job may take to make its Pod before that is shown.
 const POD_SECONDS: i64 = 45;
 
@@ -158,6 +160,10 @@ fn without_pod(draft: &mut Draft<'_>, job: &JobView) {
 }
 
 fn unschedulable(draft: &mut Draft<'_>, job: &JobView, words: &str) {
+    let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
+    if let Some(settled) = settled.filter(|at| draft.now() < *at) {
+        return draft.requeue_at(settled);
+    }
     wait_for_node(draft, job, reasons::UNSCHEDULABLE, &sentence(words));
 }
 

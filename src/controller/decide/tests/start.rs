@@ -229,6 +229,13 @@ fn without_a_node_it_waits_for_ever_saying_why() {
     pod.scheduled = None;
     pod.node = None;
     pod.unschedulable = Some(words.into());
+    world.go_to(4);
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert!(
+        plan.requeue.is_some_and(|wait| wait <= Duration::from_secs(2)),
+        "the Pod before it may still be leaving"
+    );
+    world.go_to(5);
     let plan = world.pass_to(Pending, reasons::UNSCHEDULABLE);
     assert_eq!(plan.status.message.as_deref(), Some(words));
     world.go_to(1_000_000);
