@@ -158,7 +158,9 @@ def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
     passed = cargo_passes(plan, target, {**env, "RUST_TEST_THREADS": str(AT_ONCE)}, [plan.filter])
     alone = names_alone(ignored_tests(plan, target, env), plan.filter)
     if not alone and not plan.filter:
-        raise LabError(f"there is no ignored test {ALONE}…: a rename in tests/cluster has lost what testrun.py runs alone")
+        raise LabError(
+            f"there is no ignored test {ALONE}…: a rename in tests/cluster has lost what testrun.py runs alone"
+        )
     if alone:
         say("now, one by one, the tests that disturb every other one")
         passed &= cargo_passes(plan, target, {**env, "RUST_TEST_THREADS": "1"}, ["--ignored", "--exact", *alone])
