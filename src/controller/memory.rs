@@ -29,8 +29,8 @@ pub struct Memory {
 struct Entry {
     written: Option<Written>,
     partial: Option<(i64, u32)>,
-    /// Why its result could not be read.
-    unread: Option<String>,
+    /// The attempt whose result could not be read, and why.
+    unread: Option<(i64, String)>,
     /// When its place may be written.
     place_at: Option<Instant>,
 }
@@ -120,14 +120,22 @@ impl Memory {
         self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
     }
 
-    /// Why its result could not be read when it was to be told last; None if it could.
+    /// Why the result of the present attempt could not be read when it was to be told; None if it could last.
     pub fn unread(&self, submission: &Submission) -> Option<String> {
-        self.lock().get(&uid_of(submission))?.unread.clone()
+        let attempt = submission.status.as_ref()?.attempt?;
+        let (of, why) = self.lock().get(&uid_of(submission))?.unread.clone()?;
+        (of == attempt).then_some(why)
     }
 
-    /// Remembers whether its result could be read.
+    /// Remembers whether its result could be read. The first words stand: others for the same would be a write each.
     pub fn note_unread(&self, submission: &Submission, why: Option<String>) {
-        self.lock().entry(uid_of(submission)).or_default().unread = why;
+        let attempt = submission.status.as_ref().and_then(|s| s.attempt).unwrap_or(1);
+        let mut entries = self.lock();
+        let known = &mut entries.entry(uid_of(submission)).or_default().unread;
+        match (why, &known) {
+            (Some(_), Some((of, _))) if *of == attempt => {}
+            (why, _) => *known = why.map(|why| (attempt, why)),
+        }
     }
 
     /// Drops an object that is gone.

@@ -3,12 +3,15 @@
 
 use std::time::Duration;
 
+use jiff::SignedDuration;
 use leaderboard_results::{Format, metrics, number_text};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
+use super::bucket::BucketError;
 use super::context::Context;
 use super::failure_log::Tail;
+use super::sync::END_WAITS;
 use super::view::View;
 use crate::api::{FailureClass, LogTail, ResultsFormat, State, SubmissionStatus};
 use crate::pod::report::Report;
@@ -23,17 +26,49 @@ const TEXT_TIMEOUT: Duration = Duration::from_secs(20);
 const STDOUT_KEY: &str = "evalai/stdout.txt";
 const METADATA_KEY: &str = "evalai/metadata.json";
 
+/// Why there is no text of a result.
+#[derive(thiserror::Error, Debug)]
+pub(super) enum TextError {
+    /// It may come.
+    #[error(transparent)]
+    Unread(#[from] BucketError),
+    /// What is stored is not what the report names: the Pod ended between the two. It will hardly change.
+    #[error("{key} {problem}")]
+    Unfit {
+        /// Below the run's prefix.
+        key: &'static str,
+        problem: &'static str,
+    },
+}
+
+impl TextError {
+    /// How long an end waits for its texts.
+    pub(super) fn patience(&self) -> SignedDuration {
+        match self {
+            Self::Unread(_) => END_WAITS,
+            Self::Unfit { .. } => SignedDuration::from_mins(10),
+        }
+    }
+}
+
 /// The payload of a partial or final result.
-pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, String> {
+pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
     let text = |key| stored(context, view, report, key);
     let (stdout, metadata) = futures::future::try_join(text(STDOUT_KEY), text(METADATA_KEY)).await?;
     Ok(Payload {
-        phase: phase(view),
-        result: report.results.clone(),
         stdout,
         metadata,
-        ..Payload::default()
+        ..without_texts(view, report)
     })
+}
+
+/// The numbers alone.
+pub(super) fn without_texts(view: &View, report: &Report) -> Payload {
+    Payload {
+        phase: phase(view),
+        result: report.results.clone(),
+        ..Payload::default()
+    }
 }
 
 /// Phase whose leaderboard gets the result.
@@ -70,7 +105,8 @@ pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTai
     payload.environment_log = tail.text;
 }
 
-async fn stored(context: &Context, view: &View, report: &Report, key: &str) -> Result<String, String> {
+async fn stored(context: &Context, view: &View, report: &Report, key: &'static str) -> Result<String, TextError> {
+    let unfit = |problem| TextError::Unfit { key, problem };
     let Some(expected) = report.files.get(key) else {
         return Ok(String::new());
     };
@@ -81,14 +117,12 @@ async fn stored(context: &Context, view: &View, report: &Report, key: &str) -> R
     let archive = context.archive(&plan.storage, &plan.run_id);
     let read = archive.get(key, MAX_TEXT);
     let object = context.buckets.call_large(&plan.storage, TEXT_TIMEOUT, read).await;
-    let object = object.map_err(|e| e.to_string())?;
-    let bytes = object
-        .ok_or_else(|| format!("{key} is missing although the report names it"))?
-        .bytes;
+    let missing = || unfit("is missing although the report names it");
+    let bytes = object?.ok_or_else(missing)?.bytes;
     if hex(&Sha256::digest(&bytes)) != expected.sha256 {
-        return Err(format!("{key} is of another round than the report"));
+        return Err(unfit("is of another round than the report"));
     }
-    String::from_utf8(bytes).map_err(|_| format!("{key} is not text"))
+    String::from_utf8(bytes).map_err(|_| unfit("is not text"))
 }
 
 fn hex(bytes: &[u8]) -> String {

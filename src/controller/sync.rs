@@ -10,15 +10,15 @@ use kube::ResourceExt;
 use super::context::Context;
 use super::decide::Tell;
 use super::observe::{report, uid_of};
-use super::result_texts;
+use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
 use crate::api::{Leaderboard, Submission, SubmissionStatus, names};
 use crate::services::ObjectKey;
 use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
 
-/// How long the row of an end waits for a result that cannot be read: as long as the end itself.
-const ROW_WAITS: SignedDuration = SignedDuration::from_hours(24);
+/// How long an end waits to be told for a result that cannot be read: as long as the end itself.
+pub(super) const END_WAITS: SignedDuration = SignedDuration::from_hours(24);
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct Sync {
@@ -130,7 +130,7 @@ impl Sync {
         } else {
             view.report.clone()
         };
-        if end && matches!(sight, ReportSight::Unreadable(_)) && row_may_wait(view, status) {
+        if end && matches!(sight, ReportSight::Unreadable(_)) && may_wait(view, status, END_WAITS) {
             return;
         }
         if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
@@ -168,13 +168,13 @@ struct Way {
 async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
     let read = result_texts::payload(context, view, report).await;
-    let unread = |why: &String| {
-        tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of a partial result wait to be read");
-    };
-    let payload = read.inspect_err(unread).ok()?;
     let attempt = view.submission.spec.attempt;
+    // What cannot be read is left out: the next route has a result of its own.
     context.memory.told_partial(&view.submission, attempt, report.done);
-    Some(Arc::new(payload))
+    let unread = |why: &TextError| {
+        tracing::warn!(submission = %view.submission.name_any(), %why, "a partial result is left out");
+    };
+    Some(Arc::new(read.inspect_err(unread).ok()?))
 }
 
 /// The report as it is stored at the end; passes after the end read none.
@@ -201,10 +201,10 @@ fn note_unread(context: &Context, view: &View, why: Option<String>) {
     context.memory.note_unread(&view.submission, why);
 }
 
-/// Whether a row that is never written again waits for its result. One that is being deleted has no time for it.
-fn row_may_wait(view: &View, status: &SubmissionStatus) -> bool {
+/// Whether an end that is told once waits for its result. One that is being deleted has no time for it.
+fn may_wait(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> bool {
     let ended = status.times.finished.as_ref().map_or(view.now, |t| t.0);
-    view.submission.metadata.deletion_timestamp.is_none() && view.now.duration_since(ended) < ROW_WAITS
+    view.submission.metadata.deletion_timestamp.is_none() && view.now.duration_since(ended) < longest
 }
 
 async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
@@ -212,12 +212,14 @@ async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, o
     let mut payload = match &sight {
         ReportSight::Ours(report) => match result_texts::payload(context, view, report).await {
             Ok(payload) => payload,
-            Err(why) => {
-                note_unread(context, view, Some(why));
+            Err(error) if may_wait(view, status, error.patience()) => {
+                note_unread(context, view, Some(error.to_string()));
                 return None;
             }
+            Err(_) => result_texts::without_texts(view, report),
         },
-        ReportSight::Unreadable(_) => return None,
+        // What is Finished is nothing without its result.
+        ReportSight::Unreadable(_) if outcome == Outcome::Finished || may_wait(view, status, END_WAITS) => return None,
         _ => Payload {
             phase: result_texts::phase(view),
             result: "[]".into(),

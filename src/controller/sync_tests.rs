@@ -164,7 +164,7 @@ async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ev
 
     let mut bench = self::bench().await;
     bench.stores("torn");
-    bench.view.now = bench.view.now.checked_add(ROW_WAITS).unwrap();
+    bench.view.now = bench.view.now.checked_add(END_WAITS).unwrap();
     bench.records_the_end().await;
     assert_eq!(bench.row().await["submission_status"], "CANCELLED");
 

@@ -10,7 +10,7 @@ use super::failure::sentence;
 use super::{Action, Tell, accept, log, stop};
 use crate::api::conditions::{self, Truth};
 use crate::api::{State, reasons};
-use crate::controller::view::{EvalaiEnd, JobSight, JobView, View};
+use crate::controller::view::{EvalaiEnd, JobSight, JobView};
 
 /// How often an unpublished end is looked at again.
 const AGAIN: Duration = Duration::from_secs(30);
@@ -52,7 +52,7 @@ pub(super) fn leave_job(draft: &mut Draft<'_>) {
     if job.end.is_some() {
         return keep_job_for_its_time(draft, job);
     }
-    if let Some(until) = farewell(draft.view) {
+    if let Some(until) = farewell(draft) {
         draft.requeue_at(until);
         return keep_job_for_its_time(draft, job);
     }
@@ -65,10 +65,12 @@ pub(super) fn leave_job(draft: &mut Draft<'_>) {
 }
 
 /// Until when a Pod whose run has ended may take to say its farewell; None if nothing is to be waited for.
-fn farewell(view: &View) -> Option<Timestamp> {
-    let pod = view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
-    let until = after(pod.run_ended?, FAREWELL_SECONDS);
-    (view.now < until).then_some(until)
+fn farewell(draft: &Draft<'_>) -> Option<Timestamp> {
+    let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
+    pod.run_ended?;
+    let end = conditions::get(&draft.status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
+    let until = after(end.last_transition_time.0, FAREWELL_SECONDS);
+    (draft.now() < until).then_some(until)
 }
 
 fn is_not_wanted(draft: &Draft<'_>, type_: &str) -> bool {
@@ -129,7 +131,7 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             };
             draft.act(Action::Tell(wish));
             let failed = view.error.map(|e| format!("The last request failed: {}", sentence(&e)));
-            let failed = unread(draft).or(failed);
+            let failed = failed.or(unread(draft));
             let (reason, message) = if is_overtaken {
                 (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
             } else {

@@ -2,6 +2,7 @@
 //!
 //! Called by the stages of `decide`. The class says whose failure it is; only a participant's is charged.
 
+use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::Draft;
@@ -222,7 +223,10 @@ fn last_end(pod: &PodView, id: i32) -> Option<LastEnd> {
     let agent = end_of(Side::Agent);
     let simulator = end_of(Side::Simulator);
     let (word, end) = match (agent, simulator) {
-        (Some(agent), Some(simulator)) if blame_each_other(simulator, agent) => (FORGED, agent.end),
+        (Some(agent), Some(simulator)) if blame_each_other(simulator.end, agent.end) => {
+            let may_say_more = simulator.runs || agent.runs;
+            (if may_say_more { UNSETTLED } else { FORGED }, agent.end)
+        }
         (Some(agent), Some(simulator)) if is_followed(simulator.end, agent.end) => {
             (word(Side::Simulator, simulator.end), simulator.end)
         }
@@ -243,15 +247,16 @@ fn is_followed(simulator: &EndView, agent: &EndView) -> bool {
         (Some(simulator), Some(agent)) => agent.duration_since(simulator).as_secs() > SAME_ROUND_SECONDS,
         _ => false,
     };
-    !says_peer_crashed(simulator) && !is_before(simulator, agent) && !is_long_before
+    // One that was killed without a word is missed only when its container is started again.
+    let is_of_agents_round = !is_long_before || says_peer_crashed(agent);
+    !says_peer_crashed(simulator) && !is_before(simulator, agent) && is_of_agents_round
 }
 
 /// Either side writes down its own crash before the other can see it, so one of them has a cause of its own. Where neither has,
-/// the agent has written a crash into its folder of the status files. A side that runs again has its last word still to say.
-fn blame_each_other(simulator: Ended<'_>, agent: Ended<'_>) -> bool {
-    let is_same_round = !is_before(simulator.end, agent.end) && !is_before(agent.end, simulator.end);
-    let has_said_so = |side: Ended<'_>| !side.runs && says_peer_crashed(side.end);
-    has_said_so(simulator) && has_said_so(agent) && is_same_round
+/// the agent has written a crash into its folder of the status files.
+fn blame_each_other(simulator: &EndView, agent: &EndView) -> bool {
+    let is_same_round = !is_before(simulator, agent) && !is_before(agent, simulator);
+    says_peer_crashed(simulator) && says_peer_crashed(agent) && is_same_round
 }
 
 fn says_peer_crashed(end: &EndView) -> bool {
@@ -269,7 +274,7 @@ pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
     let limit = draft.retries().pair.max(1);
     let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
     let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
-    let worn = crashed().find(|p| p.crashes >= limit && !last_word(p).is_some_and(is_no_cause));
+    let worn = crashed().find(|p| p.crashes >= limit && !waits_for_a_word(p, draft.now()));
     let pair = hopeless.or(worn)?;
     Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
 }
@@ -280,9 +285,15 @@ const UNSEEN: &str = "unseen";
 const FOLLOWED: &str = "peerCrashed";
 /// The word for a crash that an agent has made up.
 const FORGED: &str = "forged";
+/// The word for one that looks like it, while a side that runs again may have its last word still to say.
+const UNSETTLED: &str = "unsettled";
+/// How long the other side's own word is waited for: more than a container has for its end. It may never come.
+const WORD_SECONDS: i64 = 120;
 
-fn is_no_cause(word: &str) -> bool {
-    [UNSEEN, FOLLOWED].contains(&word)
+fn waits_for_a_word(pair: &PairStatus, now: Timestamp) -> bool {
+    let is_no_cause = last_word(pair).is_some_and(|word| [UNSEEN, FOLLOWED, UNSETTLED].contains(&word));
+    let time = pair.last.as_ref().and_then(|last| last.time.as_ref());
+    is_no_cause && time.is_some_and(|time| now.duration_since(time.0).as_secs().abs() < WORD_SECONDS)
 }
 
 fn last_word(pair: &PairStatus) -> Option<&str> {
@@ -310,7 +321,10 @@ pub(super) fn of_job(status: &SubmissionStatus, end: &JobEnd, pod: Option<&PodVi
 fn worst_pair(status: &SubmissionStatus) -> Option<Failure> {
     let crashed = status.pairs.iter().filter(|p| p.crashes > 0 && p.last.is_some());
     let pair = crashed.max_by_key(|p| p.crashes)?;
-    Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
+    // The Pod is gone with the word that was still to come: nobody is charged on a suspicion.
+    let word = last_word(pair)?;
+    let word = if word == UNSETTLED { FOLLOWED } else { word };
+    Some(of_pair(pair.id, pair.crashes, word))
 }
 
 fn of_pair(id: i32, crashes: i32, word: &str) -> Failure {
@@ -341,7 +355,7 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
                  dead end in its code."
             ),
         ),
-        FORGED => (
+        FORGED | UNSETTLED => (
             reasons::AGENT_CRASHED,
             format!(
                 "Agent {id} ended {times} by a status file that says it crashed, which it has not. Leave the folder of the \

@@ -181,9 +181,38 @@ fn ends_of_different_rounds_explain_nothing_of_each_other() {
     assert_eq!(world.pass().status.failure.unwrap().reason, reasons::AGENT_CRASHED);
 }
 
+/// Its simulator, which obeys at once, may run again before the agent has ended.
+#[test]
+fn a_forger_that_takes_its_time_to_end_is_found_out_all_the_same() {
+    let mut simulator = ended("simulator-1", 3, "peerCrashed", 1, 80);
+    simulator.running = true;
+    let mut world = World::local().running();
+    world.see(simulator);
+    world.see(ended("agent-1", 3, "peerCrashed", 1, 100));
+    world.go_to(219);
+    world.pass_to(Running, reasons::RUNNING);
+    world.go_to(220);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(
+        (failure.reason.as_str(), failure.charged),
+        (reasons::AGENT_CRASHED, true)
+    );
+}
+
+/// The kubelet waits for minutes before it starts a container again that has been killed often.
+#[test]
+fn a_simulator_that_was_killed_without_a_word_long_before_its_agent_noticed_is_the_cause() {
+    let mut world = World::local().running();
+    world.see(ended("simulator-1", 3, "silentDeath", 137, 100));
+    let mut agent = ended("agent-1", 3, "peerCrashed", 1, 400);
+    agent.last.as_mut().unwrap().began = Some(at(60));
+    world.see(agent);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
 #[test]
 fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_word() {
-    // Its old life ended with the agent's crash of the round before, and the agent's present life had begun by then.
     let mut old = ended("simulator-1", 2, "peerCrashed", 1, 60);
     old.running = true;
     let mut world = World::local().running();
@@ -196,7 +225,16 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_word() {
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
 
-    // It never comes: the Pod has gone with it.
+    // It never comes: somebody from outside ends the simulator each time.
+    let mut stopped = silent.clone();
+    stopped.see(ended("simulator-1", 3, "stopped", 143, 100));
+    stopped.go_to(219);
+    stopped.pass_to(Running, reasons::RUNNING);
+    stopped.go_to(220);
+    let failure = stopped.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+
+    // Or the Pod has gone with it.
     silent.view.pod = None;
     silent.leaderboard().retries.infrastructure = 0;
     silent.job().end = Some(JobEnd::Failed {

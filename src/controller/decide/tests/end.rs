@@ -66,7 +66,7 @@ fn a_farewell_that_never_ends_does_not_keep_the_job() {
     world.pass_to(Finished, reasons::FINISHED);
     let deletes = |plan: &Plan| has(plan, |a| matches!(a, Action::DeleteJob { .. }));
     world.recorded();
-    world.go_to(619);
+    world.go_to(620);
     let plan = world.pass();
     assert!(!deletes(&plan));
     assert!(
@@ -75,7 +75,7 @@ fn a_farewell_that_never_ends_does_not_keep_the_job() {
         plan.requeue
     );
     let mut lost = world.clone();
-    world.go_to(620);
+    world.go_to(621);
     assert!(deletes(&world.pass()));
     // Its node is gone: nobody says farewell.
     lost.pod().delete_by = Some(at(500));

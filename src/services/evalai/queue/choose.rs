@@ -56,6 +56,8 @@ enum Step {
     Get,
     /// A read that is worth nothing without the write that follows it.
     GetForEnd,
+    /// The same for a partial result.
+    GetForPartial,
     Image,
     Progress,
     Partial,
@@ -121,7 +123,7 @@ impl Queue {
         let count = match (&offer.what, offer.priority) {
             (_, Priority::Free) => return now.at,
             (_, Priority::EndNow | Priority::PartialNow) => 1,
-            (What::Sub(_, Step::GetForEnd), _) => reserved.saturating_add(2),
+            (What::Sub(_, Step::GetForEnd | Step::GetForPartial), _) => reserved.saturating_add(2),
             _ => reserved.saturating_add(1),
         };
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
@@ -214,11 +216,15 @@ impl Queue {
             if sub.partial_verdict() == Some(Verdict::Send) {
                 if within(sub.clear_at, window, now) {
                     let is_read = within(sub.read.map(|read| read.answered), window, now);
-                    let priority = if is_read { Priority::PartialNow } else { Priority::Rest };
+                    let priority = if is_read && sub.read_for_partial {
+                        Priority::PartialNow
+                    } else {
+                        Priority::Rest
+                    };
                     return Some((priority, partial.since, true, Step::Partial));
                 }
                 if self.lists_are_late(sub, window) || partial.since + self.timing.patience <= now.at {
-                    return Some((Priority::Rest, partial.since, true, Step::GetForEnd));
+                    return Some((Priority::Rest, partial.since, true, Step::GetForPartial));
                 }
             }
         }
@@ -338,7 +344,8 @@ impl Queue {
     }
 
     fn start_sub(&mut self, key: &Key, step: Step) -> Option<Request> {
-        let sub = self.subs.get(key)?;
+        let sub = self.subs.get_mut(key)?;
+        sub.read_for_partial = step == Step::GetForPartial;
         let subject = Subject {
             key: key.clone(),
             challenge: sub.challenge,
@@ -346,7 +353,7 @@ impl Queue {
             attempt: sub.run.attempt,
         };
         let request = match step {
-            Step::Get | Step::GetForEnd => Request::Get(subject),
+            Step::Get | Step::GetForEnd | Step::GetForPartial => Request::Get(subject),
             Step::Image => Request::Image(subject, sub.view.row.as_ref()?.input_file.clone()?),
             Step::Progress => {
                 let progress = sub.progress.as_ref()?.what;
@@ -360,7 +367,7 @@ impl Queue {
             }
         };
         let busy = match step {
-            Step::GetForEnd => Busy::ReadForEnd,
+            Step::GetForEnd | Step::GetForPartial => Busy::ReadForEnd,
             _ if request.is_write() => Busy::Write,
             _ => Busy::Read,
         };

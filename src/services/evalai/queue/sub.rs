@@ -57,6 +57,8 @@ pub(super) struct Sub {
     /// Digest of the end that was last refused here, before it was sent.
     pub end_refused: Option<u64>,
     pub read: Option<Read>,
+    /// The last request of it was a read that reserved the write of a partial result.
+    pub read_for_partial: bool,
     /// Answer of the last read of it, or of the last list that would have held it, had it been cancelled.
     pub fresh_at: Option<Duration>,
     /// Answer of the last read, or request of the last list, that says that it is not cancelled, by whatever attempt.
@@ -96,6 +98,7 @@ impl Sub {
             partial_sent: None,
             end_refused: None,
             read: None,
+            read_for_partial: false,
             fresh_at: None,
             clear_at: None,
             outdated: false,
@@ -115,6 +118,7 @@ impl Sub {
         let fresh = Self::new(self.pk, self.challenge, run);
         *self = Self {
             read: self.read,
+            read_for_partial: false,
             fresh_at: self.fresh_at,
             clear_at: self.clear_at,
             outdated: self.outdated,
