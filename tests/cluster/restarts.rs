@@ -21,9 +21,9 @@ use crate::scene::{Scene, containers, done, say, scenario};
 
 const EXPECTED: &str = "Finished; EvalAI finished; one Job, one row; the same Pod, nothing in it restarted";
 /// How many seconds the part is away before it is started again.
-const AWAY: &str = "5";
+const AWAY: &str = "3";
 /// A run outlives what it is to get by without: each of four pairs drives five such routes.
-const ROUTE_MS: &str = "6000";
+const ROUTE_MS: &str = "4000";
 /// A Lease runs out (15 s), EvalAI is left alone (75 s), and the machine is slow.
 const LIMIT: Duration = Duration::from_mins(4);
 const PAIRS: usize = 4;
