@@ -15,7 +15,7 @@ help: ## Explain every target
 demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time)
 	$(LAB) demo
 
-test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; 45 min the first time)
+test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; 35 min the first time)
 	$(LAB) test
 
 test-core: ## Run the tests that need neither root nor a node
@@ -59,7 +59,7 @@ lint: ## Check format and lints
 	cargo fmt --all --check
 	cargo clippy --profile $(PROFILE) --workspace --all-targets -- -D warnings
 
-deny: ## Check licenses, advisories, sources and unused dependencies
+deny: ## Check licenses, bans, sources and unused dependencies (needs cargo-deny and cargo-machete)
 	cargo deny --offline check bans licenses sources
 	cargo machete
 
