@@ -127,15 +127,19 @@ impl Memory {
         (of == attempt).then_some(why)
     }
 
-    /// Remembers whether its result could be read. The first words stand: others for the same would be a write each.
-    pub fn note_unread(&self, submission: &Submission, why: Option<String>) {
+    /// Remembers that its result could not be read. The first words stand: others for the same would be a write each.
+    pub fn note_unread(&self, submission: &Submission, why: &str) {
         let attempt = submission.status.as_ref().and_then(|s| s.attempt).unwrap_or(1);
         let mut entries = self.lock();
         let known = &mut entries.entry(uid_of(submission)).or_default().unread;
-        match (why, &known) {
-            (Some(_), Some((of, _))) if *of == attempt => {}
-            (why, _) => *known = why.map(|why| (attempt, why)),
+        if known.as_ref().is_none_or(|(of, _)| *of != attempt) {
+            *known = Some((attempt, why.to_owned()));
         }
+    }
+
+    /// All of its result could be read.
+    pub fn note_read(&self, submission: &Submission) {
+        self.lock().entry(uid_of(submission)).or_default().unread = None;
     }
 
     /// Drops an object that is gone.

@@ -7,18 +7,21 @@ use std::sync::{Arc, Mutex, PoisonError};
 use jiff::{SignedDuration, Timestamp};
 use kube::ResourceExt;
 
+use super::bucket::BucketError;
 use super::context::Context;
 use super::decide::Tell;
 use super::observe::{report, uid_of};
 use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
-use crate::api::{Leaderboard, Submission, SubmissionStatus, names};
+use crate::api::{Leaderboard, Submission, SubmissionStatus, conditions, names};
 use crate::services::ObjectKey;
 use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
 
 /// How long an end waits to be told for a result that cannot be read: as long as the end itself.
 pub(super) const END_WAITS: SignedDuration = SignedDuration::from_hours(24);
+/// What is left to tell an end in before the finalizer of a deleted object gives up.
+const BEFORE_RELEASE: SignedDuration = SignedDuration::from_mins(2);
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct Sync {
@@ -130,8 +133,12 @@ impl Sync {
         } else {
             view.report.clone()
         };
-        if end && matches!(sight, ReportSight::Unreadable(_)) && may_wait(view, status, END_WAITS) {
-            return;
+        if end && matches!(sight, ReportSight::Unreadable(_)) {
+            if may_wait(view, status, END_WAITS) {
+                return;
+            }
+        } else if end {
+            context.memory.note_read(&view.submission);
         }
         if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
             self.recorder.record(table, &object_key(&view.submission), row, end);
@@ -169,10 +176,12 @@ async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
     let read = result_texts::payload(context, view, report).await;
     let attempt = view.submission.spec.attempt;
-    // What cannot be read is left out: the next route has a result of its own.
-    context.memory.told_partial(&view.submission, attempt, report.done);
+    // What takes too long or is not there is left out: the next route has a result of its own.
+    if !matches!(read, Err(TextError::Unread(BucketError::Refused(_)))) {
+        context.memory.told_partial(&view.submission, attempt, report.done);
+    }
     let unread = |why: &TextError| {
-        tracing::warn!(submission = %view.submission.name_any(), %why, "a partial result is left out");
+        tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of a partial result were not read");
     };
     Some(Arc::new(read.inspect_err(unread).ok()?))
 }
@@ -183,37 +192,43 @@ async fn last_report(context: &Context, view: &View) -> ReportSight {
         Some(report) => ReportSight::Ours(Arc::clone(report)),
         None => report::read_now(context, &view.submission, view.now).await,
     };
-    let why = match &sight {
-        ReportSight::Unreadable(why) => Some(why.clone()),
-        _ => None,
-    };
-    note_unread(context, view, why);
+    if let ReportSight::Unreadable(why) = &sight {
+        note_unread(context, view, why);
+    }
     sight
 }
 
 /// The status tells it until the result could be read, our own log once.
-fn note_unread(context: &Context, view: &View, why: Option<String>) {
-    if let Some(why) = &why
-        && view.unread.is_none()
-    {
+fn note_unread(context: &Context, view: &View, why: &str) {
+    if view.unread.is_none() {
         tracing::warn!(submission = %view.submission.name_any(), %why, "the result cannot be read, so its end waits");
     }
     context.memory.note_unread(&view.submission, why);
 }
 
-/// Whether an end that is told once waits for its result. One that is being deleted has no time for it.
+/// Whether an end that is told once waits for its result: so long after it was decided, and not until the finalizer gives up.
 fn may_wait(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> bool {
-    let ended = status.times.finished.as_ref().map_or(view.now, |t| t.0);
-    view.submission.metadata.deletion_timestamp.is_none() && view.now.duration_since(ended) < longest
+    let end = conditions::get(&status.conditions, conditions::FINISHED);
+    let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
+    let patience = until(end.map_or(view.now, |c| c.last_transition_time.0), longest);
+    let Some(deleted) = &view.submission.metadata.deletion_timestamp else {
+        return view.now < patience;
+    };
+    let seconds = view.leaderboard.as_ref().map_or(0, |l| l.spec.finalize_seconds);
+    let release = until(deleted.0, SignedDuration::from_secs(seconds) - BEFORE_RELEASE);
+    view.now < patience.min(release)
 }
 
 async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
     let sight = last_report(context, view).await;
     let mut payload = match &sight {
         ReportSight::Ours(report) => match result_texts::payload(context, view, report).await {
-            Ok(payload) => payload,
+            Ok(payload) => {
+                context.memory.note_read(&view.submission);
+                payload
+            }
             Err(error) if may_wait(view, status, error.patience()) => {
-                note_unread(context, view, Some(error.to_string()));
+                note_unread(context, view, &error.to_string());
                 return None;
             }
             Err(_) => result_texts::without_texts(view, report),

@@ -6,6 +6,7 @@ use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
@@ -81,7 +82,14 @@ async fn bench() -> Bench {
     let now = Timestamp::now();
     let status = submission.status.as_mut().unwrap();
     status.state = Some(State::Cancelled);
-    status.times.finished = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(now));
+    status.conditions = vec![Condition {
+        type_: conditions::FINISHED.into(),
+        status: "True".into(),
+        reason: "Cancelled".into(),
+        message: String::new(),
+        last_transition_time: Time(now),
+        observed_generation: None,
+    }];
     let status = status.clone();
     let view = View {
         now,
@@ -171,8 +179,16 @@ async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ev
     let mut bench = self::bench().await;
     bench.stores("torn");
     let mut submission = bench.view.submission.as_ref().clone();
-    submission.metadata.deletion_timestamp = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(bench.view.now));
+    submission.metadata.deletion_timestamp = Some(Time(bench.view.now));
     bench.view.submission = Arc::new(submission);
+    bench.records_the_end().await;
+    assert!(!bench.is_handed_in());
+    // The finalizer is about to give up.
+    bench.view.now = bench
+        .view
+        .now
+        .checked_add(SignedDuration::from_secs(900 - 120))
+        .unwrap();
     bench.records_the_end().await;
     assert_eq!(bench.row().await["submission_status"], "CANCELLED");
 }

@@ -207,8 +207,8 @@ fn is_obedient(end: &EndView) -> bool {
 #[derive(Clone, Copy)]
 struct Ended<'a> {
     end: &'a EndView,
-    /// It has been started again since.
-    runs: bool,
+    /// Which of its container's lives that was, from 1.
+    life: i32,
 }
 
 /// How a pair last crashed. Both sides of a round end within moments: a simulator that crashed of itself takes its agent
@@ -217,18 +217,20 @@ fn last_end(pod: &PodView, id: i32) -> Option<LastEnd> {
     let end_of = |wanted: Side| {
         let of_pair = |c: &&ContainerView| pair_of(&c.name).is_some_and(|(side, pair)| side == wanted && pair == id);
         let container = pod.containers.iter().find(of_pair)?;
-        let (end, runs) = (container.last.as_ref()?, container.running);
-        (end.exit_code != 0 && !is_obedient(end)).then_some(Ended { end, runs })
+        let end = container.last.as_ref()?;
+        let life = container.restarts.saturating_add(i32::from(!container.running));
+        (end.exit_code != 0 && !is_obedient(end)).then_some(Ended { end, life })
     };
     let agent = end_of(Side::Agent);
     let simulator = end_of(Side::Simulator);
     let (word, end) = match (agent, simulator) {
-        (Some(agent), Some(simulator)) if blame_each_other(simulator.end, agent.end) => {
-            let may_say_more = simulator.runs || agent.runs;
-            (if may_say_more { UNSETTLED } else { FORGED }, agent.end)
-        }
+        (Some(agent), Some(simulator)) if blame_each_other(simulator, agent) => (FORGED, agent.end),
         (Some(agent), Some(simulator)) if is_followed(simulator.end, agent.end) => {
             (word(Side::Simulator, simulator.end), simulator.end)
+        }
+        // The simulator followed a later end of its agent, which is not seen yet.
+        (Some(agent), Some(simulator)) if says_peer_crashed(simulator.end) && is_before(agent.end, simulator.end) => {
+            (UNSEEN, simulator.end)
         }
         (Some(agent), _) => (word(Side::Agent, agent.end), agent.end),
         (None, simulator) => (word(Side::Simulator, simulator?.end), simulator?.end),
@@ -253,10 +255,12 @@ fn is_followed(simulator: &EndView, agent: &EndView) -> bool {
 }
 
 /// Either side writes down its own crash before the other can see it, so one of them has a cause of its own. Where neither has,
-/// the agent has written a crash into its folder of the status files.
-fn blame_each_other(simulator: &EndView, agent: &EndView) -> bool {
-    let is_same_round = !is_before(simulator, agent) && !is_before(agent, simulator);
-    says_peer_crashed(simulator) && says_peer_crashed(agent) && is_same_round
+/// the agent has written a crash into its folder of the status files. A life of its own tells the end that is meant: an agent that
+/// was killed without a word overlaps with the simulator of the round before, whose next end is still to come.
+fn blame_each_other(simulator: Ended<'_>, agent: Ended<'_>) -> bool {
+    let is_same_round = !is_before(simulator.end, agent.end) && !is_before(agent.end, simulator.end);
+    let both_say_so = says_peer_crashed(simulator.end) && says_peer_crashed(agent.end);
+    both_say_so && is_same_round && simulator.life == agent.life
 }
 
 fn says_peer_crashed(end: &EndView) -> bool {
@@ -274,7 +278,7 @@ pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
     let limit = draft.retries().pair.max(1);
     let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
     let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
-    let worn = crashed().find(|p| p.crashes >= limit && !waits_for_a_word(p, draft.now()));
+    let worn = crashed().find(|p| p.crashes >= limit && !(p.crashes == limit && waits_for_a_word(p, draft.now())));
     let pair = hopeless.or(worn)?;
     Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
 }
@@ -285,13 +289,11 @@ const UNSEEN: &str = "unseen";
 const FOLLOWED: &str = "peerCrashed";
 /// The word for a crash that an agent has made up.
 const FORGED: &str = "forged";
-/// The word for one that looks like it, while a side that runs again may have its last word still to say.
-const UNSETTLED: &str = "unsettled";
 /// How long the other side's own word is waited for: more than a container has for its end. It may never come.
 const WORD_SECONDS: i64 = 120;
 
 fn waits_for_a_word(pair: &PairStatus, now: Timestamp) -> bool {
-    let is_no_cause = last_word(pair).is_some_and(|word| [UNSEEN, FOLLOWED, UNSETTLED].contains(&word));
+    let is_no_cause = last_word(pair).is_some_and(|word| [UNSEEN, FOLLOWED].contains(&word));
     let time = pair.last.as_ref().and_then(|last| last.time.as_ref());
     is_no_cause && time.is_some_and(|time| now.duration_since(time.0).as_secs().abs() < WORD_SECONDS)
 }
@@ -321,10 +323,7 @@ pub(super) fn of_job(status: &SubmissionStatus, end: &JobEnd, pod: Option<&PodVi
 fn worst_pair(status: &SubmissionStatus) -> Option<Failure> {
     let crashed = status.pairs.iter().filter(|p| p.crashes > 0 && p.last.is_some());
     let pair = crashed.max_by_key(|p| p.crashes)?;
-    // The Pod is gone with the word that was still to come: nobody is charged on a suspicion.
-    let word = last_word(pair)?;
-    let word = if word == UNSETTLED { FOLLOWED } else { word };
-    Some(of_pair(pair.id, pair.crashes, word))
+    Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
 }
 
 fn of_pair(id: i32, crashes: i32, word: &str) -> Failure {
@@ -355,7 +354,7 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
                  dead end in its code."
             ),
         ),
-        FORGED | UNSETTLED => (
+        FORGED => (
             reasons::AGENT_CRASHED,
             format!(
                 "Agent {id} ended {times} by a status file that says it crashed, which it has not. Leave the folder of the \

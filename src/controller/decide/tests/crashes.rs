@@ -184,14 +184,11 @@ fn ends_of_different_rounds_explain_nothing_of_each_other() {
 /// Its simulator, which obeys at once, may run again before the agent has ended.
 #[test]
 fn a_forger_that_takes_its_time_to_end_is_found_out_all_the_same() {
-    let mut simulator = ended("simulator-1", 3, "peerCrashed", 1, 80);
+    let mut simulator = ended("simulator-1", 4, "peerCrashed", 1, 80);
     simulator.running = true;
     let mut world = World::local().running();
     world.see(simulator);
     world.see(ended("agent-1", 3, "peerCrashed", 1, 100));
-    world.go_to(219);
-    world.pass_to(Running, reasons::RUNNING);
-    world.go_to(220);
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(
         (failure.reason.as_str(), failure.charged),
@@ -209,6 +206,33 @@ fn a_simulator_that_was_killed_without_a_word_long_before_its_agent_noticed_is_t
     world.see(agent);
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn an_end_of_an_earlier_round_is_not_the_word_that_is_waited_for() {
+    let mut agent = ended("agent-1", 3, "peerCrashed", 1, 100);
+    agent.running = true;
+    let mut world = World::local().running();
+    world.see(agent);
+    world.see(ended("simulator-1", 3, "peerCrashed", 1, 400));
+    world.go_to(401);
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    world.see(ended("agent-1", 3, "idle", 1, 401));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::IDLE);
+}
+
+#[test]
+fn a_word_that_has_not_come_until_the_next_crash_is_waited_for_no_longer() {
+    let mut world = World::local().running();
+    for (restarts, second, reason) in [(3, 100, reasons::RUNNING), (4, 130, reasons::STOPPING)] {
+        world.see(ended("simulator-1", restarts, "stopped", 143, second));
+        world.see(ended("agent-1", restarts, "peerCrashed", 1, second));
+        world.go_to(second + 1);
+        world.pass_to(Running, reason);
+    }
+    assert_eq!(world.status().failure.unwrap().reason, reasons::SIMULATION_CRASHED);
 }
 
 #[test]
