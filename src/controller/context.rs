@@ -17,6 +17,7 @@ use super::leaderboards::Desk;
 use super::memory::Memory;
 use super::observe::board::Board;
 use super::observe::is_pod_of;
+use super::observe::node::Nodes;
 use super::observe::report::Reports;
 use super::sync::Sync;
 use crate::api::{Leaderboard, Storage, Submission};
@@ -76,6 +77,7 @@ pub struct Context {
     pub sync: Sync,
     pub aws: Aws,
     pub buckets: Buckets,
+    pub nodes: Nodes,
     pub recorder: Recorder,
     archives: Mutex<HashMap<String, Archive>>,
 }
@@ -94,6 +96,7 @@ impl Context {
             sync,
             aws,
             buckets: Buckets::default(),
+            nodes: Nodes::default(),
             recorder,
             archives: Mutex::default(),
         }

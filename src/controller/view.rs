@@ -99,7 +99,7 @@ pub struct PodView {
     pub stop: Option<Stop>,
 }
 
-/// The Pod's node, which is looked at only while the Pod is being deleted.
+/// The Pod's node, which is looked at while the Pod runs or is being deleted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum NodeSight {
     /// There was no reason to look, or no right to.

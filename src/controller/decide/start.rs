@@ -11,7 +11,7 @@ use super::failure::{self, infrastructure, participant, sentence};
 use super::trouble::{self, Trouble};
 use crate::api::conditions::{self, Truth};
 use crate::api::{Failure, State, names, reasons};
-use crate::controller::view::{JobView, PodView};
+use crate::controller::view::{JobView, NodeSight, PodView};
 
 /// What is said of a Pod that does as it should.
 pub(super) const PREPARED: &str = "Its Pod is being prepared.";
@@ -35,6 +35,10 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
     if pod.delete_by.is_some() || pod.ended_by_node.is_some() {
         draft.moves();
         return replacing(draft, LOST);
+    }
+    if let Some(message) = left_by_node(draft, pod) {
+        draft.moves();
+        return replacing(draft, &message);
     }
     if let Some(words) = &pod.unschedulable {
         return unschedulable(draft, job, words);
@@ -62,6 +66,20 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
                 draft.requeue_at(deadline);
             }
         }
+    }
+}
+
+/// What is said of a run whose node is away, before Kubernetes has given its Pod up.
+fn left_by_node(draft: &Draft<'_>, pod: &PodView) -> Option<String> {
+    let node = pod.node.as_deref().filter(|_| draft.is_running())?;
+    match draft.view.node {
+        NodeSight::Gone => Some(format!(
+            "Its Pod was lost with its node: {node} is gone. The Job makes another one, which goes on from S3."
+        )),
+        NodeSight::Silent { since } => Some(format!(
+            "Its node {node} has been silent since {since:.0}. If that lasts, its Pod is given up, and another one goes on from S3."
+        )),
+        NodeSight::Reports | NodeSight::Unknown => None,
     }
 }
 

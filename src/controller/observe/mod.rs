@@ -2,7 +2,7 @@
 
 pub mod board;
 pub mod job;
-mod node;
+pub mod node;
 pub mod pod;
 pub mod report;
 
@@ -37,6 +37,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     };
     let node = match &pod {
         Some(pod) if pod.delete_by.is_some() => node::sight(context, pod).await,
+        Some(pod) if pod.agent_started.is_some() && pod.run_ended.is_none() => node::recent_sight(context, pod).await,
         _ => NodeSight::Unknown,
     };
     let report = report::read(context, &submission, &job, pod.as_ref(), now).await;

@@ -9,7 +9,7 @@ use std::time::Duration;
 use futures::{Stream, StreamExt};
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::api::core::v1::{Node, Pod};
 use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
@@ -21,6 +21,8 @@ use serde_json::{Value, json};
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 
+/// The node of all Pods.
+const NODE: &str = "played";
 /// Routes of every run.
 pub const ROUTES: u32 = 1000;
 
@@ -102,7 +104,21 @@ where
     events.applied_objects().filter_map(async |event| event.ok())
 }
 
+/// A node whose kubelet speaks. It stays for whoever plays next.
+async fn make_node(client: &Client) {
+    let node = json!({
+        "metadata": {"name": NODE},
+        "status": {"conditions": [{"type": "Ready", "status": "True", "reason": "KubeletReady"}]},
+    });
+    let node: Node = serde_json::from_value(node).unwrap();
+    match Api::all(client.clone()).create(&PostParams::default(), &node).await {
+        Err(kube::Error::Api(status)) if status.is_already_exists() => {}
+        made => drop(made.unwrap()),
+    }
+}
+
 async fn watch_jobs(stage: Arc<Stage>) {
+    make_node(&stage.props.client).await;
     let mut known = std::collections::BTreeSet::new();
     let mut jobs = std::pin::pin!(all(stage.jobs()));
     while let Some(job) = jobs.next().await {
@@ -189,7 +205,7 @@ fn pod_of(job: &Job) -> Pod {
     let mut pod = json!({"metadata": template["metadata"], "spec": template["spec"]});
     pod["metadata"]["name"] = json!(job.name_any());
     pod["metadata"]["ownerReferences"] = json!([job.controller_owner_ref(&())]);
-    pod["spec"]["nodeName"] = json!("played");
+    pod["spec"]["nodeName"] = json!(NODE);
     serde_json::from_value(pod).unwrap()
 }
 

@@ -258,6 +258,34 @@ fn going(node: NodeSight) -> World {
 }
 
 #[test]
+fn a_node_that_is_away_is_told_before_kubernetes_gives_its_pod_up() {
+    let silent = NodeSight::Silent { since: at(40) };
+    for (node, words) in [
+        (NodeSight::Gone, "node-a is gone"),
+        (silent, "node-a has been silent since 2026-01-01T00:00:40Z."),
+    ] {
+        let mut world = World::local().running();
+        world.view.node = node;
+        let plan = world.pass_to(Running, reasons::REPLACING);
+        assert!(
+            plan.status.message.as_ref().unwrap().contains(words),
+            "{:?}",
+            plan.status.message
+        );
+        assert!(!has(&plan, |a| matches!(
+            a,
+            Action::DeleteJob { .. } | Action::ForceDeletePod { .. }
+        )));
+        world.view.node = NodeSight::Reports;
+        world.pass_to(Running, reasons::RUNNING);
+        // Of one that is being stopped the stop is told.
+        world.view.node = node;
+        world.submission().spec.cancel = true;
+        world.pass_to(Running, reasons::STOPPING);
+    }
+}
+
+#[test]
 fn a_pod_is_given_up_early_only_where_its_kubelet_is_silent() {
     let silent = |since| NodeSight::Silent { since: at(since) };
     let cases = [
