@@ -332,7 +332,8 @@ impl Gatherer {
         let Ok(Some(kept)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
             return false;
         };
-        let reached = |checkpoint: &Checkpoint| (checkpoint.done(), checkpoint.ended());
+        // Where the evaluator resumes counts, too: V1 has a file with a route's record that does not count it yet.
+        let reached = |checkpoint: &Checkpoint| (checkpoint.done(), checkpoint.counted(), checkpoint.ended());
         if worker.good.as_ref().is_some_and(|good| reached(good) >= reached(&kept)) {
             return false;
         }

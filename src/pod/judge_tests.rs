@@ -258,6 +258,22 @@ mod seen_on_a_volume {
     }
 
     #[test]
+    fn what_the_runner_kept_counts_where_only_the_evaluators_own_count_is_further() {
+        let mut volume = Volume::new();
+        let kept = volume.folder.path().join("containers-status/agent-1");
+        fs::create_dir_all(&kept).unwrap();
+        let counted = checkpoint(0, 1, 2);
+        let uncounted = counted.replacen("\"progress\":[1,2]", "\"progress\":[0,2]", 1);
+        assert_ne!(uncounted, counted);
+        put_checkpoint(volume.folder.path(), 1, &uncounted);
+        let stored = |gathered: &Gathered| gathered.objects["agent/agent1/agent_results.json"].to_vec();
+        assert_eq!(stored(&volume.round().0), uncounted.as_bytes());
+        put_checkpoint(volume.folder.path(), 1, "");
+        fs::write(kept.join("checkpoint.json"), &counted).unwrap();
+        assert_eq!(stored(&volume.round().0), counted.as_bytes());
+    }
+
+    #[test]
     fn a_crash_in_the_last_route_is_whole_and_not_complete() {
         let mut volume = Volume::new();
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));

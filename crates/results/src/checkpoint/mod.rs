@@ -21,6 +21,7 @@ const MAX_TOTAL: i128 = 1_000_000;
 pub struct Checkpoint {
     pub(crate) records: Vec<Record>,
     pub(crate) total: u32,
+    counted: u32,
     pub(crate) sensors: Vec<Text>,
     ended: bool,
     repeats: bool,
@@ -35,6 +36,12 @@ impl Checkpoint {
     pub fn done(&self) -> u32 {
         let records = u32::try_from(self.records.len()).unwrap_or(u32::MAX);
         records.saturating_sub(u32::from(self.repeats))
+    }
+
+    /// How many routes the evaluator itself counts as finished, after which it resumes. V1 writes a route's record first and the
+    /// count after it.
+    pub fn counted(&self) -> u32 {
+        self.counted
     }
 
     /// How many the file says it will finish.
@@ -73,6 +80,10 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
     }
     let sensors = sensors(plan, pair, &file.sensors)?;
     let total = total(plan, pair, &file.progress)?;
+    let counted = match file.progress.first() {
+        Some(Value::Int(counted)) => u32::try_from(*counted).unwrap_or(0),
+        _ => 0,
+    };
     let records = records(plan, pair, file.records)?;
     if plan.is_pod() {
         plausible::check_file(plan, pair, total, &records)?;
@@ -84,6 +95,7 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
     Ok(Some(Checkpoint {
         records,
         total,
+        counted,
         sensors,
         ended: file.ended,
         repeats,
