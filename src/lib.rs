@@ -11,3 +11,4 @@ pub mod observability;
 pub mod plugin;
 pub mod pod;
 pub mod services;
+mod text;

@@ -130,18 +130,16 @@ impl Kept {
 async fn look(context: &Context, view: &View, status: &SubmissionStatus, places: &[LogPlace]) -> Look {
     let mut look = Look::Nothing;
     for place in places {
-        let read = async {
-            match &place.at {
-                LogAt::Node { pod, previous } => {
-                    let namespace = view.submission.namespace().unwrap_or_default();
-                    let read = of_node(&context.client, &namespace, pod, &place.container, *previous);
-                    let read = tokio::time::timeout(TRY, read).await;
-                    read.unwrap_or_else(|_| Err("no answer in time".into()))
-                }
-                LogAt::Bucket { key } => of_bucket(context, status, key).await,
+        let read = match &place.at {
+            LogAt::Node { pod, previous } => {
+                let namespace = view.submission.namespace().unwrap_or_default();
+                let read = of_node(&context.client, &namespace, pod, &place.container, *previous);
+                let read = tokio::time::timeout(TRY, read).await;
+                read.unwrap_or_else(|_| Err("no answer in time".into()))
             }
+            LogAt::Bucket { key } => of_bucket(context, status, key).await,
         };
-        match read.await {
+        match read {
             Ok(Some(bytes)) => {
                 let text = tail(&heading(status, place), &bytes);
                 if let Some(text) = text {

@@ -15,6 +15,7 @@ use super::sync::END_WAITS;
 use super::view::View;
 use crate::api::{FailureClass, LogTail, ResultsFormat, State, SubmissionStatus};
 use crate::pod::report::Report;
+use crate::pod::upload::hex;
 use crate::services::evalai::Payload;
 use crate::services::table::Row;
 
@@ -123,14 +124,6 @@ async fn stored(context: &Context, view: &View, report: &Report, key: &'static s
         return Err(unfit("is of another round than the report"));
     }
     String::from_utf8(bytes).map_err(|_| unfit("is not text"))
-}
-
-fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write as _;
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
 }
 
 /// The row of a submission as it stands, with the metrics of a report; none before it has a team.

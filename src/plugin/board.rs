@@ -2,9 +2,9 @@
 //!
 //! Called by `why`, `overview` and `change`. Pure.
 
-use super::text::sentence;
 use crate::api::conditions;
 use crate::api::{Leaderboard, reasons};
+use crate::text::sentence;
 
 /// What was seen of a submission's Leaderboard.
 #[derive(Clone, Copy, Debug)]

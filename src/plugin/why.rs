@@ -8,10 +8,11 @@ use kube::ResourceExt;
 
 use super::board::{self, Sight};
 use super::steps;
-use super::text::{Page, join, sentence, span, when};
+use super::text::{Page, join, span, when};
 use crate::api::conditions;
 use crate::api::{Failure, FailureClass, PairStatus, State, Submission, SubmissionStatus, reasons};
 use crate::pod::report::FAILURE_LOG_KEY;
+use crate::text::sentence;
 
 /// What is known, and what is said of it so far.
 struct Story<'a> {

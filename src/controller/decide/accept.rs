@@ -5,11 +5,11 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::Draft;
-use super::failure::sentence;
 use super::{Action, end};
 use crate::api::conditions::{self, Truth};
 use crate::api::{LeaderboardSpec, State, Team, Track, effective, reasons};
 use crate::controller::view::{EvalaiInfo, Standing};
+use crate::text::sentence;
 
 /// How long EvalAI may take before its silence is shown.
 const RETRY: Duration = Duration::from_secs(30);

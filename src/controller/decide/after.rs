@@ -6,11 +6,11 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
-use super::failure::sentence;
 use super::{Action, Tell, accept, log, stop};
 use crate::api::conditions::{self, Truth};
 use crate::api::{State, reasons};
 use crate::controller::view::{EvalaiEnd, JobSight, JobView};
+use crate::text::sentence;
 
 /// How often an unpublished end is looked at again.
 const AGAIN: Duration = Duration::from_secs(30);

@@ -10,6 +10,7 @@ use crate::api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, r
 use crate::controller::view::{ContainerView, EndView, JobEnd, NodeSight, PodView};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
+use crate::text::sentence;
 
 /// A failure that is the participant's.
 pub(super) fn participant(reason: &str, message: impl Into<String>) -> Failure {
@@ -58,16 +59,6 @@ pub(super) fn what_happened(failure: &Failure) -> String {
         .strip_suffix(next)
         .filter(|_| failure.class == FailureClass::Infrastructure);
     what.unwrap_or(message).trim_end().to_owned()
-}
-
-/// Somebody else's words as a sentence.
-pub(super) fn sentence(words: &str) -> String {
-    let words = words.trim();
-    if words.is_empty() || words.ends_with(['.', '!', '?', '…']) {
-        words.to_owned()
-    } else {
-        format!("{words}.")
-    }
 }
 
 pub(super) fn job_deleted() -> Failure {
@@ -278,7 +269,7 @@ pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
     let limit = draft.retries().pair.max(1);
     let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
     let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
-    let worn = crashed().find(|p| p.crashes >= limit && !(p.crashes == limit && waits_for_a_word(p, draft.now())));
+    let worn = crashed().find(|p| p.crashes > limit || (p.crashes == limit && !waits_for_a_word(p, draft.now())));
     let pair = hopeless.or(worn)?;
     Some(of_pair(pair.id, pair.crashes, last_word(pair)?))
 }

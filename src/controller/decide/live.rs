@@ -10,6 +10,7 @@ use crate::api::conditions::{self, Truth};
 use crate::api::{PairStatus, Progress, State, Waiting, reasons};
 use crate::controller::view::{JobSight, JobView, PodView, Turn};
 use crate::pod::report::Report;
+use crate::text::sentence;
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
@@ -271,10 +272,7 @@ fn note_scores(draft: &mut Draft<'_>, report: &Report) {
     let (truth, reason, message) = match report.warnings.first() {
         Some(first) => {
             let first: String = first.chars().take(LONGEST).collect();
-            let message = format!(
-                "Scores do not follow from the infractions: {}",
-                failure::sentence(&first)
-            );
+            let message = format!("Scores do not follow from the infractions: {}", sentence(&first));
             (Truth::False, reasons::UNEXPLAINED_SCORES, message)
         }
         None if conditions::get(&draft.status.conditions, conditions::PLAUSIBLE).is_none() => return,

@@ -7,11 +7,12 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use super::draft::{Draft, after};
-use super::failure::{self, infrastructure, participant, sentence};
+use super::failure::{self, infrastructure, participant};
 use super::trouble::{self, Trouble};
 use crate::api::conditions::{self, Truth};
 use crate::api::{Failure, State, names, reasons};
 use crate::controller::view::{JobView, NodeSight, PodView};
+use crate::text::sentence;
 
 /// What is said of a Pod that does as it should.
 pub(super) const PREPARED: &str = "Its Pod is being prepared.";

@@ -1,7 +1,8 @@
 //! Sentences: each failure has its own, with a next step that a retry leaves out.
 
 use crate::api::reasons;
-use crate::controller::decide::failure::{infrastructure, invalid_results, participant, sentence, what_happened};
+use crate::controller::decide::failure::{infrastructure, invalid_results, participant, what_happened};
+use crate::text::sentence;
 
 #[test]
 fn a_next_step_is_added_and_taken_off_again() {

@@ -9,6 +9,7 @@ mod end;
 mod failure;
 mod line;
 mod log;
+mod nodes;
 mod properties;
 mod resume;
 mod rules;
