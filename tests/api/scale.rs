@@ -225,6 +225,7 @@ impl World {
         let millis = |time: Duration| u64::try_from(time.as_millis()).unwrap();
         evalai.set_knobs(Knobs {
             list_delay_ms: millis(size.list),
+            list_row_ms: 0,
             put_delay_ms: millis(size.put),
             ..Knobs::default()
         });

@@ -93,6 +93,14 @@ error_texts! {
     ACCESS_TOKEN = 401 Shape::Json, r#"{"detail":"Given token not valid for any token type","code":"token_not_valid","messages":[{"token_class":"RefreshToken","token_type":"refresh","message":"Token has wrong type"}]}"#;
     /// `Bearer` with an unknown or expired token.
     BAD_BEARER = 401 Shape::Json, r#"{"detail":"Given token not valid for any token type","code":"token_not_valid","messages":[{"token_class":"RefreshToken","token_type":"refresh","message":"Token is invalid or expired"}]}"#;
+    /// `Bearer` with a token that its user has renewed since.
+    BLACKLISTED = 401 Shape::Json, r#"{"detail":"Given token not valid for any token type","code":"token_not_valid","messages":[{"token_class":"RefreshToken","token_type":"refresh","message":"Token is blacklisted"}]}"#;
+    /// `Bearer` without a token, or with more than one.
+    BAD_AUTHORIZATION_HEADER = 401 Shape::Json, r#"{"detail":"Authorization header must contain two space-delimited values","code":"bad_authorization_header"}"#;
+    /// `Token` without a key.
+    KEY_MISSING = 401 Shape::Detail, "Invalid token header. No credentials provided.";
+    /// `Token` with more than one key.
+    KEY_WITH_SPACES = 401 Shape::Detail, "Invalid token header. Token string should not contain spaces.";
     /// The user has not confirmed the e-mail address.
     UNVERIFIED_EMAIL = 403 Shape::Detail, "Please verify your email!";
     /// More requests in a minute than the throttle lets through; comes with `Retry-After`.

@@ -1,6 +1,8 @@
 //! The knobs: delays, a dead queue, and requests that fail on purpose. Set by the control plane, read by `server` and
 //! the handlers. Pure.
 
+use std::time::Duration;
+
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
 /// How a request fails.
@@ -93,22 +95,51 @@ impl Fault {
     }
 }
 
-/// All knobs.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+/// All knobs. Unless a test says otherwise, the times are those of the real server.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Knobs {
+    /// Before the reads of a PUT of results, in milliseconds; one PUT after the other.
+    pub put_turn_ms: u64,
     /// Between the reads and the saves of a PUT of results, in milliseconds.
     pub put_delay_ms: u64,
     /// Between the reads and the saves of a PATCH of progress, in milliseconds.
     pub patch_delay_ms: u64,
     /// Between the read of a list and its answer, in milliseconds.
     pub list_delay_ms: u64,
+    /// The same for each row of the list.
+    pub list_row_ms: u64,
+    /// How long a connection without a request is kept open, in milliseconds.
+    pub keep_alive_ms: u64,
+    /// A request on a connection that has been idle for so many milliseconds meets its end: the connection is closed
+    /// without an answer, and nothing is done. Absent: none does.
+    pub close_reused_ms: Option<u64>,
     /// The queue does not answer.
     pub queue_down: bool,
     /// Requests per user and minute; 0 is no limit. Absent: as the program was started.
     pub throttle: Option<usize>,
     /// What fails next, in this order.
     pub fail_next: Vec<Fault>,
+}
+
+impl Default for Knobs {
+    fn default() -> Self {
+        Self {
+            // More than one turn and less than two fit into the time between read and save. So of six results at once
+            // two read before any was saved, one reads one row, and the others read two.
+            put_turn_ms: 25,
+            put_delay_ms: 40,
+            patch_delay_ms: 40,
+            list_delay_ms: 0,
+            list_row_ms: 10,
+            // The load balancer's in front of EvalAI.
+            keep_alive_ms: 60_000,
+            close_reused_ms: None,
+            queue_down: false,
+            throttle: None,
+            fail_next: Vec::new(),
+        }
+    }
 }
 
 /// The longest delay.
@@ -122,17 +153,31 @@ impl Knobs {
         };
         all.extend(change.clone());
         let knobs: Self = serde_json::from_value(serde_json::Value::Object(all)).map_err(|error| error.to_string())?;
-        if [knobs.put_delay_ms, knobs.patch_delay_ms, knobs.list_delay_ms]
-            .iter()
-            .any(|delay| *delay > LONGEST_MS)
-        {
+        let delays = [
+            knobs.put_turn_ms,
+            knobs.put_delay_ms,
+            knobs.patch_delay_ms,
+            knobs.list_delay_ms,
+            knobs.list_row_ms,
+        ];
+        if delays.iter().any(|delay| *delay > LONGEST_MS) {
             return Err(format!("a delay is at most {LONGEST_MS} ms"));
         }
         Ok(knobs)
     }
 
-    /// Takes the first fault that fits a request.
-    pub fn take(&mut self, method: &str, path: &str) -> Option<Fault> {
+    /// Takes the first fault that fits a request. `reused_after` is how long its connection was idle before.
+    pub fn take(&mut self, method: &str, path: &str, reused_after: Option<Duration>) -> Option<Fault> {
+        let closing = self.close_reused_ms.map(Duration::from_millis);
+        if closing.is_some_and(|closing| reused_after.is_some_and(|idle| idle >= closing)) {
+            return Some(Fault {
+                method: None,
+                path_prefix: None,
+                answer: Failure::Close,
+                times: 1,
+                when: When::Before,
+            });
+        }
         let fault = self.fail_next.iter_mut().find(|fault| fault.hits(method, path))?;
         fault.times -= 1;
         let taken = fault.clone();
@@ -161,12 +206,25 @@ mod tests {
             {"answer": "close", "when": "after"},
         ]});
         let mut knobs = set(&faults).unwrap();
-        let mut hit = |method, path| knobs.take(method, path).map(|fault| (fault.answer, fault.when));
+        let mut hit = |method, path| knobs.take(method, path, None).map(|fault| (fault.answer, fault.when));
         assert_eq!(hit("PUT", "/api/jobs/x"), Some((Failure::Status(503), When::Before)));
         assert_eq!(hit("GET", "/api/jobs/x"), Some((Failure::Close, When::After)));
         assert_eq!(hit("GET", "/api/jobs/x"), None);
         assert_eq!(hit("PUT", "/api/jobs/x"), Some((Failure::Status(503), When::Before)));
         assert_eq!(hit("PUT", "/api/jobs/x"), None);
+    }
+
+    #[test]
+    fn a_connection_that_was_idle_for_too_long_is_closed_under_its_request() {
+        let mut knobs = set(&json!({"close_reused_ms": 2_000})).unwrap();
+        let mut hit = |idle: Option<u64>| {
+            let fault = knobs.take("PATCH", "/", idle.map(Duration::from_millis));
+            fault.map(|fault| (fault.answer, fault.when))
+        };
+        assert_eq!(hit(None), None, "a new connection");
+        assert_eq!(hit(Some(1_999)), None);
+        assert_eq!(hit(Some(2_000)), Some((Failure::Close, When::Before)));
+        assert_eq!(hit(Some(2_000)), Some((Failure::Close, When::Before)), "each time");
     }
 
     #[test]

@@ -6,13 +6,15 @@ use std::collections::BTreeSet;
 use serde_json::{Value, json};
 
 use crate::model::{LeaderboardRow, Split, Status, Submission};
+use crate::reply::Reply;
 use crate::state::State;
 use crate::views;
 
-/// The public entries of a split, best first, one a team: each as the API shows it. Missing metrics are `"#"`.
-pub(crate) fn entries(state: &State, split: u64, order_by: Option<&str>) -> Vec<Value> {
+/// The public entries of a split, best first, one a team: each as the API shows it. Missing metrics are `"#"`. The
+/// server reads the metric that ranks as a number and raises on a bool, whosever it is.
+pub(crate) fn entries(state: &State, split: u64, order_by: Option<&str>) -> Result<Vec<Value>, Reply> {
     let Some((_, _, board)) = state.split(split) else {
-        return Vec::new();
+        return Ok(Vec::new());
     };
     let order = order_by.filter(|label| board.schema.labels.iter().any(|known| known == label));
     let order = order.unwrap_or(&board.schema.default_order_by);
@@ -23,13 +25,17 @@ pub(crate) fn entries(state: &State, split: u64, order_by: Option<&str>) -> Vec<
     let mut found: Vec<_> = with
         .filter(|(_, submission)| is_shown(state, split, submission))
         .collect();
+    if found
+        .iter()
+        .any(|(row, _)| row.result.get(order).is_some_and(Value::is_boolean))
+    {
+        return Err(Reply::server_error());
+    }
     found.sort_by(|(a, _), (b, _)| score(b).partial_cmp(&score(a)).unwrap_or(Ordering::Equal));
     let mut teams = BTreeSet::new();
     found.retain(|(_, submission)| submission.is_baseline || teams.insert(submission.participant_team));
-    found
-        .into_iter()
-        .map(|(row, submission)| entry(state, board, row, submission, score(row)))
-        .collect()
+    let entry = |(row, submission)| entry(state, board, row, submission, score(row));
+    Ok(found.into_iter().map(entry).collect())
 }
 
 fn is_shown(state: &State, split: u64, submission: &Submission) -> bool {

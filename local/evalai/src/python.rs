@@ -1,8 +1,9 @@
 //! The few pieces of Python that show through EvalAI's answers and files: `json.loads` with its NaN, `repr`, truth.
 //! Used by `update` and `views`; pure.
 
-use std::fmt::Write as _;
+use std::fmt::{self, Write as _};
 
+use serde::de::{Deserialize, DeserializeOwned, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value;
 
 /// Stands for a number JSON has no word for (NaN, an infinity), which Python's `json.loads` reads and the server
@@ -16,7 +17,7 @@ pub fn is_not_finite(value: &Value) -> bool {
 
 /// `json.loads`: JSON, and NaN, Infinity, -Infinity and numbers too large for a float besides. The error is Python's
 /// text.
-pub fn loads(text: &str) -> Result<Value, String> {
+pub fn loads<T: DeserializeOwned>(text: &str) -> Result<T, String> {
     if text.trim().is_empty() {
         return Err("Expecting value: line 1 column 1 (char 0)".to_owned());
     }
@@ -138,13 +139,43 @@ pub fn repr(value: &Value) -> String {
         },
         Value::String(text) => repr_str(text),
         Value::Array(items) => format!("[{}]", items.iter().map(repr).collect::<Vec<_>>().join(", ")),
-        Value::Object(fields) => {
-            let fields: Vec<_> = fields
-                .iter()
-                .map(|(key, value)| format!("{}: {}", repr_str(key), repr(value)))
-                .collect();
-            format!("{{{}}}", fields.join(", "))
+        Value::Object(fields) => repr_dict(fields.iter().map(|(key, value)| (key.as_str(), value))),
+    }
+}
+
+/// `repr` of a dict, in the order of its items.
+pub fn repr_dict<'a>(items: impl Iterator<Item = (&'a str, &'a Value)>) -> String {
+    let items: Vec<_> = items
+        .map(|(key, value)| format!("{}: {}", repr_str(key), repr(value)))
+        .collect();
+    format!("{{{}}}", items.join(", "))
+}
+
+/// An object's keys in the order they were sent: Python's dicts keep it, maps here do not.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Keys(pub Vec<String>);
+
+impl<'de> Deserialize<'de> for Keys {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Reader;
+        impl<'de> Visitor<'de> for Reader {
+            type Value = Keys;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("an object")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Keys, A::Error> {
+                let mut keys = Vec::new();
+                while let Some((key, _)) = map.next_entry::<String, IgnoredAny>()? {
+                    if !keys.contains(&key) {
+                        keys.push(key);
+                    }
+                }
+                Ok(Keys(keys))
+            }
         }
+        deserializer.deserialize_map(Reader)
     }
 }
 
@@ -239,11 +270,15 @@ mod tests {
             "[('Driving score', <class 'str'>)]"
         );
         assert_eq!(repr_list(&["Bogus"]), "['Bogus']");
+        assert_eq!(
+            loads(r#"{"b": 1, "a": NaN, "b": 2}"#),
+            Ok(Keys(vec!["b".to_owned(), "a".to_owned()]))
+        );
     }
 
     #[test]
     fn loads_reads_what_json_has_no_word_for() {
-        let value =
+        let value: Value =
             loads(r#"{"a": NaN, "b": -Infinity, "c": 1e999, "d": "NaN \" 1e999", "e": -1.5, "f": 12}"#).unwrap();
         for key in ["a", "b", "c"] {
             assert!(is_not_finite(&value[key]), "{key}");
@@ -254,9 +289,18 @@ mod tests {
 
     #[test]
     fn errors_are_pythons() {
-        assert_eq!(loads("").unwrap_err(), "Expecting value: line 1 column 1 (char 0)");
-        assert_eq!(loads("nope").unwrap_err(), "Expecting value: line 1 column 2 (char 1)");
-        assert_eq!(loads("[] 1").unwrap_err(), "Extra data: line 1 column 4 (char 3)");
+        assert_eq!(
+            loads::<Value>("").unwrap_err(),
+            "Expecting value: line 1 column 1 (char 0)"
+        );
+        assert_eq!(
+            loads::<Value>("nope").unwrap_err(),
+            "Expecting value: line 1 column 2 (char 1)"
+        );
+        assert_eq!(
+            loads::<Value>("[] 1").unwrap_err(),
+            "Extra data: line 1 column 4 (char 3)"
+        );
         assert_eq!(
             loads_type_error(&json!([1])),
             "the JSON object must be str, bytes or bytearray, not list"

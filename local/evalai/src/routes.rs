@@ -5,6 +5,8 @@
 pub enum Endpoint {
     /// `accounts/user/get_auth_token`
     AuthToken,
+    /// `accounts/user/refresh_auth_token`
+    RenewToken,
     /// `jobs/submission/{pk}`
     Submission(u64),
     /// `jobs/submission/{pk}/update_started_at/`
@@ -62,6 +64,16 @@ impl Endpoint {
     pub fn is_public(&self) -> bool {
         matches!(self, Self::Leaderboard(_) | Self::Phase(..) | Self::Splits(_))
     }
+
+    /// A user who signs in must have a confirmed e-mail address.
+    pub fn wants_email(&self) -> bool {
+        !matches!(self, Self::Leaderboard(_) | Self::Splits(_))
+    }
+
+    /// Counts against the user's requests a minute.
+    pub fn counts(&self) -> bool {
+        !matches!(self, Self::Splits(_))
+    }
 }
 
 /// What a path leads to.
@@ -93,6 +105,7 @@ fn endpoint(path: &str) -> Option<Endpoint> {
     let parts: Vec<&str> = path.split('/').collect();
     Some(match parts.as_slice() {
         ["accounts", "user", "get_auth_token"] => Endpoint::AuthToken,
+        ["accounts", "user", "refresh_auth_token"] => Endpoint::RenewToken,
         ["jobs", "submission", pk] => Endpoint::Submission(key(pk)?),
         ["jobs", "submission", pk, "update_started_at", ""] => Endpoint::StartedAt(key(pk)?),
         ["jobs", "submissions", pk, "re-run", ""] => Endpoint::Rerun(key(pk)?),
@@ -118,7 +131,8 @@ fn endpoint(path: &str) -> Option<Endpoint> {
 
 fn key(text: &str) -> Option<u64> {
     let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
-    digits.then(|| text.parse().ok())?
+    // A key too large for the database is a path all the same, and no row has it.
+    digits.then(|| text.parse().unwrap_or(u64::MAX))
 }
 
 fn name(text: &str) -> Option<String> {
@@ -138,6 +152,10 @@ mod tests {
             ("/api/jobs/submission/1/", Found::Nothing),
             ("/api/jobs/submission/x", Found::Nothing),
             ("/api/jobs/submission/+1", Found::Nothing),
+            (
+                "/api/jobs/submission/99999999999999999999",
+                Found::Endpoint(Endpoint::Submission(u64::MAX)),
+            ),
             (
                 "/api/jobs/challenge/1/update_submission/",
                 Found::Endpoint(Endpoint::Update(1)),

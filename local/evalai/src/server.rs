@@ -5,8 +5,9 @@
 
 use std::fmt;
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes, to_bytes};
 use axum::http::{HeaderMap, Request, header};
@@ -22,6 +23,7 @@ use tokio::task::JoinSet;
 
 use crate::faults::{Failure, Fault, Knobs, When};
 use crate::handlers::{self, Call};
+use crate::idle::Idle;
 use crate::log::{Entry, RequestLog};
 use crate::model::FileState;
 use crate::queue::{MemoryQueues, Queues};
@@ -65,6 +67,8 @@ impl Config {
 /// Everything the requests share.
 pub(crate) struct App {
     pub(crate) queues: Arc<dyn Queues>,
+    /// The one whose results the server looks at.
+    pub(crate) turn: tokio::sync::Mutex<()>,
     state: Mutex<State>,
     knobs: Mutex<Knobs>,
     log: Mutex<RequestLog>,
@@ -156,6 +160,7 @@ impl Handle {
     /// Replaces all knobs.
     pub fn set_knobs(&self, knobs: Knobs) {
         *self.app.knobs() = knobs;
+        self.app.changed();
     }
 
     /// Copies of the logged requests, oldest first.
@@ -187,6 +192,7 @@ impl Handle {
 pub fn serve(config: Config, listeners: Vec<TcpListener>) -> Handle {
     let app = Arc::new(App {
         queues: config.queues,
+        turn: tokio::sync::Mutex::default(),
         state: Mutex::new(State::new(config.seed)),
         knobs: Mutex::default(),
         log: Mutex::default(),
@@ -227,12 +233,28 @@ async fn accept(app: Arc<App>, listener: TcpListener) {
     }
 }
 
+/// Answers the requests of a connection until its client closes it, or it has been idle for too long.
 async fn converse(app: Arc<App>, stream: TcpStream) {
-    let service = service_fn(move |request| respond(Arc::clone(&app), request));
-    if let Err(error) = http1::Builder::new()
-        .serve_connection(TokioIo::new(stream), service)
-        .await
-    {
+    let idle = Arc::new(Idle::new());
+    let service = service_fn(|request| {
+        let (app, idle) = (Arc::clone(&app), Arc::clone(&idle));
+        async move {
+            let reused_after = idle.begin();
+            let answer = respond(app, request, reused_after).await;
+            idle.end();
+            answer
+        }
+    });
+    let mut connection = pin!(http1::Builder::new().serve_connection(TokioIo::new(stream), service));
+    let keep_alive = || Duration::from_millis(app.knobs().keep_alive_ms);
+    let ended = tokio::select! {
+        ended = connection.as_mut() => ended,
+        () = idle.over(keep_alive, app.changes.subscribe()) => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(error) = ended {
         tracing::debug!(%error, "a connection ended early");
     }
 }
@@ -263,9 +285,15 @@ struct Asked {
     query: Option<String>,
     headers: HeaderMap,
     body: Bytes,
+    /// How long its connection was idle before; none on a new one.
+    reused_after: Option<Duration>,
 }
 
-async fn respond(app: Arc<App>, request: Request<Incoming>) -> Result<Response<Body>, Closed> {
+async fn respond(
+    app: Arc<App>,
+    request: Request<Incoming>,
+    reused_after: Option<Duration>,
+) -> Result<Response<Body>, Closed> {
     let (head, body) = request.into_parts();
     let Ok(body) = to_bytes(Body::new(body), BODY_LIMIT).await else {
         return Ok(Reply::error(&errors::BODY_TOO_LARGE, &[]).into_response());
@@ -276,6 +304,7 @@ async fn respond(app: Arc<App>, request: Request<Incoming>) -> Result<Response<B
         query: head.uri.query().map(str::to_owned),
         headers: head.headers,
         body,
+        reused_after,
     };
     let mut stop = app.stop.subscribe();
     match tokio::spawn(process(app, asked))
@@ -309,7 +338,7 @@ async fn process(app: Arc<App>, asked: Asked) -> Outcome {
         .map_or_else(|| asked.path.clone(), |query| format!("{}?{query}", asked.path));
     let id = app.log().begin(now(), &asked.method, &path, token, &asked.body);
     app.changed();
-    let fault = app.knobs().take(&asked.method, &asked.path);
+    let fault = app.knobs().take(&asked.method, &asked.path, asked.reused_after);
     let outcome = match &fault {
         Some(fault) if fault.when == When::Before => fail(fault),
         _ => {
@@ -366,11 +395,7 @@ fn media(app: &App, path: &str) -> Outcome {
             let json = std::path::Path::new(path)
                 .extension()
                 .is_some_and(|extension| extension == "json");
-            let content_type = if json {
-                "application/json"
-            } else {
-                "text/plain; charset=utf-8"
-            };
+            let content_type = if json { "application/json" } else { "text/plain" };
             Outcome::Reply(Reply::of(200, content_type, content.clone()))
         }
     }
@@ -394,7 +419,8 @@ async fn api(app: &Arc<App>, asked: Asked) -> Answer {
         .cloned();
     match &user {
         None if !endpoint.is_public() => return Err((&errors::NO_CREDENTIALS).into()),
-        Some(user) if !user.verified => return Err((&errors::UNVERIFIED_EMAIL).into()),
+        Some(user) if !user.verified && endpoint.wants_email() => return Err((&errors::UNVERIFIED_EMAIL).into()),
+        Some(_) if !endpoint.counts() => {}
         _ => app.check_throttle(user.as_ref().map(|user| user.id))?,
     }
     if !endpoint.methods().contains(&asked.method.as_str()) {

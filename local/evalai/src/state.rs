@@ -3,14 +3,14 @@
 //! A row is read by cloning it and saved whole, as the server's models are: what another request wrote in between is
 //! lost. That is on purpose.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
 use serde::Serialize;
 use serde_json::Value;
 
 use crate::errors;
-use crate::model::{Challenge, LeaderboardRow, Phase, Split, Status, Submission, Team, TokenKind, User};
+use crate::model::{Challenge, LeaderboardRow, Phase, Split, Status, Submission, Team, Token, TokenKind, User};
 use crate::reply::Reply;
 use crate::seed::Seed;
 
@@ -43,6 +43,14 @@ pub struct State {
     pub files: BTreeMap<String, Vec<u8>>,
     /// Every message that went out, oldest first.
     pub published: Vec<Published>,
+    /// Refresh tokens that profile pages gave in place of older ones, with their users; the newest last.
+    renewed: Vec<(u64, String)>,
+    /// Refresh tokens that nobody may use any more.
+    blacklist: BTreeSet<String>,
+    /// Where each submission's row lies in the table: an update puts the row behind all others.
+    #[serde(skip)]
+    places: BTreeMap<u64, u64>,
+    last_place: u64,
     next_submission: u64,
     last_row: u64,
     last_file: u64,
@@ -58,6 +66,10 @@ impl State {
             rows: BTreeMap::new(),
             files: BTreeMap::new(),
             published: Vec::new(),
+            renewed: Vec::new(),
+            blacklist: BTreeSet::new(),
+            places: BTreeMap::new(),
+            last_place: 0,
             last_row: 0,
             last_file: 0,
         }
@@ -65,28 +77,69 @@ impl State {
 
     /// The user behind the value of an `Authorization` header, or none without one.
     pub fn authenticate(&self, header: Option<&str>) -> Result<Option<&User>, Reply> {
-        let Some((scheme, value)) = header.and_then(|header| header.split_once(' ')) else {
-            return Ok(None);
+        let words: Vec<_> = header.unwrap_or_default().split_whitespace().collect();
+        let error = match words.as_slice() {
+            ["Bearer", token] => return self.bearer(token).map(Some),
+            ["Bearer", ..] => &errors::BAD_AUTHORIZATION_HEADER,
+            [scheme, rest @ ..] if scheme.eq_ignore_ascii_case("Token") => match rest {
+                [] => &errors::KEY_MISSING,
+                [key] => return self.key_owner(key).map(Some),
+                _ => &errors::KEY_WITH_SPACES,
+            },
+            _ => return Ok(None),
         };
-        let owner = |bearer: bool| {
-            let tokens = |user| move |token| (user, token);
-            let mut all = self
-                .seed
-                .users
-                .iter()
-                .flat_map(|user: &User| user.tokens.iter().map(tokens(user)));
-            all.find(|(_, token)| token.value == value.trim() && (token.kind != TokenKind::Key) == bearer)
-        };
-        match (scheme, owner(scheme == "Bearer")) {
-            ("Bearer", Some((_, token))) if token.kind == TokenKind::Access => Err((&errors::ACCESS_TOKEN).into()),
-            ("Bearer", Some((user, token))) if !token.expired && user.active => Ok(Some(user)),
-            ("Bearer", _) => Err((&errors::BAD_BEARER).into()),
-            ("Token", None) => Err((&errors::INVALID_KEY).into()),
-            ("Token", Some((user, _))) if !user.active => Err((&errors::INACTIVE_USER).into()),
-            ("Token", Some((_, token))) if token.expired => Err((&errors::EXPIRED_KEY).into()),
-            ("Token", Some((user, _))) => Ok(Some(user)),
-            _ => Ok(None),
+        Err(error.into())
+    }
+
+    fn bearer(&self, value: &str) -> Result<&User, Reply> {
+        if self.blacklist.contains(value) {
+            return Err((&errors::BLACKLISTED).into());
         }
+        if let Some((user, _)) = self.renewed.iter().find(|(_, token)| token == value) {
+            return self.user(*user).ok_or_else(|| (&errors::BAD_BEARER).into());
+        }
+        match self.token(|token| token.kind != TokenKind::Key && token.value == value) {
+            Some((_, token)) if token.kind == TokenKind::Access => Err((&errors::ACCESS_TOKEN).into()),
+            Some((user, token)) if !token.expired && user.active => Ok(user),
+            _ => Err((&errors::BAD_BEARER).into()),
+        }
+    }
+
+    fn key_owner(&self, value: &str) -> Result<&User, Reply> {
+        match self.token(|token| token.kind == TokenKind::Key && token.value == value) {
+            None => Err((&errors::INVALID_KEY).into()),
+            Some((user, _)) if !user.active => Err((&errors::INACTIVE_USER).into()),
+            Some((_, token)) if token.expired => Err((&errors::EXPIRED_KEY).into()),
+            Some((user, _)) => Ok(user),
+        }
+    }
+
+    fn token(&self, wanted: impl Fn(&Token) -> bool) -> Option<(&User, &Token)> {
+        let tokens = |user| move |token| (user, token);
+        let users = self.seed.users.iter();
+        let mut all = users.flat_map(|user: &User| user.tokens.iter().map(tokens(user)));
+        all.find(|(_, token)| wanted(token))
+    }
+
+    /// The refresh token that the user's profile page shows.
+    pub fn refresh_token<'a>(&'a self, user: &'a User) -> Option<&'a str> {
+        let renewed = self.renewed.iter().rev().find(|(id, _)| *id == user.id);
+        let first = || {
+            let mut tokens = user.tokens.iter();
+            let found = tokens.find(|token| token.kind == TokenKind::Refresh && !token.expired);
+            found.map(|token| token.value.as_str())
+        };
+        renewed.map(|(_, token)| token.as_str()).or_else(first)
+    }
+
+    /// Gives the user a new refresh token; the one before is blacklisted at once.
+    pub fn renew_token(&mut self, user: &User) -> String {
+        if let Some(old) = self.refresh_token(user).map(str::to_owned) {
+            self.blacklist.insert(old);
+        }
+        let token = format!("local-{}-token-{}", user.username, self.renewed.len() + 2);
+        self.renewed.push((user.id, token.clone()));
+        token
     }
 
     /// A user by primary key.
@@ -150,7 +203,7 @@ impl State {
         self.phase(submission.challenge_phase).map(|(challenge, _)| challenge)
     }
 
-    /// A submission of the team and phase that counts as under way.
+    /// How many submissions of the team and phase count as under way; deleted ones do as well.
     pub fn in_progress(&self, team: u64, phase: u64) -> usize {
         let of_team = |s: &&Submission| s.participant_team == team && s.challenge_phase == phase;
         self.submissions
@@ -183,7 +236,16 @@ impl State {
 
     /// Saves a whole submission over the one of the same key.
     pub fn save(&mut self, submission: Submission) {
+        self.last_place += 1;
+        self.places.insert(submission.id, self.last_place);
         self.submissions.insert(submission.id, submission);
+    }
+
+    /// The submissions as they lie in the table, which is the order of a query that asks for none.
+    pub fn table(&self) -> Vec<&Submission> {
+        let mut rows: Vec<_> = self.submissions.values().collect();
+        rows.sort_by_key(|row| self.places.get(&row.id));
+        rows
     }
 
     /// Saves a submission as a new row: a new key, status submitted whatever it says, the next number of its team in
@@ -211,9 +273,16 @@ impl State {
     /// Stores a file of a submission under a name of its own and hands the path below `/media/` back.
     pub fn store(&mut self, submission: u64, extension: &str, content: Vec<u8>) -> String {
         self.last_file += 1;
+        let row = self.submissions.get(&submission);
+        let folder = row.and_then(|row| {
+            let (challenge, phase) = self.phase(row.challenge_phase)?;
+            Some(format!("challenge_{}/phase_{}/", challenge.id, phase.id))
+        });
         let path = format!(
-            "submission_files/submission_{submission}/{:08x}-0000-4000-8000-{:012x}.{extension}",
-            self.last_file, self.last_file
+            "submission_files/{}submission_{submission}/{:08x}-0000-4000-8000-{:012x}.{extension}",
+            folder.unwrap_or_default(),
+            self.last_file,
+            self.last_file
         );
         self.files.insert(path.clone(), content);
         path
@@ -244,9 +313,14 @@ mod tests {
         );
         assert_eq!(name(None), Ok(None));
         assert_eq!(name(Some("Basic x")), Ok(None));
+        assert_eq!(name(Some("bearer local-host-token")), Ok(None));
         for (header, error) in [
             ("Bearer local-host-access-token", errors::ACCESS_TOKEN),
             ("Bearer local-late-token", errors::BAD_BEARER),
+            ("Bearer ", errors::BAD_AUTHORIZATION_HEADER),
+            ("Bearer local-host-token again", errors::BAD_AUTHORIZATION_HEADER),
+            ("Token", errors::KEY_MISSING),
+            ("Token a b", errors::KEY_WITH_SPACES),
             ("Bearer 0000000000000000000000000000000000000001", errors::BAD_BEARER),
             ("Token local-host-token", errors::INVALID_KEY),
             ("Token 0000000000000000000000000000000000000022", errors::INACTIVE_USER),

@@ -5,7 +5,6 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use crate::body::Form;
 use crate::errors::{self, ErrorText};
 use crate::model::{Challenge, FileState, Phase, Status, Submission, User};
 use crate::python;
@@ -127,7 +126,7 @@ pub fn create(state: &mut State, new: NewSubmission, file_state: FileState, now:
 /// The image an input file names, or EvalAI's refusal.
 pub fn image_of(input: &[u8]) -> Result<String, Reply> {
     let bad = |text: String| Reply::error(&errors::SUBMIT_BAD_FILE, &[&text]);
-    let value = python::loads(&String::from_utf8_lossy(input)).map_err(bad)?;
+    let value: Value = python::loads(&String::from_utf8_lossy(input)).map_err(bad)?;
     match value.get("submitted_image_uri") {
         Some(image) => Ok(python::str(image)),
         None => Err(bad("'submitted_image_uri'".to_owned())),
@@ -245,60 +244,6 @@ fn again(state: &State, id: u64, deleted: &ErrorText) -> Result<(Submission, Cha
     }
     let challenge = state.challenge_of(submission).ok_or_else(unknown)?;
     Ok((submission.clone(), challenge.clone()))
-}
-
-/// `update_submission_meta`: writes the named fields, whatever they are, and publishes nothing. All wrong fields are
-/// named in one answer.
-pub fn edit(submission: &mut Submission, form: &Form) -> Result<(), Reply> {
-    let mut wrong = Map::new();
-    for (name, value) in &form.fields {
-        if let Err(text) = edit_field(submission, name, value) {
-            wrong.insert(name.clone(), json!([text]));
-        }
-    }
-    if wrong.is_empty() {
-        Ok(())
-    } else {
-        Err(Reply::json(400, &Value::Object(wrong)))
-    }
-}
-
-fn edit_field(submission: &mut Submission, name: &str, value: &Value) -> Result<(), String> {
-    match name {
-        "status" => {
-            let status = value.as_str().and_then(Status::parse);
-            submission.status = status.ok_or_else(|| errors::INVALID_CHOICE.message(&[&python::str(value)]))?;
-        }
-        "method_name" => submission.method_name = text(value)?,
-        "method_description" => submission.method_description = text(value)?,
-        "project_url" => submission.project_url = text(value)?,
-        "publication_url" => submission.publication_url = text(value)?,
-        "is_public" => submission.is_public = truth(value)?,
-        "is_flagged" => submission.is_flagged = truth(value)?,
-        "ignore_submission" => submission.ignore_submission = truth(value)?,
-        "is_baseline" => submission.is_baseline = truth(value)?,
-        "is_verified_by_host" => submission.is_verified_by_host = truth(value)?,
-        "submission_metadata" => submission.submission_metadata = value.clone(),
-        _ => {}
-    }
-    Ok(())
-}
-
-fn text(value: &Value) -> Result<String, String> {
-    match value {
-        Value::String(text) => Ok(text.clone()),
-        Value::Number(number) => Ok(number.to_string()),
-        Value::Null => Err("This field may not be null.".to_owned()),
-        _ => Err("Not a valid string.".to_owned()),
-    }
-}
-
-fn truth(value: &Value) -> Result<bool, String> {
-    match python::str(value).to_lowercase().as_str() {
-        "true" | "t" | "y" | "yes" | "on" | "1" => Ok(true),
-        "false" | "f" | "n" | "no" | "off" | "0" => Ok(false),
-        _ => Err("Must be a valid boolean.".to_owned()),
-    }
 }
 
 /// What [`bulk`] makes.

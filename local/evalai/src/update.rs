@@ -4,6 +4,7 @@
 //! whole. Whatever happens between the two is overwritten, or doubled where both halves of two requests interleave.
 
 use jiff::Timestamp;
+use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::body::Form;
@@ -60,8 +61,7 @@ pub fn prepare_put(state: &State, door: Door, form: &Form) -> Result<Write, Repl
         | (Some(status @ Status::PartiallyEvaluated), Door::Partial) => status,
         _ => return Err((&errors::INVALID_STATUS).into()),
     };
-    let mut rows = Vec::new();
-    let mut shown = Vec::new();
+    let (mut rows, mut shown) = (Vec::new(), Vec::new());
     if matches!(submission.status, Status::Finished | Status::PartiallyEvaluated) {
         let mode = if door == Door::Update {
             Mode::Put
@@ -70,7 +70,7 @@ pub fn prepare_put(state: &State, door: Door, form: &Form) -> Result<Write, Repl
         };
         (rows, shown) = check_results(state, &submission, form, mode)?;
     }
-    texts.result = python::repr(&Value::Array(shown));
+    texts.result = format!("[{}]", shown.join(", "));
     Ok(Write {
         progress: false,
         submission,
@@ -113,11 +113,10 @@ pub fn prepare_patch(state: &State, door: Door, form: &Form, now: Timestamp) -> 
         (Some(status @ (Status::PartiallyEvaluated | Status::Finished)), Door::Partial) => {
             let (rows, shown) = check_results(state, &submission, form, Mode::Merge)?;
             submission.status = status;
-            let result = python::repr(&Value::Array(shown));
             let texts = Texts {
                 stdout: form.text("stdout")?,
                 stderr: form.text("stderr")?,
-                result,
+                result: format!("[{}]", shown.join(", ")),
                 ..Texts::default()
             };
             Ok(Write {
@@ -162,17 +161,23 @@ fn named(state: &State, form: &Form) -> Result<Submission, Reply> {
     submission.ok_or_else(|| Reply::error(&errors::SUBMISSION_NOT_FOUND, &[&python::str(value)]))
 }
 
-/// A primary key sent as a number or as its decimal text. Null is no key; anything else raises in the server.
-fn key(value: &Value) -> Result<Option<u64>, Reply> {
-    let number = match value {
+/// A primary key sent as a number, cut as Python's `int` cuts it, or as its decimal text. None: no row has it. What is
+/// no number raises in the server.
+pub(crate) fn key(value: &Value) -> Result<Option<u64>, Reply> {
+    let text = match value {
         Value::Null => return Ok(None),
-        Value::Number(number) => number.as_i64(),
-        Value::String(text) => text.trim().parse::<i64>().ok(),
-        _ => None,
+        Value::Number(number) => match number.as_f64() {
+            Some(float) if number.is_f64() => format!("{:.0}", float.trunc()),
+            _ => number.to_string(),
+        },
+        Value::String(text) => text.trim().to_owned(),
+        _ => String::new(),
     };
-    number
-        .map(|number| u64::try_from(number).ok())
-        .ok_or_else(Reply::server_error)
+    let digits = text.strip_prefix(['-', '+']).unwrap_or(&text);
+    if digits.is_empty() || !digits.bytes().all(|byte| byte.is_ascii_digit()) {
+        return Err(Reply::server_error());
+    }
+    Ok(text.parse().ok())
 }
 
 /// The three ways a result is checked.
@@ -188,10 +193,12 @@ fn check_results(
     submission: &Submission,
     form: &Form,
     mode: Mode,
-) -> Result<(Vec<LeaderboardRow>, Vec<Value>), Reply> {
+) -> Result<(Vec<LeaderboardRow>, Vec<String>), Reply> {
     let mut rows = Vec::new();
     let mut shown = Vec::new();
+    let mut orders = orders(form).into_iter();
     for item in results(form)? {
+        let order = orders.next().unwrap_or_default();
         let Value::Object(item) = item else {
             return Err(Reply::server_error());
         };
@@ -222,7 +229,9 @@ fn check_results(
         }
         rows.push(row);
         if item.get("show_to_participant").is_some_and(python::truthy) {
-            shown.push(Value::Object(accuracies.cloned().unwrap_or_default()));
+            let sent = |name: &'_ String| accuracies.and_then(|all| all.get_key_value(name));
+            let sent = order.iter().filter_map(sent);
+            shown.push(python::repr_dict(sent.map(|(name, value)| (name.as_str(), value))));
         }
     }
     Ok((rows, shown))
@@ -231,7 +240,7 @@ fn check_results(
 /// The items of `result`: a list inside a string. What else Python can walk over without an error is empty.
 fn results(form: &Form) -> Result<Vec<Value>, Reply> {
     let invalid = |error: String| Reply::error(&errors::RESULT_INVALID, &[&error]);
-    let parsed = match form.fields.get("result") {
+    let parsed: Value = match form.fields.get("result") {
         None => python::loads("").map_err(invalid)?,
         Some(Value::String(text)) => python::loads(text).map_err(invalid)?,
         Some(other) => return Err(invalid(python::loads_type_error(other))),
@@ -242,6 +251,17 @@ fn results(form: &Form) -> Result<Vec<Value>, Reply> {
         Value::String(text) if text.is_empty() => Ok(Vec::new()),
         _ => Err(Reply::server_error()),
     }
+}
+
+/// The metrics of each item in the order they were sent.
+fn orders(form: &Form) -> Vec<Vec<String>> {
+    #[derive(Deserialize)]
+    struct Item {
+        accuracies: python::Keys,
+    }
+    let text = form.value("result").as_str().unwrap_or_default();
+    let items: Vec<Item> = python::loads(text).unwrap_or_default();
+    items.into_iter().map(|item| item.accuracies.0).collect()
 }
 
 fn split_of<'a>(state: &'a State, form: &Form, item: &Map<String, Value>) -> Result<&'a Split, Reply> {
@@ -308,7 +328,7 @@ fn malformed(accuracies: &Map<String, Value>) -> Result<(), Reply> {
 /// A host's correction of a leaderboard row: the labels must match exactly. Hands the new row back.
 pub fn correct_row(row: &LeaderboardRow, split: &Split, form: &Form) -> Result<LeaderboardRow, Reply> {
     let invalid = |error: String| Reply::error(&errors::ROW_INVALID, &[&error]);
-    let data = match form.value("leaderboard_data") {
+    let data: Value = match form.value("leaderboard_data") {
         Value::Null => return Err((&errors::ROW_BLANK).into()),
         Value::String(text) => python::loads(text).map_err(invalid)?,
         other => return Err(invalid(python::loads_type_error(other))),

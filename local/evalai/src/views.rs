@@ -1,6 +1,8 @@
 //! Rows as the API shows them. Pure; `base` is the scheme and host the client used, as the server builds file links.
 
 use jiff::Timestamp;
+use jiff::civil::DateTime;
+use jiff::tz::TimeZone;
 use serde_json::{Value, json};
 
 use crate::model::{Challenge, Phase, Split, Submission, User};
@@ -14,6 +16,39 @@ pub fn time(at: Timestamp) -> String {
         "%Y-%m-%dT%H:%M:%S.%6fZ"
     };
     at.strftime(format).to_string()
+}
+
+/// Why a text is no time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BadTime {
+    /// It does not look like one.
+    Shape,
+    /// It looks like one, and there is no such day or hour.
+    Value,
+}
+
+/// A time as Django reads it: `YYYY-MM-DDTHH:MM[:SS[.ffffff]]` with `Z`, an offset or, meaning UTC, nothing.
+pub fn parse_time(text: &str) -> Result<Timestamp, BadTime> {
+    let shape = text.len() >= 16
+        && text
+            .bytes()
+            .zip(*b"0000-00-00T00:00")
+            .all(|(byte, wanted)| match wanted {
+                b'0' => byte.is_ascii_digit(),
+                b'T' => matches!(byte, b'T' | b' '),
+                _ => byte == wanted,
+            });
+    if !shape {
+        return Err(BadTime::Shape);
+    }
+    if let Ok(at) = text.parse() {
+        return Ok(at);
+    }
+    let civil: Option<DateTime> = text.parse().ok();
+    let at = civil
+        .and_then(|civil| civil.to_zoned(TimeZone::UTC).ok())
+        .map(|zoned| zoned.timestamp());
+    at.ok_or(BadTime::Value)
 }
 
 /// A submission, as `viewer` may see it: only hosts see the environment's log.
@@ -93,24 +128,43 @@ pub fn is_fifo(queue: &str) -> bool {
         .is_some_and(|extension| extension == "fifo")
 }
 
-/// A phase.
-pub fn phase(challenge: &Challenge, row: &Phase) -> Value {
-    json!({
+/// A phase; hosts see more of it.
+pub fn phase(challenge: &Challenge, row: &Phase, host: bool) -> Value {
+    let title = challenge.title.split(' ').next().unwrap_or_default().to_lowercase();
+    let mut view = json!({
         "id": row.id,
         "name": row.name,
-        "codename": row.codename,
-        "slug": format!("{}-{}", row.codename.to_lowercase(), row.id),
-        "challenge": challenge.id,
-        "environment_image": null,
-        "is_active": row.is_active,
-        "is_public": row.is_public,
-        "is_submission_public": true,
-        "is_submission_paused": false,
-        "disable_logs": false,
+        "description": row.name,
         "leaderboard_public": true,
+        "start_date": "2020-01-01T00:00:00Z",
+        "end_date": "2099-12-31T23:59:59Z",
+        "challenge": challenge.id,
+        "max_submissions_per_day": 100_000,
+        "max_submissions_per_month": 100_000,
+        "max_submissions": 100_000,
+        "submission_artifact_retention_policy": "keep_forever",
+        "is_public": row.is_public,
+        "is_active": row.is_active,
+        "codename": row.codename,
+        "slug": format!("{title}-{}-{}", row.codename.replace(' ', "-").to_lowercase(), challenge.id),
         "max_concurrent_submissions_allowed": row.max_concurrent_submissions_allowed,
+        "is_restricted_to_select_one_submission": false,
+        "submission_meta_attributes": null,
         "is_partial_submission_evaluation_enabled": row.is_partial_submission_evaluation_enabled,
-    })
+        "allowed_submission_file_types": ".json, .zip, .txt, .tsv, .gz, .csv, .h5, .npy",
+        "default_submission_meta_attributes": null,
+        "allowed_email_ids": [],
+        "is_submission_public": true,
+        "disable_logs": false,
+        "is_submission_paused": false,
+    });
+    if host {
+        for name in ["environment_image", "test_annotation", "config_id"] {
+            view[name] = Value::Null;
+        }
+        view["annotations_uploaded_using_cli"] = json!(false);
+    }
+    view
 }
 
 /// A phase split. The codename of its dataset split is not in it.

@@ -5,29 +5,18 @@ mod support;
 use evalai_stand_in::errors;
 use reqwest::Method;
 use serde_json::{Value, json};
-use support::{HOST, IMAGE, Stand, TEAM_A, TEAM_B, UPDATE, put_body};
+use support::{HOST, IMAGE, PARTIAL, Stand, TEAM_A, TEAM_B, UPDATE, put_body};
 
 const SUBMIT: &str = "/api/jobs/challenge/1/challenge_phase/1/submission/";
 
-async fn upload(stand: &Stand, path: &str, content: &str) -> support::Got {
-    let body = format!(
-        "--b\r\nContent-Disposition: form-data; name=\"status\"\r\n\r\nsubmitting\r\n\
-         --b\r\nContent-Disposition: form-data; name=\"method_name\"\r\n\r\nmine\r\n\
-         --b\r\nContent-Disposition: form-data; name=\"input_file\"; filename=\"a.json\"\r\n\r\n{content}\r\n--b--\r\n"
-    );
-    let request = stand.request(Method::POST, path, TEAM_A);
-    Stand::send(
-        request
-            .header("content-type", "multipart/form-data; boundary=b")
-            .body(body),
-    )
-    .await
+fn file() -> String {
+    json!({ "submitted_image_uri": IMAGE }).to_string()
 }
 
 #[tokio::test]
 async fn a_push_sends_string_keys() {
     let stand = Stand::start().await;
-    let got = upload(&stand, SUBMIT, &json!({ "submitted_image_uri": IMAGE }).to_string()).await;
+    let got = stand.upload(SUBMIT, TEAM_A, &file()).await;
     assert_eq!(got.status, 201, "{}", got.text);
     let row = got.json();
     assert_eq!(
@@ -39,7 +28,8 @@ async fn a_push_sends_string_keys() {
         "submitted_image_uri": IMAGE, "submission_pk": 1,
     });
     assert_eq!(stand.sent(), [message]);
-    upload(&stand, SUBMIT, "{}")
+    stand
+        .upload(SUBMIT, TEAM_A, "{}")
         .await
         .is(&errors::SUBMIT_BAD_FILE, &["'submitted_image_uri'"]);
     stand
@@ -50,21 +40,24 @@ async fn a_push_sends_string_keys() {
         .post(SUBMIT, TEAM_A, &json!({"file_url": "http://x/y"}))
         .await
         .is(&errors::SUBMIT_BAD_URL, &[]);
-    let file = json!({"input_file": {"submitted_image_uri": IMAGE}});
-    stand.post(SUBMIT, HOST, &file).await.is(&errors::SUBMIT_NO_TEAM, &[]);
+    let json = json!({"input_file": {"submitted_image_uri": IMAGE}});
+    let got = stand.post(SUBMIT, TEAM_A, &json).await;
+    got.is(&errors::SUBMIT_NO_FILE, &[]);
+    let got = stand.upload(SUBMIT, HOST, &file()).await;
+    got.is(&errors::SUBMIT_NO_TEAM, &[]);
     stand
-        .post(&SUBMIT.replace("phase/1", "phase/9"), TEAM_A, &file)
+        .upload(&SUBMIT.replace("phase/1", "phase/9"), TEAM_A, &file())
         .await
         .is(&errors::SUBMIT_NO_PHASE, &[]);
     for _ in 0..2 {
-        assert_eq!(stand.post(SUBMIT, TEAM_A, &file).await.status, 201);
+        assert_eq!(stand.upload(SUBMIT, TEAM_A, &file()).await.status, 201);
     }
     stand
-        .post(SUBMIT, TEAM_A, &file)
+        .upload(SUBMIT, TEAM_A, &file())
         .await
         .is(&errors::SUBMIT_CONCURRENT, &["3"]);
     assert_eq!(
-        stand.post(SUBMIT, TEAM_B, &file).await.status,
+        stand.upload(SUBMIT, TEAM_B, &file()).await.status,
         201,
         "another team has its own three"
     );
@@ -227,8 +220,8 @@ async fn an_input_file_that_can_not_be_fetched_loses_the_message() {
 async fn a_dead_queue_leaves_the_submission_without_a_message() {
     let stand = Stand::start().await;
     stand.knobs(&json!({"queue_down": true})).await;
-    let file = json!({"input_file": {"submitted_image_uri": IMAGE}});
-    stand.post(SUBMIT, TEAM_A, &file).await.is(&errors::SERVER_ERROR, &[]);
+    let got = stand.upload(SUBMIT, TEAM_A, &file()).await;
+    got.is(&errors::SERVER_ERROR, &[]);
     assert_eq!(stand.submission(1).await["status"], "submitted");
     assert!(stand.sent().is_empty());
 }
@@ -313,4 +306,29 @@ async fn a_deleted_submission_keeps_its_status() {
         .get("/api/jobs/submission/2", HOST)
         .await
         .is(&errors::NO_SUCH_SUBMISSION, &["2"]);
+}
+
+#[tokio::test]
+async fn deleted_submissions_count_as_in_progress_and_stay_on_the_leaderboard() {
+    let stand = Stand::start().await;
+    for pk in 1..=3 {
+        assert_eq!(stand.upload(SUBMIT, TEAM_A, &file()).await.status, 201);
+        let path = format!("/api/jobs/submission/{pk}");
+        Stand::send(stand.request(Method::DELETE, &path, TEAM_A)).await.ok();
+    }
+    let refused = stand.upload(SUBMIT, TEAM_A, &file()).await;
+    refused.is(&errors::SUBMIT_CONCURRENT, &["3"]);
+
+    let partial = put_body(1, "partially_evaluated", 3.0);
+    stand.put(PARTIAL, &partial).await.ok();
+    let got = stand.upload(SUBMIT, TEAM_A, &file()).await;
+    assert_eq!(got.status, 201, "a partly evaluated one does not count: {}", got.text);
+    let refused = stand.upload(SUBMIT, TEAM_A, &file()).await;
+    refused.is(&errors::SUBMIT_CONCURRENT, &["3"]);
+
+    stand.put(UPDATE, &put_body(1, "finished", 3.0)).await.ok();
+    let board = stand.get("/api/jobs/challenge_phase_split/1/leaderboard/", "").await;
+    let board = board.ok().json();
+    assert_eq!(board["results"][0]["submission__id"], 1);
+    assert_eq!(stand.submission(1).await["ignore_submission"], true);
 }

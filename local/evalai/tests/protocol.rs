@@ -106,6 +106,7 @@ async fn paths_methods_and_bodies_are_exact() {
 #[tokio::test]
 async fn lists_filter_by_status_and_date() {
     let stand = Stand::start().await;
+    stand.knobs(&json!({"list_row_ms": 0})).await;
     let bulk = json!({"count": 500, "phase": 2, "team": 1, "age_seconds": 3_600});
     let got = stand.post("/_stand-in/bulk", "", &bulk).await;
     assert_eq!(got.json(), json!({"first": 1, "last": 500}));
@@ -358,4 +359,58 @@ async fn the_control_plane_logs_shows_and_resets() {
         let got = stand.post(path, "", &body).await;
         assert!(got.status >= 400 && got.text.contains(word), "{got:?}");
     }
+}
+
+#[tokio::test]
+async fn a_phase_has_the_servers_fields_and_more_of_them_for_hosts() {
+    let stand = Stand::start().await;
+    let path = "/api/challenges/challenge/1/challenge_phase/1";
+    let everybody = [
+        "id",
+        "name",
+        "description",
+        "leaderboard_public",
+        "start_date",
+        "end_date",
+        "challenge",
+        "max_submissions_per_day",
+        "max_submissions_per_month",
+        "max_submissions",
+        "submission_artifact_retention_policy",
+        "is_public",
+        "is_active",
+        "codename",
+        "slug",
+        "max_concurrent_submissions_allowed",
+        "is_restricted_to_select_one_submission",
+        "submission_meta_attributes",
+        "is_partial_submission_evaluation_enabled",
+        "allowed_submission_file_types",
+        "default_submission_meta_attributes",
+        "allowed_email_ids",
+        "is_submission_public",
+        "disable_logs",
+        "is_submission_paused",
+    ];
+    let hosts = [
+        "annotations_uploaded_using_cli",
+        "test_annotation",
+        "environment_image",
+        "config_id",
+    ];
+    let names = |row: &serde_json::Value| -> Vec<String> { row.as_object().unwrap().keys().cloned().collect() };
+    let sorted = |names: &[&str]| {
+        let mut names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
+        names.sort();
+        names
+    };
+    for auth in ["", TEAM_A] {
+        let row = stand.get(path, auth).await.ok().json();
+        assert_eq!(names(&row), sorted(&everybody), "{auth}");
+        assert_eq!(row["slug"], "carla-sensors-1");
+    }
+    let all = sorted(&[&everybody[..], &hosts[..]].concat());
+    assert_eq!(names(&stand.get(path, HOST).await.ok().json()), all);
+    let list = stand.get("/api/challenges/1/phases/", HOST).await.ok().json();
+    assert_eq!(names(&list[1]), all);
 }

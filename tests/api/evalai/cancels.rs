@@ -39,6 +39,7 @@ async fn measure(what: &str, list_delay_ms: u64, requests_per_minute: u32) {
     world.server.set_knobs(Knobs {
         put_delay_ms: u64::try_from(PUT.as_millis()).unwrap(),
         list_delay_ms,
+        list_row_ms: 0,
         ..Knobs::default()
     });
     let pks: Vec<i64> = (0..CANCELS).map(|_| world.submit()).collect();

@@ -4,21 +4,20 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use jiff::civil::DateTime;
-use jiff::tz::TimeZone;
 use serde_json::{Value, json};
 
 use super::Call;
 use crate::errors;
 use crate::leaderboards;
-use crate::model::{Status, TokenKind};
+use crate::model::Status;
 use crate::reply::{Answer, Reply};
-use crate::views;
+use crate::views::{self, BadTime};
 
-/// The submissions of a challenge, unpaginated. Read first, answered late: what the delay knob shows is stale.
+/// The submissions of a challenge, unpaginated and in no order. Read first, answered late, for each row costs queries of
+/// its own: a long list is stale.
 pub(super) async fn list(call: &Call, challenge: u64) -> Answer {
     let user = call.user()?;
-    let body = {
+    let rows: Vec<_> = {
         let state = call.app.state();
         let unknown = || Reply::error(&errors::CHALLENGE_NOT_FOUND, &[&challenge.to_string()]);
         state.challenge(challenge).ok_or_else(unknown)?;
@@ -34,22 +33,23 @@ pub(super) async fn list(call: &Call, challenge: u64) -> Answer {
             .asked("submitted_before")
             .map(|text| date("submitted_before", text))
             .transpose()?;
-        let rows = state.submissions.values().filter(|row| {
+        let rows = state.table().into_iter().filter(|row| {
             status.is_none_or(|status| row.status == status)
                 && after.is_none_or(|after| row.submitted_at > after)
                 && before.is_none_or(|before| row.submitted_at < before)
                 && state.challenge_of(row).is_some_and(|of| of.id == challenge)
         });
-        Value::Array(
-            rows.map(|row| views::submission(&state, row, user, &call.base))
-                .collect(),
-        )
+        rows.map(|row| views::submission(&state, row, user, &call.base))
+            .collect()
     };
-    let delay = Duration::from_millis(call.app.knobs().list_delay_ms);
-    if !delay.is_zero() {
-        tokio::time::sleep(delay).await;
+    let delay = {
+        let knobs = call.app.knobs();
+        knobs.list_delay_ms + knobs.list_row_ms * rows.len() as u64
+    };
+    if delay > 0 {
+        tokio::time::sleep(Duration::from_millis(delay)).await;
     }
-    Ok(Reply::ok(&body))
+    Ok(Reply::ok(&Value::Array(rows)))
 }
 
 fn listable(text: &str) -> Result<Status, Reply> {
@@ -57,42 +57,27 @@ fn listable(text: &str) -> Result<Status, Reply> {
     status.ok_or_else(|| Reply::error(&errors::LIST_STATUS, &[text]))
 }
 
-/// A date as Django reads it: `YYYY-MM-DDTHH:MM[:SS[.ffffff]]` with `Z`, an offset or, meaning UTC, nothing. What has
-/// the shape and is no date raises in the server.
+/// A bound of a list. What has the shape of a date and is none raises in the server.
 fn date(name: &str, text: &str) -> Result<Timestamp, Reply> {
-    let shape = text.len() >= 16
-        && text
-            .bytes()
-            .zip(*b"0000-00-00T00:00")
-            .all(|(byte, wanted)| match wanted {
-                b'0' => byte.is_ascii_digit(),
-                b'T' => matches!(byte, b'T' | b' '),
-                _ => byte == wanted,
-            });
-    if !shape {
-        return Err(Reply::error(&errors::LIST_DATE, &[name]));
-    }
-    if let Ok(at) = text.parse() {
-        return Ok(at);
-    }
-    let civil: Option<DateTime> = text.parse().ok();
-    let at = civil
-        .and_then(|civil| civil.to_zoned(TimeZone::UTC).ok())
-        .map(|zoned| zoned.timestamp());
-    at.ok_or_else(Reply::server_error)
+    views::parse_time(text).map_err(|error| match error {
+        BadTime::Shape => Reply::error(&errors::LIST_DATE, &[name]),
+        BadTime::Value => Reply::server_error(),
+    })
 }
 
 /// The user's refresh token, as the profile page shows it.
 pub(super) fn auth_token(call: &Call) -> Answer {
-    let token = call
-        .user()?
-        .tokens
-        .iter()
-        .find(|token| token.kind == TokenKind::Refresh && !token.expired);
-    let token = token.ok_or_else(Reply::server_error)?;
+    let state = call.app.state();
+    let token = state.refresh_token(call.user()?).ok_or_else(Reply::server_error)?;
     Ok(Reply::ok(
-        &json!({"token": token.value, "expires_at": "2099-12-31T23:59:59Z"}),
+        &json!({"token": token, "expires_at": "2099-12-31T23:59:59Z"}),
     ))
+}
+
+/// The profile page's button for a new token.
+pub(super) fn renew_token(call: &Call) -> Answer {
+    let token = call.app.state().renew_token(call.user()?);
+    Ok(Reply::ok(&json!({ "token": token })))
 }
 
 /// How many submissions of a phase have which status.
@@ -125,7 +110,7 @@ pub(super) fn leaderboard(call: &Call, split: u64) -> Answer {
         if !board.public && !insider {
             return Err((&errors::LEADERBOARD_PRIVATE).into());
         }
-        leaderboards::entries(&state, split, call.asked("order_by"))
+        leaderboards::entries(&state, split, call.asked("order_by"))?
     };
     call.page(entries)
 }
@@ -137,7 +122,8 @@ pub(super) fn phase(call: &Call, challenge: u64, phase: u64) -> Answer {
     let found = row.phases.iter().find(|row| row.id == phase);
     let values = [phase.to_string(), challenge.to_string()];
     let unknown = || Reply::error(&errors::NO_PHASE_OF_CHALLENGE, &[&values[0], &values[1]]);
-    Ok(Reply::ok(&views::phase(row, found.ok_or_else(unknown)?)))
+    let host = call.user.as_ref().is_some_and(|user| row.hosts.contains(&user.id));
+    Ok(Reply::ok(&views::phase(row, found.ok_or_else(unknown)?, host)))
 }
 
 /// All phases of a challenge.
@@ -148,7 +134,7 @@ pub(super) fn phases(call: &Call, challenge: u64) -> Answer {
     let state = call.app.state();
     let row = state.challenge(challenge).ok_or_else(unknown)?;
     Ok(Reply::ok(&Value::Array(
-        row.phases.iter().map(|phase| views::phase(row, phase)).collect(),
+        row.phases.iter().map(|phase| views::phase(row, phase, true)).collect(),
     )))
 }
 

@@ -20,6 +20,11 @@ pub(super) async fn update(call: &Call, challenge: u64, door: Door) -> Answer {
     }
     let form = call.form().await?;
     let put = call.method == "PUT";
+    if put {
+        let _turn = call.app.turn.lock().await;
+        let turn = call.app.knobs().put_turn_ms;
+        pause(turn).await;
+    }
     let write = {
         let state = call.app.state();
         if put {
@@ -30,13 +35,9 @@ pub(super) async fn update(call: &Call, challenge: u64, door: Door) -> Answer {
     };
     let delay = {
         let knobs = call.app.knobs();
-        Duration::from_millis(if put { knobs.put_delay_ms } else { knobs.patch_delay_ms })
+        if put { knobs.put_delay_ms } else { knobs.patch_delay_ms }
     };
-    if delay.is_zero() {
-        tokio::task::yield_now().await;
-    } else {
-        tokio::time::sleep(delay).await;
-    }
+    pause(delay).await;
     let progress = write.progress;
     let saved = update::commit(&mut call.app.state(), write, now());
     if progress {
@@ -47,16 +48,24 @@ pub(super) async fn update(call: &Call, challenge: u64, door: Door) -> Answer {
     ))
 }
 
+/// The server works for so long; what others ask meanwhile comes in between.
+async fn pause(millis: u64) {
+    if millis == 0 {
+        tokio::task::yield_now().await;
+    } else {
+        tokio::time::sleep(Duration::from_millis(millis)).await;
+    }
+}
+
 /// Starts the clock of a submission again. Nobody is refused.
 pub(super) fn started_at(call: &Call, pk: u64) -> Answer {
     let row = {
         let mut state = call.app.state();
-        let row = state
-            .submissions
-            .get_mut(&pk)
-            .ok_or_else(|| Reply::from(&errors::STARTED_AT_UNKNOWN))?;
+        let row = state.submissions.get(&pk).cloned();
+        let mut row = row.ok_or_else(|| Reply::from(&errors::STARTED_AT_UNKNOWN))?;
         row.started_at = Some(now());
-        row.clone()
+        state.save(row.clone());
+        row
     };
     call.submission(&row)
 }

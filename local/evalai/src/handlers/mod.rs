@@ -116,6 +116,7 @@ pub(crate) async fn answer(call: Call, endpoint: Endpoint) -> Answer {
         Endpoint::ChallengeOfQueue(queue) => queues::challenge(&call, &queue),
         Endpoint::List(challenge) => context::list(&call, challenge).await,
         Endpoint::AuthToken => context::auth_token(&call),
+        Endpoint::RenewToken => context::renew_token(&call),
         Endpoint::CountByStatus(phase) => context::count_by_status(&call, phase),
         Endpoint::Leaderboard(split) => context::leaderboard(&call, split),
         Endpoint::Phase(challenge, phase) => context::phase(&call, challenge, phase),

@@ -4,6 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::{Call, publish};
 use crate::body::Form;
+use crate::edit;
 use crate::errors;
 use crate::model::FileState;
 use crate::reply::{Answer, Reply};
@@ -16,7 +17,9 @@ pub(super) fn submission(call: &Call, pk: u64) -> Answer {
     let user = call.user()?;
     let row = {
         let mut state = call.app.state();
-        let unknown = || Reply::error(&errors::NO_SUCH_SUBMISSION, &[&pk.to_string()]);
+        // As the path has it: the database looks for a number of any length.
+        let asked = call.path.rsplit('/').next().unwrap_or_default();
+        let unknown = || Reply::error(&errors::NO_SUCH_SUBMISSION, &[asked]);
         let mut row = state.submissions.get(&pk).ok_or_else(unknown)?.clone();
         let host = state
             .challenge_of(&row)
@@ -51,7 +54,7 @@ pub(super) async fn submit(call: &Call, challenge: u64, phase: u64) -> Answer {
         };
         (new, challenge.is_docker_based)
     };
-    let Some(input) = input_of(&form) else {
+    let Some(input) = form.files.get("input_file").cloned() else {
         return submit_url(call, &form, new).await;
     };
     let image = if docker {
@@ -76,18 +79,6 @@ pub(super) async fn submit(call: &Call, challenge: u64, phase: u64) -> Answer {
         status: 201,
         ..call.submission(&row)?
     })
-}
-
-/// The uploaded file. A JSON body may hold it as an object or a text, for clients without a multipart form.
-fn input_of(form: &Form) -> Option<Vec<u8>> {
-    let inline = |value: &Value| match value {
-        Value::String(text) => text.clone().into_bytes(),
-        other => other.to_string().into_bytes(),
-    };
-    form.files
-        .get("input_file")
-        .cloned()
-        .or_else(|| form.fields.get("input_file").map(inline))
 }
 
 /// A push by URL. Only files this server serves can be fetched.
@@ -166,7 +157,7 @@ pub(super) async fn edit(call: &Call, challenge: u64, pk: u64) -> Answer {
             own.ok_or_else(|| Reply::error(&errors::NO_SUCH_SUBMISSION, &[&key]))?
         };
         let mut row = row.clone();
-        submissions::edit(&mut row, &form)?;
+        edit::edit(&mut state, &mut row, &form)?;
         state.save(row.clone());
         row
     };

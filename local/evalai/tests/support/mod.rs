@@ -123,6 +123,18 @@ impl Stand {
         self.call(Method::POST, path, auth, body).await
     }
 
+    /// What `evalai push` does: a form with a file.
+    pub(crate) async fn upload(&self, path: &str, auth: &str, content: &str) -> Got {
+        let body = format!(
+            "--b\r\nContent-Disposition: form-data; name=\"status\"\r\n\r\nsubmitting\r\n\
+             --b\r\nContent-Disposition: form-data; name=\"method_name\"\r\n\r\nmine\r\n\
+             --b\r\nContent-Disposition: form-data; name=\"input_file\"; filename=\"a.json\"\r\n\r\n{content}\r\n--b--\r\n"
+        );
+        let request = self.request(Method::POST, path, auth);
+        let request = request.header("content-type", "multipart/form-data; boundary=b");
+        Self::send(request.body(body)).await
+    }
+
     /// Submits for team a in phase 1 and hands the key back.
     pub(crate) async fn submit(&self) -> u64 {
         let body = json!({"team": "team-a", "phase": 1, "image": IMAGE});
