@@ -111,8 +111,8 @@ pub struct Knobs {
     pub list_row_ms: u64,
     /// How long a connection without a request is kept open, in milliseconds.
     pub keep_alive_ms: u64,
-    /// A request on a connection that has been idle for so many milliseconds meets its end: the connection is closed
-    /// without an answer, and nothing is done. Absent: none does.
+    /// A request on a connection that has been idle for so many milliseconds finds it closed: there is no answer, and
+    /// nothing is done. Absent: none does.
     pub close_reused_ms: Option<u64>,
     /// The queue does not answer.
     pub queue_down: bool,

@@ -11,7 +11,7 @@ use crate::state::State;
 use crate::views;
 
 /// The public entries of a split, best first, one a team: each as the API shows it. Missing metrics are `"#"`. The
-/// server reads the metric that ranks as a number and raises on a bool, whosever it is.
+/// server reads the metric that ranks as a number and raises on a bool, so one such row is a 500 for all readers.
 pub(crate) fn entries(state: &State, split: u64, order_by: Option<&str>) -> Result<Vec<Value>, Reply> {
     let Some((_, _, board)) = state.split(split) else {
         return Ok(Vec::new());

@@ -67,7 +67,7 @@ impl Config {
 /// Everything the requests share.
 pub(crate) struct App {
     pub(crate) queues: Arc<dyn Queues>,
-    /// The one whose results the server looks at.
+    /// Held by the PUT whose turn it is: the server looks at one after the other.
     pub(crate) turn: tokio::sync::Mutex<()>,
     state: Mutex<State>,
     knobs: Mutex<Knobs>,

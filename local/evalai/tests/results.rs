@@ -14,15 +14,22 @@ const LEADERBOARD: &str = "/api/jobs/challenge_phase_split/1/leaderboard/";
 #[tokio::test]
 async fn six_results_at_once_double_the_row_without_any_help() {
     let stand = Stand::start().await;
-    let pk = stand.submit().await;
-    let body = put_body(pk, "finished", 7.0);
-    let answers = join_all((0..6).map(|_| stand.put(UPDATE, &body))).await;
-    let mut statuses: Vec<_> = answers.iter().map(|got| got.status).collect();
-    statuses.sort_unstable();
-    let rows = stand.handle.state().rows.len();
-    // On an idle machine, as in the real server: 200 200 200 500 500 500, and two rows.
-    assert!(rows >= 2, "{rows} rows, {statuses:?}");
-    assert_eq!((statuses[1], statuses[5]), (200, 500), "{statuses:?}");
+    let mut seen = Vec::new();
+    // On an idle machine the first six are answered as in the real server: 200 200 200 500 500 500, with two rows.
+    let pk = loop {
+        let pk = stand.submit().await;
+        let body = put_body(pk, "finished", 7.0);
+        let answers = join_all((0..6).map(|_| stand.put(UPDATE, &body))).await;
+        let mut statuses: Vec<_> = answers.iter().map(|got| got.status).collect();
+        statuses.sort_unstable();
+        let rows = stand.handle.state().rows.into_values();
+        let rows = rows.filter(|row| row.submission == pk).count();
+        if rows >= 2 && statuses[1] == 200 && statuses[5] == 500 {
+            break pk;
+        }
+        seen.push((rows, statuses));
+        assert!(seen.len() < 5, "{seen:?}");
+    };
     let late = stand.put(UPDATE, &put_body(pk, "finished", 8.0)).await;
     late.is(&errors::SERVER_ERROR, &[]);
 }
