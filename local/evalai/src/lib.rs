@@ -4,8 +4,8 @@
 //! does is what EvalAI's own server was seen to do, including what is wrong with it (no state machine, duplicate
 //! leaderboard rows after concurrent results, whole rows saved late).
 //!
-//! The pure part ([`state`], [`update`], [`submissions`], [`edit`], [`views`], [`python`], [`throttle`], [`routes`]) knows no
-//! network and no clock; [`server`] and `handlers` put HTTP around it.
+//! The pure part ([`state`], [`update`], [`submissions`], [`edit`], [`views`], [`python`], [`throttle`], [`routes`])
+//! knows no network and no clock; [`server`] and `handlers` put HTTP around it.
 
 pub mod body;
 pub mod control;

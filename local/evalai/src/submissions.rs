@@ -1,5 +1,5 @@
-//! What people do: submit, cancel and edit, delete, re-run, resume; and the messages that follow. Called by the handlers
-//! and the control plane under the lock. Pure.
+//! What people do: submit, re-run, resume; and the messages that follow. Called by the handlers and the control plane
+//! under the lock. Pure.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
