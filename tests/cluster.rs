@@ -37,6 +37,7 @@ mod cluster {
     mod failures;
     mod losses;
     mod matrix;
+    mod matrix_evalai;
     mod matrix_outages;
     mod matrix_runs;
     mod matrix_stops;

@@ -1,4 +1,5 @@
-//! The matrix: the operator can't reach its API server, and the run goes on without it.
+//! The matrix: the operator can't reach its API server, and the run goes on without it; or its environment names another AWS
+//! than its Leaderboards do.
 
 use std::time::Duration;
 
@@ -7,8 +8,9 @@ use leaderboard_operator::api::Submission;
 use serde_json::json;
 
 use super::matrix::Case;
+use crate::evalai::Evalai;
 use crate::gate::Gate;
-use crate::operator::controller_through;
+use crate::operator::{both_with, controller_through};
 use crate::scene::{Scene, done, scenario};
 
 const LIMIT: Duration = Duration::from_mins(4);
@@ -39,6 +41,33 @@ async fn an_api_server_out_of_reach_costs_nothing() {
 
         case.ends(scene, "alone", LIMIT).await;
         case.also(&format!("{} Job", scene.jobs().await.len()));
+        case.close();
+    })
+    .await;
+}
+
+/// Bucket, table and queue of a Leaderboard that names their endpoints are there, whatever the operator's environment says.
+#[tokio::test]
+async fn the_endpoints_of_a_leaderboard_win_over_the_environment() {
+    scenario("matrix-endpoints", async |scene: &Scene| {
+        let mut case = Case::open(
+            "AWS_ENDPOINT_URL names another AWS than the Leaderboard",
+            "Finished; row FINISHED; 0 messages left",
+        );
+        let evalai = Evalai::start(scene).await;
+        let elsewhere = Gate::open("127.0.0.1", &scene.cloud.endpoint).await;
+        elsewhere.shut();
+        scene.evalai_leaderboard("lb", &evalai, json!({"pairs": 1, "routes": 2})).await;
+        let _operator = both_with(scene, "AWS_ENDPOINT_URL", &elsewhere.url);
+        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        let name = format!("submission-{pk}");
+        let exists = |found: Option<&Submission>| found.is_some();
+        scene.wait(&name, "its message was read", LIMIT, exists).await;
+        case.ends(scene, &name, LIMIT).await;
+        let row = scene.cloud.row(&scene.cloud.table).await;
+        case.also(&format!("row {}", row["submission_status"]));
+        let [waiting, received] = scene.cloud.messages().await;
+        case.also(&format!("{} messages left", waiting + received));
         case.close();
     })
     .await;

@@ -18,8 +18,14 @@ use super::scene::Scene;
 pub const HOST_TOKEN: &str = "local-host-token";
 /// Another host's, with a throttle of its own.
 const PERSON: &str = "local-organizer-token";
+/// Alice of team a, whose submissions the tests push.
+pub const PARTICIPANT: &str = "local-team-a-token";
 /// Id of the first phase that [`Evalai::start_wide`] adds.
 pub const FIRST_PHASE: u64 = 101;
+/// A connection without a request for so long is idle.
+const IDLE_MS: u64 = 100;
+/// After this time, and a sweep, nobody waits for a message any more.
+const LOST_AFTER: Duration = Duration::from_secs(140);
 /// Requests a minute that EvalAI lets a token make.
 pub const REQUESTS_PER_MINUTE: usize = 60;
 
@@ -39,6 +45,10 @@ impl Evalai {
 
     /// Starts one with so many phases more in challenge 1, from [`FIRST_PHASE`] on, that serves everybody at once.
     pub async fn start_wide(scene: &Scene, phases: u64) -> Self {
+        Self::serve(scene, Self::wide_seed(phases), 0).await
+    }
+
+    fn wide_seed(phases: u64) -> Seed {
         let mut seed = Seed::built_in().unwrap();
         let model = seed.challenges[0].phases[0].clone();
         for id in FIRST_PHASE..FIRST_PHASE + phases {
@@ -50,6 +60,13 @@ impl Evalai {
             phase.splits[0].leaderboard = id;
             seed.challenges[0].phases.push(phase);
         }
+        seed
+    }
+
+    /// Starts one as [`Evalai::start_wide`] does, with one phase more, whose submissions have keys from `first` on.
+    pub async fn start_from(scene: &Scene, first: u64) -> Self {
+        let mut seed = Self::wide_seed(1);
+        seed.first_submission = first;
         Self::serve(scene, seed, 0).await
     }
 
@@ -77,6 +94,14 @@ impl Evalai {
         });
     }
 
+    /// A connection that was idle is closed in the very moment in which it is used again.
+    pub fn close_idle_connections(&self) {
+        self.handle.set_knobs(Knobs {
+            close_reused_ms: Some(IDLE_MS),
+            ..Knobs::default()
+        });
+    }
+
     /// The next requests to save final results fail so.
     pub fn fail_finals(&self, answer: Failure, times: u32) {
         self.handle.set_knobs(Knobs {
@@ -92,8 +117,12 @@ impl Evalai {
     }
 
     async fn call(&self, method: reqwest::Method, path: &str, body: &Value) -> Value {
+        self.call_as(PERSON, method, path, body).await
+    }
+
+    async fn call_as(&self, token: &str, method: reqwest::Method, path: &str, body: &Value) -> Value {
         let request = self.http.request(method, format!("{}{path}", self.url));
-        let answer = request.bearer_auth(PERSON).json(body).send().await.unwrap();
+        let answer = request.bearer_auth(token).json(body).send().await.unwrap();
         let (status, text) = (answer.status(), answer.text().await.unwrap());
         assert!(status.is_success(), "{path}: {status} {text}");
         serde_json::from_str(&text).unwrap()
@@ -116,6 +145,30 @@ impl Evalai {
         let path = format!("/api/jobs/challenges/1/submissions/{pk}/update_submission_meta/");
         self.call(reqwest::Method::PATCH, &path, &json!({"status": status.as_str()}))
             .await;
+    }
+
+    /// Deletes a submission as its participant does. No message is sent.
+    pub async fn delete(&self, pk: u64) {
+        let path = format!("/api/jobs/submission/{pk}");
+        self.call_as(PARTICIPANT, reqwest::Method::DELETE, &path, &Value::Null).await;
+    }
+
+    /// Writes fields of a submission's row as somebody may.
+    pub async fn edit_as(&self, token: &str, pk: u64, fields: &Value) {
+        let path = format!("/api/jobs/challenges/1/submissions/{pk}/update_submission_meta/");
+        self.call_as(token, reqwest::Method::PATCH, &path, fields).await;
+    }
+
+    /// Waits until the operator has listed new submissions, so long after now that one without a message counts as lost.
+    pub async fn await_swept(&self, limit: Duration) {
+        let lost = jiff::Timestamp::now() + LOST_AFTER;
+        let listed = self.handle.wait_until(|_, log| {
+            let mut lists = log.entries().filter(|entry| entry.path.contains("submission/?status="));
+            lists.any(|entry| entry.time > lost && entry.answered.is_some())
+        });
+        if timeout(limit, listed).await.is_err() {
+            panic!("no list of new submissions is asked for within {} s", limit.as_secs());
+        }
     }
 
     /// Resumes as the web page does.

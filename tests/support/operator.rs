@@ -2,8 +2,9 @@
 //! that it can be killed, stopped and started again without anybody else's notice.
 
 use std::convert::Infallible;
+use std::ffi::OsStr;
 use std::fs::{self, File};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
@@ -32,7 +33,16 @@ pub struct Process {
 
 /// Starts `leaderboard-operator controller`.
 pub fn controller(scene: &Scene) -> Process {
-    Process::start(scene, "controller", &controller_arguments(scene), None)
+    Process::start(scene, "controller", &controller_arguments(scene), &[])
+}
+
+/// Starts controller and bridge with a variable in their environment.
+pub fn both_with(scene: &Scene, name: &str, value: &str) -> [Process; 2] {
+    let variables = [(name, OsStr::new(value))];
+    [
+        Process::start(scene, "controller", &controller_arguments(scene), &variables),
+        Process::start(scene, "bridge", &[], &variables),
+    ]
 }
 
 /// Starts one that reaches the API server through a gate. It ends by itself when the gate is shut for long.
@@ -42,7 +52,8 @@ pub fn controller_through(scene: &Scene, gate: &Gate) -> Process {
     config["clusters"][0]["cluster"]["server"] = gate.url.replacen("http:", "https:", 1).into();
     let path = scene.logs.join("kubeconfig");
     fs::write(&path, config.to_string()).unwrap();
-    Process::start(scene, "controller", &controller_arguments(scene), Some(&path))
+    let variables = [("KUBECONFIG", path.as_os_str())];
+    Process::start(scene, "controller", &controller_arguments(scene), &variables)
 }
 
 fn controller_arguments(scene: &Scene) -> [&str; 6] {
@@ -52,7 +63,7 @@ fn controller_arguments(scene: &Scene) -> [&str; 6] {
 
 /// Starts `leaderboard-operator bridge`.
 pub fn bridge(scene: &Scene) -> Process {
-    Process::start(scene, "bridge", &[], None)
+    Process::start(scene, "bridge", &[], &[])
 }
 
 /// Keeps a program running: starts it again whenever it has ended by itself, as the kubelet would. It never returns; the
@@ -70,7 +81,7 @@ pub async fn kept(scene: &Scene, start: impl Fn(&Scene) -> Process) -> Infallibl
 }
 
 impl Process {
-    fn start(scene: &Scene, program: &str, arguments: &[&str], kubeconfig: Option<&Path>) -> Self {
+    fn start(scene: &Scene, program: &str, arguments: &[&str], variables: &[(&str, &OsStr)]) -> Self {
         static NUMBER: AtomicU32 = AtomicU32::new(1);
         let name = format!("{program}-{}", NUMBER.fetch_add(1, Ordering::Relaxed));
         let log = File::create(scene.logs.join(format!("{name}.log"))).unwrap();
@@ -89,13 +100,11 @@ impl Process {
                 "RUST_LOG",
                 std::env::var("LEADERBOARD_TEST_LOG").as_deref().unwrap_or(LOG),
             )
+            .envs(variables.iter().copied())
             .stdin(Stdio::null())
             .stdout(log.try_clone().unwrap())
             .stderr(log)
             .kill_on_drop(true);
-        if let Some(path) = kubeconfig {
-            command.env("KUBECONFIG", path);
-        }
         let child = command
             .spawn()
             .unwrap_or_else(|error| panic!("{program} does not start: {error}"));
