@@ -94,7 +94,8 @@ pub struct View {
     pub progress: Option<Progress>,
     /// EvalAI has ended this attempt, by somebody else's hand.
     pub ended: Option<Status>,
-    /// A write of ours was under way when EvalAI ended it, and may have undone that there.
+    /// EvalAI may yet say otherwise: a write of ours was under way when it was ended there and may have undone that, or it was
+    /// deleted, which ends nothing there.
     pub overtaken: bool,
     /// What became of the wish for an end.
     pub end: Option<Ended>,
@@ -126,7 +127,8 @@ pub enum Ended {
     Agreed(Status),
     /// EvalAI has ended the run itself: the outcome becomes Cancelled, nothing was written.
     Otherwise(Status),
-    /// EvalAI refuses it. It is tried again from time to time, and at once with other texts.
+    /// EvalAI refuses it, or would file it wrongly. It is tried again from time to time, and at once with other texts; a cancel
+    /// that such a try finds makes it `Otherwise`.
     Refused(String),
 }
 

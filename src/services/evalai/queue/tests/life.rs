@@ -8,9 +8,10 @@ fn a_whole_life() {
     bench.running(7);
     assert_eq!(bench.view(7).progress, Some(Progress::Running));
     bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.write("partial 7");
+    bench.read_and_write(7, "partial");
     bench.wish(7, 1, Wish::Partial(results(41.0)));
     bench.expect_nothing();
+    bench.wait(3.0);
     bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
     bench.get(7, row(7, Status::PartiallyEvaluated));
     bench.write("finished 7");
@@ -55,8 +56,24 @@ fn progress_names_the_job_once() {
     let ticket = bench.write("queued 7");
     assert!(matches!(&ticket.request, Request::Progress(_, _, Some(job)) if job == "submission-7-1"));
     bench.wish(7, 1, Wish::Running);
+    let named = Row {
+        jobs: vec!["submission-7-1".into()],
+        ..row(7, Status::Queued)
+    };
+    bench.get(7, named);
     let ticket = bench.write("running 7");
     assert!(matches!(&ticket.request, Request::Progress(_, _, None)));
+}
+
+#[test]
+fn queued_is_left_out_where_running_is_wanted_already() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Queued);
+    let read = bench.expect("submission 7");
+    bench.wish(7, 1, Wish::Running);
+    bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Submitted))));
+    bench.write("running 7");
+    bench.expect_nothing();
 }
 
 #[test]
@@ -73,6 +90,7 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
     for status in [
         Status::Cancelled,
         Status::Archived,
+        Status::Deleted,
         Status::Ignored,
         Status::Finished,
         Status::Failed,
@@ -116,6 +134,7 @@ fn results_that_cannot_be_right_are_not_sent() {
         ..Payload::default()
     });
     bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
+    bench.get(7, row(7, Status::Running));
     assert!(matches!(bench.view(7).end, Some(Ended::Refused(_))));
     bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
     bench.expect_nothing();
