@@ -14,7 +14,7 @@ use super::status::Status;
 pub struct Row {
     /// Its id.
     pub id: i64,
-    /// Where it stands; [`Status::Ignored`] if it was deleted.
+    /// Where it stands; [`Status::Deleted`] or [`Status::Ignored`] if it was deleted.
     pub status: Status,
     /// Id of its phase.
     pub phase: Option<i64>,
@@ -90,10 +90,10 @@ impl<'de> Deserialize<'de> for Row {
         let jobs = raw.job_name.as_array().into_iter().flatten();
         Ok(Self {
             id: raw.id,
-            status: if ignored {
-                Status::Ignored
-            } else {
-                Status::parse(&raw.status)
+            status: match Status::parse(&raw.status) {
+                status if ignored && status.is_live() => Status::Deleted,
+                _ if ignored => Status::Ignored,
+                status => status,
             },
             phase: raw.challenge_phase.as_i64(),
             team_id: raw.participant_team.as_i64(),
@@ -190,10 +190,18 @@ mod tests {
     }
 
     #[test]
-    fn a_deleted_submission_keeps_its_status_and_is_ignored() {
-        let row: Row =
-            serde_json::from_value(json!({"id": 7, "status": "running", "ignore_submission": true})).unwrap();
-        assert_eq!(row.status, Status::Ignored);
+    fn a_deleted_submission_is_told_by_whether_it_had_come_to_its_end() {
+        for (status, deleted) in [
+            ("submitted", Status::Deleted),
+            ("running", Status::Deleted),
+            ("partially_evaluated", Status::Deleted),
+            ("finished", Status::Ignored),
+            ("cancelled", Status::Ignored),
+            ("evaluating", Status::Ignored),
+        ] {
+            let row = json!({"id": 7, "status": status, "ignore_submission": true});
+            assert_eq!(serde_json::from_value::<Row>(row).unwrap().status, deleted, "{status}");
+        }
     }
 
     #[test]

@@ -39,7 +39,7 @@ fn priorities() {
     bench.write("failed 3");
     bench.wait(0.5);
     bench.expect_nothing();
-    bench.wait(1.4);
+    bench.wait(1.9);
     let ticket = bench.expect("submission 2");
     bench.answer(&ticket, Reply::Row(Answer::Done(row(2, Status::Running))));
     bench.write("cancelled 2");
@@ -199,6 +199,7 @@ fn lists_keep_their_period_however_slow_they_are() {
     }
     // A server that needs longer than that is never asked twice at the same time, and is given a rest.
     let ticket = bench.expect("list of cancelled");
+    bench.get(7, row(7, Status::Running));
     bench.wait(25.0);
     bench.expect_nothing();
     bench.answer(&ticket, Reply::Rows(Answer::Done(vec![])));
