@@ -170,7 +170,7 @@ fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &
         ResultsFormat::V2 => leaderboard_results::Format::V2,
     };
     let target = Target {
-        api_server: evalai.api_server.clone(),
+        api_server: evalai.server(),
         challenge: evalai.challenge,
         split: evalai.split.clone(),
         token: Arc::clone(token),
