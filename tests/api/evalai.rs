@@ -495,6 +495,36 @@ async fn a_lost_message_is_found_for_the_server_that_has_it() {
 }
 
 #[tokio::test]
+async fn a_token_whose_user_is_no_host_is_told_and_one_submission_condemns_none() {
+    let mut world = World::new().await;
+    let good = world.target.clone();
+    world.target = target(&world.server.url(), "local-team-a-token");
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    let why = loop {
+        if let Some(why) = world.hub.token_refused(&leaderboard()) {
+            break why;
+        }
+        world.changed.recv().await.unwrap();
+    };
+    assert!(
+        why.contains("no host of this challenge") && why.contains("evalai.token"),
+        "{why}"
+    );
+    // A submission that the host of another challenge may not read.
+    world.target = target(&world.server.url(), "local-stranger-token");
+    let pk = world.submit();
+    world.ask(pk, false);
+    let view = world.until(pk, |view| view.last_error.is_some()).await;
+    let error = view.last_error.unwrap();
+    assert!(error.contains("no host of its challenge"), "{error}");
+    world.hub.serve(&leaderboard(), &good).unwrap();
+    while world.hub.labels(&leaderboard()).0.is_none() {
+        world.changed.recv().await.unwrap();
+    }
+    assert_eq!(world.hub.token_refused(&leaderboard()), None);
+}
+
+#[tokio::test]
 async fn a_refused_token_is_told_and_a_new_one_taken() {
     let mut world = World::new().await;
     let good = world.target.clone();

@@ -147,9 +147,13 @@ impl Client {
                 challenge,
                 purpose,
                 after,
-            } => Reply::Rows(self.get(token, &list(*challenge, purpose.status(), *after)).await),
+            } => {
+                let path = list(*challenge, purpose.status(), *after);
+                Reply::Rows(self.get(token, &path).await.of_hosts())
+            }
             Request::Phases(challenge) => {
-                Reply::Phases(self.get(token, &format!("challenges/{challenge}/phases/")).await)
+                let path = format!("challenges/{challenge}/phases/");
+                Reply::Phases(self.get(token, &path).await.of_hosts())
             }
             Request::Splits(challenge) => {
                 let path = format!("challenges/{challenge}/challenge_phase_split");

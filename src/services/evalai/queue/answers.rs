@@ -168,7 +168,7 @@ impl Queue {
                 sub.view.end = Some(Ended::Refused(refusal.message.clone()));
                 sub.write_failed(refusal.message, retry, now);
             }
-            (About::Request, _) => {
+            (About::Request | About::Challenge, _) => {
                 drop_partial(sub, request);
                 sub.write_failed(refusal.message, pause(sub.write_failures), now);
             }

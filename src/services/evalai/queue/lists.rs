@@ -173,6 +173,7 @@ impl Queue {
             }
             Answer::Throttled(_) => look.poll.busy = false,
             other => {
+                look.is_forbidden = matches!(&other, Answer::Refused(refusal) if refusal.about == About::Challenge);
                 look.error = other.error();
                 look.restart();
                 look.poll.failed(now.at, RETRY_LOOK);
