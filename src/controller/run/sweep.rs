@@ -33,11 +33,23 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
         phase: row.phase,
         submission: row.submission,
         image: None,
-        source: Source::Sweep,
+        source: Source::Sweep {
+            is_resuming: row.is_resuming,
+        },
         sent_ms: row.time.as_millisecond(),
     };
     let (server, submission, leaderboard) = (&row.server, row.submission, board.name_any());
     match ingest::apply(&api, &leaderboard, &incoming).await {
+        Ok(Outcome::Repeat) => tracing::debug!(server, submission, namespace, leaderboard, "it is known"),
+        Ok(Outcome::Refused) => {
+            tracing::warn!(
+                server,
+                submission,
+                namespace,
+                leaderboard,
+                "EvalAI's row asks for another attempt, and no message has announced it: none begins"
+            );
+        }
         Ok(Outcome::IdTaken(owner)) => {
             tracing::warn!(server, submission, namespace, leaderboard, owner, "the name is taken");
         }
