@@ -274,6 +274,7 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
                     (None, _) => Standing::Wanted,
                 },
                 status: ended.unwrap_or(row.status).as_str().to_owned(),
+                phase: row.phase,
                 team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
                 team_name: row.team_name.clone(),
                 submitted_at: row.submitted_at,
@@ -287,6 +288,7 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
             .as_ref()
             .filter(|_| present)
             .map(|end| map_end(end, seen.read_at)),
+        team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }

@@ -181,6 +181,8 @@ pub struct EvalaiView {
     pub overtaken: bool,
     /// What became of the final result of this attempt.
     pub end: Option<EvalaiEnd>,
+    /// Team of its row, as last read.
+    pub team_id: Option<String>,
     /// Why the last request failed.
     pub error: Option<String>,
 }
@@ -190,6 +192,8 @@ pub struct EvalaiView {
 pub struct EvalaiInfo {
     pub standing: Standing,
     pub status: String,
+    /// Phase of its row; none where EvalAI does not say.
+    pub phase: Option<i64>,
     pub team_id: String,
     pub team_name: Option<String>,
     pub submitted_at: Option<Timestamp>,

@@ -463,6 +463,68 @@ async fn a_lost_message_is_found_by_the_sweep() {
 }
 
 #[tokio::test]
+async fn a_lost_message_is_found_for_the_server_that_has_it() {
+    let mut world = World::new().await;
+    let (config, _) = Config::in_memory().unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let other = evalai_stand_in::serve(Config { throttle: 0, ..config }, vec![listener]);
+    // The ids of challenge, phase and submission are the same in both.
+    let at = Timestamp::now() - SignedDuration::from_secs(300);
+    let lost = world.submit_with(FileState::Stored, at);
+    let own = std::mem::replace(&mut world.server, other);
+    assert_eq!(world.submit_with(FileState::Stored, at), lost);
+    let second = Key {
+        name: "staging".into(),
+        ..leaderboard()
+    };
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    world
+        .hub
+        .serve(&second, &target(&world.server.url(), "local-host-token"))
+        .unwrap();
+    let mut servers = Vec::new();
+    for _ in 0..2 {
+        let found = world.sweep.recv().await.unwrap();
+        assert_eq!((found.challenge, found.phase, found.submission), (1, 1, lost));
+        servers.push(found.server);
+    }
+    servers.sort();
+    let mut wanted = [own.url(), world.server.url()];
+    wanted.sort();
+    assert_eq!(servers, wanted);
+}
+
+#[tokio::test]
+async fn a_token_whose_user_is_no_host_is_told_and_one_submission_condemns_none() {
+    let mut world = World::new().await;
+    let good = world.target.clone();
+    world.target = target(&world.server.url(), "local-team-a-token");
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    let why = loop {
+        if let Some(why) = world.hub.token_refused(&leaderboard()) {
+            break why;
+        }
+        world.changed.recv().await.unwrap();
+    };
+    assert!(
+        why.contains("no host of this challenge") && why.contains("evalai.token"),
+        "{why}"
+    );
+    // A submission that the host of another challenge may not read.
+    world.target = target(&world.server.url(), "local-stranger-token");
+    let pk = world.submit();
+    world.ask(pk, false);
+    let view = world.until(pk, |view| view.last_error.is_some()).await;
+    let error = view.last_error.unwrap();
+    assert!(error.contains("no host of its challenge"), "{error}");
+    world.hub.serve(&leaderboard(), &good).unwrap();
+    while world.hub.labels(&leaderboard()).0.is_none() {
+        world.changed.recv().await.unwrap();
+    }
+    assert_eq!(world.hub.token_refused(&leaderboard()), None);
+}
+
+#[tokio::test]
 async fn a_refused_token_is_told_and_a_new_one_taken() {
     let mut world = World::new().await;
     let good = world.target.clone();

@@ -10,7 +10,7 @@ use kube::ResourceExt;
 use super::reach::Unreachable;
 use crate::api::conditions::{self, Truth};
 use crate::api::leaderboard::Counts;
-use crate::api::{Leaderboard, LeaderboardStatus, effective, names, reasons};
+use crate::api::{Evalai, Leaderboard, LeaderboardStatus, effective, names, reasons};
 
 /// What one pass saw of a Leaderboard.
 #[derive(Clone, Debug)]
@@ -164,7 +164,7 @@ fn phase_conflict(view: &LeaderboardView) -> Option<String> {
     let mine = &view.leaderboard;
     let server = server(mine)?;
     let phases: Vec<i64> = mine.spec.tracks.iter().filter_map(|t| t.phase).collect();
-    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && age(l) < age(mine));
+    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && is_older(l, mine));
     others
         .filter(|l| {
             l.spec
@@ -185,7 +185,7 @@ fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
             l.spec.storage.endpoint.clone(),
         )
     };
-    let others = others(view).filter(|l| place(l) == place(mine) && age(l) < age(mine));
+    let others = others(view).filter(|l| place(l) == place(mine) && is_older(l, mine));
     let foreign = |l: &&Arc<Leaderboard>| matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
     others.filter(|l| foreign(l)).map(|l| qualified(l)).next()
 }
@@ -197,18 +197,11 @@ fn others(view: &LeaderboardView) -> impl Iterator<Item = &Arc<Leaderboard>> {
 }
 
 fn server(leaderboard: &Leaderboard) -> Option<String> {
-    leaderboard
-        .spec
-        .evalai
-        .as_ref()
-        .map(|e| e.api_server.trim_end_matches('/').to_owned())
+    leaderboard.spec.evalai.as_ref().map(Evalai::server)
 }
 
-fn age(leaderboard: &Leaderboard) -> (Option<Timestamp>, String) {
-    (
-        leaderboard.metadata.creation_timestamp.as_ref().map(|t| t.0),
-        leaderboard.name_any(),
-    )
+fn is_older(one: &Leaderboard, other: &Leaderboard) -> bool {
+    one.seniority() < other.seniority()
 }
 
 fn qualified(leaderboard: &Leaderboard) -> String {

@@ -6,6 +6,7 @@
 mod counts;
 mod marks;
 mod passes;
+mod sweep;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,7 +18,7 @@ use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
-use kube::{Api, Client, ResourceExt};
+use kube::{Client, ResourceExt};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
@@ -29,7 +30,6 @@ use super::sync::Sync;
 use super::watches::preflight::{Need, await_kinds, watch_access};
 use super::watches::{Touch, Touches, Watch, Watchable, guarded, spawn_watch};
 use crate::api::{GROUP, Leaderboard, Submission};
-use crate::bridge::ingest::{self, Incoming, Source};
 use crate::observability::Observability;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
@@ -387,12 +387,10 @@ fn hub(
             });
         }
     });
-    tokio::spawn(sweep_into_cluster(
-        client.clone(),
-        leaderboards.clone(),
-        rows,
-        seen.clone(),
-    ));
+    let (client, leaderboards, stop) = (client.clone(), leaderboards.clone(), seen.stop.clone());
+    tokio::spawn(async move {
+        tokio::select! { () = stop.wait() => {}, () = sweep::into_cluster(client, leaderboards, rows) => {} }
+    });
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
@@ -404,52 +402,6 @@ fn hub(
         timeouts: Timeouts::default(),
         meter: counts::meter(seen),
     })
-}
-
-/// Submissions whose message was lost go the same way as those of messages.
-async fn sweep_into_cluster(
-    client: Client,
-    leaderboards: Store<Leaderboard>,
-    mut rows: mpsc::UnboundedReceiver<SweepRow>,
-    seen: Observability,
-) {
-    loop {
-        let row = tokio::select! {
-            () = seen.stop.wait() => return,
-            row = rows.recv() => match row { Some(row) => row, None => return },
-        };
-        let all = leaderboards.state();
-        let Some(board) = serving(&all, &row) else { continue };
-        let api: Api<Submission> = Api::namespaced(client.clone(), &board.namespace().unwrap_or_default());
-        let incoming = Incoming {
-            challenge: row.challenge,
-            phase: row.phase,
-            submission: row.submission,
-            image: None,
-            source: Source::Sweep,
-            sent_ms: row.time.as_millisecond(),
-        };
-        match ingest::apply(&api, &board.name_any(), &incoming).await {
-            Ok(outcome) => tracing::info!(
-                submission = row.submission,
-                ?outcome,
-                "EvalAI waits for a submission whose message was lost"
-            ),
-            Err(error) => tracing::warn!(submission = row.submission, "{error}"),
-        }
-    }
-}
-
-/// The oldest Leaderboard that serves a row's phase.
-fn serving<'a>(all: &'a [Arc<Leaderboard>], row: &SweepRow) -> Option<&'a Arc<Leaderboard>> {
-    let serves = |l: &&Arc<Leaderboard>| {
-        l.spec.evalai.as_ref().is_some_and(|e| e.challenge == row.challenge)
-            && l.spec.tracks.iter().any(|t| t.phase == Some(row.phase))
-            && l.metadata.deletion_timestamp.is_none()
-    };
-    all.iter()
-        .filter(serves)
-        .min_by_key(|l| (l.metadata.creation_timestamp.as_ref().map(|t| t.0), l.name_any()))
 }
 
 #[cfg(test)]

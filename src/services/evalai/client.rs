@@ -90,6 +90,9 @@ impl Client {
                 .connect_timeout(timeouts.connect)
                 .user_agent(concat!("leaderboard-operator/", env!("CARGO_PKG_VERSION")))
                 .retry(reqwest::retry::never())
+                // A server closes idle connections when it likes. A write that is sent on one in that moment has no answer, and
+                // may have been served: nothing is written for over a minute. At some 54 requests a minute nothing is kept open.
+                .pool_max_idle_per_host(0)
         };
         let made = |builder: reqwest::ClientBuilder| builder.build().map_err(|e| ClientError(chain(&e)));
         Ok(Self {
@@ -144,9 +147,13 @@ impl Client {
                 challenge,
                 purpose,
                 after,
-            } => Reply::Rows(self.get(token, &list(*challenge, purpose.status(), *after)).await),
+            } => {
+                let path = list(*challenge, purpose.status(), *after);
+                Reply::Rows(self.get(token, &path).await.of_hosts())
+            }
             Request::Phases(challenge) => {
-                Reply::Phases(self.get(token, &format!("challenges/{challenge}/phases/")).await)
+                let path = format!("challenges/{challenge}/phases/");
+                Reply::Phases(self.get(token, &path).await.of_hosts())
             }
             Request::Splits(challenge) => {
                 let path = format!("challenges/{challenge}/challenge_phase_split");
@@ -295,3 +302,7 @@ fn put<'a>(subject: &Subject, status: &'a str, results: bool, payload: &'a Paylo
         environment_log: Some(&payload.environment_log),
     }
 }
+
+#[cfg(test)]
+#[path = "client_tests.rs"]
+mod tests;

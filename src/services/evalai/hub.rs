@@ -181,9 +181,12 @@ impl Hub {
         })
     }
 
-    /// What EvalAI says of a Leaderboard's token, while it refuses it.
+    /// What EvalAI says of a Leaderboard's token, while it refuses it, at all or for the challenge.
     pub fn token_refused(&self, leaderboard: &Key) -> Option<String> {
-        self.place(leaderboard)?.queue().token_refused().map(str::to_owned)
+        let shared = self.place(leaderboard)?;
+        let queue = shared.queue();
+        let refused = queue.token_refused().or_else(|| queue.challenge_refused(leaderboard));
+        refused.map(str::to_owned)
     }
 
     /// Takes nothing new and waits for what is on its way, at most 70 s. True if every write is answered, so that the next

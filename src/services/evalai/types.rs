@@ -144,9 +144,13 @@ pub enum Changed {
 /// A submission that asks to be run and that nobody here knows: its message may be lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SweepRow {
+    /// Root of the server that has the row, as in [`Target::api_server`]: ids are unique within a server only.
+    pub server: String,
     pub challenge: i64,
     pub phase: i64,
     pub submission: i64,
+    /// EvalAI says `resuming`, not `submitted`.
+    pub is_resuming: bool,
     /// When it asked to be run: its re-run or resume, else its submission.
     pub time: Timestamp,
 }

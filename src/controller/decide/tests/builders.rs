@@ -69,6 +69,7 @@ pub fn info() -> EvalaiInfo {
     EvalaiInfo {
         standing: Standing::Wanted,
         status: "submitted".into(),
+        phase: Some(7),
         team_id: "42".into(),
         team_name: Some("Team".into()),
         submitted_at: Some(at(-60)),

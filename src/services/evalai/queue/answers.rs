@@ -164,7 +164,7 @@ impl Queue {
             (About::Token, _) => {}
             (About::Missing, _) => sub.outdated = true,
             (About::Request, Request::Final(..)) => sub.refuse_end(refusal.message, now),
-            (About::Request, _) => {
+            (About::Request | About::Challenge, _) => {
                 drop_partial(sub, request);
                 sub.write_failed(refusal.message, pause(sub.write_failures), now);
             }

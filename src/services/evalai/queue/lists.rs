@@ -11,6 +11,7 @@ use super::{Now, Queue};
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
 use crate::services::evalai::row::{Row, Split};
+use crate::services::evalai::status::Status;
 use crate::services::evalai::types::{Changed, SweepRow};
 
 /// What the sweep has found is not handed out again for so long.
@@ -112,11 +113,17 @@ impl Queue {
         if age < lost || time < since || said || self.pks.contains_key(&row.id) {
             return;
         }
+        // All that this queue serves is of one server.
+        let Some(target) = self.served.values().find(|target| target.challenge == id) else {
+            return;
+        };
         challenge.swept.insert(row.id, (time, now.at));
         self.sweep.push(SweepRow {
+            server: target.api_server.clone(),
             challenge: id,
             phase,
             submission: row.id,
+            is_resuming: row.status == Status::Resuming,
             time,
         });
     }
@@ -139,6 +146,7 @@ impl Queue {
             }
             Answer::Throttled(_) => look.poll.busy = false,
             other => {
+                look.is_forbidden = matches!(&other, Answer::Refused(refusal) if refusal.about == About::Challenge);
                 look.error = other.error();
                 look.restart();
                 look.poll.failed(now.at, RETRY_LOOK);

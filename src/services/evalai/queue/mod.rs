@@ -313,6 +313,13 @@ impl Queue {
         self.token_refused.as_ref().map(|(why, _)| why.as_str())
     }
 
+    /// What EvalAI last said of the token's rights on the challenge of a Leaderboard, if it has none.
+    pub fn challenge_refused(&self, leaderboard: &Key) -> Option<&str> {
+        let target = self.served.get(leaderboard)?;
+        let look = &self.challenges.get(&target.challenge)?.look;
+        look.error.as_deref().filter(|_| look.is_forbidden)
+    }
+
     /// Objects to wake.
     pub fn take_changes(&mut self) -> BTreeSet<Changed> {
         std::mem::take(&mut self.changes)

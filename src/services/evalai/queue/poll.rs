@@ -101,6 +101,8 @@ pub(super) struct Look {
     pub catalog: Option<Catalog>,
     /// Why there is no newer one.
     pub error: Option<String>,
+    /// It is that the token's user is no host of the challenge.
+    pub is_forbidden: bool,
 }
 
 impl Look {
@@ -133,7 +135,7 @@ impl Look {
             return;
         };
         let codenames = std::mem::take(&mut self.codenames);
-        self.error = None;
+        (self.error, self.is_forbidden) = (None, false);
         self.catalog = Some(Catalog {
             at,
             phases,

@@ -256,3 +256,37 @@ fn a_refused_token_is_told_and_asked_again_after_a_minute_or_its_renewal() {
     bench.get(7, row(7, Status::Submitted));
     assert_eq!(bench.queue.token_refused(), None);
 }
+
+#[test]
+fn a_user_who_is_no_host_is_told_for_that_challenge_and_stops_no_other() {
+    let mut bench = Bench::new();
+    bench.serve();
+    let no_host = || Answer::Refused(refusal(About::Challenge, 401));
+    let mut phases = 0;
+    while let Some((_, ticket)) = bench.next() {
+        match ticket.request {
+            Request::Phases(_) => {
+                phases += 1;
+                bench.answer(&ticket, Reply::Phases(no_host()));
+            }
+            _ => bench.answer(&ticket, Reply::Rows(Answer::Refused(refusal(About::Challenge, 400)))),
+        }
+    }
+    assert_eq!(phases, 1);
+    assert_eq!(bench.queue.challenge_refused(&key(100)), Some("EvalAI answered 401"));
+    assert_eq!(
+        (bench.queue.token_refused(), bench.queue.challenge_refused(&key(101))),
+        (None, None)
+    );
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Submitted));
+    bench.wait(60.0);
+    while let Some((_, ticket)) = bench.next() {
+        match ticket.request {
+            Request::Phases(_) => bench.answer(&ticket, Reply::Phases(Answer::Done(vec![]))),
+            Request::Splits(_) => bench.answer(&ticket, Reply::Splits(Answer::Done(vec![]))),
+            _ => bench.answer(&ticket, Reply::Rows(Answer::Done(vec![]))),
+        }
+    }
+    assert_eq!(bench.queue.challenge_refused(&key(100)), None);
+}

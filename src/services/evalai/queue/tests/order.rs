@@ -102,6 +102,7 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         ..row(pk, Status::Submitted)
     };
     let resumed = Row {
+        status: Status::Resuming,
         resumed_at: Some(wall(-200)),
         ..at(5, -1_000_000)
     };
@@ -117,9 +118,13 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         .queue
         .take_sweep()
         .into_iter()
-        .map(|row| (row.submission, row.time))
+        .map(|row| (row.server, row.submission, row.is_resuming, row.time))
         .collect();
-    assert_eq!(swept, [(1, wall(-1000)), (5, wall(-200))]);
+    let server = target().api_server;
+    assert_eq!(
+        swept,
+        [(server.clone(), 1, false, wall(-1000)), (server, 5, true, wall(-200))]
+    );
     let mut again = 0;
     for _ in 0..11 {
         bench.wait(60.0);
