@@ -52,7 +52,7 @@ impl TextError {
     }
 }
 
-/// The payload of a partial or final result.
+/// The payload of a final result.
 pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
     let text = |key| stored(context, view, report, key);
     let (stdout, metadata) = futures::future::try_join(text(STDOUT_KEY), text(METADATA_KEY)).await?;
@@ -61,6 +61,19 @@ pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> 
         metadata,
         ..without_texts(view, report)
     })
+}
+
+/// The payload of a partial result: with the metrics over the routes so far, where `results` has zeros until the end.
+pub(super) async fn partial_payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
+    let payload = payload(context, view, report).await?;
+    Ok(Payload {
+        result: partial_results(report).to_owned(),
+        ..payload
+    })
+}
+
+fn partial_results(report: &Report) -> &str {
+    report.partial_results.as_ref().unwrap_or(&report.results)
 }
 
 /// The numbers alone.
@@ -184,6 +197,7 @@ fn columns(results: &str, format: ResultsFormat) -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use serde_json::json;
 
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
@@ -221,6 +235,18 @@ mod tests {
                 "{container}"
             );
         }
+    }
+
+    #[test]
+    fn a_partial_result_has_the_metrics_so_far_where_a_report_has_them() {
+        let report = json!({
+            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "pairs": [],
+            "final": false, "eligible": false, "entryStatus": "Started", "results": "zeros", "partialResults": "so far",
+        });
+        let mut report: Report = serde_json::from_value(report).unwrap();
+        assert_eq!(partial_results(&report), "so far");
+        report.partial_results = None;
+        assert_eq!(partial_results(&report), "zeros", "of an older operator's Pod");
     }
 
     #[test]

@@ -174,7 +174,7 @@ struct Way {
 
 async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
-    let read = result_texts::payload(context, view, report).await;
+    let read = result_texts::partial_payload(context, view, report).await;
     let attempt = view.submission.spec.attempt;
     // What takes too long or is not there is left out: the next route has a result of its own.
     if !matches!(read, Err(TextError::Unread(BucketError::Refused(_)))) {

@@ -326,6 +326,7 @@ pub fn report(done: u32) -> Report {
         why: None,
         warnings: Vec::new(),
         results: "[]".into(),
+        partial_results: None,
         files: std::collections::BTreeMap::new(),
     }
 }
