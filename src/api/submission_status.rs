@@ -242,12 +242,16 @@ pub enum FailureClass {
 
 /// What went wrong.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
 pub struct Failure {
     pub class: FailureClass,
     /// One of `api::reasons`.
     pub reason: String,
-    /// A sentence with the next step.
+    /// A sentence with the next step, for the challenge's hosts.
     pub message: String,
+    /// What the participant reads of it in EvalAI; absent where that is `message`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub participant_message: Option<String>,
     /// Whether it should cost the participant an attempt.
     pub charged: bool,
     /// The pair that it happened in, from 1; absent if it concerns the whole run.

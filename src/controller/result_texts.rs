@@ -90,7 +90,7 @@ pub(super) fn phase(view: &View) -> i64 {
     view.submission.spec.evalai.map_or(0, |e| e.phase)
 }
 
-/// What the participant reads of a failure: class, sentence and next step, in our words only.
+/// What the participant reads of a failure: class, sentence and a next step that a participant can do, in our words only.
 pub(super) fn stderr(status: &SubmissionStatus) -> String {
     let Some(failure) = &status.failure else {
         return String::new();
@@ -99,7 +99,8 @@ pub(super) fn stderr(status: &SubmissionStatus) -> String {
         FailureClass::Participant => "participant",
         FailureClass::Infrastructure => "infrastructure, not charged",
     };
-    format!("{} ({class}): {}", failure.reason, failure.message)
+    let text = failure.participant_message.as_ref().unwrap_or(&failure.message);
+    format!("{} ({class}): {text}", failure.reason)
 }
 
 /// Who may read the log of a failure.
@@ -114,9 +115,9 @@ pub(super) fn log_readers(view: &View) -> LogTail {
 pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTail) {
     let Some(tail) = tail else { return };
     if readers == LogTail::Participants && tail.is_agents() {
-        payload.stderr = format!("{}\n\n{}", payload.stderr, tail.text);
+        payload.stderr = format!("{}\n\n{}", payload.stderr, tail.for_participants());
     }
-    payload.environment_log = tail.text;
+    payload.environment_log = tail.for_hosts();
 }
 
 async fn stored(context: &Context, view: &View, report: &Report, key: &'static str) -> Result<String, TextError> {
@@ -214,6 +215,8 @@ mod tests {
         let shown = |container: &str, readers| {
             let tail = Tail {
                 container: container.into(),
+                attempt: 1,
+                key: Some("agent/agent1/leaderboard.log".into()),
                 text: "route 7".into(),
             };
             let mut payload = Payload {
@@ -221,14 +224,23 @@ mod tests {
                 ..Payload::default()
             };
             add_log(&mut payload, Some(tail), readers);
-            assert_eq!(payload.environment_log, "route 7");
+            assert!(
+                payload
+                    .environment_log
+                    .ends_with("in agent/agent1/leaderboard.log.\nroute 7")
+            );
+            assert!(
+                !payload.stderr.contains("leaderboard.log"),
+                "no file that only hosts can read"
+            );
             assert!(!payload.stdout.contains("route") && !payload.metadata.contains("route"));
             payload.stderr
         };
         for container in ["agent-1", "simulator-1", "contents"] {
             assert!(!shown(container, LogTail::Hosts).contains("route"), "{container}");
         }
-        assert!(shown("agent-1", LogTail::Participants).ends_with("it crashed.\n\nroute 7"));
+        let told = "it crashed.\n\nThe end of agent-1's log in attempt 1:\nroute 7";
+        assert!(shown("agent-1", LogTail::Participants).ends_with(told));
         for container in ["simulator-1", "contents", "workspace", "logcopy"] {
             assert!(
                 !shown(container, LogTail::Participants).contains("route"),

@@ -287,6 +287,10 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
             "{fetched}"
         );
         assert_eq!(fetched.contains("4711"), is_open, "{leaderboard}: {fetched}");
+        assert!(
+            !fetched.contains("leaderboard.log"),
+            "only hosts can read it: {fetched}"
+        );
         assert_eq!(own["stdout_file"].as_str().map(|_| ()), Some(()));
 
         let (row, all) = world.fetched(pk, HOST).await;

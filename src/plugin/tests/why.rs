@@ -56,8 +56,8 @@ submission-42 is Failed since 2026-11-01 11:57:00 UTC (3 min ago).
 
 Track:       sensors of Leaderboard carla-20; submission 42 of phase 7 in EvalAI
 Reason:      AgentCrashed: An agent crashed as often as retries.pair allows.
-Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results, mend it
-             and submit again.
+Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the
+             participant fixes the agent and submits again.
 Failure:     AgentCrashed, the participant's, charged, in pair 2.
 Attempt:     1.
 Routes:      12/20 done, driving score ~41.20 so far.
@@ -72,7 +72,8 @@ Log:         the agent's of pair 2: the end of agent/agent2/leaderboard.log. For
              it may show the routes:
              aws s3 cp s3://results/v2/42/evalai/environment_log.txt -
 
-Next:        Look at agent/agent2/leaderboard.log of the results, mend the agent, submit again."
+Next:        Look at agent/agent2/leaderboard.log of the results; the participant fixes the agent
+             and submits again."
     );
 }
 
