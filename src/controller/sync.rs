@@ -15,7 +15,7 @@ use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
 use crate::api::{Leaderboard, Submission, SubmissionStatus, conditions, names};
 use crate::services::ObjectKey;
-use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
+use crate::services::evalai::{self, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
 
 /// How long an end waits to be told for a result that cannot be read: as long as the end itself.
@@ -257,6 +257,11 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
     let present = seen.attempt == attempt;
     let ended = seen.ended.filter(|_| present);
     let answered = seen.answered >= attempt;
+    let (image, image_problem) = match seen.image.clone() {
+        Some(ImageAnswer::Named(image)) => (Some(image), None),
+        Some(ImageAnswer::NotAnImage(why)) => (None, Some(why)),
+        Some(ImageAnswer::Unread(_)) | None => (None, None),
+    };
     EvalaiView {
         info: seen
             .row
@@ -272,7 +277,8 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
                 team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
                 team_name: row.team_name.clone(),
                 submitted_at: row.submitted_at,
-                image: seen.image.as_ref().and_then(|i| i.as_ref().ok().cloned()),
+                image,
+                image_problem,
             }),
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,

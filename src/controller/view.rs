@@ -194,6 +194,8 @@ pub struct EvalaiInfo {
     pub team_name: Option<String>,
     pub submitted_at: Option<Timestamp>,
     pub image: Option<String>,
+    /// Why the uploaded file names no image, which no later read changes; none while it has not been read.
+    pub image_problem: Option<String>,
 }
 
 /// What EvalAI's status means for a run of this attempt.

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -53,6 +53,8 @@ struct Inner {
     options: Options,
     /// All queues count time from here, so that a moment means the same in each.
     start: Instant,
+    /// `not_before` on the clock of people.
+    writes_from: Timestamp,
     outlets: Outlets,
     closing: watch::Sender<bool>,
     state: Mutex<State>,
@@ -82,12 +84,20 @@ impl Hub {
             sweep: options.sweep.clone(),
         };
         Self(Arc::new(Inner {
+            writes_from: wall(options.not_before),
             options,
             start: Instant::now(),
             outlets,
             closing: watch::Sender::new(false),
             state: Mutex::default(),
         }))
+    }
+
+    /// From when on EvalAI is written to, while it is not yet: the process before has not confirmed its last requests. Then
+    /// every Leaderboard that is served and every submission with something to write is woken.
+    pub fn writes_from(&self) -> Option<Timestamp> {
+        let inner = &self.0;
+        (Instant::now() < inner.options.not_before).then_some(inner.writes_from)
     }
 
     /// A Leaderboard serves its challenge: it is swept, checked, and its token is renewed by calling this again.
@@ -290,4 +300,11 @@ impl Hub {
             task: Some(task),
         })
     }
+}
+
+/// A moment on the clock of people, if it is still to come.
+fn wall(at: Instant) -> Timestamp {
+    let now = Timestamp::now();
+    let wait = SignedDuration::try_from(at.saturating_duration_since(Instant::now())).unwrap_or_default();
+    now.checked_add(wait).unwrap_or(now)
 }

@@ -86,8 +86,8 @@ pub struct View {
     pub read_at: Option<Timestamp>,
     /// The newest attempt whose `ask` the row answers; 0 is none.
     pub answered: i64,
-    /// The image of the uploaded file, if it was asked for; or why there is none.
-    pub image: Option<Result<String, String>>,
+    /// What the uploaded file says of the image; none before it was asked for and answered.
+    pub image: Option<ImageAnswer>,
     /// The attempt that all below speaks of.
     pub attempt: i64,
     /// How far EvalAI knows this attempt to be.
@@ -104,6 +104,17 @@ pub struct View {
     pub last_error: Option<String>,
     /// Nothing is written until then, because a write was not answered.
     pub unanswered_until: Option<Timestamp>,
+}
+
+/// What the uploaded file says of the image.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ImageAnswer {
+    /// It names this one.
+    Named(String),
+    /// It was read and names none that could be pulled, and why: no later read changes that.
+    NotAnImage(String),
+    /// It could not be read yet, and why. It is tried again.
+    Unread(String),
 }
 
 /// What became of a wish for an end.

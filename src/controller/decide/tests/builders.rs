@@ -73,6 +73,7 @@ pub fn info() -> EvalaiInfo {
         team_name: Some("Team".into()),
         submitted_at: Some(at(-60)),
         image: Some("ecr/agent:9".into()),
+        image_problem: None,
     }
 }
 

@@ -15,7 +15,7 @@ use crate::services::evalai::payload::digest;
 use crate::services::evalai::request::{Reply, Request, Subject};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::Status;
-use crate::services::evalai::types::{Changed, Ended};
+use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
 
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);
@@ -109,19 +109,20 @@ impl Queue {
         }
     }
 
-    fn took_image(&mut self, subject: &Subject, answer: Answer<String>, now: &Now) {
+    fn took_image(&mut self, subject: &Subject, answer: Answer<ImageAnswer>, now: &Now) {
         self.lanes.entry(subject.pk).or_default().busy = None;
         self.change(subject, |sub| {
-            let error = answer.error();
-            sub.view.image = match answer {
-                Answer::Done(image) => Some(Ok(image)),
+            sub.view.image = Some(match answer {
+                Answer::Done(image) => {
+                    sub.view.last_error = None;
+                    image
+                }
                 other => {
                     let why = other.error().unwrap_or_default();
                     sub.read_failed(why.clone(), now);
-                    Some(Err(why))
+                    ImageAnswer::Unread(why)
                 }
-            };
-            sub.view.last_error = error;
+            });
         });
     }
 

@@ -76,6 +76,7 @@ struct Offer {
 impl Queue {
     /// The next request, and marks it as sent. `may_write` is the fence: false keeps every write back.
     pub fn next(&mut self, now: Now, may_write: bool) -> Next {
+        self.open_writes(&now);
         let (due, later): (Vec<_>, Vec<_>) = self
             .offers(&now, may_write)
             .into_iter()
@@ -96,7 +97,8 @@ impl Queue {
                 .iter()
                 .map(|offer| offer.ready)
                 .chain(not_yet.iter().map(|(at, _)| *at));
-            return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).min());
+            let opens = (!self.open).then_some(self.not_before);
+            return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).chain(opens).min());
         };
         match self.start(&best.what, &now) {
             Some(request) => {
@@ -201,10 +203,7 @@ impl Queue {
             let alone = asked.listed || !by_list;
             return alone.then_some((Priority::Acceptance, asked.since, false, Step::Get));
         }
-        if sub.image
-            && !matches!(sub.view.image, Some(Ok(_)))
-            && sub.view.row.as_ref().is_some_and(|row| row.input_file.is_some())
-        {
+        if sub.wants_image() {
             return Some((Priority::Free, now.at, false, Step::Image));
         }
         let read_at = sub.read.map_or(Duration::ZERO, |read| read.requested);

@@ -128,6 +128,8 @@ pub struct Queue {
     budget: Budget,
     /// No write before.
     not_before: Duration,
+    /// That moment has come, and everything that waited for it knows.
+    open: bool,
     subs: BTreeMap<Key, Sub>,
     pks: BTreeMap<i64, BTreeSet<Key>>,
     lanes: BTreeMap<i64, Lane>,
@@ -146,6 +148,7 @@ impl Queue {
             timing,
             budget: Budget::new(requests_per_minute, now.at),
             not_before,
+            open: not_before <= now.at,
             subs: BTreeMap::new(),
             pks: BTreeMap::new(),
             lanes: BTreeMap::new(),
@@ -203,6 +206,18 @@ impl Queue {
     /// Whether a write was not answered and the server may still be working on it.
     pub fn is_unsure(&self, now: Now) -> bool {
         self.lanes.values().any(|lane| lane.hold_until > now.at)
+    }
+
+    /// Wakes what waited for the first write, once, when it may be sent.
+    fn open_writes(&mut self, now: &Now) {
+        if self.open || now.at < self.not_before {
+            return;
+        }
+        self.open = true;
+        let waiting = self.subs.iter().filter(|(_, sub)| sub.wants_write());
+        let waiting = waiting.map(|(key, _)| Changed::Submission(key.clone()));
+        let boards = self.served.keys().cloned().map(Changed::Leaderboard);
+        self.changes.extend(waiting.chain(boards));
     }
 
     /// Wants to know whether an attempt may run, and its image where the object has none. This and the two below say
@@ -348,7 +363,7 @@ impl Queue {
 
 fn wish_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
     let further = sub.view.progress >= Some(wanted) || sub.progress.as_ref().is_some_and(|p| p.what >= wanted);
-    if further || has_end(sub) {
+    if further || sub.has_end() {
         return false;
     }
     sub.progress = Some(Wanted {
@@ -361,7 +376,7 @@ fn wish_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
 
 fn wish_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
     let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == payload);
-    if has_end(sub) || pending || sub.partial_sent == Some(digest(&payload)) {
+    if sub.has_end() || pending || sub.partial_sent == Some(digest(&payload)) {
         return false;
     }
     if let Err(why) = check(&payload, &target.split, &target.labels) {
@@ -397,8 +412,4 @@ fn wish_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Paylo
         sub.refuse_end(why);
     }
     true
-}
-
-fn has_end(sub: &Sub) -> bool {
-    sub.end.is_some() || sub.view.end.is_some() || sub.is_over()
 }

@@ -13,7 +13,7 @@ use crate::services::evalai::guard::{self, End, Start, Verdict};
 use crate::services::evalai::payload::digest;
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
-use crate::services::evalai::types::{Ended, Payload, Run, View};
+use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, View};
 
 /// Wait before an unknown word of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
@@ -127,12 +127,18 @@ impl Sub {
                 row: old.row,
                 read_at: old.read_at,
                 answered: old.answered,
-                image: old.image,
+                // A file that named no image is read once more for each attempt.
+                image: old.image.filter(|image| matches!(image, ImageAnswer::Named(_))),
                 unanswered_until: old.unanswered_until,
                 ..fresh.view.clone()
             },
             ..fresh
         };
+    }
+
+    /// Whether this attempt has come to its end, published or not.
+    pub fn has_end(&self) -> bool {
+        self.end.is_some() || self.view.end.is_some() || self.is_over()
     }
 
     /// Whether nothing more is to be said of this attempt.
@@ -143,6 +149,18 @@ impl Sub {
                 .end
                 .as_ref()
                 .is_some_and(|end| !matches!(end, Ended::Refused(_)))
+    }
+
+    /// Whether EvalAI is to be told something.
+    pub fn wants_write(&self) -> bool {
+        self.end.is_some() || self.progress.is_some() || self.partial.is_some()
+    }
+
+    /// Whether the uploaded file is to be read: until it was read, and for nothing that has come to its end.
+    pub fn wants_image(&self) -> bool {
+        let unread = matches!(self.view.image, None | Some(ImageAnswer::Unread(_)));
+        let has_file = self.view.row.as_ref().is_some_and(|row| row.input_file.is_some());
+        self.image && unread && has_file && !self.has_end()
     }
 
     /// When it was submitted, EvalAI's own word first.

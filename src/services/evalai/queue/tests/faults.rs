@@ -136,6 +136,35 @@ fn without_the_lease_and_after_a_takeover_only_reads_are_sent() {
 }
 
 #[test]
+fn what_waits_for_the_first_write_is_woken_once_when_it_may_be_sent() {
+    let mut bench = Bench::with_writes_after(75);
+    bench.serve();
+    while let Some((_, ticket)) = bench.next() {
+        match ticket.request {
+            Request::Phases(_) => bench.answer(&ticket, Reply::Phases(Answer::Done(vec![]))),
+            Request::Splits(_) => bench.answer(&ticket, Reply::Splits(Answer::Done(vec![]))),
+            _ => bench.answer(&ticket, Reply::Rows(Answer::Done(vec![]))),
+        }
+    }
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Submitted));
+    bench.wish(8, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.queue.take_changes();
+    let now = bench.now();
+    let Next::Wait(Some(until)) = bench.queue.next(now, true) else {
+        panic!("a write is sent before its time")
+    };
+    assert!(until <= Duration::from_secs(75), "{until:?}");
+    assert_eq!(bench.queue.take_changes(), [].into());
+    bench.wait(15.0);
+    bench.expect("submission 8");
+    let woken = [Changed::Submission(key(8)), Changed::Leaderboard(key(100))];
+    assert_eq!(bench.queue.take_changes(), woken.into());
+    bench.next();
+    assert_eq!(bench.queue.take_changes(), [].into(), "once");
+}
+
+#[test]
 fn a_refused_token_is_told_and_asked_again_after_a_minute_or_its_renewal() {
     let mut bench = Bench::new();
     bench.serve();

@@ -189,12 +189,56 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
     let used = bench.queue.budget_used(now);
     let ticket = bench.expect("image 7");
     bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
-    assert!(matches!(bench.view(7).image, Some(Err(_))));
+    assert!(matches!(bench.view(7).image, Some(ImageAnswer::Unread(_))));
     bench.wait(5.0);
     let ticket = bench.expect("image 7");
-    bench.answer(&ticket, Reply::Image(Answer::Done("registry.example/a:1".into())));
-    assert_eq!(bench.view(7).image, Some(Ok("registry.example/a:1".into())));
+    let named = ImageAnswer::Named("registry.example/a:1".into());
+    bench.answer(&ticket, Reply::Image(Answer::Done(named.clone())));
+    assert_eq!(bench.view(7).image, Some(named));
     assert_eq!(bench.queue.budget_used(now), used);
     bench.wait(100.0);
     bench.expect_nothing();
+}
+
+/// A submission whose image is asked for, up to the download of its file.
+fn image_wanted(bench: &mut Bench, attempt: i64) -> Ticket {
+    let now = bench.now();
+    bench.queue.ask(&target(), &key(7), 7, &run(7, attempt), true, now);
+    let found = Row {
+        input_file: Some("http://files/x.json".into()),
+        ..row(7, Status::Resuming)
+    };
+    bench.get(7, found);
+    bench.expect("image 7")
+}
+
+#[test]
+fn a_file_that_was_read_and_names_no_image_is_not_read_again_in_that_attempt() {
+    let mut bench = Bench::new();
+    let ticket = image_wanted(&mut bench, 1);
+    let problem = ImageAnswer::NotAnImage("the uploaded file is no JSON".into());
+    bench.answer(&ticket, Reply::Image(Answer::Done(problem.clone())));
+    assert_eq!(
+        (bench.view(7).image, bench.view(7).last_error),
+        (Some(problem), None),
+        "it is an answer, not a failed request"
+    );
+    for _ in 0..20 {
+        bench.wait(60.0);
+        bench.expect_nothing();
+    }
+    image_wanted(&mut bench, 2);
+}
+
+#[test]
+fn the_file_of_a_submission_that_is_over_is_not_fetched() {
+    let mut bench = Bench::new();
+    let ticket = image_wanted(&mut bench, 1);
+    bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
+    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(0.0)));
+    bench.get(7, row(7, Status::Cancelled));
+    for _ in 0..20 {
+        bench.wait(60.0);
+        bench.expect_nothing();
+    }
 }

@@ -13,6 +13,7 @@ use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
 use crate::services::evalai::status::Status;
+use crate::services::evalai::types::ImageAnswer;
 use crate::services::token::Token;
 
 /// A queue whose time is ours.
