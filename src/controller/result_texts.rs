@@ -140,7 +140,8 @@ async fn stored(context: &Context, view: &View, report: &Report, key: &'static s
     String::from_utf8(bytes).map_err(|_| unfit("is not text"))
 }
 
-/// The row of a submission as it stands, with the metrics of a report; none before it has a team.
+/// The row of a submission as it stands; none before it has a team. Only a finished one has metrics, those of its report, as in
+/// the original's table: of every other the columns are absent, whatever an earlier operator has written there.
 pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<Row> {
     let team = status.team.as_ref()?;
     let plan = status.plan.as_ref()?;
@@ -161,8 +162,13 @@ pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<
         end_time: text(status.times.finished.as_ref()),
         results: status.results.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
-        metrics: report.map(|r| columns(&r.results, plan.results)).unwrap_or_default(),
+        metrics: columns(report.filter(|_| is_finished(status)), plan.results),
     })
+}
+
+/// Whether its results count.
+pub(super) fn is_finished(status: &SubmissionStatus) -> bool {
+    status.state == Some(State::Finished)
 }
 
 fn table_status(state: Option<State>) -> &'static str {
@@ -175,24 +181,24 @@ fn table_status(state: Option<State>) -> &'static str {
     }
 }
 
-/// The metric columns, as text with the digits of results.json.
-fn columns(results: &str, format: ResultsFormat) -> Vec<(String, String)> {
+/// The metric columns, as text with the digits of results.json; those without a value are to be removed.
+fn columns(report: Option<&Report>, format: ResultsFormat) -> Vec<(String, Option<String>)> {
     let format = match format {
         ResultsFormat::V1 => Format::V1,
         ResultsFormat::V2 => Format::V2,
     };
-    let parsed: Value = serde_json::from_str(results).unwrap_or_default();
+    let parsed: Value = report
+        .and_then(|report| serde_json::from_str(&report.results).ok())
+        .unwrap_or_default();
     let accuracies = &parsed[0]["accuracies"];
-    let known = metrics(format).iter().filter_map(|metric| {
-        let value = accuracies.get(metric.name)?;
-        let text = if value.is_f64() {
-            number_text(value.as_f64()?)
-        } else {
-            value.to_string()
-        };
-        Some((metric.column.to_owned(), text))
-    });
-    known.collect()
+    let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
+        Some(number) => number_text(number),
+        None => value.to_string(),
+    };
+    let all = metrics(format)
+        .iter()
+        .map(|metric| (metric.column.to_owned(), accuracies.get(metric.name).map(text)));
+    all.collect()
 }
 
 #[cfg(test)]
@@ -200,14 +206,45 @@ mod tests {
     use super::*;
     use serde_json::json;
 
+    fn report(results: &str) -> Report {
+        serde_json::from_value(json!({
+            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "pairs": [],
+            "final": false, "eligible": false, "entryStatus": "Started", "results": results, "partialResults": "so far",
+        }))
+        .unwrap()
+    }
+
+    fn plan() -> Value {
+        json!({
+            "runId": "7", "results": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-3"], "routes": 4,
+            "repetitions": 1, "storage": {"bucket": "b"}, "image": "i", "contentsImage": "c", "simulatorImage": "s",
+        })
+    }
+
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
         let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
-        let found = columns(results, ResultsFormat::V2);
-        let get = |name: &str| found.iter().find(|(n, _)| n == name).map(|(_, v)| v.as_str());
+        let found = columns(Some(&report(results)), ResultsFormat::V2);
+        let get = |name: &str| found.iter().find(|(n, _)| n == name).and_then(|(_, v)| v.as_deref());
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
         assert_eq!(get("agent_blocked"), Some("0"));
+        assert_eq!(found.len(), 15);
+    }
+
+    #[test]
+    fn only_the_row_of_a_finished_submission_has_metrics() {
+        let report = report(r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]"#);
+        let score = |state: &str| {
+            let status = json!({"state": state, "team": {"id": "3"}, "plan": plan()});
+            let row = row(Some(&report), &serde_json::from_value(status).unwrap()).unwrap();
+            assert_eq!(row.metrics.len(), 15, "what is not there is removed");
+            row.metrics[0].clone()
+        };
+        for state in ["Pending", "Running", "Resumed", "Failed", "Cancelled"] {
+            assert_eq!(score(state), ("driving_score".to_owned(), None), "{state}");
+        }
+        assert_eq!(score("Finished").1.as_deref(), Some("43.125"));
     }
 
     #[test]
@@ -251,11 +288,7 @@ mod tests {
 
     #[test]
     fn a_partial_result_has_the_metrics_so_far_where_a_report_has_them() {
-        let report = json!({
-            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "pairs": [],
-            "final": false, "eligible": false, "entryStatus": "Started", "results": "zeros", "partialResults": "so far",
-        });
-        let mut report: Report = serde_json::from_value(report).unwrap();
+        let mut report = report("zeros");
         assert_eq!(partial_results(&report), "so far");
         report.partial_results = None;
         assert_eq!(partial_results(&report), "zeros", "of an older operator's Pod");
@@ -263,6 +296,7 @@ mod tests {
 
     #[test]
     fn a_broken_report_has_no_columns() {
-        assert!(columns("not json", ResultsFormat::V2).is_empty());
+        let found = columns(Some(&report("not json")), ResultsFormat::V2);
+        assert!(found.iter().all(|(_, value)| value.is_none()));
     }
 }

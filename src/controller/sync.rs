@@ -123,21 +123,19 @@ impl Sync {
         self.hub.forget(&object_key(submission));
     }
 
-    /// Writes the row, or lets the next write carry it. The last one of an attempt shows what was stored last, which no pass may
-    /// have seen while the attempt went on.
+    /// Writes the row, or lets the next write carry it. That of a finished submission has the metrics of what was stored last.
     pub async fn record(&self, context: &Context, view: &View, status: &SubmissionStatus, end: bool) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
-        let sight = if end {
+        let sight = if result_texts::is_finished(status) {
             last_report(context, view).await
         } else {
-            view.report.clone()
+            ReportSight::NotRead
         };
-        if end && matches!(sight, ReportSight::Unreadable(_)) {
-            if may_wait(view, status, END_WAITS) {
-                return;
-            }
-        } else if end {
+        if matches!(sight, ReportSight::Unreadable(_)) && may_wait(view, status, END_WAITS) {
+            return;
+        }
+        if end && !matches!(sight, ReportSight::Unreadable(_)) {
             context.memory.note_read(&view.submission);
         }
         if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
