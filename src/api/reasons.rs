@@ -84,6 +84,7 @@ pub const IN_USE: &str = "InUse";
 pub const JOB_CREATED: &str = "JobCreated";
 pub const JOB_RECREATED: &str = "JobRecreated";
 pub const RELEASED_UNPUBLISHED: &str = "ReleasedUnpublished";
+pub const RERUN_IN_EVALAI: &str = "RerunInEvalAI";
 /// The challenge's phases, splits or metric labels are not those of the Leaderboard.
 pub const LABELS_DIFFER: &str = "LabelsDiffer";
 /// The bucket, or what stands in for it, does not answer or refuses.

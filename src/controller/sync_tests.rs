@@ -108,6 +108,7 @@ async fn bench(state: State) -> Bench {
         record: Some(RecordView::default()),
         partial_told: None,
         unread: None,
+        rerun_as: None,
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,

@@ -16,6 +16,8 @@ use crate::text::sentence;
 const AGAIN: Duration = Duration::from_secs(30);
 /// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
 const FAREWELL_SECONDS: i64 = 120;
+/// What EvalAI calls a row that was cancelled.
+const CANCELLED: &str = "cancelled";
 const TOLD_AGAIN: &str =
     "A request that was under way may have undone EvalAI's own end; EvalAI is asked, and told again.";
 
@@ -28,7 +30,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = published != Sync::Waiting && record(draft) == Sync::Done;
     let complete = published == Sync::Done && recorded;
-    if complete {
+    if complete && !follow_rerun(draft) {
         draft.act(Action::ForgetEvalai);
     } else {
         draft.requeue_in(AGAIN);
@@ -89,6 +91,34 @@ fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Sync {
     } else {
         Sync::Waiting
     }
+}
+
+/// Notes that EvalAI has cancelled a result because it was re-run, of which nobody is notified. Returns whether EvalAI has to be
+/// asked for that: the re-run's row can be edited by its participant, so it alone is no proof.
+fn follow_rerun(draft: &mut Draft<'_>) -> bool {
+    let rerun = draft.view.rerun_as.clone().filter(|_| draft.status.rerun_as.is_none());
+    let Some(rerun) = rerun.filter(|_| !draft.is_deleting() && draft.leaderboard().is_some()) else {
+        return false;
+    };
+    let evalai = draft.view.evalai.as_ref();
+    let Some(info) = evalai.and_then(|evalai| evalai.info.as_ref()) else {
+        draft.act(Action::AskEvalai);
+        return true;
+    };
+    if info.status != CANCELLED {
+        // What is known may be older than the re-run; it is asked for anew when the submission is looked at next.
+        return false;
+    }
+    let message = format!("EvalAI has cancelled it: it was re-run as {}.", rerun.submission_name);
+    let ended = draft.status.message.take().unwrap_or_default();
+    draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
+    if let Some(published) = conditions::get(&draft.status.conditions, conditions::PUBLISHED).cloned() {
+        let truth = Truth::from(published.status == "True");
+        draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
+    }
+    draft.event(false, reasons::RERUN_IN_EVALAI, message);
+    draft.status.rerun_as = Some(rerun);
+    false
 }
 
 fn publish(draft: &mut Draft<'_>) -> Sync {

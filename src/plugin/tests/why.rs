@@ -78,6 +78,17 @@ Next:        Look at agent/agent2/leaderboard.log of the results; the participan
 }
 
 #[test]
+fn both_submissions_of_a_rerun_name_each_other() {
+    let other = |name: &str| json!({"submissionName": name, "time": "2026-11-01T11:57:00Z"});
+    let old = told(&with(finished(), &json!({"rerunAs": other("submission-99")})));
+    let line = "Re-run:      as submission-99, 2026-11-01 11:57:00 UTC (3 min ago); EvalAI has cancelled this one.\n";
+    assert!(old.contains(line), "{old}");
+    let new = told(&with(waiting(), &json!({"rerunOf": other("submission-7")})));
+    let line = "Re-run:      of submission-7, 2026-11-01 11:57:00 UTC (3 min ago).\n";
+    assert!(new.contains(line), "{new}");
+}
+
+#[test]
 fn an_infrastructures_failure_is_not_charged_and_is_resumed() {
     let words = told(&node_lost());
     for expected in [

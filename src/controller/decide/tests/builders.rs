@@ -72,6 +72,7 @@ pub fn info() -> EvalaiInfo {
         team_id: "42".into(),
         team_name: Some("Team".into()),
         submitted_at: Some(at(-60)),
+        rerun_of: None,
         image: Some("ecr/agent:9".into()),
         image_problem: None,
     }
@@ -103,6 +104,7 @@ impl World {
                 record: Some(RecordView::default()),
                 partial_told: None,
                 unread: None,
+                rerun_as: None,
             },
         }
     }
