@@ -68,6 +68,8 @@ pub const STORED: &str = "Stored";
 pub const NOT_STORED: &str = "NotStored";
 pub const WRITTEN: &str = "Written";
 pub const WAITING: &str = "Waiting";
+/// The process before may still have requests under way.
+pub const WAITING_FOR_PREVIOUS_CONTROLLER: &str = "WaitingForPreviousController";
 pub const REFUSED: &str = "Refused";
 
 // Of a Leaderboard.

@@ -109,6 +109,7 @@ async fn bench(state: State) -> Bench {
         partial_told: None,
         unread: None,
         rerun_as: None,
+        evalai_writes_from: None,
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,

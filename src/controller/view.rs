@@ -30,6 +30,8 @@ pub struct View {
     pub unread: Option<String>,
     /// The submission that re-runs this one, as its status says.
     pub rerun_as: Option<Rerun>,
+    /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
+    pub evalai_writes_from: Option<Timestamp>,
 }
 
 /// The Job that the present attempt should have.

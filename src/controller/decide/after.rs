@@ -164,6 +164,12 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             let failed = failed.or(unread(draft));
             let (reason, message) = if is_overtaken {
                 (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
+            } else if let Some(until) = draft.view.evalai_writes_from {
+                draft.requeue_at(until);
+                (
+                    reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
+                    Some(previous_controller(until)),
+                )
             } else {
                 (reasons::WAITING, failed)
             };
@@ -176,6 +182,14 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             Sync::Waiting
         }
     }
+}
+
+/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
+pub fn previous_controller(until: Timestamp) -> String {
+    format!(
+        "The controller before may still have requests under way; EvalAI is written to again from {} UTC on.",
+        until.strftime("%H:%M:%S")
+    )
 }
 
 /// What keeps an end from being told before anybody was asked.

@@ -23,6 +23,7 @@ use std::time::Duration;
 use super::view::View;
 use crate::api::{SubmissionStatus, names};
 use crate::pod::run::Stop;
+pub use after::previous_controller;
 use draft::Draft;
 pub use log::{LogAt, LogPlace};
 

@@ -52,6 +52,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let partial_told = context.memory.partial_told(&submission);
     let unread = context.memory.unread(&submission);
     let rerun_as = context.reruns.of(&submission);
+    let evalai_writes_from = context.sync.hub.writes_from();
     View {
         now,
         submission,
@@ -66,6 +67,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         partial_told,
         unread,
         rerun_as,
+        evalai_writes_from,
     }
 }
 

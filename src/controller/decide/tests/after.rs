@@ -1,5 +1,6 @@
 //! After the end: EvalAI, the table, the Job's time to live.
 
+use jiff::SignedDuration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
@@ -284,6 +285,28 @@ fn a_submission_remembers_which_one_it_reruns() {
     assert_eq!(world.pass().status.rerun_of, Some(of.clone()));
     world.in_evalai().info.as_mut().unwrap().rerun_of = None;
     assert_eq!(world.pass().status.rerun_of, Some(of));
+}
+
+#[test]
+fn an_end_says_until_when_it_waits_for_the_controller_before() {
+    let mut world = finished();
+    world.view.evalai_writes_from = world.view.now.checked_add(SignedDuration::from_secs(20)).ok();
+    let plan = world.pass();
+    let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert_eq!(shown.reason, reasons::WAITING_FOR_PREVIOUS_CONTROLLER);
+    let until = world.view.evalai_writes_from.unwrap().strftime("%H:%M:%S").to_string();
+    assert!(
+        shown.message.contains(&format!("from {until} UTC on")),
+        "{}",
+        shown.message
+    );
+    assert_eq!(tells(&plan), [Tell::Finished], "it is the first to be sent then");
+    assert!(plan.requeue.unwrap() <= std::time::Duration::from_secs(21));
+    world.view.evalai_writes_from = None;
+    assert_eq!(
+        condition(&world.pass(), PUBLISHED),
+        ("False".into(), reasons::WAITING.into())
+    );
 }
 
 #[test]

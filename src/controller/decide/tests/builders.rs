@@ -105,6 +105,7 @@ impl World {
                 partial_told: None,
                 unread: None,
                 rerun_as: None,
+                evalai_writes_from: None,
             },
         }
     }
