@@ -72,6 +72,8 @@ pub const STORED: &str = "Stored";
 pub const NOT_STORED: &str = "NotStored";
 pub const WRITTEN: &str = "Written";
 pub const WAITING: &str = "Waiting";
+/// The process before may still have requests under way.
+pub const WAITING_FOR_PREVIOUS_CONTROLLER: &str = "WaitingForPreviousController";
 pub const REFUSED: &str = "Refused";
 
 // Of a Leaderboard.
@@ -92,6 +94,7 @@ pub const RELEASED_UNPUBLISHED: &str = "ReleasedUnpublished";
 pub const ATTEMPT_WITHOUT_MESSAGE: &str = "AttemptWithoutMessage";
 /// EvalAI's row belongs to another team than at its acceptance.
 pub const TEAM_DIFFERS: &str = "TeamDiffers";
+pub const RERUN_IN_EVALAI: &str = "RerunInEvalAI";
 /// The challenge's phases, splits or metric labels are not those of the Leaderboard.
 pub const LABELS_DIFFER: &str = "LabelsDiffer";
 /// The bucket, or what stands in for it, does not answer or refuses.

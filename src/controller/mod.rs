@@ -20,6 +20,7 @@ pub mod memory;
 pub mod network_policy;
 pub mod observe;
 pub mod pod_overlay;
+pub mod reruns;
 mod result_texts;
 pub mod run;
 pub mod significance;

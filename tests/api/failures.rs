@@ -5,8 +5,8 @@
 //! logcopy.
 #![cfg(test)]
 
-use evalai_stand_in::model::{FileState, Status};
-use evalai_stand_in::submissions::{NewSubmission, create};
+use evalai_stand_in::model::{FileState, Status, User};
+use evalai_stand_in::submissions::{NewSubmission, create, rerun};
 use evalai_stand_in::{Config, Handle};
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
@@ -141,12 +141,31 @@ impl World {
         let pk = self
             .evalai
             .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
+        let name = self.object(leaderboard, phase, pk).await;
+        (pk, name)
+    }
+
+    /// A host re-runs a submission; hands back the new key and the new object's name.
+    async fn rerun(&self, leaderboard: &str, phase: u64, pk: u64) -> (u64, String) {
+        let again = self.evalai.with_state(|state| {
+            let host = User {
+                staff: true,
+                ..state.user(11).unwrap().clone()
+            };
+            rerun(state, &host, pk, Timestamp::now())
+        });
+        let new = again.unwrap_or_else(|_| panic!("EvalAI re-runs {pk}"));
+        (new, self.object(leaderboard, phase, new).await)
+    }
+
+    /// The object of a submission, as the bridge makes it.
+    async fn object(&self, leaderboard: &str, phase: u64, pk: u64) -> String {
         let name = names::submission(i64::try_from(pk).unwrap());
         let spec = json!({"leaderboard": leaderboard, "image": image,
                           "evalai": {"challenge": 1, "phase": phase, "submission": pk}});
         let submission = Submission::new(&name, serde_json::from_value(spec).unwrap());
         self.api().create(&PostParams::default(), &submission).await.unwrap();
-        (pk, name)
+        name
     }
 
     fn archive(&self, run: u64) -> Archive {
@@ -293,6 +312,10 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
             "{fetched}"
         );
         assert_eq!(fetched.contains("4711"), is_open, "{leaderboard}: {fetched}");
+        assert!(
+            !fetched.contains("leaderboard.log"),
+            "only hosts can read it: {fetched}"
+        );
         assert_eq!(own["stdout_file"].as_str().map(|_| ()), Some(()));
 
         let (row, all) = world.fetched(pk, HOST).await;
@@ -311,6 +334,34 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
             "{shown}"
         );
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let _controller = world.controller();
+    let (old, name) = world.submit("lb", 1).await;
+    world.run_that_crashes(old, &name).await;
+    let is_published = |s: &SubmissionStatus| s.times.published.is_some();
+    world.until(&name, "EvalAI has the end", is_published).await;
+
+    let (new, rerun) = world.rerun("lb", 1, old).await;
+    let statuses = [old, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));
+    assert_eq!(statuses, [Status::Cancelled, Status::Submitted]);
+    let of = |s: &SubmissionStatus| s.rerun_of.as_ref().is_some_and(|of| of.submission_name == name);
+    world.until(&rerun, "it names what it re-runs", of).await;
+    let again = |s: &SubmissionStatus| s.rerun_as.as_ref().is_some_and(|again| again.submission_name == rerun);
+    world.until(&name, "it names its re-run", again).await;
+    let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
+    assert_eq!(status.state, Some(State::Failed), "its result stays");
+    let message = status.message.unwrap();
+    let told = format!("EvalAI has cancelled it: it was re-run as {rerun}.");
+    assert!(
+        message.starts_with("Agent 1 crashed") && message.ends_with(&told),
+        "{message}"
+    );
+    assert!(world.shown(&name).await.contains("re-run as"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

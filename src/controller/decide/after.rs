@@ -16,6 +16,8 @@ use crate::text::sentence;
 const AGAIN: Duration = Duration::from_secs(30);
 /// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
 const FAREWELL_SECONDS: i64 = 120;
+/// What EvalAI calls a row that was cancelled.
+const CANCELLED: &str = "cancelled";
 const TOLD_AGAIN: &str =
     "A request that was under way may have undone EvalAI's own end; EvalAI is asked, and told again.";
 
@@ -29,7 +31,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = published != Sync::Waiting && record(draft) == Sync::Done;
     let complete = published == Sync::Done && recorded;
-    if complete {
+    if complete && !follow_rerun(draft) {
         draft.act(Action::ForgetEvalai);
     } else {
         draft.requeue_in(AGAIN);
@@ -112,6 +114,34 @@ fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Sync {
     }
 }
 
+/// Notes that EvalAI has cancelled a result because it was re-run, of which nobody is notified. Returns whether EvalAI has to be
+/// asked for that: the re-run's row can be edited by its participant, so it alone is no proof.
+fn follow_rerun(draft: &mut Draft<'_>) -> bool {
+    let rerun = draft.view.rerun_as.clone().filter(|_| draft.status.rerun_as.is_none());
+    let Some(rerun) = rerun.filter(|_| !draft.is_deleting() && draft.leaderboard().is_some()) else {
+        return false;
+    };
+    let evalai = draft.view.evalai.as_ref();
+    let Some(info) = evalai.and_then(|evalai| evalai.info.as_ref()) else {
+        draft.act(Action::AskEvalai);
+        return true;
+    };
+    if info.status != CANCELLED {
+        // What is known may be older than the re-run; it is asked for anew when the submission is looked at next.
+        return false;
+    }
+    let message = format!("EvalAI has cancelled it: it was re-run as {}.", rerun.submission_name);
+    let ended = draft.status.message.take().unwrap_or_default();
+    draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
+    if let Some(published) = conditions::get(&draft.status.conditions, conditions::PUBLISHED).cloned() {
+        let truth = Truth::from(published.status == "True");
+        draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
+    }
+    draft.event(false, reasons::RERUN_IN_EVALAI, message);
+    draft.status.rerun_as = Some(rerun);
+    false
+}
+
 fn publish(draft: &mut Draft<'_>) -> Sync {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
@@ -155,6 +185,12 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             let failed = failed.or(unread(draft));
             let (reason, message) = if is_overtaken {
                 (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
+            } else if let Some(until) = draft.view.evalai_writes_from {
+                draft.requeue_at(until);
+                (
+                    reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
+                    Some(previous_controller(until)),
+                )
             } else {
                 (reasons::WAITING, failed)
             };
@@ -192,6 +228,14 @@ fn is_of_another_phase(draft: &Draft<'_>) -> bool {
     let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
     let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
     differs && draft.status.plan.is_none() && draft.status.state == Some(State::Cancelled)
+}
+
+/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
+pub fn previous_controller(until: Timestamp) -> String {
+    format!(
+        "The controller before may still have requests under way; EvalAI is written to again from {} UTC on.",
+        until.strftime("%H:%M:%S")
+    )
 }
 
 /// What keeps an end from being told before anybody was asked.

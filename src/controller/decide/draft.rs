@@ -141,6 +141,7 @@ impl<'a> Draft<'a> {
             progress: old.progress,
             score: old.score.map(|s| if s.starts_with('~') { s } else { format!("~{s}") }),
             results: old.results,
+            rerun_of: old.rerun_of,
             times: crate::api::Times {
                 submitted: old.times.submitted,
                 ..Default::default()

@@ -129,6 +129,7 @@ fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now
         invalid_pod: probe.invalid_pod(),
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(context, leaderboard, &key, now),
+        evalai_writes_from: context.sync.hub.writes_from(),
         budget: context.sync.hub.budget_used(&key),
     }
 }

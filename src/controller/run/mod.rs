@@ -196,6 +196,7 @@ impl Watches {
                 if places.moved(object, touch.is_gone) {
                     context.board.moved(&namespace, &object.spec.leaderboard);
                 }
+                let original = context.reruns.moved(object, touch.is_gone);
                 if touch.is_gone {
                     return vec![Touched::Gone(submissions.drop(object)), Touched::Leaderboard(board)];
                 }
@@ -205,6 +206,7 @@ impl Watches {
                     .then(|| Touched::Submission(ObjectRef::from_obj(object)));
                 own.into_iter()
                     .chain(moved.in_line.then_some(Touched::Leaderboard(board)))
+                    .chain(original.map(Touched::Submission))
                     .collect()
             },
         );
