@@ -110,6 +110,19 @@ pub enum Outcome {
     IdTaken(String),
 }
 
+impl std::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Created => f.write_str("created"),
+            Self::Bumped(attempt) => write!(f, "resumed as attempt {attempt}"),
+            Self::Refused => f.write_str("no message has announced the attempt, so none begins"),
+            Self::Repeat => f.write_str("known already"),
+            Self::Deleting => f.write_str("the old one is still being deleted"),
+            Self::IdTaken(owner) => write!(f, "the name is taken by {owner}"),
+        }
+    }
+}
+
 /// Why nothing could be done.
 #[derive(Debug, Error)]
 pub enum IngestError {

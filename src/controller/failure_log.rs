@@ -19,6 +19,7 @@ use super::decide::{LogAt, LogPlace};
 use super::observe::uid_of;
 use super::view::View;
 use crate::api::SubmissionStatus;
+use crate::observability::text;
 use crate::pod::report::FAILURE_LOG_KEY;
 
 /// Characters that are kept, as EvalAI's own worker does.
@@ -219,7 +220,7 @@ async fn of_node(
         Ok(stream) => stream,
         // Gone, or the container has no earlier run that the node remembers.
         Err(kube::Error::Api(status)) if [400, 404].contains(&status.code) => return Ok(None),
-        Err(error) => return Err(error.to_string()),
+        Err(error) => return Err(text::kube(&error)),
     };
     let mut bytes = Vec::new();
     let read = pin!(stream).take(NODE_BYTES).read_to_end(&mut bytes).await;

@@ -12,7 +12,7 @@ pub mod context;
 pub mod decide;
 pub mod failure_log;
 #[cfg(test)]
-mod fixtures;
+pub(crate) mod fixtures;
 pub mod job_spec;
 pub mod leader;
 pub mod leaderboards;

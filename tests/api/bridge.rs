@@ -13,6 +13,8 @@ use kube::runtime::wait::await_condition;
 use kube::{Client, ResourceExt};
 use leaderboard_operator::api::{Leaderboard, Submission, names};
 use leaderboard_operator::bridge::{self, Health, Observer, Settings};
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::{TaskFailed, Tasks};
 use leaderboard_operator::services::aws::Aws;
 use serde_json::{Value, json};
 use tokio::sync::watch;
@@ -143,19 +145,19 @@ struct Bridge {
     health: Arc<Health>,
     counter: Arc<Counter>,
     stop: watch::Sender<bool>,
-    task: tokio::task::JoinHandle<()>,
+    task: tokio::task::JoinHandle<Result<(), TaskFailed>>,
 }
 
 impl Bridge {
     fn start(client: Client, stand_in: &StandIn, namespace: &str) -> Self {
-        let (stop, stopped) = watch::channel(false);
+        let (stop, stopped) = Stop::new();
         let (health, counter) = (Arc::new(Health::default()), Arc::new(Counter::default()));
         let settings = Settings {
             namespace: Some(namespace.to_owned()),
             health: health.clone(),
             observer: counter.clone(),
         };
-        let task = tokio::spawn(bridge::run(client, stand_in.aws.clone(), stopped, settings));
+        let task = tokio::spawn(bridge::run(client, stand_in.aws.clone(), Tasks::new(stopped), settings));
         Self {
             health,
             counter,
@@ -173,6 +175,7 @@ impl Bridge {
         tokio::time::timeout(LIMIT, self.task)
             .await
             .expect("the bridge ends")
+            .unwrap()
             .unwrap();
     }
 }

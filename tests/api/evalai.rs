@@ -17,6 +17,8 @@ use evalai_stand_in::model::{FileState, Status as Stored};
 use evalai_stand_in::submissions::{NewSubmission, create};
 use evalai_stand_in::{Config, Handle, Knobs};
 use jiff::{SignedDuration, Timestamp};
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::evalai::{
     Changed, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target,
     Timeouts, Timing, View, Wish,
@@ -101,6 +103,7 @@ impl World {
             timing,
             timeouts,
             meter: Meter::default(),
+            tasks: Tasks::new(Stop::new().1),
         });
         let target = target(&server.url(), "local-host-token");
         Self {

@@ -141,7 +141,7 @@ impl World {
         let pk = self
             .evalai
             .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
-        let name = self.object(leaderboard, phase, pk).await;
+        let name = self.object(leaderboard, phase, pk, image).await;
         (pk, name)
     }
 
@@ -155,11 +155,12 @@ impl World {
             rerun(state, &host, pk, Timestamp::now())
         });
         let new = again.unwrap_or_else(|_| panic!("EvalAI re-runs {pk}"));
-        (new, self.object(leaderboard, phase, new).await)
+        let image = json!("r/team-a:1");
+        (new, self.object(leaderboard, phase, new, &image).await)
     }
 
     /// The object of a submission, as the bridge makes it.
-    async fn object(&self, leaderboard: &str, phase: u64, pk: u64) -> String {
+    async fn object(&self, leaderboard: &str, phase: u64, pk: u64, image: &Value) -> String {
         let name = names::submission(i64::try_from(pk).unwrap());
         let spec = json!({"leaderboard": leaderboard, "image": image,
                           "evalai": {"challenge": 1, "phase": phase, "submission": pk}});

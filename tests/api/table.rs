@@ -9,10 +9,12 @@ use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
 use leaderboard_operator::api;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::ObjectKey;
 use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
 use serde_json::json;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 
 use super::bridge::{LIMIT, StandIn};
 
@@ -312,12 +314,12 @@ async fn the_recorder_writes_in_the_background_behind_its_fence() {
     let (spec, _) = usual(&stand_in).await;
     let fence = Arc::new(AtomicBool::new(true));
     let (may_write, (wake, mut woken)) = (fence.clone(), mpsc::unbounded_channel());
-    let (stop, stopped) = watch::channel(false);
+    let (stop, stopped) = Stop::new();
     let recorder = Recorder::new(
         stand_in.aws.clone(),
         move || may_write.load(Ordering::SeqCst),
         wake,
-        stopped,
+        Tasks::new(stopped),
     );
     let key = |name: &str| ObjectKey {
         namespace: "ns".into(),

@@ -8,7 +8,7 @@ use kube::runtime::reflector::Store;
 use kube::{Api, Client, ResourceExt};
 use tokio::sync::mpsc;
 
-use crate::api::{Evalai, Leaderboard, Submission};
+use crate::api::{Evalai, Leaderboard, Submission, names};
 use crate::bridge::ingest::{self, Incoming, Outcome, Source};
 use crate::services::evalai::SweepRow;
 
@@ -38,32 +38,31 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
         },
         sent_ms: row.time.as_millisecond(),
     };
-    let (server, submission, leaderboard) = (&row.server, row.submission, board.name_any());
+    let (server, leaderboard) = (&row.server, board.name_any());
+    let submission = format!("{namespace}/{}", names::submission(row.submission));
     match ingest::apply(&api, &leaderboard, &incoming).await {
-        Ok(Outcome::Repeat) => tracing::debug!(server, submission, namespace, leaderboard, "it is known"),
+        Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "it is known"),
         Ok(Outcome::Refused) => {
             tracing::warn!(
                 server,
                 submission,
-                namespace,
                 leaderboard,
                 "EvalAI's row asks for another attempt, and no message has announced it: none begins"
             );
         }
         Ok(Outcome::IdTaken(owner)) => {
-            tracing::warn!(server, submission, namespace, leaderboard, owner, "the name is taken");
+            tracing::warn!(server, submission, leaderboard, owner, "the name is taken");
         }
         Ok(outcome) => {
             tracing::info!(
                 server,
                 submission,
-                namespace,
                 leaderboard,
-                ?outcome,
+                %outcome,
                 "EvalAI waits for a submission whose message was lost"
             );
         }
-        Err(error) => tracing::warn!(server, submission, namespace, leaderboard, "{error}"),
+        Err(error) => tracing::warn!(server, submission, leaderboard, %error, "not ingested"),
     }
 }
 
