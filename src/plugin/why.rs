@@ -384,7 +384,7 @@ fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static s
         let is_mendable = status.failure.as_ref().is_some_and(is_infrastructure);
         return (is_mendable || reason == reasons::CANCELLED).then_some("resume");
     }
-    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING]
+    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]
         .contains(&reason)
         .then_some("cancel")
 }

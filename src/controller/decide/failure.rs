@@ -46,6 +46,7 @@ fn next_step(reason: &str) -> &'static str {
             "Look at the simulator's log, then resume it, which repeats the route it was at."
         }
         reasons::JOB_FAILED => "Look at the Job's events, then resume it.",
+        reasons::PHASE_DIFFERS => "Set the phase back in EvalAI, then resume it.",
         reasons::SCHEDULE_DEADLINE => "Add a node or make room, then resume it.",
         _ => "Mend that, then resume it.",
     }
@@ -59,6 +60,12 @@ pub(super) fn what_happened(failure: &Failure) -> String {
         .strip_suffix(next)
         .filter(|_| failure.class == FailureClass::Infrastructure);
     what.unwrap_or(message).trim_end().to_owned()
+}
+
+/// What was submitted names no image that could ever be pulled.
+pub(super) fn image_invalid(what: &str) -> Failure {
+    let message = format!("{what} Submit again with an image as in registry.example/team/agent:1.");
+    participant(reasons::IMAGE_INVALID, message)
 }
 
 pub(super) fn job_deleted() -> Failure {

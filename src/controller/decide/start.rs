@@ -212,8 +212,10 @@ fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &s
 }
 
 fn too_late(found: &Trouble, seconds: i64) -> Failure {
-    if found.reason == reasons::PREFIX_IN_USE {
-        return infrastructure(found.reason, &found.message);
+    match found.reason {
+        reasons::PREFIX_IN_USE => return infrastructure(found.reason, &found.message),
+        reasons::IMAGE_INVALID => return failure::image_invalid(&found.message),
+        _ => {}
     }
     let reason = if found.reason == reasons::PREPARING {
         reasons::START_DEADLINE

@@ -8,6 +8,7 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use super::status::Status;
+use crate::api::ImageReference;
 
 /// A submission as EvalAI shows it to a host.
 #[derive(Clone, Debug, PartialEq)]
@@ -147,11 +148,9 @@ pub fn image(file: &[u8]) -> Result<String, String> {
     let image = image
         .ok_or_else(|| "the uploaded file has no submitted_image_uri".to_owned())?
         .trim();
-    let plausible = !image.is_empty() && image.len() <= 512 && image.bytes().all(|byte| byte.is_ascii_graphic());
-    if plausible {
-        Ok(image.to_owned())
-    } else {
-        Err("submitted_image_uri in the uploaded file is no image".to_owned())
+    match ImageReference::parse(image) {
+        Ok(_) => Ok(image.to_owned()),
+        Err(why) => Err(format!("submitted_image_uri in the uploaded file is no image: {why}")),
     }
 }
 
@@ -207,7 +206,13 @@ mod tests {
             (json!({}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": 1}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": "two words"}), "no image"),
-            (json!({"submitted_image_uri": ""}), "no image"),
+            (json!({"submitted_image_uri": ""}), "no image: it is empty"),
+            (json!({"submitted_image_uri": "  "}), "no image: it is empty"),
+            (json!({"submitted_image_uri": null}), "no submitted_image_uri"),
+            (json!({"submitted_image_uri": {"a": 1}}), "no submitted_image_uri"),
+            (json!({"submitted_image_uri": "x".repeat(513)}), "512 characters"),
+            (json!({"submitted_image_uri": "team/Agent:1"}), "upper-case"),
+            (json!({"submitted_image_uri": "ägent:1"}), "not ASCII"),
         ] {
             assert!(of(value).unwrap_err().contains(part));
         }

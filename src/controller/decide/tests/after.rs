@@ -222,3 +222,35 @@ fn a_finished_job_gets_its_time_to_live_once() {
     world.job().has_ttl = true;
     assert!(!has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
 }
+
+#[test]
+fn a_row_that_has_gone_to_another_team_is_said_with_its_end() {
+    let mut world = finished();
+    world.in_evalai().team_id = Some("42".into());
+    let mut same = world.clone();
+    same.published();
+    assert_eq!(events(&same.pass()), ["Published"]);
+
+    world.in_evalai().team_id = Some("43".into());
+    world.published();
+    let plan = world.pass();
+    assert_eq!(events(&plan), ["Published", reasons::TEAM_DIFFERS]);
+    let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert!(
+        shown.message.contains("team 43") && shown.message.contains("team 42"),
+        "{}",
+        shown.message
+    );
+}
+
+#[test]
+fn the_team_is_that_of_the_acceptance() {
+    let mut world = World::evalai();
+    let (position, eta) = (1, None);
+    world.view.turn = crate::controller::view::Turn::Wait { position, eta };
+    world.pass();
+    let info = world.in_evalai().info.as_mut().unwrap();
+    (info.team_id, info.team_name) = ("43".into(), Some("Other".into()));
+    let team = world.pass().status.team.unwrap();
+    assert_eq!((team.id.as_deref(), team.name.as_deref()), (Some("42"), Some("Team")));
+}
