@@ -15,7 +15,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, State, Storage, Submission, SubmissionStatus, names};
+use leaderboard_operator::api::{Leaderboard, State, Storage, Submission, SubmissionStatus, conditions, names};
 use leaderboard_operator::controller::context::Settings;
 use leaderboard_operator::controller::leader::{self, Identity};
 use leaderboard_operator::controller::run::{self, Clients};
@@ -125,18 +125,24 @@ impl World {
 
     /// Team a pushes to a phase; hands back EvalAI's key and the object's name.
     async fn submit(&self, leaderboard: &str, phase: u64) -> (u64, String) {
+        let image = json!("r/team-a:1");
+        self.submit_image(leaderboard, phase, &image, &image).await
+    }
+
+    /// The same with these images in the uploaded file and in the object.
+    async fn submit_image(&self, leaderboard: &str, phase: u64, uploaded: &Value, image: &Value) -> (u64, String) {
         let new = NewSubmission {
             team: 1,
             phase,
             user: 11,
-            input: json!({"submitted_image_uri": "r/team-a:1"}).to_string().into_bytes(),
+            input: json!({ "submitted_image_uri": uploaded }).to_string().into_bytes(),
             fields: Map::new(),
         };
         let pk = self
             .evalai
             .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
         let name = names::submission(i64::try_from(pk).unwrap());
-        let spec = json!({"leaderboard": leaderboard, "image": "r/team-a:1",
+        let spec = json!({"leaderboard": leaderboard, "image": image,
                           "evalai": {"challenge": 1, "phase": phase, "submission": pk}});
         let submission = Submission::new(&name, serde_json::from_value(spec).unwrap());
         self.api().create(&PostParams::default(), &submission).await.unwrap();
@@ -378,5 +384,41 @@ async fn of_a_stored_log_only_the_end_is_read() {
         ("missing", None),
     ] {
         assert_eq!(archive.tail(key, 65_536).await.unwrap(), tail, "{key}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_can_never_be_an_image_fails_at_once_and_the_participant_reads_why() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let _controller = world.controller();
+    let uploaded = [
+        json!(null),
+        json!(""),
+        json!(5),
+        json!({"a": 1}),
+        json!("  "),
+        json!("x".repeat(513)),
+        json!("r/Team:1"),
+        json!("r/té:1"),
+        json!("two words"),
+    ];
+    let mut submitted = Vec::new();
+    for uploaded in &uploaded {
+        submitted.push(world.submit_image("lb", 1, uploaded, &json!(null)).await);
+    }
+    let (good, bad) = (json!("r/team-a:1"), json!("r/Team:1"));
+    submitted.push(world.submit_image("lb", 1, &good, &bad).await);
+    for (pk, name) in submitted {
+        let failed = world
+            .evalai
+            .wait_until(|state, _| state.submissions[&pk].status == Status::Failed);
+        timeout(LIMIT, failed).await.expect("EvalAI hears of the failure");
+        let (_, fetched) = world.fetched(pk, PARTICIPANT).await;
+        assert!(fetched.contains("ImageInvalid (participant): The subm"), "{fetched}");
+        let is_published = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::PUBLISHED);
+        world.until(&name, "it is published", is_published).await;
+        let job = world.api::<Job>().get_opt(&names::job(&name, 1, 0)).await.unwrap();
+        assert_eq!(job, None);
     }
 }
