@@ -175,7 +175,7 @@ pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming:
                 resource_version,
             }
         }
-        // Told once: a row that is edited again and again is not worth a write each time.
+        // Noted once: a row that is edited again and again is not worth a write each time.
         Source::Sweep { .. } if record.refused.is_some_and(|refused| refused.attempt == attempt) => Ingest::Repeat,
         Source::Sweep { .. } => Ingest::Refuse {
             attempt,

@@ -498,7 +498,7 @@ async fn a_lost_message_is_found_for_the_server_that_has_it() {
 }
 
 #[tokio::test]
-async fn a_token_whose_user_is_no_host_is_told_and_one_submission_condemns_none() {
+async fn a_token_whose_user_is_no_host_is_named_and_one_submission_condemns_none() {
     let mut world = World::new().await;
     let good = world.target.clone();
     world.target = target(&world.server.url(), "local-team-a-token");

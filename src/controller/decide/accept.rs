@@ -48,9 +48,9 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
     let image = match image(draft, info.as_ref()) {
         Image::Named(image) => image,
         Image::Unknown => {
-            let message = "Neither the Submission nor EvalAI names an image. Ask the participant to push again, and cancel \
-                           this submission.";
-            return refuse(draft, reasons::IMAGE_MISSING, message);
+            let message = image_unread(draft);
+            let message = draft.stall(reasons::IMAGE_MISSING, &message);
+            return refuse(draft, reasons::IMAGE_MISSING, &message);
         }
         Image::Invalid { image, what } => {
             // The plan makes it a row of the table, as any other failure.
@@ -123,6 +123,16 @@ fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
             Image::Invalid { image, what }
         }
     }
+}
+
+/// What is said while the file in EvalAI cannot be read.
+fn image_unread(draft: &Draft<'_>) -> String {
+    let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
+    let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
+    format!(
+        "The Submission names no image, and the file in EvalAI that names it could not be read yet; it is tried again.{why} If \
+         that lasts, look at EvalAI's files, or ask the participant to push again and cancel this submission."
+    )
 }
 
 /// What is said of a row that belongs to another phase than the Submission: its run would count for neither.

@@ -64,9 +64,17 @@ fn an_image_is_taken_from_evalai_where_the_object_names_none() {
     let mut world = World::evalai();
     world.submission().spec.image = None;
     world.in_evalai().info.as_mut().unwrap().image = None;
+    world.in_evalai().error = Some("EvalAI answered 404: not found".into());
     let plan = world.pass_to(Pending, reasons::IMAGE_MISSING);
     assert_eq!(condition(&plan, ACCEPTED).0, "False");
     assert!(!creates(&plan));
+    let message = plan.status.message.unwrap();
+    assert!(
+        message.contains("it is tried again. The last request failed: EvalAI answered 404"),
+        "{message}"
+    );
+    world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
 }
 
 #[test]

@@ -258,7 +258,7 @@ fn a_refused_token_is_told_and_asked_again_after_a_minute_or_its_renewal() {
 }
 
 #[test]
-fn a_user_who_is_no_host_is_told_for_that_challenge_and_stops_no_other() {
+fn a_user_who_is_no_host_is_refused_for_that_challenge_and_stops_no_other() {
     let mut bench = Bench::new();
     bench.serve();
     let no_host = || Answer::Refused(refusal(About::Challenge, 401));
