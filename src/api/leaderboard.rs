@@ -5,9 +5,11 @@
 
 use std::collections::BTreeMap;
 
+use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::CustomResource;
 use kube::KubeSchema;
+use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
 use super::leaderboard_parts::{
@@ -139,6 +141,20 @@ pub struct LeaderboardSpec {
     #[serde(default = "defaults::finalize_seconds")]
     #[schemars(range(min = 0, max = 604_800))]
     pub finalize_seconds: i64,
+}
+
+impl Leaderboard {
+    /// Whether a phase of an EvalAI challenge is one of its tracks.
+    pub fn serves(&self, challenge: i64, phase: i64) -> bool {
+        let is_of_challenge = self.spec.evalai.as_ref().is_some_and(|e| e.challenge == challenge);
+        is_of_challenge && self.spec.tracks.iter().any(|track| track.phase == Some(phase))
+    }
+
+    /// Sorts the older one first: it serves a phase that several claim.
+    pub fn seniority(&self) -> (Option<Timestamp>, String, String) {
+        let created = self.metadata.creation_timestamp.as_ref().map(|time| time.0);
+        (created, self.name_any(), self.namespace().unwrap_or_default())
+    }
 }
 
 /// What the operator last saw of a Leaderboard.

@@ -50,6 +50,16 @@ pub struct Evalai {
     pub log_tail: LogTail,
 }
 
+impl Evalai {
+    /// The server in one spelling: two Leaderboards of one server are compared by it.
+    pub fn server(&self) -> String {
+        let root = self.api_server.trim_end_matches('/');
+        let host = root.find("://").map_or(0, |at| at + 3);
+        let path = root[host..].find('/').map_or(root.len(), |at| host + at);
+        format!("{}{}", root[..path].to_ascii_lowercase(), &root[path..])
+    }
+}
+
 /// Where EvalAI's token is kept: exactly one of the two.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]

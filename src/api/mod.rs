@@ -4,6 +4,8 @@
 
 pub mod conditions;
 pub mod effective;
+pub mod image;
+pub mod ingested;
 pub mod leaderboard;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
@@ -12,6 +14,8 @@ pub mod reasons;
 pub mod submission;
 pub mod submission_status;
 
+pub use image::{ImageReference, NotAnImage};
+pub use ingested::{Ingested, RefusedAttempt};
 pub use leaderboard::{Leaderboard, LeaderboardSpec, LeaderboardStatus};
 pub use leaderboard_parts::*;
 pub use submission::{EvalaiRef, Submission, SubmissionSpec, Team};

@@ -17,7 +17,7 @@ pub const LABEL_MANAGED_BY: &str = "app.kubernetes.io/managed-by";
 /// Value of the label above.
 pub const OPERATOR: &str = "leaderboard-operator";
 
-/// Annotation on a Submission: which message made or bumped it, `{"message": id, "sent": milliseconds}`.
+/// Annotation on a Submission: which message made or bumped it; see [`super::Ingested`].
 pub const ANNOTATION_INGESTED: &str = "leaderboard.carla.org/ingested";
 /// Annotation on a Pod: why it is to stop, `Cancel`, `Retries` or `RunDeadline`.
 pub const ANNOTATION_STOP: &str = "leaderboard.carla.org/stop";

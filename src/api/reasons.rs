@@ -25,6 +25,8 @@ pub const LEADERBOARD_NOT_FOUND: &str = "LeaderboardNotFound";
 pub const TRACK_NOT_FOUND: &str = "TrackNotFound";
 pub const IMAGE_MISSING: &str = "ImageMissing";
 pub const LEADERBOARD_NOT_READY: &str = "LeaderboardNotReady";
+/// EvalAI's row belongs to another phase.
+pub const PHASE_DIFFERS: &str = "PhaseDiffers";
 
 // While a submission runs.
 pub const ACCEPTED: &str = "Accepted";
@@ -50,6 +52,8 @@ pub const TIME_LIMIT: &str = "TimeLimit";
 pub const INVALID_RESULTS: &str = "InvalidResults";
 pub const CANNOT_START: &str = "CannotStart";
 pub const DISK_FULL: &str = "DiskFull";
+/// What was submitted names no image that could ever be pulled.
+pub const IMAGE_INVALID: &str = "ImageInvalid";
 
 // Failures of the infrastructure.
 pub const SIMULATION_CRASHED: &str = "SimulationCrashed";
@@ -68,6 +72,8 @@ pub const STORED: &str = "Stored";
 pub const NOT_STORED: &str = "NotStored";
 pub const WRITTEN: &str = "Written";
 pub const WAITING: &str = "Waiting";
+/// The process before may still have requests under way.
+pub const WAITING_FOR_PREVIOUS_CONTROLLER: &str = "WaitingForPreviousController";
 pub const REFUSED: &str = "Refused";
 
 // Of a Leaderboard.
@@ -84,6 +90,11 @@ pub const IN_USE: &str = "InUse";
 pub const JOB_CREATED: &str = "JobCreated";
 pub const JOB_RECREATED: &str = "JobRecreated";
 pub const RELEASED_UNPUBLISHED: &str = "ReleasedUnpublished";
+/// No message has announced an attempt that EvalAI's row asks for.
+pub const ATTEMPT_WITHOUT_MESSAGE: &str = "AttemptWithoutMessage";
+/// EvalAI's row belongs to another team than at its acceptance.
+pub const TEAM_DIFFERS: &str = "TeamDiffers";
+pub const RERUN_IN_EVALAI: &str = "RerunInEvalAI";
 /// The challenge's phases, splits or metric labels are not those of the Leaderboard.
 pub const LABELS_DIFFER: &str = "LabelsDiffer";
 /// The bucket, or what stands in for it, does not answer or refuses.

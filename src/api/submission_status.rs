@@ -98,6 +98,12 @@ pub struct SubmissionStatus {
     /// Node of the present Pod.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub node: Option<String>,
+    /// The submission that this one re-runs: EvalAI made a new row for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rerun_of: Option<Rerun>,
+    /// The submission that re-runs this one: EvalAI has cancelled this one's result. State, score and the table's row stay.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rerun_as: Option<Rerun>,
     /// Where the results are, `s3://bucket/prefix/id`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub results: Option<String>,
@@ -142,6 +148,17 @@ pub struct RunPlan {
     /// True if the stored results of an earlier run are taken up.
     #[serde(default)]
     pub resume: bool,
+}
+
+/// The other submission of a re-run.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct Rerun {
+    /// Its name, in the same namespace.
+    pub submission_name: String,
+    /// When EvalAI made the new row.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub time: Option<Time>,
 }
 
 /// Routes that are done, over all pairs and repetitions.
@@ -242,12 +259,16 @@ pub enum FailureClass {
 
 /// What went wrong.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
 pub struct Failure {
     pub class: FailureClass,
     /// One of `api::reasons`.
     pub reason: String,
-    /// A sentence with the next step.
+    /// A sentence with the next step, for the challenge's hosts.
     pub message: String,
+    /// What the participant reads of it in EvalAI; absent where that is `message`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub participant_message: Option<String>,
     /// Whether it should cost the participant an attempt.
     pub charged: bool,
     /// The pair that it happened in, from 1; absent if it concerns the whole run.

@@ -9,11 +9,11 @@ use std::time::Duration;
 
 use kube::Api;
 use kube::api::{ObjectMeta, Patch, PatchParams, PostParams};
-use serde::{Deserialize, Serialize};
-use serde_json::json;
+use serde_json::{Value, json};
 use thiserror::Error;
 
-use crate::api::{EvalaiRef, State, Submission, SubmissionSpec, conditions, names};
+use crate::api::ingested::SWEEP;
+use crate::api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 pub const SWEEP_AGE_MS: i64 = 120_000;
@@ -22,8 +22,10 @@ pub const SWEEP_AGE_MS: i64 = 120_000;
 const CALL_LIMIT: Duration = Duration::from_secs(8);
 /// How often a lost race is looked at again before the caller has to come back later.
 const ROUNDS: usize = 6;
-/// What the annotation names as the message when the sweep made or bumped the object.
-const SWEEP: &str = "sweep";
+/// So many attempts begin without a message after one that came. EvalAI lets only hosts resume, but lets participants write their
+/// row's status and times: more would be runs that nobody has granted. One is enough for a resume whose message was lost; a person
+/// who wants another one raises `spec.attempt`.
+const MOST_WITHOUT_MESSAGE: usize = 1;
 
 /// Who says that a submission wants to run.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -31,14 +33,17 @@ pub enum Source {
     /// A message, by its id.
     Message(String),
     /// The sweep of EvalAI's lists.
-    Sweep,
+    Sweep {
+        /// The row says `resuming`, which EvalAI sets for a resume; else `submitted`.
+        is_resuming: bool,
+    },
 }
 
 impl Source {
     fn id(&self) -> &str {
         match self {
             Self::Message(id) => id,
-            Self::Sweep => SWEEP,
+            Self::Sweep { .. } => SWEEP,
         }
     }
 }
@@ -71,13 +76,6 @@ impl Incoming {
     }
 }
 
-/// The annotation that says what made or bumped an object.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Ingested {
-    message: String,
-    sent: i64,
-}
-
 /// What is to be done.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Ingest {
@@ -85,6 +83,8 @@ pub enum Ingest {
     Create(Box<Submission>),
     /// It has ended and is wanted again: raise its attempt, if it still is at this resourceVersion.
     Bump { attempt: i64, resource_version: String },
+    /// It has ended, and EvalAI's row asks for an attempt that no message has announced: note that, so that people see it.
+    Refuse { attempt: i64, resource_version: String },
     /// It is known already.
     Repeat,
     /// The old one is being deleted: come back when it is gone.
@@ -100,12 +100,27 @@ pub enum Outcome {
     Created,
     /// Its attempt was raised to this number.
     Bumped(i64),
+    /// No message has announced the attempt that EvalAI's row asks for, and none begins.
+    Refused,
     /// It was known already.
     Repeat,
     /// The old one is being deleted: come back when it is gone.
     Deleting,
     /// The name belongs to another leaderboard, challenge or phase; the text says to which.
     IdTaken(String),
+}
+
+impl std::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Created => f.write_str("created"),
+            Self::Bumped(attempt) => write!(f, "resumed as attempt {attempt}"),
+            Self::Refused => f.write_str("no message has announced the attempt, so none begins"),
+            Self::Repeat => f.write_str("known already"),
+            Self::Deleting => f.write_str("the old one is still being deleted"),
+            Self::IdTaken(owner) => write!(f, "the name is taken by {owner}"),
+        }
+    }
 }
 
 /// Why nothing could be done.
@@ -141,12 +156,31 @@ pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming:
     if spec.leaderboard != leaderboard || spec.evalai != Some(incoming.reference()) {
         return Ingest::IdTaken(owner(existing));
     }
-    match &existing.metadata.resource_version {
-        Some(version) if is_ended(existing) && is_newer(existing, incoming) => Ingest::Bump {
-            attempt: spec.attempt + 1,
-            resource_version: version.clone(),
+    let Some(resource_version) = existing.metadata.resource_version.clone() else {
+        return Ingest::Repeat;
+    };
+    if !is_ended(existing) || !is_newer(existing, incoming) {
+        return Ingest::Repeat;
+    }
+    let record = Ingested::of(existing).unwrap_or_default();
+    let attempt = spec.attempt + 1;
+    match incoming.source {
+        Source::Message(_) => Ingest::Bump {
+            attempt,
+            resource_version,
         },
-        _ => Ingest::Repeat,
+        Source::Sweep { is_resuming } if is_resuming && record.without_message.len() < MOST_WITHOUT_MESSAGE => {
+            Ingest::Bump {
+                attempt,
+                resource_version,
+            }
+        }
+        // Noted once: a row that is edited again and again is not worth a write each time.
+        Source::Sweep { .. } if record.refused.is_some_and(|refused| refused.attempt == attempt) => Ingest::Repeat,
+        Source::Sweep { .. } => Ingest::Refuse {
+            attempt,
+            resource_version,
+        },
     }
 }
 
@@ -162,13 +196,7 @@ fn is_ended(existing: &Submission) -> bool {
 
 /// True if this was sent after what made or bumped the object.
 fn is_newer(existing: &Submission, incoming: &Incoming) -> bool {
-    let recorded = existing
-        .metadata
-        .annotations
-        .as_ref()
-        .and_then(|all| all.get(names::ANNOTATION_INGESTED))
-        .and_then(|text| serde_json::from_str::<Ingested>(text).ok());
-    let Some(recorded) = recorded else {
+    let Some(recorded) = Ingested::of(existing) else {
         // Made by hand: only what was sent after it was made is a wish to resume it.
         let created = existing.metadata.creation_timestamp.as_ref();
         return created.is_some_and(|time| incoming.sent_ms >= time.0.as_millisecond() + 1000);
@@ -196,7 +224,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
     Submission {
         metadata: ObjectMeta {
             name: Some(names::submission(incoming.submission)),
-            annotations: Some(BTreeMap::from([annotation(incoming)])),
+            annotations: Some(BTreeMap::from([annotation(&record(None, incoming, 1))])),
             labels: Some(BTreeMap::from([
                 (names::LABEL_LEADERBOARD.to_owned(), leaderboard.to_owned()),
                 (names::LABEL_PHASE.to_owned(), incoming.phase.to_string()),
@@ -218,9 +246,25 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
     }
 }
 
-fn annotation(incoming: &Incoming) -> (String, String) {
-    let text = json!({ "message": incoming.source.id(), "sent": incoming.sent_ms }).to_string();
-    (names::ANNOTATION_INGESTED.to_owned(), text)
+/// What is noted of an attempt that this begins. A message begins the count anew; a first run needs none to be granted.
+fn record(existing: Option<&Submission>, incoming: &Incoming, attempt: i64) -> Ingested {
+    let mut without_message = match incoming.source {
+        Source::Message(_) => Vec::new(),
+        Source::Sweep { .. } => existing.and_then(Ingested::of).unwrap_or_default().without_message,
+    };
+    if incoming.source == (Source::Sweep { is_resuming: true }) {
+        without_message.push(attempt);
+    }
+    Ingested {
+        message: incoming.source.id().to_owned(),
+        sent: incoming.sent_ms,
+        without_message,
+        refused: None,
+    }
+}
+
+fn annotation(record: &Ingested) -> (String, String) {
+    (names::ANNOTATION_INGESTED.to_owned(), json!(record).to_string())
 }
 
 /// Creates or bumps the Submission in the namespace of `api`, which is that of the Leaderboard.
@@ -235,8 +279,27 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
                 attempt,
                 resource_version,
             } => {
-                let bumped = bump(api, &name, attempt, &resource_version, incoming).await?;
+                let record = record(existing.as_ref(), incoming, attempt);
+                let spec = json!({ "attempt": attempt, "cancel": false });
+                let bumped = note(api, &name, &resource_version, &record, &spec).await?;
                 bumped.then_some(Outcome::Bumped(attempt))
+            }
+            Ingest::Refuse {
+                attempt,
+                resource_version,
+            } => {
+                let known = existing.as_ref().and_then(Ingested::of).unwrap_or_default();
+                let at = incoming.sent_ms;
+                let refused = Some(RefusedAttempt { attempt, at });
+                let noted = note(
+                    api,
+                    &name,
+                    &resource_version,
+                    &Ingested { refused, ..known },
+                    &json!({}),
+                )
+                .await?;
+                noted.then_some(Outcome::Refused)
             }
             Ingest::Repeat => Some(Outcome::Repeat),
             Ingest::Deleting => Some(Outcome::Deleting),
@@ -260,18 +323,18 @@ async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result
     unless_lost(&[409], name, "created", request).await
 }
 
-/// False if the object is no longer what the decision was made on.
-async fn bump(
+/// Writes the annotation, and with it what changes of the spec. False if the object is no longer what the decision was made on.
+async fn note(
     api: &Api<Submission>,
     name: &str,
-    attempt: i64,
     resource_version: &str,
-    incoming: &Incoming,
+    record: &Ingested,
+    spec: &Value,
 ) -> Result<bool, IngestError> {
-    let (key, text) = annotation(incoming);
+    let (key, text) = annotation(record);
     let patch = json!({
         "metadata": { "resourceVersion": resource_version, "annotations": { key: text } },
-        "spec": { "attempt": attempt, "cancel": false },
+        "spec": spec,
     });
     let params = PatchParams {
         field_manager: Some(names::MANAGER_INGEST.to_owned()),

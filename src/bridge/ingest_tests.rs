@@ -24,7 +24,12 @@ fn message(id: &str, sent_ms: i64) -> Incoming {
 }
 
 fn sweep(sent_ms: i64) -> Incoming {
-    incoming(Source::Sweep, sent_ms)
+    incoming(Source::Sweep { is_resuming: false }, sent_ms)
+}
+
+/// What the sweep finds of a resume whose message was lost.
+fn swept_resume(sent_ms: i64) -> Incoming {
+    incoming(Source::Sweep { is_resuming: true }, sent_ms)
 }
 
 /// What the API server would hold after the first `incoming`.
@@ -59,7 +64,7 @@ fn with_state(mut made: Submission, state: State) -> Submission {
 /// The object after a bump was carried out and the controller has not looked yet.
 fn bumped(mut made: Submission, by: &Incoming) -> Submission {
     made.spec.attempt += 1;
-    let (key, text) = annotation(by);
+    let (key, text) = annotation(&record(Some(&made), by, made.spec.attempt));
     made.metadata.annotations.get_or_insert_default().insert(key, text);
     made.metadata.resource_version = Some("11".into());
     made
@@ -182,20 +187,85 @@ fn the_sweep_and_the_message_that_it_stood_in_for_count_once() {
     );
     check("a resume after that", &by_sweep, &message("b", last + 1), &bump_to(2));
     check("the same row again", &by_sweep, &swept, &REPEAT);
-    check("the next lost resume", &by_sweep, &sweep(300_000), &bump_to(2));
+    check("the next lost resume", &by_sweep, &swept_resume(300_000), &bump_to(2));
     check("a row that a message served", &by_message, &sweep(99_500), &REPEAT);
     check(
         "a lost resume after a message",
         &by_message,
-        &sweep(300_000),
+        &swept_resume(300_000),
         &bump_to(2),
     );
     check(
         "a row of one that runs",
         &with_state(made_by(&first), State::Running),
-        &sweep(300_000),
+        &swept_resume(300_000),
         &REPEAT,
     );
+}
+
+fn refuse(attempt: i64, version: &str) -> Ingest {
+    Ingest::Refuse {
+        attempt,
+        resource_version: version.into(),
+    }
+}
+
+/// The object after a refusal was noted.
+fn refused(mut made: Submission, sent_ms: i64) -> Submission {
+    let record = Ingested {
+        refused: Some(RefusedAttempt {
+            attempt: made.spec.attempt + 1,
+            at: sent_ms,
+        }),
+        ..Ingested::of(&made).unwrap_or_default()
+    };
+    let (key, text) = annotation(&record);
+    made.metadata.annotations.get_or_insert_default().insert(key, text);
+    made
+}
+
+#[test]
+fn a_row_that_was_edited_to_submitted_begins_no_other_attempt() {
+    let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    check("the first time", &failed, &sweep(300_000), &refuse(2, "10"));
+    let noted = refused(failed, 300_000);
+    check("the same row again", &noted, &sweep(300_000), &REPEAT);
+    check("edited once more", &noted, &sweep(400_000), &REPEAT);
+    check("a message", &noted, &message("b", 350_000), &bump_to(2));
+    // A person has raised the attempt.
+    let mut raised = noted;
+    raised.spec.attempt = 2;
+    let raised = with_state(raised, State::Failed);
+    check("after another attempt", &raised, &sweep(500_000), &refuse(3, "10"));
+}
+
+#[test]
+fn one_attempt_begins_without_a_message_until_the_next_message_comes() {
+    let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    let lost = swept_resume(300_000);
+    check("a resume whose message was lost", &failed, &lost, &bump_to(2));
+    let second = with_state(bumped(failed, &lost), State::Failed);
+    assert_eq!(Ingested::of(&second).unwrap().without_message, [2]);
+    check("another one", &second, &swept_resume(600_000), &refuse(3, "11"));
+    let noted = refused(second, 600_000);
+    check("and another one", &noted, &swept_resume(900_000), &REPEAT);
+    let resume = message("b", 950_000);
+    let third = with_state(bumped(noted, &resume), State::Failed);
+    assert_eq!(Ingested::of(&third).unwrap().without_message, [0_i64; 0]);
+    let want = Ingest::Bump {
+        attempt: 4,
+        resource_version: "11".into(),
+    };
+    check("after a message", &third, &swept_resume(1_300_000), &want);
+}
+
+#[test]
+fn a_resume_without_a_message_counts_also_where_its_object_is_gone() {
+    let made = with_state(made_by(&swept_resume(100_000)), State::Failed);
+    assert_eq!(Ingested::of(&made).unwrap().without_message, [1]);
+    check("the next one", &made, &swept_resume(600_000), &refuse(2, "10"));
+    let first = with_state(made_by(&sweep(100_000)), State::Failed);
+    check("of a first run", &first, &swept_resume(600_000), &bump_to(2));
 }
 
 #[test]
@@ -349,6 +419,23 @@ async fn a_bump_is_one_patch_bound_to_what_was_read() {
         "spec": {"attempt": 2, "cancel": false},
     });
     assert_eq!(asked[2].1, want);
+}
+
+#[tokio::test]
+async fn a_refusal_is_noted_and_changes_no_attempt() {
+    let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    let script = vec![refusal(409, "AlreadyExists"), object(&failed), object(&failed)];
+    let (outcome, asked) = against(script, sweep(300_000)).await;
+    assert_eq!(outcome.unwrap(), Outcome::Refused);
+    let record = json!({"message": "a", "sent": 100_000, "refused": {"attempt": 2, "at": 300_000}}).to_string();
+    let want = json!({
+        "metadata": {"resourceVersion": "10", "annotations": {names::ANNOTATION_INGESTED: record}},
+        "spec": {},
+    });
+    assert_eq!(
+        (asked[2].0.as_str(), &asked[2].1),
+        (format!("PATCH {ONE}").as_str(), &want)
+    );
 }
 
 #[tokio::test]

@@ -5,8 +5,7 @@
 use serde_json::{Map, Value};
 use thiserror::Error;
 
-/// Longest image reference that a Submission may have.
-const IMAGE_LIMIT: usize = 512;
+use crate::api::image;
 
 /// A message that names a submission of EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,15 +57,15 @@ pub fn parse(body: &str) -> Result<Message, Malformed> {
         challenge: id(&map, "challenge_pk")?,
         phase: id(&map, "phase_pk")?,
         submission: id(&map, "submission_pk")?,
-        image: map.get("submitted_image_uri").and_then(Value::as_str).and_then(image),
+        image: map.get("submitted_image_uri").and_then(Value::as_str).and_then(fitting),
     })
 }
 
-/// An image reference as a Submission holds it, if the text is one.
-pub fn image(text: &str) -> Option<String> {
+/// The text as the image of a Submission, if the definition would take it. Whether it can be pulled is judged at acceptance.
+fn fitting(text: &str) -> Option<String> {
     let text = text.trim();
     let starts_well = text.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit());
-    let fits = text.chars().count() <= IMAGE_LIMIT && !text.contains(char::is_whitespace);
+    let fits = text.chars().count() <= image::LONGEST && !text.contains(char::is_whitespace);
     (starts_well && fits).then(|| text.to_owned())
 }
 

@@ -18,19 +18,18 @@ use std::time::Duration;
 use kube::Client;
 use kube::runtime::events::{Recorder, Reporter};
 use tokio::sync::watch;
-use tokio::task::{AbortHandle, JoinSet};
+use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 pub use health::{Health, Readiness};
 
+use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::aws::Aws;
 use poller::Poller;
 use world::World;
 
 /// How long messages in hand may take to be finished when the program stops.
 const DRAIN: Duration = Duration::from_secs(20);
-/// How often it is checked that each poller still runs.
-const CHECK: Duration = Duration::from_secs(30);
 /// An answer of the API server that is younger than this is taken for granted.
 const PULSE_AGE: Duration = Duration::from_secs(5);
 /// How soon the API server must answer before messages are received.
@@ -96,7 +95,6 @@ impl Shared {
 struct Running {
     connection: Connection,
     stop: watch::Sender<bool>,
-    task: AbortHandle,
 }
 
 /// How to reach a queue.
@@ -106,12 +104,15 @@ struct Connection {
     endpoint: Option<String>,
 }
 
-/// Runs the bridge until `shutdown` becomes true; then finishes what is in hand, within 20 s.
-pub async fn run(client: Client, aws: Aws, mut shutdown: watch::Receiver<bool>, settings: Settings) {
+/// Runs the bridge until the stop of `tasks`; then finishes what is in hand, within 20 s.
+///
+/// # Errors
+/// If one of its tasks has ended before.
+pub async fn run(client: Client, aws: Aws, tasks: Tasks, settings: Settings) -> Result<(), TaskFailed> {
     let (sender, mut world) = watch::channel(World::default());
     let api = world::api(client.clone(), settings.namespace.as_deref());
     let (health, observer) = (settings.health.clone(), settings.observer.clone());
-    let watch_task = tokio::spawn(world::follow(api, sender, health, observer));
+    let watch_task = tasks.stay("watch of leaderboards", world::follow(api, sender, health, observer));
     let reporter = Reporter {
         controller: "leaderboard.carla.org/bridge".to_owned(),
         instance: std::env::var("POD_NAME").ok(),
@@ -127,20 +128,23 @@ pub async fn run(client: Client, aws: Aws, mut shutdown: watch::Receiver<bool>, 
         shared,
         world: world.clone(),
         running: BTreeMap::new(),
-        tasks: JoinSet::new(),
+        tasks: tasks.clone(),
+        started: Vec::new(),
     };
-    let mut check = tokio::time::interval(CHECK);
     loop {
         tokio::select! {
-            _ = shutdown.wait_for(|stop| *stop) => break,
-            changed = world.changed() => if changed.is_err() { break },
-            _ = check.tick() => {}
+            biased;
+            failed = tasks.failed() => return Err(failed),
+            () = tasks.stop().wait() => break,
+            // The watch's task holds the sender: its end is a failed task.
+            changed = world.changed() => if changed.is_err() { std::future::pending().await },
         }
         let wished = wished(&world.borrow_and_update());
         pollers.adjust(&wished);
     }
     pollers.drain().await;
     watch_task.abort();
+    Ok(())
 }
 
 /// The queues that Leaderboards name, each reached as the oldest of them says.
@@ -167,7 +171,9 @@ struct Pollers {
     shared: Arc<Shared>,
     world: watch::Receiver<World>,
     running: BTreeMap<String, Running>,
-    tasks: JoinSet<()>,
+    tasks: Tasks,
+    /// All that have begun, those whose queue is no longer read until they have finished what is in hand.
+    started: Vec<JoinHandle<Option<()>>>,
 }
 
 impl Pollers {
@@ -175,7 +181,7 @@ impl Pollers {
     fn adjust(&mut self, wished: &BTreeMap<String, Connection>) {
         let health = self.shared.settings.health.clone();
         self.running.retain(|url, running| {
-            let keep = wished.get(url) == Some(&running.connection) && !running.task.is_finished();
+            let keep = wished.get(url) == Some(&running.connection);
             if !keep {
                 tracing::info!(queue = url, "the queue is no longer read in this way");
                 running.stop.send_replace(true);
@@ -188,7 +194,7 @@ impl Pollers {
                 self.start(url, connection);
             }
         }
-        while self.tasks.try_join_next().is_some() {}
+        self.started.retain(|task| !task.is_finished());
     }
 
     fn start(&mut self, url: &str, connection: &Connection) {
@@ -202,17 +208,19 @@ impl Pollers {
         let running = Running {
             connection: connection.clone(),
             stop,
-            task: self.tasks.spawn(poller.run()),
         };
+        // It may end before the process does: its queue may be taken out of the Leaderboards.
+        let task = self.tasks.may_end(format!("queue {url}"), poller.run());
+        self.started.push(task);
         self.running.insert(url.to_owned(), running);
     }
 
     /// Lets each poller finish what it has in hand.
-    async fn drain(mut self) {
+    async fn drain(self) {
         for running in self.running.values() {
             running.stop.send_replace(true);
         }
-        let all = async { while self.tasks.join_next().await.is_some() {} };
+        let all = futures::future::join_all(self.started);
         if tokio::time::timeout(DRAIN, all).await.is_err() {
             tracing::warn!("messages in hand were not finished in time and will come back");
         }

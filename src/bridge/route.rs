@@ -138,23 +138,13 @@ pub fn readers(url: &str, leaderboards: &[Arc<Leaderboard>]) -> Vec<Arc<Leaderbo
         .filter(|lb| lb.spec.evalai.is_some() && queue_of(lb).is_some_and(|queue| queue.url == url))
         .cloned()
         .collect();
-    readers.sort_by_key(|lb| age(lb));
+    readers.sort_by_key(|lb| lb.seniority());
     readers
 }
 
 /// The queue of a Leaderboard that takes messages.
 pub fn queue_of(leaderboard: &Leaderboard) -> Option<&Queue> {
     leaderboard.spec.queue.as_ref()
-}
-
-/// Sorts the older Leaderboard first: it serves a phase that several claim.
-fn age(leaderboard: &Leaderboard) -> (Option<jiff::Timestamp>, String, String) {
-    let created = leaderboard.metadata.creation_timestamp.as_ref().map(|time| time.0);
-    (
-        created,
-        leaderboard.name_any(),
-        leaderboard.namespace().unwrap_or_default(),
-    )
 }
 
 /// What the readers of a queue, the oldest first, say about it together.
@@ -185,7 +175,7 @@ pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, syn
         }
         Err(malformed) => return Fate::Dead(DeadReason::Malformed(malformed.to_string())),
     };
-    if let Some(leaderboard) = readers.iter().find(|lb| serves(lb, message)) {
+    if let Some(leaderboard) = readers.iter().find(|lb| lb.serves(message.challenge, message.phase)) {
         return Fate::Ingest {
             namespace: leaderboard.namespace().unwrap_or_default(),
             leaderboard: leaderboard.name_any(),
@@ -208,7 +198,8 @@ pub fn settle(envelope: &Envelope, outcome: &Result<Outcome, IngestError>, rules
     match outcome {
         Ok(Outcome::Created) => Fate::Delete(Done::Created),
         Ok(Outcome::Bumped(_)) => Fate::Delete(Done::Bumped),
-        Ok(Outcome::Repeat) => Fate::Delete(Done::Repeat),
+        // Only the sweep is refused an attempt.
+        Ok(Outcome::Repeat | Outcome::Refused) => Fate::Delete(Done::Repeat),
         Ok(Outcome::Deleting) => later(envelope.receives, SHORT_WAIT, Later::Deleting),
         Ok(Outcome::IdTaken(owner)) => Fate::Dead(DeadReason::IdTaken(owner.clone())),
         // Definitions that are newer or older than this program may refuse what others accept.
@@ -223,14 +214,6 @@ pub fn settle(envelope: &Envelope, outcome: &Result<Outcome, IngestError>, rules
 /// A dead letter without a dead-letter queue comes back ever more slowly.
 pub fn blocked(receives: i32) -> Fate {
     later(receives, LONGEST_WAIT, Later::Blocked)
-}
-
-fn serves(leaderboard: &Leaderboard, message: &Message) -> bool {
-    let spec = &leaderboard.spec;
-    spec.evalai
-        .as_ref()
-        .is_some_and(|evalai| evalai.challenge == message.challenge)
-        && spec.tracks.iter().any(|track| track.phase == Some(message.phase))
 }
 
 fn is_overdue(envelope: &Envelope, rules: &Rules, now_ms: i64) -> bool {

@@ -53,5 +53,6 @@ pub(super) async fn report_readiness(health: Arc<Health>, seen: Observability) {
         let now = health.readiness();
         seen.readiness
             .set("queues", if now.ready { Ok(()) } else { Err(now.text) });
+        seen.readiness.registered();
     }
 }

@@ -20,20 +20,22 @@ use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
 
+/// The commit that was built, where the build was given one.
+const REVISION: Option<&str> = option_env!("LEADERBOARD_REVISION");
 /// Environment variable with the log filter.
 const ENV_LOG: &str = "RUST_LOG";
 
 pub(super) fn controller(options: Controller) -> ExitCode {
-    start(options.server.log_format, || lead(options))
+    start("controller", options.server.log_format, || lead(options))
 }
 
 pub(super) fn bridge(options: Server) -> ExitCode {
-    start(options.log_format, || serve_bridge(options))
+    start("bridge", options.log_format, || serve_bridge(options))
 }
 
 pub(super) fn workspace(options: &InPod) -> ExitCode {
     ownlog::start(None);
-    start_quiet(|| async {
+    start_logged("workspace", || async {
         let setting = setting(options)?;
         workspace_program::main(setting).await.map_err(|e| e.to_string())
     })
@@ -42,7 +44,7 @@ pub(super) fn workspace(options: &InPod) -> ExitCode {
 pub(super) fn logcopy(options: &InPod) -> ExitCode {
     // Its log is one of the results as well.
     ownlog::start(Some(&Places::below(&options.root).logs));
-    start_quiet(|| async {
+    start_logged("logcopy", || async {
         let setting = setting(options)?;
         let stop = on_signals().map_err(|e| e.to_string())?;
         Box::pin(logcopy_program::main(setting, async move { stop.wait().await }))
@@ -57,7 +59,7 @@ fn setting(options: &InPod) -> Result<Setting, String> {
 }
 
 /// Logs, then works until the end; an error is said once and is the exit code.
-fn start<W>(format: Format, work: impl FnOnce() -> W) -> ExitCode
+fn start<W>(program: &'static str, format: Format, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
 {
@@ -65,13 +67,18 @@ where
         eprintln!("leaderboard-operator: {error}");
         return ExitCode::from(2);
     }
-    start_quiet(work)
+    start_logged(program, work)
 }
 
-fn start_quiet<W>(work: impl FnOnce() -> W) -> ExitCode
+fn start_logged<W>(program: &'static str, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
 {
+    let (version, revision) = (
+        env!("CARGO_PKG_VERSION"),
+        REVISION.filter(|revision| !revision.is_empty()),
+    );
+    tracing::info!(program, version, revision, "starting");
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
@@ -129,11 +136,12 @@ async fn serve_bridge(options: Server) -> Result<(), String> {
         health: std::sync::Arc::clone(&health),
         observer: std::sync::Arc::new(super::counters::BridgeCounters::new(&seen)),
     };
-    let reporting = tokio::spawn(super::counters::report_readiness(health, seen.clone()));
-    bridge::run(client, Aws::load().await, seen.stop.receiver(), settings).await;
+    let reporting = super::counters::report_readiness(health, seen.clone());
+    let reporting = seen.tasks.stay("readiness", reporting);
+    let result = bridge::run(client, Aws::load().await, seen.tasks.clone(), settings).await;
     reporting.abort();
     server.close().await;
-    Ok(())
+    result.map_err(|e| e.to_string())
 }
 
 async fn cluster() -> Result<Config, String> {

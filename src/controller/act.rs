@@ -21,13 +21,14 @@ use super::job_spec::{self, JobInput};
 use super::observe::{is_pod_of, uid_of};
 use super::significance::{Change, change, patience};
 use super::view::View;
-use crate::api::{Submission, SubmissionStatus, names};
+use crate::api::{State, Submission, SubmissionStatus, names};
+use crate::observability::text;
 use crate::pod::report::OWNER_KEY;
 
 /// What a pass could not carry out.
 #[derive(thiserror::Error, Debug)]
 pub enum ActError {
-    #[error("{what} of {object} failed: {source}")]
+    #[error("{what} of {object} failed: {}", text::kube(source))]
     Kubernetes {
         what: &'static str,
         object: String,
@@ -207,7 +208,27 @@ impl Actor<'_> {
         let call = api.patch_status(&name, &params, &body);
         let answer = self.call("the status", &self.name(), call).await?;
         self.context.memory.wrote(&answer);
+        self.log_transition(status);
         Ok(None)
+    }
+
+    /// One line for each change of the state, its reason or the attempt, written when it is stored: what a submission went
+    /// through can be read from the log without anything else.
+    fn log_transition(&self, new: &SubmissionStatus) {
+        let old = self.submission().status.as_ref();
+        let standing = |status: &SubmissionStatus| (status.state, status.reason.clone(), status.attempt);
+        if old.map(standing).unwrap_or_default() == standing(new) {
+            return;
+        }
+        tracing::info!(
+            submission = %format_args!("{}/{}", self.namespace, self.name()),
+            leaderboard = self.submission().spec.leaderboard,
+            attempt = new.attempt,
+            from = old.and_then(|status| status.state).map_or("none", State::as_str),
+            to = new.state.map_or("none", State::as_str),
+            reason = new.reason,
+            "{}", new.message.as_deref().unwrap_or("the submission has moved on")
+        );
     }
 
     async fn create_job(&self, status: &SubmissionStatus, attempt: i64, retry: i32) -> Result<(), ActError> {
@@ -374,7 +395,8 @@ impl Actor<'_> {
         match tokio::time::timeout(CALL_TIMEOUT, call).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => {
-                tracing::warn!(submission = %self.name(), reason = %event.reason, %error, "an event was not taken");
+                let error = text::kube(&error);
+                tracing::warn!(submission = %self.name(), reason = %event.reason, error, "an event was not taken");
             }
             Err(_) => tracing::warn!(submission = %self.name(), reason = %event.reason, "an event was not answered"),
         }
@@ -396,3 +418,7 @@ fn is_gone(error: &ActError) -> bool {
 fn is_conflict(error: &ActError) -> bool {
     matches!(error, ActError::Kubernetes { source, .. } if matches!(source.as_ref(), kube::Error::Api(status) if status.code == 409))
 }
+
+#[cfg(test)]
+#[path = "act_tests.rs"]
+mod tests;

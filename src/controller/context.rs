@@ -19,6 +19,7 @@ use super::observe::board::Board;
 use super::observe::is_pod_of;
 use super::observe::node::Nodes;
 use super::observe::report::Reports;
+use super::reruns::Reruns;
 use super::sync::Sync;
 use crate::api::{Leaderboard, Storage, Submission};
 use crate::services::archive::Archive;
@@ -71,6 +72,7 @@ pub struct Context {
     pub stores: Stores,
     pub memory: Memory,
     pub reports: Reports,
+    pub reruns: Reruns,
     pub board: Board,
     pub failure_logs: FailureLogs,
     pub desk: Desk,
@@ -90,6 +92,7 @@ impl Context {
             stores,
             memory: Memory::default(),
             reports: Reports::default(),
+            reruns: Reruns::default(),
             board: Board::default(),
             failure_logs: FailureLogs::default(),
             desk: Desk::default(),

@@ -19,6 +19,7 @@ use super::decide::{LogAt, LogPlace};
 use super::observe::uid_of;
 use super::view::View;
 use crate::api::SubmissionStatus;
+use crate::observability::text;
 use crate::pod::report::FAILURE_LOG_KEY;
 
 /// Characters that are kept, as EvalAI's own worker does.
@@ -50,7 +51,10 @@ struct Kept {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tail {
     pub container: String,
-    /// With a first line that says whose log it is; at most 10,000 characters in all.
+    pub attempt: i64,
+    /// Where all of it is, below the run's prefix, if it is stored.
+    pub key: Option<String>,
+    /// With the first line for hosts at most 10,000 characters.
     pub text: String,
 }
 
@@ -58,6 +62,23 @@ impl Tail {
     /// Whether the participant's own program wrote it.
     pub fn is_agents(&self) -> bool {
         self.container.starts_with("agent-")
+    }
+
+    /// With a first line that says whose log it is, and where all of it is.
+    pub fn for_hosts(&self) -> String {
+        format!(
+            "{}{}",
+            heading(&self.container, self.attempt, self.key.as_deref()),
+            self.text
+        )
+    }
+
+    /// With a first line that names no file which only hosts can read.
+    pub fn for_participants(&self) -> String {
+        format!(
+            "The end of {}'s log in attempt {}:\n{}",
+            self.container, self.attempt, self.text
+        )
     }
 }
 
@@ -141,10 +162,8 @@ async fn look(context: &Context, view: &View, status: &SubmissionStatus, places:
         };
         match read {
             Ok(Some(bytes)) => {
-                let text = tail(&heading(status, place), &bytes);
-                if let Some(text) = text {
-                    let container = place.container.clone();
-                    return Look::Found(Tail { container, text });
+                if let Some(found) = found(status, place, &bytes) {
+                    return Look::Found(found);
                 }
             }
             Ok(None) => {}
@@ -158,12 +177,26 @@ async fn look(context: &Context, view: &View, status: &SubmissionStatus, places:
     look
 }
 
-fn heading(status: &SubmissionStatus, place: &LogPlace) -> String {
-    let attempt = status.attempt.unwrap_or(1);
-    let container = &place.container;
-    match &place.at {
-        LogAt::Bucket { key } => format!("The end of {container}'s log in attempt {attempt}; all of it is in {key}.\n"),
-        LogAt::Node { .. } => format!("The end of {container}'s log in attempt {attempt}.\n"),
+fn found(status: &SubmissionStatus, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
+    let (container, attempt) = (place.container.clone(), status.attempt.unwrap_or(1));
+    let key = match &place.at {
+        LogAt::Bucket { key } => Some(key.clone()),
+        LogAt::Node { .. } => None,
+    };
+    let heading = heading(&container, attempt, key.as_deref());
+    let text = tail(TAIL_CHARS.saturating_sub(heading.chars().count()), bytes)?;
+    Some(Tail {
+        container,
+        attempt,
+        key,
+        text,
+    })
+}
+
+fn heading(container: &str, attempt: i64, key: Option<&str>) -> String {
+    match key {
+        Some(key) => format!("The end of {container}'s log in attempt {attempt}; all of it is in {key}.\n"),
+        None => format!("The end of {container}'s log in attempt {attempt}.\n"),
     }
 }
 
@@ -187,7 +220,7 @@ async fn of_node(
         Ok(stream) => stream,
         // Gone, or the container has no earlier run that the node remembers.
         Err(kube::Error::Api(status)) if [400, 404].contains(&status.code) => return Ok(None),
-        Err(error) => return Err(error.to_string()),
+        Err(error) => return Err(text::kube(&error)),
     };
     let mut bytes = Vec::new();
     let read = pin!(stream).take(NODE_BYTES).read_to_end(&mut bytes).await;
@@ -209,7 +242,7 @@ async fn store(context: &Context, view: &View, status: &SubmissionStatus, tail: 
         return true;
     };
     let archive = context.archive(&plan.storage, &plan.run_id);
-    let put = archive.put(FAILURE_LOG_KEY, tail.text.clone().into_bytes());
+    let put = archive.put(FAILURE_LOG_KEY, tail.for_hosts().into_bytes());
     let Err(why) = context.buckets.call_large(&plan.storage, TRY, put).await else {
         return true;
     };
@@ -217,17 +250,17 @@ async fn store(context: &Context, view: &View, status: &SubmissionStatus, tail: 
     false
 }
 
-/// The last characters of a log below a heading: text alone, without colors and control characters. None if nothing is left.
-fn tail(heading: &str, bytes: &[u8]) -> Option<String> {
+/// The last characters of a log, as many as there is room for: text alone, without colors and control characters. None if nothing
+/// is left.
+fn tail(room: usize, bytes: &[u8]) -> Option<String> {
     let clean = plain(&String::from_utf8_lossy(bytes));
     // What was read may begin in the middle of a character.
     let clean = clean.trim_start_matches(char::REPLACEMENT_CHARACTER).trim();
     if clean.is_empty() {
         return None;
     }
-    let room = TAIL_CHARS.saturating_sub(heading.chars().count());
     let skip = clean.chars().count().saturating_sub(room);
-    Some(heading.chars().chain(clean.chars().skip(skip)).collect())
+    Some(clean.chars().skip(skip).collect())
 }
 
 /// A terminal's text as a file's: a carriage return ends a line, sequences that move or color are dropped.
@@ -268,20 +301,43 @@ mod tests {
 
     use super::*;
 
+    fn status() -> SubmissionStatus {
+        SubmissionStatus {
+            attempt: Some(1),
+            ..SubmissionStatus::default()
+        }
+    }
+
+    fn place() -> LogPlace {
+        let key = "agent/agent2/leaderboard.log".to_owned();
+        LogPlace {
+            container: "agent-2".into(),
+            at: LogAt::Bucket { key },
+        }
+    }
+
     #[test]
     fn a_tail_is_the_end_of_the_text_and_no_longer_than_allowed() {
         let long: Vec<String> = (0..5000).map(|n| format!("line {n} ü")).collect();
         let long = long.join("\n");
-        let found = tail("The end:\n", long.as_bytes()).unwrap();
-        assert_eq!(found.chars().count(), TAIL_CHARS);
-        assert!(
-            found.starts_with("The end:\n") && found.ends_with("line 4999 ü"),
-            "{found}"
-        );
-        assert_eq!(tail("The end:\n", b"short\n").as_deref(), Some("The end:\nshort"));
+        let cut = found(&status(), &place(), long.as_bytes()).unwrap().for_hosts();
+        assert_eq!(cut.chars().count(), TAIL_CHARS);
+        let heading = "The end of agent-2's log in attempt 1; all of it is in agent/agent2/leaderboard.log.\n";
+        assert!(cut.starts_with(heading) && cut.ends_with("line 4999 ü"), "{cut}");
+        let short = found(&status(), &place(), b"short\n").unwrap();
+        assert_eq!(short.for_hosts(), format!("{heading}short"));
         for nothing in ["", " \n\r\n", "\u{1b}[0m\u{0}"] {
-            assert_eq!(tail("The end:\n", nothing.as_bytes()), None, "{nothing:?}");
+            assert_eq!(found(&status(), &place(), nothing.as_bytes()), None, "{nothing:?}");
         }
+    }
+
+    #[test]
+    fn what_participants_read_of_a_log_names_no_file_of_the_hosts() {
+        let tail = found(&status(), &place(), b"Traceback: boom\n").unwrap();
+        assert_eq!(
+            tail.for_participants(),
+            "The end of agent-2's log in attempt 1:\nTraceback: boom"
+        );
     }
 
     #[test]
@@ -298,21 +354,15 @@ mod tests {
             (b"cut \x1b", "cut"),
             ("\u{85}\u{9b}31m é".as_bytes(), "31m é"),
         ] {
-            assert_eq!(tail("", bytes).as_deref(), Some(text), "{bytes:?}");
+            assert_eq!(tail(TAIL_CHARS, bytes).as_deref(), Some(text), "{bytes:?}");
         }
     }
 
     #[test]
     fn a_log_belongs_to_one_job() {
         let logs = FailureLogs::default();
-        let mut status = SubmissionStatus {
-            attempt: Some(1),
-            ..SubmissionStatus::default()
-        };
-        let found = Tail {
-            container: "agent-2".into(),
-            text: "t".into(),
-        };
+        let mut status = status();
+        let found = found(&status, &place(), b"t").unwrap();
         assert!(found.is_agents());
         logs.put("u", Kept::new(&status, Some(found.clone())));
         assert_eq!(logs.tail("u", &status), Some(found));

@@ -23,6 +23,8 @@ use tower_test::mock::{Handle, pair};
 use super::context::{Context, Settings, Stores};
 use super::sync::Sync;
 use crate::api::{Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use crate::observability::shutdown::Stop;
+use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options, Timeouts, Timing};
 use crate::services::meter::Meter;
@@ -75,7 +77,8 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let known = cluster.submissions.iter().map(|s| (s.name_any(), json!(s))).collect();
     tokio::spawn(serve(handle, known, tell));
     let client = Client::new(service, NAMESPACE);
-    let (stop, stopped) = watch::channel(false);
+    let (stop, stopped) = Stop::new();
+    let tasks = Tasks::new(stopped);
     let (changed, sweep, wake) = (
         mpsc::unbounded_channel().0,
         mpsc::unbounded_channel().0,
@@ -89,8 +92,9 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         timing: Timing::default(),
         timeouts: Timeouts::default(),
         meter: Meter::default(),
+        tasks: tasks.clone(),
     });
-    let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, stopped));
+    let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, tasks));
     let stores = Stores {
         leaderboards: store(cluster.leaderboards),
         submissions: store(cluster.submissions),

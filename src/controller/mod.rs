@@ -12,7 +12,7 @@ pub mod context;
 pub mod decide;
 pub mod failure_log;
 #[cfg(test)]
-mod fixtures;
+pub(crate) mod fixtures;
 pub mod job_spec;
 pub mod leader;
 pub mod leaderboards;
@@ -20,6 +20,7 @@ pub mod memory;
 pub mod network_policy;
 pub mod observe;
 pub mod pod_overlay;
+pub mod reruns;
 mod result_texts;
 pub mod run;
 pub mod significance;

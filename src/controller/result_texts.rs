@@ -52,7 +52,7 @@ impl TextError {
     }
 }
 
-/// The payload of a partial or final result.
+/// The payload of a final result.
 pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
     let text = |key| stored(context, view, report, key);
     let (stdout, metadata) = futures::future::try_join(text(STDOUT_KEY), text(METADATA_KEY)).await?;
@@ -61,6 +61,19 @@ pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> 
         metadata,
         ..without_texts(view, report)
     })
+}
+
+/// The payload of a partial result: with the metrics over the routes so far, where `results` has zeros until the end.
+pub(super) async fn partial_payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
+    let payload = payload(context, view, report).await?;
+    Ok(Payload {
+        result: partial_results(report).to_owned(),
+        ..payload
+    })
+}
+
+fn partial_results(report: &Report) -> &str {
+    report.partial_results.as_ref().unwrap_or(&report.results)
 }
 
 /// The numbers alone.
@@ -77,7 +90,7 @@ pub(super) fn phase(view: &View) -> i64 {
     view.submission.spec.evalai.map_or(0, |e| e.phase)
 }
 
-/// What the participant reads of a failure: class, sentence and next step, in our words only.
+/// What the participant reads of a failure: class, sentence and a next step that a participant can do, in our words only.
 pub(super) fn stderr(status: &SubmissionStatus) -> String {
     let Some(failure) = &status.failure else {
         return String::new();
@@ -86,7 +99,8 @@ pub(super) fn stderr(status: &SubmissionStatus) -> String {
         FailureClass::Participant => "participant",
         FailureClass::Infrastructure => "infrastructure, not charged",
     };
-    format!("{} ({class}): {}", failure.reason, failure.message)
+    let text = failure.participant_message.as_ref().unwrap_or(&failure.message);
+    format!("{} ({class}): {text}", failure.reason)
 }
 
 /// Who may read the log of a failure.
@@ -101,9 +115,9 @@ pub(super) fn log_readers(view: &View) -> LogTail {
 pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTail) {
     let Some(tail) = tail else { return };
     if readers == LogTail::Participants && tail.is_agents() {
-        payload.stderr = format!("{}\n\n{}", payload.stderr, tail.text);
+        payload.stderr = format!("{}\n\n{}", payload.stderr, tail.for_participants());
     }
-    payload.environment_log = tail.text;
+    payload.environment_log = tail.for_hosts();
 }
 
 async fn stored(context: &Context, view: &View, report: &Report, key: &'static str) -> Result<String, TextError> {
@@ -126,7 +140,8 @@ async fn stored(context: &Context, view: &View, report: &Report, key: &'static s
     String::from_utf8(bytes).map_err(|_| unfit("is not text"))
 }
 
-/// The row of a submission as it stands, with the metrics of a report; none before it has a team.
+/// The row of a submission as it stands; none before it has a team. Only a finished one has metrics, those of its report, as in
+/// the original's table: of every other the columns are absent, whatever an earlier operator has written there.
 pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<Row> {
     let team = status.team.as_ref()?;
     let plan = status.plan.as_ref()?;
@@ -147,8 +162,13 @@ pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<
         end_time: text(status.times.finished.as_ref()),
         results: status.results.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
-        metrics: report.map(|r| columns(&r.results, plan.results)).unwrap_or_default(),
+        metrics: columns(report.filter(|_| is_finished(status)), plan.results),
     })
+}
+
+/// Whether its results count.
+pub(super) fn is_finished(status: &SubmissionStatus) -> bool {
+    status.state == Some(State::Finished)
 }
 
 fn table_status(state: Option<State>) -> &'static str {
@@ -161,38 +181,70 @@ fn table_status(state: Option<State>) -> &'static str {
     }
 }
 
-/// The metric columns, as text with the digits of results.json.
-fn columns(results: &str, format: ResultsFormat) -> Vec<(String, String)> {
+/// The metric columns, as text with the digits of results.json; those without a value are to be removed.
+fn columns(report: Option<&Report>, format: ResultsFormat) -> Vec<(String, Option<String>)> {
     let format = match format {
         ResultsFormat::V1 => Format::V1,
         ResultsFormat::V2 => Format::V2,
     };
-    let parsed: Value = serde_json::from_str(results).unwrap_or_default();
+    let parsed: Value = report
+        .and_then(|report| serde_json::from_str(&report.results).ok())
+        .unwrap_or_default();
     let accuracies = &parsed[0]["accuracies"];
-    let known = metrics(format).iter().filter_map(|metric| {
-        let value = accuracies.get(metric.name)?;
-        let text = if value.is_f64() {
-            number_text(value.as_f64()?)
-        } else {
-            value.to_string()
-        };
-        Some((metric.column.to_owned(), text))
-    });
-    known.collect()
+    let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
+        Some(number) => number_text(number),
+        None => value.to_string(),
+    };
+    let all = metrics(format)
+        .iter()
+        .map(|metric| (metric.column.to_owned(), accuracies.get(metric.name).map(text)));
+    all.collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use serde_json::json;
+
+    fn report(results: &str) -> Report {
+        serde_json::from_value(json!({
+            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "pairs": [],
+            "final": false, "eligible": false, "entryStatus": "Started", "results": results, "partialResults": "so far",
+        }))
+        .unwrap()
+    }
+
+    fn plan() -> Value {
+        json!({
+            "runId": "7", "results": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-3"], "routes": 4,
+            "repetitions": 1, "storage": {"bucket": "b"}, "image": "i", "contentsImage": "c", "simulatorImage": "s",
+        })
+    }
 
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
         let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
-        let found = columns(results, ResultsFormat::V2);
-        let get = |name: &str| found.iter().find(|(n, _)| n == name).map(|(_, v)| v.as_str());
+        let found = columns(Some(&report(results)), ResultsFormat::V2);
+        let get = |name: &str| found.iter().find(|(n, _)| n == name).and_then(|(_, v)| v.as_deref());
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
         assert_eq!(get("agent_blocked"), Some("0"));
+        assert_eq!(found.len(), 15);
+    }
+
+    #[test]
+    fn only_the_row_of_a_finished_submission_has_metrics() {
+        let report = report(r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]"#);
+        let score = |state: &str| {
+            let status = json!({"state": state, "team": {"id": "3"}, "plan": plan()});
+            let row = row(Some(&report), &serde_json::from_value(status).unwrap()).unwrap();
+            assert_eq!(row.metrics.len(), 15, "what is not there is removed");
+            row.metrics[0].clone()
+        };
+        for state in ["Pending", "Running", "Resumed", "Failed", "Cancelled"] {
+            assert_eq!(score(state), ("driving_score".to_owned(), None), "{state}");
+        }
+        assert_eq!(score("Finished").1.as_deref(), Some("43.125"));
     }
 
     #[test]
@@ -200,6 +252,8 @@ mod tests {
         let shown = |container: &str, readers| {
             let tail = Tail {
                 container: container.into(),
+                attempt: 1,
+                key: Some("agent/agent1/leaderboard.log".into()),
                 text: "route 7".into(),
             };
             let mut payload = Payload {
@@ -207,14 +261,23 @@ mod tests {
                 ..Payload::default()
             };
             add_log(&mut payload, Some(tail), readers);
-            assert_eq!(payload.environment_log, "route 7");
+            assert!(
+                payload
+                    .environment_log
+                    .ends_with("in agent/agent1/leaderboard.log.\nroute 7")
+            );
+            assert!(
+                !payload.stderr.contains("leaderboard.log"),
+                "no file that only hosts can read"
+            );
             assert!(!payload.stdout.contains("route") && !payload.metadata.contains("route"));
             payload.stderr
         };
         for container in ["agent-1", "simulator-1", "contents"] {
             assert!(!shown(container, LogTail::Hosts).contains("route"), "{container}");
         }
-        assert!(shown("agent-1", LogTail::Participants).ends_with("it crashed.\n\nroute 7"));
+        let told = "it crashed.\n\nThe end of agent-1's log in attempt 1:\nroute 7";
+        assert!(shown("agent-1", LogTail::Participants).ends_with(told));
         for container in ["simulator-1", "contents", "workspace", "logcopy"] {
             assert!(
                 !shown(container, LogTail::Participants).contains("route"),
@@ -224,7 +287,16 @@ mod tests {
     }
 
     #[test]
+    fn a_partial_result_has_the_metrics_so_far_where_a_report_has_them() {
+        let mut report = report("zeros");
+        assert_eq!(partial_results(&report), "so far");
+        report.partial_results = None;
+        assert_eq!(partial_results(&report), "zeros", "of an older operator's Pod");
+    }
+
+    #[test]
     fn a_broken_report_has_no_columns() {
-        assert!(columns("not json", ResultsFormat::V2).is_empty());
+        let found = columns(Some(&report("not json")), ResultsFormat::V2);
+        assert!(found.iter().all(|(_, value)| value.is_none()));
     }
 }

@@ -11,11 +11,12 @@ use super::bucket::BucketError;
 use super::context::Context;
 use super::decide::Tell;
 use super::observe::{report, uid_of};
+use super::reruns;
 use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
-use crate::api::{Leaderboard, Submission, SubmissionStatus, conditions, names};
+use crate::api::{Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
 use crate::services::ObjectKey;
-use crate::services::evalai::{self, Ended, Hub, Outcome, Payload, Run, Status, Target, Wish};
+use crate::services::evalai::{self, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
 
 /// How long an end waits to be told for a result that cannot be read: as long as the end itself.
@@ -57,7 +58,13 @@ impl Sync {
     }
 
     /// What EvalAI is known to say of a submission.
-    pub fn evalai_view(&self, leaderboard: Option<&Leaderboard>, submission: &Submission) -> Option<EvalaiView> {
+    /// `known` looks another Submission up by its name.
+    pub fn evalai_view(
+        &self,
+        leaderboard: Option<&Leaderboard>,
+        submission: &Submission,
+        known: impl Fn(&str) -> Option<Arc<Submission>>,
+    ) -> Option<EvalaiView> {
         submission.spec.evalai?;
         let Some(seen) = self.hub.view(&object_key(submission)) else {
             let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
@@ -67,7 +74,11 @@ impl Sync {
                 ..EvalaiView::default()
             });
         };
-        Some(map_view(&seen, submission))
+        let rerun_of = seen
+            .row
+            .as_ref()
+            .and_then(|row| reruns::original(row, submission, known));
+        Some(map_view(&seen, submission, rerun_of))
     }
 
     /// What is known of a submission's row. None without a table.
@@ -84,10 +95,10 @@ impl Sync {
         }))
     }
 
-    /// Asks EvalAI whether a submission wants to run.
+    /// Asks EvalAI whether a submission wants to run, or what became of one that has ended.
     pub fn ask(&self, view: &View) {
         let Some(way) = self.way(view) else { return };
-        let wants_image = view.submission.spec.image.is_none();
+        let wants_image = wants_image(&view.submission);
         let asked = self.hub.ask(&way.target, &way.key, way.pk, &way.run, wants_image);
         log_refused(&view.submission, asked);
     }
@@ -123,21 +134,19 @@ impl Sync {
         self.hub.forget(&object_key(submission));
     }
 
-    /// Writes the row, or lets the next write carry it. The last one of an attempt shows what was stored last, which no pass may
-    /// have seen while the attempt went on.
+    /// Writes the row, or lets the next write carry it. That of a finished submission has the metrics of what was stored last.
     pub async fn record(&self, context: &Context, view: &View, status: &SubmissionStatus, end: bool) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
-        let sight = if end {
+        let sight = if result_texts::is_finished(status) {
             last_report(context, view).await
         } else {
-            view.report.clone()
+            ReportSight::NotRead
         };
-        if end && matches!(sight, ReportSight::Unreadable(_)) {
-            if may_wait(view, status, END_WAITS) {
-                return;
-            }
-        } else if end {
+        if matches!(sight, ReportSight::Unreadable(_)) && may_wait(view, status, END_WAITS) {
+            return;
+        }
+        if end && !matches!(sight, ReportSight::Unreadable(_)) {
             context.memory.note_read(&view.submission);
         }
         if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
@@ -174,7 +183,7 @@ struct Way {
 
 async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
-    let read = result_texts::payload(context, view, report).await;
+    let read = result_texts::partial_payload(context, view, report).await;
     let attempt = view.submission.spec.attempt;
     // What takes too long or is not there is left out: the next route has a result of its own.
     if !matches!(read, Err(TextError::Unread(BucketError::Refused(_)))) {
@@ -250,13 +259,25 @@ async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, o
     Some(Wish::Final(outcome, Arc::new(payload)))
 }
 
-fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
+/// Whether it is run only with an image that EvalAI names.
+fn wants_image(submission: &Submission) -> bool {
+    let status = submission.status.as_ref();
+    let has_ended = status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
+    submission.spec.image.is_none() && !has_ended
+}
+
+fn map_view(seen: &evalai::View, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
     let attempt = submission.spec.attempt;
     // An image that was asked for is waited for; why there is none is an answer too.
-    let image_known = submission.spec.image.is_some() || seen.image.is_some();
+    let image_known = !wants_image(submission) || seen.image.is_some();
     let present = seen.attempt == attempt;
     let ended = seen.ended.filter(|_| present);
     let answered = seen.answered >= attempt;
+    let (image, image_problem) = match seen.image.clone() {
+        Some(ImageAnswer::Named(image)) => (Some(image), None),
+        Some(ImageAnswer::NotAnImage(why)) => (None, Some(why)),
+        Some(ImageAnswer::Unread(_)) | None => (None, None),
+    };
     EvalaiView {
         info: seen
             .row
@@ -269,10 +290,13 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
                     (None, _) => Standing::Wanted,
                 },
                 status: ended.unwrap_or(row.status).as_str().to_owned(),
+                phase: row.phase,
                 team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
                 team_name: row.team_name.clone(),
                 submitted_at: row.submitted_at,
-                image: seen.image.as_ref().and_then(|i| i.as_ref().ok().cloned()),
+                rerun_of,
+                image,
+                image_problem,
             }),
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
@@ -281,6 +305,7 @@ fn map_view(seen: &evalai::View, submission: &Submission) -> EvalaiView {
             .as_ref()
             .filter(|_| present)
             .map(|end| map_end(end, seen.read_at)),
+        team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }

@@ -33,7 +33,11 @@ impl Stored {
     fn update(&self, request: &Value) {
         let mut item = self.item.lock().unwrap();
         let update = request["UpdateExpression"].as_str().unwrap();
-        for set in update.trim_start_matches("SET ").split(", ") {
+        let (set, remove) = update.split_once(" REMOVE ").unwrap_or((update, ""));
+        for name in remove.split(", ").filter(|name| !name.is_empty()) {
+            item.remove(request["ExpressionAttributeNames"][name].as_str().unwrap());
+        }
+        for set in set.trim_start_matches("SET ").split(", ") {
             let (name, value) = set.split_once(" = ").unwrap();
             let column = request["ExpressionAttributeNames"][name].as_str().unwrap();
             let value = &request["ExpressionAttributeValues"][value];
@@ -64,8 +68,8 @@ struct Bench {
     status: SubmissionStatus,
 }
 
-/// A submission that has come to its end, whose row has the metrics of a partial result.
-async fn bench() -> Bench {
+/// A submission that has come to this end, whose row has the metrics of a partial result of an earlier operator's.
+async fn bench(state: State) -> Bench {
     let (sender, written) = mpsc::unbounded_channel();
     let partial = BTreeMap::from([("driving_score".to_owned(), "10.5".to_owned())]);
     let stored = Stored {
@@ -81,11 +85,11 @@ async fn bench() -> Bench {
     let (mut submission, _) = with_job("sub", &board);
     let now = Timestamp::now();
     let status = submission.status.as_mut().unwrap();
-    status.state = Some(State::Cancelled);
+    status.state = Some(state);
     status.conditions = vec![Condition {
         type_: conditions::FINISHED.into(),
         status: "True".into(),
-        reason: "Cancelled".into(),
+        reason: state.as_str().into(),
         message: String::new(),
         last_transition_time: Time(now),
         observed_generation: None,
@@ -104,6 +108,8 @@ async fn bench() -> Bench {
         record: Some(RecordView::default()),
         partial_told: None,
         unread: None,
+        rerun_as: None,
+        evalai_writes_from: None,
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,
@@ -150,17 +156,31 @@ fn last() -> String {
 
 #[tokio::test]
 async fn the_row_of_an_end_has_the_metrics_of_the_last_report() {
-    let mut bench = bench().await;
+    let mut bench = bench(State::Finished).await;
     bench.stores(&last());
     bench.records_the_end().await;
     let row = bench.row().await;
-    assert_eq!(row["submission_status"], "CANCELLED");
+    assert_eq!(row["submission_status"], "FINISHED");
     assert_eq!(row["driving_score"], "43.125", "not those of a partial result");
 }
 
 #[tokio::test]
+async fn the_row_of_an_end_without_results_that_count_has_no_metrics_and_waits_for_no_report() {
+    for (state, status) in [(State::Cancelled, "CANCELLED"), (State::Failed, "FAILED")] {
+        let mut bench = bench(state).await;
+        bench.stores("torn");
+        bench.records_the_end().await;
+        let row = bench.row().await;
+        assert_eq!(
+            (row["submission_status"].as_str(), row.get("driving_score")),
+            (status, None)
+        );
+    }
+}
+
+#[tokio::test]
 async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ever() {
-    let mut bench = bench().await;
+    let mut bench = bench(State::Finished).await;
     bench.stores("torn");
     bench.records_the_end().await;
     assert!(!bench.is_handed_in());
@@ -170,13 +190,13 @@ async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ev
     assert_eq!(bench.row().await["driving_score"], "43.125");
     assert_eq!(bench.unread(), None);
 
-    let mut bench = self::bench().await;
+    let mut bench = self::bench(State::Finished).await;
     bench.stores("torn");
     bench.view.now = bench.view.now.checked_add(END_WAITS).unwrap();
     bench.records_the_end().await;
-    assert_eq!(bench.row().await["submission_status"], "CANCELLED");
+    assert_eq!(bench.row().await["submission_status"], "FINISHED");
 
-    let mut bench = self::bench().await;
+    let mut bench = self::bench(State::Finished).await;
     bench.stores("torn");
     let mut submission = bench.view.submission.as_ref().clone();
     submission.metadata.deletion_timestamp = Some(Time(bench.view.now));
@@ -190,5 +210,5 @@ async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ev
         .checked_add(SignedDuration::from_secs(900 - 120))
         .unwrap();
     bench.records_the_end().await;
-    assert_eq!(bench.row().await["submission_status"], "CANCELLED");
+    assert_eq!(bench.row().await["submission_status"], "FINISHED");
 }

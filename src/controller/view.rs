@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use jiff::Timestamp;
 
-use crate::api::{Leaderboard, Submission};
+use crate::api::{Leaderboard, Rerun, Submission};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 
@@ -28,6 +28,10 @@ pub struct View {
     pub partial_told: Option<u32>,
     /// Why its result could not be read when it was to be told last.
     pub unread: Option<String>,
+    /// The submission that re-runs this one, as its status says.
+    pub rerun_as: Option<Rerun>,
+    /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
+    pub evalai_writes_from: Option<Timestamp>,
 }
 
 /// The Job that the present attempt should have.
@@ -181,6 +185,8 @@ pub struct EvalaiView {
     pub overtaken: bool,
     /// What became of the final result of this attempt.
     pub end: Option<EvalaiEnd>,
+    /// Team of its row, as last read.
+    pub team_id: Option<String>,
     /// Why the last request failed.
     pub error: Option<String>,
 }
@@ -190,10 +196,16 @@ pub struct EvalaiView {
 pub struct EvalaiInfo {
     pub standing: Standing,
     pub status: String,
+    /// Phase of its row; none where EvalAI does not say.
+    pub phase: Option<i64>,
     pub team_id: String,
     pub team_name: Option<String>,
     pub submitted_at: Option<Timestamp>,
+    /// The submission that this one re-runs.
+    pub rerun_of: Option<Rerun>,
     pub image: Option<String>,
+    /// Why the uploaded file names no image, which no later read changes; none while it has not been read.
+    pub image_problem: Option<String>,
 }
 
 /// What EvalAI's status means for a run of this attempt.

@@ -1,7 +1,7 @@
-//! Whether a restart would help: tasks that must not end, and watches that stay broken while the API server answers.
+//! Whether a restart would help: watches that stay broken while the API server answers.
 //!
-//! Told by the tasks themselves, read by the health server. An outage of the API server is no reason to restart, so a
-//! stuck watch counts only while somebody else gets answers.
+//! Kept by the watches themselves, read by the health server. An outage of the API server is no reason to restart, so a
+//! stuck watch counts only while somebody else gets answers. A task that ends needs no probe: it ends the process (`tasks`).
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -25,7 +25,6 @@ pub struct Liveness(Arc<Mutex<State>>);
 struct State {
     answered: Option<Instant>,
     watches: BTreeMap<String, WatchState>,
-    dead: Vec<String>,
 }
 
 #[derive(Debug, Default)]
@@ -64,30 +63,18 @@ impl Liveness {
         }
     }
 
-    /// Registers a task that must live as long as the process: it counts as dead when the guard is dropped, also by a
-    /// panic, unless `TaskGuard::finished` was called.
-    pub fn task(&self, name: &str) -> TaskGuard {
-        TaskGuard {
-            liveness: self.clone(),
-            name: Some(name.to_owned()),
-        }
-    }
-
     /// What a restart would cure, one sentence each. Empty: alive.
     pub fn problems(&self) -> Vec<String> {
         let (state, now) = (self.lock(), Instant::now());
-        let mut problems: Vec<_> = state
-            .dead
-            .iter()
-            .map(|name| format!("the task {name} has ended"))
-            .collect();
-        if state.answered.is_some_and(|at| now - at < ANSWERED_LATELY) {
-            let stuck = state.watches.iter().filter(|(_, watch)| watch.is_stuck(now));
-            problems.extend(stuck.map(|(name, _)| {
-                format!("the watch of {name} has been broken for 10 minutes while the API server answers other calls")
-            }));
+        if state.answered.is_none_or(|at| now - at >= ANSWERED_LATELY) {
+            return Vec::new();
         }
-        problems
+        let stuck = state.watches.iter().filter(|(_, watch)| watch.is_stuck(now));
+        stuck
+            .map(|(name, _)| {
+                format!("the watch of {name} has been broken for 10 minutes while the API server answers other calls")
+            })
+            .collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -140,28 +127,6 @@ impl WatchProbe {
 impl Drop for WatchProbe {
     fn drop(&mut self) {
         self.liveness.lock().watches.remove(&self.name);
-    }
-}
-
-/// See `Liveness::task`.
-#[derive(Debug)]
-pub struct TaskGuard {
-    liveness: Liveness,
-    name: Option<String>,
-}
-
-impl TaskGuard {
-    /// The task has ended as it should.
-    pub fn finished(mut self) {
-        self.name = None;
-    }
-}
-
-impl Drop for TaskGuard {
-    fn drop(&mut self) {
-        if let Some(name) = self.name.take() {
-            self.liveness.lock().dead.push(name);
-        }
     }
 }
 
@@ -236,19 +201,5 @@ mod tests {
             liveness.problems().is_empty(),
             "a watch that is given up is not asked for"
         );
-    }
-
-    #[tokio::test]
-    async fn a_task_that_ends_by_itself_is_told_and_one_that_was_finished_is_not() {
-        let liveness = Liveness::default();
-        let (lease, sweep) = (liveness.task("lease"), liveness.task("sweep"));
-        sweep.finished();
-        assert!(liveness.problems().is_empty());
-        let task = tokio::spawn(async move {
-            let _guard = lease;
-            panic!("on purpose");
-        });
-        assert!(task.await.is_err());
-        assert_eq!(liveness.problems(), ["the task lease has ended"]);
     }
 }

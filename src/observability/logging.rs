@@ -72,13 +72,28 @@ where
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use std::io::Write;
     use std::sync::{Arc, Mutex};
 
+    /// What was logged, as the JSON lines of a program with the usual filter.
     #[derive(Clone, Default)]
-    struct Lines(Arc<Mutex<Vec<u8>>>);
+    pub(crate) struct Lines(Arc<Mutex<Vec<u8>>>);
+
+    impl Lines {
+        /// Takes what this thread logs until the guard is dropped.
+        pub(crate) fn collect(&self) -> tracing::subscriber::DefaultGuard {
+            let writer = self.clone();
+            let subscriber = subscriber(Format::Json, None, move || writer.clone(), false).unwrap();
+            tracing::subscriber::set_default(subscriber)
+        }
+
+        /// What has come since the last time.
+        pub(crate) fn take(&self) -> String {
+            String::from_utf8(std::mem::take(&mut *self.0.lock().unwrap())).unwrap()
+        }
+    }
 
     impl Write for Lines {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
@@ -100,8 +115,7 @@ mod tests {
             tracing::info!(attempt = 2, "started");
             tracing::debug!("a detail");
         });
-        let bytes = lines.0.lock().unwrap().clone();
-        String::from_utf8(bytes).unwrap()
+        lines.take()
     }
 
     #[test]
@@ -138,5 +152,89 @@ mod tests {
             .err()
             .unwrap();
         assert!(error.to_string().contains("info,=="), "{error}");
+    }
+    /// The text inside the parentheses of each `tracing` macro of a source.
+    fn macros(source: &str) -> Vec<&str> {
+        let starts = ["trace", "debug", "info", "warn", "error"].map(|level| format!("tracing::{level}!("));
+        let begins = starts.iter().flat_map(|start| {
+            let found = source.match_indices(start.as_str());
+            found.map(|(at, _)| &source[at + start.len()..]).collect::<Vec<_>>()
+        });
+        begins.map(|rest| &rest[..length(rest)]).collect()
+    }
+
+    /// Up to the parenthesis that ends it; parentheses in texts do not count.
+    fn length(rest: &str) -> usize {
+        let (mut depth, mut in_text, mut escaped) = (1, false, false);
+        for (at, byte) in rest.bytes().enumerate() {
+            match byte {
+                _ if escaped => escaped = false,
+                b'\\' if in_text => escaped = true,
+                b'"' => in_text = !in_text,
+                b'(' if !in_text => depth += 1,
+                b')' if !in_text => depth -= 1,
+                _ => {}
+            }
+            if depth == 0 {
+                return at;
+            }
+        }
+        rest.len()
+    }
+
+    /// A dump of a data structure: `?field`, `field = ?value`, `{value:?}`.
+    fn has_dump(call: &str) -> bool {
+        let before = |at: usize| call[..at].trim_end().bytes().last();
+        let after = |at: usize| call[at + 1..].bytes().next();
+        let sigil = |at: usize| {
+            matches!(before(at), None | Some(b',' | b'='))
+                && after(at).is_some_and(|byte| byte.is_ascii_alphabetic() || byte == b'_')
+        };
+        call.contains(":?}") || call.contains(":#?}") || call.match_indices('?').any(|(at, _)| sigil(at))
+    }
+
+    fn sources(folder: &std::path::Path, found: &mut Vec<std::path::PathBuf>) {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                sources(&path, found);
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                found.push(path);
+            }
+        }
+    }
+
+    #[test]
+    fn dumps_in_log_lines_are_recognized() {
+        for dump in ["?outcome, \"x\"", "a = ?b", "\"{why:?}\"", "a,\n    ?b"] {
+            assert!(has_dump(dump), "{dump}");
+        }
+        for fine in ["%error, \"why?\"", "a = b.c()?, \"x\"", "\"{error}\""] {
+            assert!(!has_dump(fine), "{fine}");
+        }
+        // In pieces, since this source is looked through too.
+        let source = r#"tracing:: info!(a = f(b), "smile ;)"); tracing:: warn!("{c:?}");"#.replace(":: ", "::");
+        assert_eq!(macros(&source), [r#"a = f(b), "smile ;)""#, r#""{c:?}""#]);
+    }
+
+    #[test]
+    fn no_log_line_dumps_a_data_structure() {
+        let mut found = Vec::new();
+        sources(
+            &std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src"),
+            &mut found,
+        );
+        let mut dumps = Vec::new();
+        for path in found {
+            let text = std::fs::read_to_string(&path).unwrap();
+            let calls = macros(&text);
+            dumps.extend(
+                calls
+                    .into_iter()
+                    .filter(|call| has_dump(call))
+                    .map(|call| format!("{}: {call}", path.display())),
+            );
+        }
+        assert!(dumps.is_empty(), "write it with % or as a text:\n{}", dumps.join("\n"));
     }
 }

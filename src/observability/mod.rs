@@ -9,6 +9,7 @@ pub mod logging;
 pub mod metrics;
 pub mod readiness;
 pub mod shutdown;
+pub mod tasks;
 pub mod text;
 
 use std::sync::Arc;
@@ -17,6 +18,7 @@ use liveness::Liveness;
 use metrics::Metrics;
 use readiness::Readiness;
 use shutdown::Stop;
+use tasks::Tasks;
 
 /// What every part of a process is handed: where it counts, where it says what it misses, and when it has to end.
 #[derive(Clone, Debug)]
@@ -25,6 +27,7 @@ pub struct Observability {
     pub liveness: Liveness,
     pub readiness: Readiness,
     pub stop: Stop,
+    pub tasks: Tasks,
 }
 
 impl Observability {
@@ -34,6 +37,7 @@ impl Observability {
             metrics: Arc::new(Metrics::new()),
             liveness: Liveness::default(),
             readiness: Readiness::default(),
+            tasks: Tasks::new(stop.clone()),
             stop,
         }
     }

@@ -1,13 +1,24 @@
 //! What a process still misses before it can do its work, by name.
 //!
-//! Set by the parts, read by the health server. Standbys are ready: leading is no check.
+//! Set by the parts, read by the health server. Standbys are ready: leading is no check. A process that has not registered
+//! all of its checks yet is not ready, so that a probe in its first moments does not read the empty list as "nothing is missing".
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// Name of the check that stands for those which are not registered yet.
+const START: &str = "process";
+
 /// Named checks. Clones are the same registry.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Readiness(Arc<Mutex<BTreeMap<String, Result<(), String>>>>);
+
+impl Default for Readiness {
+    fn default() -> Self {
+        let starting = (START.to_owned(), Err("it is starting".to_owned()));
+        Self(Arc::new(Mutex::new(BTreeMap::from([starting]))))
+    }
+}
 
 impl Readiness {
     /// Says how a named check stands: fine, or the sentence that says what is missing. A check that was never set is
@@ -21,6 +32,11 @@ impl Readiness {
             (Some(Ok(())), Err(missing)) => tracing::warn!(check = name, missing, "no longer ready"),
             _ => {}
         }
+    }
+
+    /// Every part of the process has set its checks once: from now on they alone count.
+    pub fn registered(&self) {
+        self.remove(START);
     }
 
     /// A check that no longer applies.
@@ -43,8 +59,19 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_process_without_its_checks_is_starting() {
+        let readiness = Readiness::default();
+        assert_eq!(readiness.missing(), ["process: it is starting"]);
+        readiness.set("permissions", Ok(()));
+        assert_eq!(readiness.missing(), ["process: it is starting"], "others may follow");
+        readiness.registered();
+        assert!(readiness.missing().is_empty());
+    }
+
+    #[test]
     fn it_names_what_is_missing_and_only_that() {
         let readiness = Readiness::default();
+        readiness.registered();
         assert!(readiness.missing().is_empty());
         readiness.set("submissions synced", Err("the list has not come yet".into()));
         readiness.set("permissions", Ok(()));

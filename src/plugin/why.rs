@@ -10,7 +10,7 @@ use super::board::{self, Sight};
 use super::steps;
 use super::text::{Page, join, span, when};
 use crate::api::conditions;
-use crate::api::{Failure, FailureClass, PairStatus, State, Submission, SubmissionStatus, reasons};
+use crate::api::{Failure, FailureClass, PairStatus, Rerun, State, Submission, SubmissionStatus, reasons};
 use crate::pod::report::FAILURE_LOG_KEY;
 use crate::text::sentence;
 
@@ -37,6 +37,7 @@ pub fn explain(submission: &Submission, leaderboard: Sight<'_>, now: Timestamp) 
     story.page.gap();
     story.belongs_to();
     story.reason();
+    story.rerun();
     story.failure();
     story.line();
     story.attempt();
@@ -161,6 +162,24 @@ impl Story<'_> {
             let since = when(other.last_transition_time.0, self.now);
             let words = format!("{} since {since}: {}", other.reason, sentence(&other.message));
             self.page.row("Stalled", &words);
+        }
+    }
+
+    /// The other submission of a re-run in EvalAI.
+    fn rerun(&mut self) {
+        let ago = |rerun: &Rerun| {
+            let time = rerun.time.as_ref().map(|time| when(time.0, self.now));
+            time.map(|time| format!(", {time}")).unwrap_or_default()
+        };
+        let of = self.status.rerun_of.as_ref();
+        let of = of.map(|rerun| format!("of {}{}.", rerun.submission_name, ago(rerun)));
+        let again = self.status.rerun_as.as_ref();
+        let again = again.map(|rerun| {
+            let name = &rerun.submission_name;
+            format!("as {name}{}; EvalAI has cancelled this one.", ago(rerun))
+        });
+        for words in [of, again].into_iter().flatten() {
+            self.page.row("Re-run", &words);
         }
     }
 
@@ -384,7 +403,7 @@ fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static s
         let is_mendable = status.failure.as_ref().is_some_and(is_infrastructure);
         return (is_mendable || reason == reasons::CANCELLED).then_some("resume");
     }
-    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING]
+    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]
         .contains(&reason)
         .then_some("cancel")
 }

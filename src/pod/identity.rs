@@ -27,13 +27,13 @@ pub fn for_run(base: Aws, setting: &Setting) -> Aws {
     let storage = &setting.run.plan.storage;
     let provider = WebIdentity {
         // Never the bucket's endpoint: that one is S3's alone.
-        sts: base.sts(storage.region.as_deref(), None),
+        sts: base.sts(storage.region.as_deref()),
         policy: session_policy(&setting.run, partition(role_arn)),
         role_arn: role_arn.clone(),
         session: session_name(&setting.run),
         token: setting.places.token.clone(),
     };
-    let config = base.config(None, None).into_builder();
+    let config = base.config(None).into_builder();
     Aws::from_config(
         config
             .credentials_provider(SharedCredentialsProvider::new(provider))

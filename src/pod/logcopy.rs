@@ -8,6 +8,7 @@ mod describe;
 mod round;
 
 use std::future::Future;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -15,6 +16,7 @@ use leaderboard_results::Refusal;
 use leaderboard_runner::protocol::StatusFile;
 use tokio::sync::watch;
 
+use super::blocking;
 use super::gather::{Gatherer, results_plan};
 use super::identity;
 use super::places::{Places, Setting};
@@ -123,11 +125,12 @@ fn watch_stop(places: Places) -> (watch::Receiver<Option<Stop>>, tokio::task::Jo
             let watched = folder.as_ref().filter(|watch| watch.add(&places.podinfo));
             let text = tokio::fs::read_to_string(places.stop()).await.unwrap_or_default();
             if let Some(stop) = Stop::parse(&text) {
+                // The rounds first: the volume may be what hangs.
+                sender.send_if_modified(|known| known.replace(stop) != Some(stop));
                 if !obeyed {
                     tracing::info!(reason = stop.as_str(), "asked to stop");
-                    obeyed = cancel(&status);
+                    obeyed = create(StatusFile::Cancel, &status).await;
                 }
-                sender.send_if_modified(|known| known.replace(stop) != Some(stop));
             }
             let wake = async {
                 match watched {
@@ -142,11 +145,12 @@ fn watch_stop(places: Places) -> (watch::Receiver<Option<Stop>>, tokio::task::Jo
     (receiver, task)
 }
 
-/// Asks every container to stop. Returns whether that is said.
-fn cancel(status: &std::path::Path) -> bool {
-    let created = StatusFile::Cancel.create(status);
+/// Creates one of logcopy's own status files: what everybody else waits for. Returns whether it is there.
+async fn create(file: StatusFile, status: &Path) -> bool {
+    let folder = status.to_owned();
+    let created = blocking(move || file.create(&folder)).await.flatten();
     if let Err(error) = &created {
-        tracing::error!("simulation.cancel can't be written: {error}");
+        tracing::error!("{} can't be written: {error}", file.name());
     }
     created.is_ok()
 }
@@ -228,9 +232,17 @@ async fn last_flush(rounds: &mut Rounds, longest: Duration) {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
     use std::future::{pending, ready};
+    use std::sync::mpsc;
 
     use super::*;
+    use crate::controller::fixtures;
+    use crate::pod::upload::Haste;
+    use crate::pod::upload::send::Wanted;
+
+    /// Longer than a stop takes to be seen, and still an end of a test that would hang.
+    const PATIENCE: Duration = Duration::from_secs(20);
 
     async fn round_of(seconds: u64) -> u64 {
         tokio::time::sleep(Duration::from_secs(seconds)).await;
@@ -254,5 +266,47 @@ mod tests {
         assert_eq!(unless_stopped(round_of(3600), ready(())).await, None);
         assert_eq!(began.elapsed(), LANDING);
         assert_eq!(unless_stopped(round_of(3600), pending()).await, Some(3600));
+    }
+    #[tokio::test]
+    async fn a_disk_that_hangs_does_not_hide_the_stop() {
+        let folder = tempfile::tempdir().unwrap();
+        let places = Places::below(folder.path());
+        for made in [
+            places.logs.join("agent/agent1"),
+            places.status(),
+            places.podinfo.clone(),
+        ] {
+            fs::create_dir_all(made).unwrap();
+        }
+        fs::write(places.logs.join("agent/agent1/log"), "a line\n").unwrap();
+        let tree = Arc::new(Tree::open(&places.logs).unwrap());
+        let stamp = tree.file("agent/agent1/log").unwrap().unwrap().1;
+        // Nobody stores anything here, what is tried is only how the file is read.
+        let nowhere = "http://127.0.0.1:9";
+        let s3 = fixtures::aws(nowhere).await.s3(None, Some(nowhere));
+        let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), 1 << 20);
+        let (mut stop, watching) = watch_stop(places.clone());
+
+        let (hangs, disk_hangs) = mpsc::channel();
+        let (seen, stop_seen) = mpsc::channel();
+        let disk = std::thread::spawn(move || {
+            let _held = tree.disk.lock().unwrap();
+            hangs.send(()).unwrap();
+            stop_seen.recv_timeout(PATIENCE).is_ok()
+        });
+        disk_hangs.recv().unwrap();
+        let files = [Wanted::new("agent/agent1/log", stamp, Haste::Now)];
+        let asked = async {
+            fs::write(places.stop(), Stop::Cancel.as_str()).unwrap();
+            stop.wait_for(Option::is_some).await.unwrap();
+            let _ = seen.send(());
+        };
+        // One thread for all: a read that blocks it blocks the watch of the stop as well.
+        let (_, ()) = tokio::join!(uploader.sync(&files, None), asked);
+        assert!(
+            disk.join().unwrap(),
+            "the stop was seen only when the disk answered again"
+        );
+        watching.abort();
     }
 }

@@ -18,3 +18,9 @@ pub mod tree;
 pub mod upload;
 pub mod watch;
 pub mod workspace;
+
+/// Does what may wait for a disk, on a thread that may block. The runtime's own threads serve what must never wait, above
+/// all the watch of the stop annotation.
+pub(crate) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> std::io::Result<T> {
+    tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other)
+}

@@ -58,6 +58,10 @@ pub struct Report {
     pub warnings: Vec<String>,
     /// Text of `evalai/results.json`.
     pub results: String,
+    /// The same with the metrics over the routes done so far, in which `results` has zeros; only while the run goes on, and not
+    /// from an older operator's Pod.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub partial_results: Option<String>,
     /// Files of `evalai/` as stored in this round, by key below the prefix.
     #[serde(default)]
     pub files: BTreeMap<String, StoredFile>,

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
+use super::blocking;
 use super::ownlog::OWN_LOG;
 use super::run::console;
 use super::tree::{Tree, TreeError};
@@ -133,7 +134,8 @@ impl Shipper {
     async fn send(&mut self, path: &str, stream: &str, last: bool) -> Result<bool, LogsError> {
         let mark = self.marks.get(path).copied().unwrap_or_default();
         // A file that can't be read is the uploader's to complain about.
-        let Ok(Some((bytes, mark))) = self.next(path, mark) else {
+        let (tree, file) = (Arc::clone(&self.tree), path.to_owned());
+        let Ok(Ok(Some((bytes, mark)))) = blocking(move || next(&tree, &file, mark)).await else {
             return Ok(false);
         };
         let is_full = bytes.len() as u64 == CHUNK;
@@ -149,26 +151,12 @@ impl Shipper {
         };
         let sent = Instant::now();
         self.put(path, stream, &events, after).await?;
-        self.note(path, after);
+        self.note(path, after).await;
         let more = is_full || consumed < bytes.len();
         if more {
             tokio::time::sleep(BETWEEN_BATCHES.saturating_sub(sent.elapsed())).await;
         }
         Ok(more)
-    }
-
-    /// The next piece of a file, and where it begins: at 0 if it is another file than before.
-    fn next(&self, path: &str, mark: Mark) -> Result<Option<(Vec<u8>, Mark)>, TreeError> {
-        let Some((file, stamp)) = self.tree.file(path)? else {
-            return Ok(None);
-        };
-        let goes_on = stamp.inode == mark.inode && stamp.size >= mark.offset;
-        let offset = if goes_on { mark.offset } else { 0 };
-        let len = (stamp.size - offset).min(CHUNK);
-        let mut bytes = vec![0; usize::try_from(len).unwrap_or(0)];
-        file.read_exact_at(&mut bytes, offset)?;
-        let inode = stamp.inode;
-        Ok((len > 0).then_some((bytes, Mark { inode, offset })))
     }
 
     async fn put(&mut self, path: &str, stream: &str, events: &[LogEvent], after: Mark) -> Result<(), LogsError> {
@@ -208,22 +196,37 @@ impl Shipper {
             Err(error) => return Err(error),
         };
         if arrived {
-            self.note(&doubt.path, doubt.after);
+            self.note(&doubt.path, doubt.after).await;
         }
         self.doubt = None;
         Ok(())
     }
 
-    fn note(&mut self, path: &str, mark: Mark) {
+    async fn note(&mut self, path: &str, mark: Mark) {
         self.marks.insert(path.to_owned(), mark);
-        let noted = serde_json::to_vec(&self.marks).map_err(std::io::Error::other);
-        if let Err(error) = noted
-            .map_err(TreeError::from)
-            .and_then(|bytes| self.tree.write(NOTE, &bytes))
-        {
+        let (marks, tree) = (self.marks.clone(), Arc::clone(&self.tree));
+        let write = move || {
+            let bytes = serde_json::to_vec(&marks).map_err(std::io::Error::other)?;
+            tree.write(NOTE, &bytes)
+        };
+        if let Err(error) = blocking(write).await.map_err(TreeError::from).flatten() {
             tracing::warn!("how far logs were sent can't be noted down: {error}");
         }
     }
+}
+
+/// The next piece of a file, and where it begins: at 0 if it is another file than before.
+fn next(tree: &Tree, path: &str, mark: Mark) -> Result<Option<(Vec<u8>, Mark)>, TreeError> {
+    let Some((file, stamp)) = tree.file(path)? else {
+        return Ok(None);
+    };
+    let goes_on = stamp.inode == mark.inode && stamp.size >= mark.offset;
+    let offset = if goes_on { mark.offset } else { 0 };
+    let len = (stamp.size - offset).min(CHUNK);
+    let mut bytes = vec![0; usize::try_from(len).unwrap_or(0)];
+    file.read_exact_at(&mut bytes, offset)?;
+    let inode = stamp.inode;
+    Ok((len > 0).then_some((bytes, Mark { inode, offset })))
 }
 
 fn milliseconds() -> i64 {

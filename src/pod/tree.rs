@@ -82,6 +82,9 @@ pub struct Walk {
 pub struct Tree {
     root: OwnedFd,
     path: PathBuf,
+    /// A disk that hangs, while a test holds it.
+    #[cfg(test)]
+    pub(super) disk: std::sync::Mutex<()>,
 }
 
 impl Tree {
@@ -94,6 +97,8 @@ impl Tree {
         Ok(Self {
             root: root.into(),
             path: path.to_owned(),
+            #[cfg(test)]
+            disk: std::sync::Mutex::new(()),
         })
     }
 
@@ -104,6 +109,8 @@ impl Tree {
 
     /// Opens a regular file for reading; `None` if there is none.
     pub fn file(&self, relative: &str) -> Result<Option<(File, Stamp)>, TreeError> {
+        #[cfg(test)]
+        drop(self.disk.lock());
         let opened = self
             .look(relative)
             .and_then(|()| self.at(relative, OFlag::O_RDONLY | OFlag::O_NONBLOCK));

@@ -258,6 +258,7 @@ fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
         why: None,
         warnings: Vec::new(),
         results: leaderboard_results::render(&plan, None)?.results_json,
+        partial_results: None,
         files: std::collections::BTreeMap::new(),
     })
 }

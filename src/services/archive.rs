@@ -415,7 +415,8 @@ fn patient() -> aws_sdk_s3::config::Builder {
     aws_sdk_s3::config::Builder::new().timeout_config(timeouts)
 }
 
-async fn read_range(file: &Arc<File>, range: std::ops::Range<u64>) -> std::io::Result<Vec<u8>> {
+/// Reads a part of a file, on a thread that may block.
+pub(crate) async fn read_range(file: &Arc<File>, range: std::ops::Range<u64>) -> std::io::Result<Vec<u8>> {
     let file = Arc::clone(file);
     let read = tokio::task::spawn_blocking(move || {
         let mut bytes = vec![0; usize::try_from(range.end - range.start).map_err(std::io::Error::other)?];

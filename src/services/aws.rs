@@ -1,9 +1,11 @@
 //! One way to AWS: one HTTP client with one TLS stack, one credential chain, and clients by region and endpoint.
 //!
-//! Called by everything that talks to AWS. Endpoints with a bare host name get path-style buckets.
+//! Called by everything that talks to AWS. An endpoint that a Leaderboard names goes before one of the environment.
+//! Endpoints with a bare host name get path-style buckets.
 
 use std::time::Duration;
 
+use aws_config::retry::RetryConfig;
 use aws_config::{BehaviorVersion, Region, SdkConfig};
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
@@ -13,6 +15,18 @@ use super::meter::Meter;
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);
 /// Time one try may take.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// The configuration of one service with an endpoint, where one is given. It is set here and not in the shared
+/// configuration, because of that one the SDK prefers `AWS_ENDPOINT_URL` and the profile's `endpoint_url`.
+macro_rules! own {
+    ($sdk:ident, $shared:expr, $endpoint:expr) => {{
+        let builder = $sdk::config::Builder::from(&$shared);
+        match $endpoint {
+            Some(endpoint) => builder.endpoint_url(endpoint),
+            None => builder,
+        }
+    }};
+}
 
 /// Loaded once for a process.
 #[derive(Clone, Debug)]
@@ -64,26 +78,21 @@ impl Aws {
         self.base.region().map(ToString::to_string)
     }
 
-    /// The configuration for a region and an endpoint, where given.
-    pub fn config(&self, region: Option<&str>, endpoint: Option<&str>) -> SdkConfig {
+    /// The shared configuration for a region, where one is given. No endpoint: see [`own`].
+    pub fn config(&self, region: Option<&str>) -> SdkConfig {
         let mut builder = self.base.clone().into_builder();
         if let Some(region) = region {
             builder = builder.region(Region::new(region.to_owned()));
         } else if self.base.region().is_none() {
             builder = builder.region(Region::new("us-east-1"));
         }
-        if let Some(endpoint) = endpoint {
-            builder = builder.endpoint_url(endpoint);
-        }
         builder.build()
     }
 
     /// A client of S3. An endpoint of one's own gets path-style addresses: its buckets have no host names.
     pub fn s3(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_s3::Client {
-        let config = aws_sdk_s3::config::Builder::from(&self.config(region, endpoint))
-            .force_path_style(endpoint.is_some())
-            .build();
-        aws_sdk_s3::Client::from_conf(config)
+        let config = own!(aws_sdk_s3, self.config(region), endpoint).force_path_style(endpoint.is_some());
+        aws_sdk_s3::Client::from_conf(config.build())
     }
 
     /// A client of SQS. Long polls outlive the usual limit of one try.
@@ -93,29 +102,32 @@ impl Aws {
             .operation_attempt_timeout(Duration::from_secs(35))
             .operation_timeout(OPERATION_TIMEOUT)
             .build();
-        let config = aws_sdk_sqs::config::Builder::from(&self.config(region, endpoint))
-            .timeout_config(timeouts)
-            .build();
-        aws_sdk_sqs::Client::from_conf(config)
+        let config = own!(aws_sdk_sqs, self.config(region), endpoint).timeout_config(timeouts);
+        aws_sdk_sqs::Client::from_conf(config.build())
     }
 
     /// A client of DynamoDB.
     pub fn dynamodb(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_dynamodb::Client {
-        aws_sdk_dynamodb::Client::new(&self.config(region, endpoint))
+        aws_sdk_dynamodb::Client::from_conf(own!(aws_sdk_dynamodb, self.config(region), endpoint).build())
     }
 
-    /// A client of CloudWatch Logs.
+    /// A client of CloudWatch Logs. A retry after a lost answer would write the same lines twice.
     pub fn logs(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_cloudwatchlogs::Client {
-        aws_sdk_cloudwatchlogs::Client::new(&self.config(region, endpoint))
+        let config = own!(aws_sdk_cloudwatchlogs, self.config(region), endpoint);
+        aws_sdk_cloudwatchlogs::Client::from_conf(config.retry_config(RetryConfig::disabled()).build())
     }
 
     /// A client of Secrets Manager.
     pub fn secrets(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_secretsmanager::Client {
-        aws_sdk_secretsmanager::Client::new(&self.config(region, endpoint))
+        aws_sdk_secretsmanager::Client::from_conf(own!(aws_sdk_secretsmanager, self.config(region), endpoint).build())
     }
 
-    /// A client of STS.
-    pub fn sts(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_sts::Client {
-        aws_sdk_sts::Client::new(&self.config(region, endpoint))
+    /// A client of STS. It has no endpoint in the API: the environment's, or the region's.
+    pub fn sts(&self, region: Option<&str>) -> aws_sdk_sts::Client {
+        aws_sdk_sts::Client::new(&self.config(region))
     }
 }
+
+#[cfg(test)]
+#[path = "aws_tests.rs"]
+mod tests;

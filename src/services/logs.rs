@@ -4,7 +4,6 @@
 
 use std::time::Duration;
 
-use aws_config::retry::RetryConfig;
 use aws_sdk_cloudwatchlogs::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_cloudwatchlogs::types::InputLogEvent;
 
@@ -73,11 +72,8 @@ const HINT: &str = "Check logGroup of the leaderboard, and logs:CreateLogStream,
 impl LogClient {
     /// The group of a Leaderboard.
     pub fn of_group(aws: &Aws, group: &LogGroup) -> Self {
-        let config = aws.config(group.region.as_deref(), group.endpoint.as_deref());
-        // A retry after a lost answer would write the same lines twice.
-        let config = aws_sdk_cloudwatchlogs::config::Builder::from(&config).retry_config(RetryConfig::disabled());
         Self {
-            client: aws_sdk_cloudwatchlogs::Client::from_conf(config.build()),
+            client: aws.logs(group.region.as_deref(), group.endpoint.as_deref()),
             group: group.name.clone(),
         }
     }
@@ -109,7 +105,13 @@ impl LogClient {
         let request = request.log_stream_name(stream).set_log_events(Some(built));
         let answer = request.send().await.map_err(|error| self.failed(OP, stream, &error))?;
         if let Some(rejected) = answer.rejected_log_events_info() {
-            tracing::warn!(stream, "CloudWatch Logs rejected events for their age: {rejected:?}");
+            tracing::warn!(
+                stream,
+                too_old_until = rejected.too_old_log_event_end_index(),
+                expired_until = rejected.expired_log_event_end_index(),
+                too_new_from = rejected.too_new_log_event_start_index(),
+                "CloudWatch Logs rejected events for their age"
+            );
         }
         Ok(())
     }

@@ -64,13 +64,13 @@ pub struct Row {
     pub results: String,
     /// `12/20`.
     pub progress: String,
-    /// Metric columns and their values.
-    pub metrics: Vec<(String, String)>,
+    /// Metric columns and their values; none removes the column: only a finished submission has metrics.
+    pub metrics: Vec<(String, Option<String>)>,
 }
 
 impl Row {
-    /// The columns that are known, but for the keys and the attempt.
-    fn columns(&self) -> BTreeMap<&str, &str> {
+    /// The columns that are known, but for the keys and the attempt; those without a value are removed.
+    fn columns(&self) -> Columns<'_> {
         let fixed = [
             ("team_name", &self.team_name),
             (STATUS, &self.submission_status),
@@ -86,14 +86,17 @@ impl Row {
         let metrics = self
             .metrics
             .iter()
-            .map(|(column, value)| (column.as_str(), value.as_str()));
+            .map(|(column, value)| (column.as_str(), value.as_deref()));
         // What a metric may be called is the phase's; our own columns come last and win.
         metrics
-            .chain(fixed.iter().map(|(column, value)| (*column, value.as_str())))
-            .filter(|(column, value)| !value.is_empty() && *column != ATTEMPT)
+            .chain(fixed.iter().map(|(column, value)| (*column, Some(value.as_str()))))
+            .filter(|(column, value)| *value != Some("") && *column != ATTEMPT)
             .collect()
     }
 }
+
+/// Columns and their values; those without one are removed.
+type Columns<'a> = BTreeMap<&'a str, Option<&'a str>>;
 
 /// A time as the columns hold it: `2026-11-20 10:00:00 UTC`.
 pub fn time_text(time: jiff::Timestamp) -> String {
@@ -231,7 +234,7 @@ impl Table {
             request = request.expression_attribute_values(format!(":end{index}"), AttributeValue::S(end.into()));
         }
         let columns = self.columns(row);
-        let mut update = vec!["SET #attempt = :attempt".to_owned()];
+        let (mut set, mut remove) = (vec!["#attempt = :attempt".to_owned()], Vec::new());
         for (index, (column, value)) in columns.iter().enumerate() {
             // A name may have one placeholder only, and the status has one already.
             let name = if *column == STATUS {
@@ -239,12 +242,19 @@ impl Table {
             } else {
                 format!("#c{index}")
             };
-            update.push(format!("{name} = :v{index}"));
-            request = request
-                .expression_attribute_names(name, *column)
-                .expression_attribute_values(format!(":v{index}"), AttributeValue::S((*value).into()));
+            request = request.expression_attribute_names(&name, *column);
+            if let Some(value) = value {
+                set.push(format!("{name} = :v{index}"));
+                request = request.expression_attribute_values(format!(":v{index}"), AttributeValue::S((*value).into()));
+            } else {
+                remove.push(name);
+            }
         }
-        let request = request.update_expression(update.join(", ")).send();
+        let mut update = format!("SET {}", set.join(", "));
+        if !remove.is_empty() {
+            update = format!("{update} REMOVE {}", remove.join(", "));
+        }
+        let request = request.update_expression(update).send();
         match self.meter.aws("dynamodb", "UpdateItem", request).await {
             Ok(_) => Ok(Written::Stored),
             Err(error) => match error.as_service_error() {
@@ -258,7 +268,7 @@ impl Table {
     }
 
     /// Keys can't be set; a table may have given one the name of a column.
-    fn columns<'a>(&self, row: &'a Row) -> BTreeMap<&'a str, &'a str> {
+    fn columns<'a>(&self, row: &'a Row) -> Columns<'a> {
         let mut columns = row.columns();
         columns.retain(|column, _| *column != self.partition.name && *column != self.sort.name);
         columns
@@ -284,14 +294,13 @@ impl Table {
 }
 
 /// True if the stored item holds what we were about to write.
-fn is_same(old: &HashMap<String, AttributeValue>, attempt: i64, columns: &BTreeMap<&str, &str>) -> bool {
+fn is_same(old: &HashMap<String, AttributeValue>, attempt: i64, columns: &Columns<'_>) -> bool {
     let stored = old.get(ATTEMPT).and_then(|value| value.as_n().ok());
     let same_attempt = stored.and_then(|text| text.parse::<i64>().ok()) == Some(attempt);
     same_attempt
-        && columns.iter().all(|(column, value)| {
-            old.get(*column)
-                .and_then(|v| v.as_s().ok())
-                .is_some_and(|text| text == value)
+        && columns.iter().all(|(column, value)| match (old.get(*column), value) {
+            (stored, None) => stored.is_none(),
+            (stored, Some(value)) => stored.and_then(|v| v.as_s().ok()).is_some_and(|text| text == value),
         })
 }
 
@@ -417,19 +426,25 @@ mod tests {
             team_name: "t".into(),
             submission_status: "RUNNING".into(),
             metrics: vec![
-                ("score".into(), "1.5".into()),
-                ("team_name".into(), "x".into()),
-                ("attempt".into(), "9".into()),
+                ("score".into(), Some("1.5".into())),
+                ("gone".into(), None),
+                ("team_name".into(), None),
+                ("attempt".into(), Some("9".into())),
             ],
             ..Row::default()
         };
-        let want = BTreeMap::from([("score", "1.5"), (STATUS, "RUNNING"), ("team_name", "t")]);
+        let want = BTreeMap::from([
+            ("score", Some("1.5")),
+            ("gone", None),
+            (STATUS, Some("RUNNING")),
+            ("team_name", Some("t")),
+        ]);
         assert_eq!(row.columns(), want);
     }
 
     #[test]
     fn what_is_stored_already_is_known_again() {
-        let columns = BTreeMap::from([("a", "1"), (STATUS, "FAILED")]);
+        let columns = BTreeMap::from([("a", Some("1")), (STATUS, Some("FAILED"))]);
         let text = |text: &str| AttributeValue::S(text.into());
         let old = |attempt: &str, status: &str| {
             HashMap::from([
@@ -442,6 +457,9 @@ mod tests {
         assert!(is_same(&old("2", "FAILED"), 2, &columns));
         assert!(!is_same(&old("2", "FINISHED"), 2, &columns));
         assert!(!is_same(&old("3", "FAILED"), 2, &columns));
+        let removed = |column| BTreeMap::from([(STATUS, Some("FAILED")), (column, None)]);
+        assert!(is_same(&old("2", "FAILED"), 2, &removed("b")));
+        assert!(!is_same(&old("2", "FAILED"), 2, &removed("a")), "it is still there");
     }
 
     #[test]

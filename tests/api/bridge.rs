@@ -11,8 +11,11 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{Api, ApiResource, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, Submission, names};
+use leaderboard_operator::api::{Ingested, Leaderboard, Submission, names};
+use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
 use leaderboard_operator::bridge::{self, Health, Observer, Settings};
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::{TaskFailed, Tasks};
 use leaderboard_operator::services::aws::Aws;
 use serde_json::{Value, json};
 use tokio::sync::watch;
@@ -143,19 +146,19 @@ struct Bridge {
     health: Arc<Health>,
     counter: Arc<Counter>,
     stop: watch::Sender<bool>,
-    task: tokio::task::JoinHandle<()>,
+    task: tokio::task::JoinHandle<Result<(), TaskFailed>>,
 }
 
 impl Bridge {
     fn start(client: Client, stand_in: &StandIn, namespace: &str) -> Self {
-        let (stop, stopped) = watch::channel(false);
+        let (stop, stopped) = Stop::new();
         let (health, counter) = (Arc::new(Health::default()), Arc::new(Counter::default()));
         let settings = Settings {
             namespace: Some(namespace.to_owned()),
             health: health.clone(),
             observer: counter.clone(),
         };
-        let task = tokio::spawn(bridge::run(client, stand_in.aws.clone(), stopped, settings));
+        let task = tokio::spawn(bridge::run(client, stand_in.aws.clone(), Tasks::new(stopped), settings));
         Self {
             health,
             counter,
@@ -173,6 +176,7 @@ impl Bridge {
         tokio::time::timeout(LIMIT, self.task)
             .await
             .expect("the bridge ends")
+            .unwrap()
             .unwrap();
     }
 }
@@ -316,6 +320,41 @@ async fn a_resume_bumps_once_and_undoes_a_cancel() {
     assert_eq!(world.submissions().get("submission-7").await.unwrap().spec.attempt, 2);
     world.stand_in.drained(&url).await;
     bridge.stop().await;
+}
+
+#[tokio::test]
+async fn the_sweep_begins_one_attempt_and_a_message_any() {
+    let world = World::new("sweep").await;
+    let api = world.submissions();
+    let now = jiff::Timestamp::now().as_millisecond();
+    let take = async |source: Source, minute: i64| {
+        let incoming = Incoming {
+            challenge: 1,
+            phase: 2,
+            submission: 7,
+            image: None,
+            source,
+            sent_ms: now + minute * 60_000,
+        };
+        ingest::apply(&api, "lb", &incoming).await.unwrap()
+    };
+    let message = |id: &str| Source::Message(id.to_owned());
+    let sweep = |is_resuming| Source::Sweep { is_resuming };
+    let failed = async || world.end("submission-7", "Failed").await;
+    assert_eq!(take(message("a"), 0).await, Outcome::Created);
+    failed().await;
+    assert_eq!(take(sweep(false), 10).await, Outcome::Refused);
+    assert_eq!(take(sweep(true), 20).await, Outcome::Bumped(2));
+    failed().await;
+    assert_eq!(take(sweep(true), 30).await, Outcome::Refused);
+    assert_eq!(take(sweep(true), 40).await, Outcome::Repeat, "noted once");
+    let found = api.get("submission-7").await.unwrap();
+    let record = Ingested::of(&found).unwrap();
+    assert_eq!((found.spec.attempt, record.without_message), (2, vec![2]));
+    assert_eq!(record.refused.map(|refused| refused.attempt), Some(3));
+    assert_eq!(take(message("b"), 50).await, Outcome::Bumped(3));
+    let record = Ingested::of(&api.get("submission-7").await.unwrap()).unwrap();
+    assert_eq!((record.without_message, record.refused), (vec![], None));
 }
 
 #[tokio::test]

@@ -17,9 +17,11 @@ use evalai_stand_in::model::{FileState, Status as Stored};
 use evalai_stand_in::submissions::{NewSubmission, create};
 use evalai_stand_in::{Config, Handle, Knobs};
 use jiff::{SignedDuration, Timestamp};
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::evalai::{
-    Changed, Ended, Hub, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target, Timeouts,
-    Timing, View, Wish,
+    Changed, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target,
+    Timeouts, Timing, View, Wish,
 };
 use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
@@ -77,6 +79,14 @@ impl World {
     }
 
     async fn with(timing: Timing, timeouts: Timeouts) -> Self {
+        Self::made(timing, timeouts, Instant::now()).await
+    }
+
+    async fn opened_at(not_before: Instant) -> Self {
+        Self::made(timing(), timeouts(), not_before).await
+    }
+
+    async fn made(timing: Timing, timeouts: Timeouts, not_before: Instant) -> Self {
         let (config, _) = Config::in_memory().unwrap();
         let config = Config { throttle: 0, ..config };
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -87,12 +97,13 @@ impl World {
         let fence = leads.clone();
         let hub = Hub::new(Options {
             fence: Arc::new(move || fence.load(Ordering::SeqCst)),
-            not_before: Instant::now(),
+            not_before,
             changed: wake,
             sweep: found,
             timing,
             timeouts,
             meter: Meter::default(),
+            tasks: Tasks::new(Stop::new().1),
         });
         let target = target(&server.url(), "local-host-token");
         Self {
@@ -111,11 +122,15 @@ impl World {
 
     fn submit_with(&self, file: FileState, at: Timestamp) -> i64 {
         let input = json!({"submitted_image_uri": "registry.example/team-a:1"}).to_string();
+        self.submit_file(input.into_bytes(), file, at)
+    }
+
+    fn submit_file(&self, input: Vec<u8>, file: FileState, at: Timestamp) -> i64 {
         let new = NewSubmission {
             team: 1,
             phase: 1,
             user: 11,
-            input: input.into_bytes(),
+            input,
             fields: Map::new(),
         };
         let pk = self.server.with_state(|state| create(state, new, file, at));
@@ -242,7 +257,7 @@ async fn a_submission_lives_through_all_of_it() {
     );
     assert_eq!(
         (view.image, view.ended),
-        (Some(Ok("registry.example/team-a:1".into())), None)
+        (Some(ImageAnswer::Named("registry.example/team-a:1".into())), None)
     );
     world.live(pk);
     world.wish(pk, Wish::Queued);
@@ -451,6 +466,68 @@ async fn a_lost_message_is_found_by_the_sweep() {
 }
 
 #[tokio::test]
+async fn a_lost_message_is_found_for_the_server_that_has_it() {
+    let mut world = World::new().await;
+    let (config, _) = Config::in_memory().unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let other = evalai_stand_in::serve(Config { throttle: 0, ..config }, vec![listener]);
+    // The ids of challenge, phase and submission are the same in both.
+    let at = Timestamp::now() - SignedDuration::from_secs(300);
+    let lost = world.submit_with(FileState::Stored, at);
+    let own = std::mem::replace(&mut world.server, other);
+    assert_eq!(world.submit_with(FileState::Stored, at), lost);
+    let second = Key {
+        name: "staging".into(),
+        ..leaderboard()
+    };
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    world
+        .hub
+        .serve(&second, &target(&world.server.url(), "local-host-token"))
+        .unwrap();
+    let mut servers = Vec::new();
+    for _ in 0..2 {
+        let found = world.sweep.recv().await.unwrap();
+        assert_eq!((found.challenge, found.phase, found.submission), (1, 1, lost));
+        servers.push(found.server);
+    }
+    servers.sort();
+    let mut wanted = [own.url(), world.server.url()];
+    wanted.sort();
+    assert_eq!(servers, wanted);
+}
+
+#[tokio::test]
+async fn a_token_whose_user_is_no_host_is_named_and_one_submission_condemns_none() {
+    let mut world = World::new().await;
+    let good = world.target.clone();
+    world.target = target(&world.server.url(), "local-team-a-token");
+    world.hub.serve(&leaderboard(), &world.target).unwrap();
+    let why = loop {
+        if let Some(why) = world.hub.token_refused(&leaderboard()) {
+            break why;
+        }
+        world.changed.recv().await.unwrap();
+    };
+    assert!(
+        why.contains("no host of this challenge") && why.contains("evalai.token"),
+        "{why}"
+    );
+    // A submission that the host of another challenge may not read.
+    world.target = target(&world.server.url(), "local-stranger-token");
+    let pk = world.submit();
+    world.ask(pk, false);
+    let view = world.until(pk, |view| view.last_error.is_some()).await;
+    let error = view.last_error.unwrap();
+    assert!(error.contains("no host of its challenge"), "{error}");
+    world.hub.serve(&leaderboard(), &good).unwrap();
+    while world.hub.labels(&leaderboard()).0.is_none() {
+        world.changed.recv().await.unwrap();
+    }
+    assert_eq!(world.hub.token_refused(&leaderboard()), None);
+}
+
+#[tokio::test]
 async fn a_refused_token_is_told_and_a_new_one_taken() {
     let mut world = World::new().await;
     let good = world.target.clone();
@@ -483,8 +560,47 @@ async fn an_image_that_cannot_be_had_is_named() {
     let pk = world.submit_with(FileState::Missing, Timestamp::now());
     world.ask(pk, true);
     let view = world.until(pk, |view| view.image.is_some()).await;
-    assert!(
-        view.image
-            .is_some_and(|image| image.is_err_and(|why| why.contains("404")))
-    );
+    let Some(ImageAnswer::Unread(why)) = view.image else {
+        panic!("{:?}", view.image)
+    };
+    assert!(why.contains("404"), "{why}");
+}
+
+#[tokio::test]
+async fn a_file_that_names_no_image_is_read_once() {
+    let mut world = World::new().await;
+    let large = "x".repeat(70_000);
+    let files = [
+        json!({"submitted_image_uri": null}).to_string(),
+        json!({"submitted_image_uri": "  "}).to_string(),
+        json!({"submitted_image_uri": 5}).to_string(),
+        "no JSON".to_owned(),
+        json!({ "submitted_image_uri": large }).to_string(),
+    ];
+    for file in files {
+        let pk = world.submit_file(file.into_bytes(), FileState::Stored, Timestamp::now());
+        world.ask(pk, true);
+        let view = world.until(pk, |view| view.image.is_some()).await;
+        assert!(matches!(view.image, Some(ImageAnswer::NotAnImage(_))), "{view:?}");
+        assert_eq!(view.last_error, None);
+    }
+}
+
+#[tokio::test]
+async fn writes_that_wait_for_the_process_before_are_named_and_their_start_wakes() {
+    let opens = Instant::now() + Duration::from_secs(1);
+    let mut world = World::opened_at(opens).await;
+    let pk = world.submit();
+    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+    let from = world.hub.writes_from().unwrap();
+    assert!(from > Timestamp::now() && from < Timestamp::now() + SignedDuration::from_secs(2));
+    loop {
+        let Changed::Submission(_) = world.changed.recv().await.unwrap() else {
+            continue;
+        };
+        if world.hub.writes_from().is_none() {
+            break;
+        }
+    }
+    assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
 }

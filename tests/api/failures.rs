@@ -5,8 +5,8 @@
 //! logcopy.
 #![cfg(test)]
 
-use evalai_stand_in::model::{FileState, Status};
-use evalai_stand_in::submissions::{NewSubmission, create};
+use evalai_stand_in::model::{FileState, Status, User};
+use evalai_stand_in::submissions::{NewSubmission, create, rerun};
 use evalai_stand_in::{Config, Handle};
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
@@ -15,7 +15,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, State, Storage, Submission, SubmissionStatus, names};
+use leaderboard_operator::api::{Leaderboard, State, Storage, Submission, SubmissionStatus, conditions, names};
 use leaderboard_operator::controller::context::Settings;
 use leaderboard_operator::controller::leader::{self, Identity};
 use leaderboard_operator::controller::run::{self, Clients};
@@ -125,22 +125,48 @@ impl World {
 
     /// Team a pushes to a phase; hands back EvalAI's key and the object's name.
     async fn submit(&self, leaderboard: &str, phase: u64) -> (u64, String) {
+        let image = json!("r/team-a:1");
+        self.submit_image(leaderboard, phase, &image, &image).await
+    }
+
+    /// The same with these images in the uploaded file and in the object.
+    async fn submit_image(&self, leaderboard: &str, phase: u64, uploaded: &Value, image: &Value) -> (u64, String) {
         let new = NewSubmission {
             team: 1,
             phase,
             user: 11,
-            input: json!({"submitted_image_uri": "r/team-a:1"}).to_string().into_bytes(),
+            input: json!({ "submitted_image_uri": uploaded }).to_string().into_bytes(),
             fields: Map::new(),
         };
         let pk = self
             .evalai
             .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
+        let name = self.object(leaderboard, phase, pk, image).await;
+        (pk, name)
+    }
+
+    /// A host re-runs a submission; hands back the new key and the new object's name.
+    async fn rerun(&self, leaderboard: &str, phase: u64, pk: u64) -> (u64, String) {
+        let again = self.evalai.with_state(|state| {
+            let host = User {
+                staff: true,
+                ..state.user(11).unwrap().clone()
+            };
+            rerun(state, &host, pk, Timestamp::now())
+        });
+        let new = again.unwrap_or_else(|_| panic!("EvalAI re-runs {pk}"));
+        let image = json!("r/team-a:1");
+        (new, self.object(leaderboard, phase, new, &image).await)
+    }
+
+    /// The object of a submission, as the bridge makes it.
+    async fn object(&self, leaderboard: &str, phase: u64, pk: u64, image: &Value) -> String {
         let name = names::submission(i64::try_from(pk).unwrap());
-        let spec = json!({"leaderboard": leaderboard, "image": "r/team-a:1",
+        let spec = json!({"leaderboard": leaderboard, "image": image,
                           "evalai": {"challenge": 1, "phase": phase, "submission": pk}});
         let submission = Submission::new(&name, serde_json::from_value(spec).unwrap());
         self.api().create(&PostParams::default(), &submission).await.unwrap();
-        (pk, name)
+        name
     }
 
     fn archive(&self, run: u64) -> Archive {
@@ -287,6 +313,10 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
             "{fetched}"
         );
         assert_eq!(fetched.contains("4711"), is_open, "{leaderboard}: {fetched}");
+        assert!(
+            !fetched.contains("leaderboard.log"),
+            "only hosts can read it: {fetched}"
+        );
         assert_eq!(own["stdout_file"].as_str().map(|_| ()), Some(()));
 
         let (row, all) = world.fetched(pk, HOST).await;
@@ -305,6 +335,34 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
             "{shown}"
         );
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let _controller = world.controller();
+    let (old, name) = world.submit("lb", 1).await;
+    world.run_that_crashes(old, &name).await;
+    let is_published = |s: &SubmissionStatus| s.times.published.is_some();
+    world.until(&name, "EvalAI has the end", is_published).await;
+
+    let (new, rerun) = world.rerun("lb", 1, old).await;
+    let statuses = [old, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));
+    assert_eq!(statuses, [Status::Cancelled, Status::Submitted]);
+    let of = |s: &SubmissionStatus| s.rerun_of.as_ref().is_some_and(|of| of.submission_name == name);
+    world.until(&rerun, "it names what it re-runs", of).await;
+    let again = |s: &SubmissionStatus| s.rerun_as.as_ref().is_some_and(|again| again.submission_name == rerun);
+    world.until(&name, "it names its re-run", again).await;
+    let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
+    assert_eq!(status.state, Some(State::Failed), "its result stays");
+    let message = status.message.unwrap();
+    let told = format!("EvalAI has cancelled it: it was re-run as {rerun}.");
+    assert!(
+        message.starts_with("Agent 1 crashed") && message.ends_with(&told),
+        "{message}"
+    );
+    assert!(world.shown(&name).await.contains("re-run as"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -378,5 +436,41 @@ async fn of_a_stored_log_only_the_end_is_read() {
         ("missing", None),
     ] {
         assert_eq!(archive.tail(key, 65_536).await.unwrap(), tail, "{key}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_can_never_be_an_image_fails_at_once_and_the_participant_reads_why() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let _controller = world.controller();
+    let uploaded = [
+        json!(null),
+        json!(""),
+        json!(5),
+        json!({"a": 1}),
+        json!("  "),
+        json!("x".repeat(513)),
+        json!("r/Team:1"),
+        json!("r/té:1"),
+        json!("two words"),
+    ];
+    let mut submitted = Vec::new();
+    for uploaded in &uploaded {
+        submitted.push(world.submit_image("lb", 1, uploaded, &json!(null)).await);
+    }
+    let (good, bad) = (json!("r/team-a:1"), json!("r/Team:1"));
+    submitted.push(world.submit_image("lb", 1, &good, &bad).await);
+    for (pk, name) in submitted {
+        let failed = world
+            .evalai
+            .wait_until(|state, _| state.submissions[&pk].status == Status::Failed);
+        timeout(LIMIT, failed).await.expect("EvalAI hears of the failure");
+        let (_, fetched) = world.fetched(pk, PARTICIPANT).await;
+        assert!(fetched.contains("ImageInvalid (participant): The subm"), "{fetched}");
+        let is_published = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::PUBLISHED);
+        world.until(&name, "it is published", is_published).await;
+        let job = world.api::<Job>().get_opt(&names::job(&name, 1, 0)).await.unwrap();
+        assert_eq!(job, None);
     }
 }

@@ -30,7 +30,7 @@ async fn why_says_state_cause_and_next_step() {
             &[
                 "Failure:     AgentCrashed, the participant's, charged, in pair 2.",
                 "aws s3 cp s3://results/42/evalai/environment_log.txt -",
-                "Next:        Look at agent/agent2/leaderboard.log of the results, mend the agent, submit again.",
+                "Next:        Look at agent/agent2/leaderboard.log of the results; the participant fixes the agent",
             ],
         ),
         (

@@ -9,10 +9,12 @@ use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
 use leaderboard_operator::api;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::ObjectKey;
 use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
 use serde_json::json;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 
 use super::bridge::{LIMIT, StandIn};
 
@@ -99,8 +101,9 @@ async fn a_row_holds_all_columns_under_whatever_keys_the_table_has() {
         end_time: "2026-11-20 12:00:00 UTC".into(),
         results: "s3://bucket/7".into(),
         metrics: vec![
-            ("driving_score".into(), "41.2".into()),
-            ("name".into(), "a reserved word".into()),
+            ("driving_score".into(), Some("41.2".into())),
+            ("name".into(), Some("a reserved word".into())),
+            ("agent_blocked".into(), None),
         ],
         ..row(1, "FINISHED")
     };
@@ -189,6 +192,32 @@ async fn rows_of_the_pipeline_are_taken_over_and_unknown_columns_stay() {
     assert_eq!(
         (stored["start_time"].as_str(), stored["submission_status"].as_str()),
         ("2026-11-20 10:01:00 UTC", "RUNNING")
+    );
+}
+
+#[tokio::test]
+async fn metrics_of_an_earlier_row_are_removed() {
+    let stand_in = StandIn::start().await;
+    let (spec, table) = usual(&stand_in).await;
+    let with = |row: Row, score: Option<&str>| Row {
+        metrics: vec![("driving_score".into(), score.map(str::to_owned))],
+        ..row
+    };
+    let score = async || rows(&stand_in, &spec.name).await.remove(0).remove("driving_score");
+    // As an earlier operator wrote it.
+    assert_eq!(
+        table.write(&with(row(1, "RUNNING"), Some("10.5"))).await,
+        Ok(Written::Stored)
+    );
+    assert_eq!(score().await.as_deref(), Some("10.5"));
+    for status in ["RUNNING", "FAILED", "FAILED"] {
+        assert_eq!(table.write(&with(row(1, status), None)).await, Ok(Written::Stored));
+        assert_eq!(score().await, None, "{status}");
+    }
+    assert_eq!(
+        table.write(&with(row(1, "FAILED"), Some("10.5"))).await,
+        Ok(Written::Stale),
+        "it is not the same"
     );
 }
 
@@ -285,12 +314,12 @@ async fn the_recorder_writes_in_the_background_behind_its_fence() {
     let (spec, _) = usual(&stand_in).await;
     let fence = Arc::new(AtomicBool::new(true));
     let (may_write, (wake, mut woken)) = (fence.clone(), mpsc::unbounded_channel());
-    let (stop, stopped) = watch::channel(false);
+    let (stop, stopped) = Stop::new();
     let recorder = Recorder::new(
         stand_in.aws.clone(),
         move || may_write.load(Ordering::SeqCst),
         wake,
-        stopped,
+        Tasks::new(stopped),
     );
     let key = |name: &str| ObjectKey {
         namespace: "ns".into(),

@@ -37,6 +37,7 @@ async fn creations_changes_and_deletions_are_told() {
     let (client, namespace) = (server().await.client(), server().await.namespace("watches").await);
     let (_sender, stop) = Stop::new();
     let seen = Observability::new(stop);
+    seen.readiness.registered();
     let watch = spawn_watch::<Submission>(
         guarded(client.clone(), Some(&namespace)),
         Config::default(),
@@ -67,6 +68,7 @@ async fn the_preflight_finds_the_kinds_and_the_permissions_of_an_administrator()
     let client = server().await.client();
     let (_sender, stop) = Stop::new();
     let seen = Observability::new(stop);
+    seen.readiness.registered();
     let found = timeout(LIMIT, await_kinds(&client, &["leaderboards", "submissions"], &seen)).await;
     assert!(found.expect("in time") && seen.readiness.missing().is_empty());
     let need = |resource, verb| Need {

@@ -212,6 +212,7 @@ fn check_merged(plan: &Plan, workers: usize, merged: &Merged) {
 
 fn check_files(plan: &Plan, merged: &Merged, files: &Files) {
     assert_eq!(files.metadata_json.as_deref(), Some(merged.text.as_str()));
+    assert!(!(merged.is_final && files.partial_json.is_some()));
     let mut from = 0;
     let mut names: Vec<&str> = metrics(plan.format).iter().map(|metric| metric.name).collect();
     if plan.format == Format::V1 {

@@ -54,6 +54,8 @@ pub(crate) struct View {
     pub(crate) sensors: Vec<Text>,
     pub(crate) routes: Vec<Line>,
     pub(crate) global: Option<Global>,
+    /// The same over the routes done so far; only before the run is final. It is no part of the merged file.
+    pub(crate) so_far: Option<Global>,
 }
 
 /// One line of the route glossary; durations in seconds.
@@ -81,8 +83,7 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
     check_plan(plan, workers)?;
     let sensors = sensors(workers)?;
     let unsorted: Vec<&Record> = workers.iter().flatten().flat_map(|worker| &worker.records).collect();
-    let mut sorted = unsorted.clone();
-    sorted.sort_by_key(|record| record.key);
+    let sorted = by_route(&unsorted);
 
     let done = sum(workers, Checkpoint::done);
     let total = plan.expected().unwrap_or_else(|| sum(workers, Checkpoint::total));
@@ -90,6 +91,13 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
     if is_final {
         check_routes(plan, workers, &sorted)?;
     }
+    let done_unsorted = done_records(workers);
+    let done_sorted = by_route(&done_unsorted);
+    let so_far = if is_final {
+        None
+    } else {
+        global_so_far(plan, &done_unsorted, &done_sorted)
+    };
     let global = is_final.then(|| global(plan, &unsorted, &sorted)).transpose()?;
     let verdict = Verdict::of(plan, &sorted, &sensors, is_final);
     let text = text(plan.format, &sorted, [done, total], &sensors, global.as_ref(), &verdict)
@@ -103,13 +111,14 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
         entry_status: verdict.entry_status.to_owned(),
         outcome: verdict.outcome,
         score: global.as_ref().map(|global| global.mean(Score::Composed).as_f64()),
-        partial_score: partial_score(&sorted),
+        partial_score: partial_score(&done_sorted),
         pairs: pairs(plan, workers),
         warnings: warnings(workers),
         view: View {
             sensors,
             routes: sorted.iter().map(|record| Line::of(record)).collect(),
             global,
+            so_far,
         },
     })
 }
@@ -258,6 +267,33 @@ fn global(plan: &Plan, unsorted: &[&Record], sorted: &[&Record]) -> Result<Globa
         }
     }
     Ok(global)
+}
+
+fn by_route<'a>(records: &[&'a Record]) -> Vec<&'a Record> {
+    let mut sorted = records.to_vec();
+    sorted.sort_by_key(|record| record.key);
+    sorted
+}
+
+/// The records of the routes that are done, in the order of the files: a route that its evaluator is going to repeat is not.
+fn done_records<'a>(workers: &[Option<&'a Checkpoint>]) -> Vec<&'a Record> {
+    let workers = workers.iter().flatten();
+    let done = workers.flat_map(|worker| {
+        let count = usize::try_from(worker.done()).unwrap_or(usize::MAX);
+        worker.records.iter().take(count)
+    });
+    done.collect()
+}
+
+/// The global record over a part of the routes. None before the first, and where a metric has no finite value: a run is refused
+/// for that only at its end.
+fn global_so_far(plan: &Plan, unsorted: &[&Record], sorted: &[&Record]) -> Option<Global> {
+    if unsorted.is_empty() {
+        return None;
+    }
+    let global = global(plan, unsorted, sorted).ok()?;
+    let is_finite = |metric: &names::Metric| global.metric(metric).as_f64().is_finite();
+    names::metrics(plan.format).iter().all(is_finite).then_some(global)
 }
 
 fn partial_score(records: &[&Record]) -> Option<f64> {

@@ -5,6 +5,7 @@ use crate::json::{KeyOrder, Node, write};
 use crate::merge::{Line, Merged};
 use crate::names::{metrics, sensor_name};
 use crate::number::Number;
+use crate::statistics::Global;
 use crate::{Format, Metric, Plan, Refusal};
 
 const RATIO_DIGITS: usize = 4;
@@ -16,6 +17,9 @@ const FRAMES: f64 = 20.0;
 pub struct Files {
     /// The metrics: a list with one object, to be sent as text. All zero until the run is final.
     pub results_json: String,
+    /// The same with the metrics over the routes done so far, for a leaderboard that shows partial results. `None` once the run
+    /// is final, before the first route, and with [`Plan::as_original`].
+    pub partial_json: Option<String>,
     /// The summary a participant reads.
     pub stdout_txt: String,
     /// The merged file; `None` when there is none.
@@ -24,16 +28,20 @@ pub struct Files {
 
 /// Renders EvalAI's files; `None` when there is nothing merged yet.
 pub fn render(plan: &Plan, merged: Option<&Merged>) -> Result<Files, Refusal> {
-    let results_json = results(plan.format, merged)?;
+    let global = merged.and_then(|merged| merged.view.global.as_ref());
+    let results_json = results(plan.format, global)?;
     let Some(merged) = merged else {
         return Ok(Files {
             results_json,
+            partial_json: None,
             stdout_txt: NOTHING_YET.to_owned(),
             metadata_json: None,
         });
     };
+    let so_far = merged.view.so_far.as_ref().filter(|_| !plan.as_original);
     Ok(Files {
         results_json,
+        partial_json: so_far.map(|so_far| results(plan.format, Some(so_far))).transpose()?,
         stdout_txt: stdout(plan.format, merged)?,
         metadata_json: Some(merged.text.clone()),
     })
@@ -43,8 +51,7 @@ pub fn render(plan: &Plan, merged: Option<&Merged>) -> Result<Files, Refusal> {
 const NOTHING_YET: &str = "Initializing the submission, no data avaialable yet.\n\
     More information will be found here once the submission starts running.\n";
 
-fn results(format: Format, merged: Option<&Merged>) -> Result<String, Refusal> {
-    let global = merged.and_then(|merged| merged.view.global.as_ref());
+fn results(format: Format, global: Option<&Global>) -> Result<String, Refusal> {
     let number = |metric| Node::Number(global.map_or(Number::ZERO, |global| global.metric(metric)));
     let accuracies = metrics(format)
         .iter()

@@ -4,15 +4,19 @@ use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::Draft;
+use super::draft::{Draft, after};
+use super::failure::{self, infrastructure};
 use super::{Action, end};
 use crate::api::conditions::{self, Truth};
-use crate::api::{LeaderboardSpec, State, Team, Track, effective, reasons};
+use crate::api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
 use crate::controller::view::{EvalaiInfo, Standing};
 use crate::text::sentence;
 
 /// How long EvalAI may take before its silence is shown.
 const RETRY: Duration = Duration::from_secs(30);
+/// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
+/// participant, whose team has that submission in progress.
+const PHASE_SECONDS: i64 = 3600;
 
 /// Whether the submission may go on to its turn. Otherwise the draft says why not.
 pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
@@ -38,12 +42,24 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
         Answer::Wanted(info) => Some(info),
     };
     take_team(draft, info.as_ref());
-    let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
-    let told = info.as_ref().and_then(|i| i.image.clone());
-    let Some(image) = pinned.or_else(|| draft.spec().image.clone()).or(told) else {
-        let message = "Neither the Submission nor EvalAI names an image. Ask the participant to push again, and cancel \
-                       this submission.";
-        return refuse(draft, reasons::IMAGE_MISSING, message);
+    if let Some(what) = foreign_phase(draft, info.as_ref()) {
+        return wait_for_phase(draft, &what);
+    }
+    let image = match image(draft, info.as_ref()) {
+        Image::Named(image) => image,
+        Image::Unknown => {
+            let message = image_unread(draft);
+            let message = draft.stall(reasons::IMAGE_MISSING, &message);
+            return refuse(draft, reasons::IMAGE_MISSING, &message);
+        }
+        Image::Invalid { image, what } => {
+            // The plan makes it a row of the table, as any other failure.
+            pin(draft, leaderboard, track, image, info.as_ref());
+            let found = failure::image_invalid(&what);
+            draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
+            end::failed(draft, found);
+            return false;
+        }
     };
     if let Some(message) = not_ready(draft) {
         return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
@@ -72,6 +88,80 @@ fn not_ready(draft: &Draft<'_>) -> Option<String> {
             sentence(&ready.message)
         )
     })
+}
+
+/// What is known of the participant's image.
+enum Image {
+    Named(String),
+    /// It could not be asked for yet.
+    Unknown,
+    /// It can never be pulled, and why.
+    Invalid {
+        image: String,
+        what: String,
+    },
+}
+
+/// The image that was pinned, else the object's, else that of the file in EvalAI.
+fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
+    let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
+    let named = pinned
+        .filter(|image| !image.is_empty())
+        .or_else(|| draft.spec().image.clone())
+        .or_else(|| info.and_then(|i| i.image.clone()));
+    let Some(image) = named else {
+        let problem = info.and_then(|i| i.image_problem.as_deref());
+        return problem.map_or(Image::Unknown, |why| Image::Invalid {
+            image: String::new(),
+            what: sentence(&format!("The submission names no image: {why}")),
+        });
+    };
+    match ImageReference::parse(&image) {
+        Ok(_) => Image::Named(image),
+        Err(why) => {
+            let what = sentence(&format!("The submitted image can never be pulled: {why}"));
+            Image::Invalid { image, what }
+        }
+    }
+}
+
+/// What is said while the file in EvalAI cannot be read.
+fn image_unread(draft: &Draft<'_>) -> String {
+    let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
+    let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
+    format!(
+        "The Submission names no image, and the file in EvalAI that names it could not be read yet; it is tried again.{why} If \
+         that lasts, look at EvalAI's files, or ask the participant to push again and cancel this submission."
+    )
+}
+
+/// What is said of a row that belongs to another phase than the Submission: its run would count for neither.
+fn foreign_phase(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Option<String> {
+    let evalai = draft.spec().evalai?;
+    let (pk, ours) = (evalai.submission, evalai.phase);
+    let theirs = info?.phase.filter(|theirs| *theirs != ours)?;
+    Some(format!(
+        "EvalAI says that submission {pk} belongs to phase {theirs}, not to phase {ours} of this Submission, so it is not run."
+    ))
+}
+
+/// Waits until the row is of our phase again. The object may have been applied with a wrong phase, so nothing is reported at
+/// once; but the participant's submission does not wait for an end without limit.
+fn wait_for_phase(draft: &mut Draft<'_>, what: &str) -> bool {
+    let message = format!(
+        "{what} It goes on when EvalAI says phase {} again, and fails after {} min.",
+        draft.spec().evalai.map_or(0, |evalai| evalai.phase),
+        PHASE_SECONDS / 60
+    );
+    let message = draft.stall(reasons::PHASE_DIFFERS, &message);
+    let since = draft.stalled_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
+    let until = after(since, PHASE_SECONDS);
+    if draft.now() >= until {
+        end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, what));
+        return false;
+    }
+    draft.requeue_at(until);
+    refuse(draft, reasons::PHASE_DIFFERS, &message)
 }
 
 enum Answer {
@@ -134,16 +224,20 @@ fn missing_track(draft: &Draft<'_>, leaderboard: &LeaderboardSpec) -> String {
 
 fn take_team(draft: &mut Draft<'_>, info: Option<&EvalaiInfo>) {
     let given = draft.spec().team.clone();
-    if let Some(info) = info {
+    let is_pinned = draft.status.plan.is_some() && draft.status.team.is_some();
+    if is_pinned {
+        // A row that is edited later changes neither the run's place in line nor its row of the table.
+    } else if let Some(info) = info {
         let name = given.and_then(|t| t.name).or_else(|| info.team_name.clone());
         draft.status.team = Some(Team {
             id: Some(info.team_id.clone()),
             name,
         });
-        draft.status.times.submitted = draft.status.times.submitted.clone().or(info.submitted_at.map(Time));
     } else if given.is_some() {
         draft.status.team = given;
     }
+    let submitted = info.and_then(|info| info.submitted_at).map(Time);
+    draft.status.times.submitted = draft.status.times.submitted.take().or(submitted);
     if draft.status.times.submitted.is_none() {
         draft.status.times.submitted = draft.submission().metadata.creation_timestamp.clone();
     }
@@ -155,6 +249,8 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
         // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
         // made; all else belongs to the submission.
         Some(pinned) if draft.status.retry == 0 && draft.status.job.is_none() => crate::api::RunPlan {
+            // The same, unless an earlier attempt had none.
+            image,
             contents_image: leaderboard.contents.image.clone(),
             simulator_image: leaderboard.simulator.image.clone(),
             ..pinned

@@ -5,10 +5,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::{Draft, after};
+use super::draft::{Draft, after, seconds};
 use super::{Action, Tell, accept, log, stop};
 use crate::api::conditions::{self, Truth};
-use crate::api::{State, reasons};
+use crate::api::{Ingested, State, reasons};
 use crate::controller::view::{EvalaiEnd, JobSight, JobView};
 use crate::text::sentence;
 
@@ -16,24 +16,47 @@ use crate::text::sentence;
 const AGAIN: Duration = Duration::from_secs(30);
 /// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
 const FAREWELL_SECONDS: i64 = 120;
+/// What EvalAI calls a row that was cancelled.
+const CANCELLED: &str = "cancelled";
 const TOLD_AGAIN: &str =
     "A request that was under way may have undone EvalAI's own end; EvalAI is asked, and told again.";
 
 /// Decides for a submission in a terminal state.
 pub(super) fn decide(draft: &mut Draft<'_>) {
     leave_job(draft);
+    show_refused_attempt(draft);
     // Before EvalAI is told, since its hosts read it there.
     log::keep_at_end(draft);
     let published = publish(draft);
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = published != Sync::Waiting && record(draft) == Sync::Done;
     let complete = published == Sync::Done && recorded;
-    if complete {
+    if complete && !follow_rerun(draft) {
         draft.act(Action::ForgetEvalai);
     } else {
         draft.requeue_in(AGAIN);
     }
     release(draft, complete);
+}
+
+/// Shows once that EvalAI's row asks for another attempt which does not begin.
+fn show_refused_attempt(draft: &mut Draft<'_>) {
+    let refused = Ingested::of(draft.submission()).and_then(|record| record.refused);
+    let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt + 1) else {
+        return;
+    };
+    let reason = reasons::ATTEMPT_WITHOUT_MESSAGE;
+    let message = format!(
+        "EvalAI's row has asked for attempt {} since {}, and no message has announced it, so it does not begin: participants \
+         can edit the row. Raise spec.attempt if it is to run; else set the row's status back in EvalAI.",
+        refused.attempt,
+        seconds(refused.at)
+    );
+    let is_new = draft.stalled_since(reason).is_none();
+    draft.condition(conditions::STALLED, Truth::True, reason, &message);
+    if is_new {
+        draft.event(true, reason, message);
+    }
 }
 
 /// How far another system is with the end.
@@ -91,11 +114,40 @@ fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Sync {
     }
 }
 
+/// Notes that EvalAI has cancelled a result because it was re-run, of which nobody is notified. Returns whether EvalAI has to be
+/// asked for that: the re-run's row can be edited by its participant, so it alone is no proof.
+fn follow_rerun(draft: &mut Draft<'_>) -> bool {
+    let rerun = draft.view.rerun_as.clone().filter(|_| draft.status.rerun_as.is_none());
+    let Some(rerun) = rerun.filter(|_| !draft.is_deleting() && draft.leaderboard().is_some()) else {
+        return false;
+    };
+    let evalai = draft.view.evalai.as_ref();
+    let Some(info) = evalai.and_then(|evalai| evalai.info.as_ref()) else {
+        draft.act(Action::AskEvalai);
+        return true;
+    };
+    if info.status != CANCELLED {
+        // What is known may be older than the re-run; it is asked for anew when the submission is looked at next.
+        return false;
+    }
+    let message = format!("EvalAI has cancelled it: it was re-run as {}.", rerun.submission_name);
+    let ended = draft.status.message.take().unwrap_or_default();
+    draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
+    if let Some(published) = conditions::get(&draft.status.conditions, conditions::PUBLISHED).cloned() {
+        let truth = Truth::from(published.status == "True");
+        draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
+    }
+    draft.event(false, reasons::RERUN_IN_EVALAI, message);
+    draft.status.rerun_as = Some(rerun);
+    false
+}
+
 fn publish(draft: &mut Draft<'_>) -> Sync {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
-    if draft.spec().evalai.is_none() || (is_evalais && !is_overtaken) {
+    let is_ours = draft.spec().evalai.is_some() && !is_of_another_phase(draft);
+    if !is_ours || (is_evalais && !is_overtaken) {
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
         return Sync::Done;
     }
@@ -111,8 +163,7 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
     match view.end {
         Some(EvalaiEnd::Published { at }) => {
             draft.status.times.published = Some(Time(at));
-            draft.condition(conditions::PUBLISHED, Truth::True, reasons::WRITTEN, "");
-            draft.event(false, conditions::PUBLISHED, "EvalAI has the result.");
+            published(draft, view.team_id.as_deref());
             Sync::Done
         }
         Some(EvalaiEnd::Ended { status }) => {
@@ -134,6 +185,12 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             let failed = failed.or(unread(draft));
             let (reason, message) = if is_overtaken {
                 (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
+            } else if let Some(until) = draft.view.evalai_writes_from {
+                draft.requeue_at(until);
+                (
+                    reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
+                    Some(previous_controller(until)),
+                )
             } else {
                 (reasons::WAITING, failed)
             };
@@ -146,6 +203,39 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             Sync::Waiting
         }
     }
+}
+
+/// EvalAI has the end. Its row may by now be another team's, to whom EvalAI shows the result: participants can edit it.
+fn published(draft: &mut Draft<'_>, team: Option<&str>) {
+    let ours = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
+    let moved = ours.zip(team).filter(|(ours, theirs)| ours != theirs);
+    let message = moved.map(|(ours, theirs)| {
+        format!(
+            "EvalAI's row now belongs to team {theirs}, and EvalAI shows the result there; it was run and recorded for team \
+             {ours}. Set the team back in EvalAI, or correct the table."
+        )
+    });
+    let shown = message.clone().unwrap_or_default();
+    draft.condition(conditions::PUBLISHED, Truth::True, reasons::WRITTEN, &shown);
+    draft.event(false, conditions::PUBLISHED, "EvalAI has the result.");
+    if let Some(message) = message {
+        draft.event(true, reasons::TEAM_DIFFERS, message);
+    }
+}
+
+/// Whether it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
+fn is_of_another_phase(draft: &Draft<'_>) -> bool {
+    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
+    differs && draft.status.plan.is_none() && draft.status.state == Some(State::Cancelled)
+}
+
+/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
+pub fn previous_controller(until: Timestamp) -> String {
+    format!(
+        "The controller before may still have requests under way; EvalAI is written to again from {} UTC on.",
+        until.strftime("%H:%M:%S")
+    )
 }
 
 /// What keeps an end from being told before anybody was asked.
@@ -200,6 +290,11 @@ fn record(draft: &mut Draft<'_>) -> Sync {
         draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, "");
         return Sync::Done;
     };
+    if draft.status.plan.is_none() {
+        let message = "It was never accepted, so it has no row.";
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, message);
+        return Sync::Done;
+    }
     if draft.status.team.as_ref().and_then(|t| t.id.as_ref()).is_none() {
         let message = "The row needs a team; give spec.team.id to a submission that is not EvalAI's.";
         draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, message);

@@ -8,7 +8,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::{Action, Event, Plan};
 use crate::api::conditions::{self, Truth};
 use crate::api::{
-    Deadlines, Failure, LeaderboardSpec, Retries, State, Submission, SubmissionSpec, SubmissionStatus, names, reasons,
+    Deadlines, Failure, Ingested, LeaderboardSpec, Retries, State, Submission, SubmissionSpec, SubmissionStatus, names,
+    reasons,
 };
 use crate::controller::view::View;
 
@@ -110,11 +111,13 @@ impl<'a> Draft<'a> {
         match self.status.attempt {
             None => {
                 self.start_status(wanted);
+                self.show_unannounced(wanted);
                 // Without a status the world was seen as the first attempt's.
                 wanted != 1
             }
             Some(present) if wanted > present && self.may_be_resumed() => {
                 self.start_status(wanted);
+                self.show_unannounced(wanted);
                 true
             }
             Some(_) => false,
@@ -138,6 +141,7 @@ impl<'a> Draft<'a> {
             progress: old.progress,
             score: old.score.map(|s| if s.starts_with('~') { s } else { format!("~{s}") }),
             results: old.results,
+            rerun_of: old.rerun_of,
             times: crate::api::Times {
                 submitted: old.times.submitted,
                 ..Default::default()
@@ -146,6 +150,18 @@ impl<'a> Draft<'a> {
         };
         self.condition(conditions::FINISHED, Truth::False, reasons::PREPARING, "");
         self.say(State::Pending, reasons::PREPARING, "The submission was just taken in.");
+    }
+
+    /// Shows that no message has announced an attempt: its row may have been edited by the participant.
+    fn show_unannounced(&mut self, attempt: i64) {
+        let record = Ingested::of(self.submission()).filter(|record| record.without_message.contains(&attempt));
+        let Some(record) = record else { return };
+        let message = format!(
+            "EvalAI's row says resuming since {}, and no message has announced attempt {attempt}. EvalAI lets only hosts \
+             resume, but participants can edit the row: check who asked for it.",
+            seconds(record.sent)
+        );
+        self.event(true, reasons::ATTEMPT_WITHOUT_MESSAGE, message);
     }
 
     pub(super) fn act(&mut self, action: Action) {
@@ -247,6 +263,12 @@ impl<'a> Draft<'a> {
             requeue: self.requeue,
         }
     }
+}
+
+/// Milliseconds since 1970, for people.
+pub(super) fn seconds(milliseconds: i64) -> String {
+    let at = Timestamp::from_millisecond(milliseconds).unwrap_or_default();
+    format!("{at:.0}")
 }
 
 /// The moment `seconds` after another.

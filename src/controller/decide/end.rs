@@ -175,7 +175,8 @@ fn finished(draft: &mut Draft<'_>, report: &Report) {
     close(draft, State::Finished, reasons::FINISHED, &message);
 }
 
-fn failed(draft: &mut Draft<'_>, found: Failure) {
+/// Ends as Failed; nothing needs to be stopped any more.
+pub(super) fn failed(draft: &mut Draft<'_>, found: Failure) {
     let (reason, message) = (found.reason.clone(), found.message.clone());
     draft.status.failure = Some(found);
     close(draft, State::Failed, &reason, &message);

@@ -6,59 +6,53 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::Draft;
+use super::next_steps::{Steps, for_both, in_the_log_of, infrastructure_for_participants, of_infrastructure, smaller};
 use crate::api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
 use crate::controller::view::{ContainerView, EndView, JobEnd, NodeSight, PodView};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use crate::text::sentence;
 
-/// A failure that is the participant's.
-pub(super) fn participant(reason: &str, message: impl Into<String>) -> Failure {
+/// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
+pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
+    let message = format!("{what} {}", next.hosts);
+    let for_participants = format!("{what} {}", next.participant);
     Failure {
         class: FailureClass::Participant,
         reason: reason.into(),
-        message: message.into(),
+        participant_message: Some(for_participants).filter(|text| *text != message),
+        message,
         charged: true,
         pair: None,
     }
 }
 
-/// A failure that is not: `what` happened, in one sentence; the next step is the reason's.
+/// A failure that is not: `what` happened, in one sentence for hosts; the next step is the reason's.
 pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
     Failure {
         class: FailureClass::Infrastructure,
         reason: reason.into(),
-        message: format!("{what} {}", next_step(reason)).trim_end().to_owned(),
+        message: format!("{what} {}", of_infrastructure(reason)).trim_end().to_owned(),
+        participant_message: Some(infrastructure_for_participants(reason)),
         charged: false,
         pair: None,
-    }
-}
-
-/// What a host does about a failure of the infrastructure that no retry has mended.
-fn next_step(reason: &str) -> &'static str {
-    match reason {
-        // The words of `workspace` hold it already.
-        reasons::PREFIX_IN_USE => "",
-        reasons::JOB_DELETED => "Find out who deletes Jobs in this namespace, then resume it.",
-        reasons::NODE_LOST => "Look at the node, then resume it.",
-        reasons::RESULTS_NOT_STORED => "Look at the log of logcopy and at the bucket, then resume it.",
-        reasons::SIMULATION_CRASHED => {
-            "Look at the simulator's log, then resume it, which repeats the route it was at."
-        }
-        reasons::JOB_FAILED => "Look at the Job's events, then resume it.",
-        reasons::SCHEDULE_DEADLINE => "Add a node or make room, then resume it.",
-        _ => "Mend that, then resume it.",
     }
 }
 
 /// The message of a failure without the next step, for as long as it may mend itself.
 pub(super) fn what_happened(failure: &Failure) -> String {
     let message = failure.message.as_str();
-    let next = next_step(&failure.reason);
+    let next = of_infrastructure(&failure.reason);
     let what = message
         .strip_suffix(next)
         .filter(|_| failure.class == FailureClass::Infrastructure);
     what.unwrap_or(message).trim_end().to_owned()
+}
+
+/// What was submitted names no image that could ever be pulled.
+pub(super) fn image_invalid(what: &str) -> Failure {
+    let next = for_both("Submit again with an image as in registry.example/team/agent:1.");
+    participant(reasons::IMAGE_INVALID, what, &next)
 }
 
 pub(super) fn job_deleted() -> Failure {
@@ -79,10 +73,12 @@ pub(super) fn node_lost(node: Option<&str>, sight: NodeSight) -> Failure {
 }
 
 pub(super) fn time_limit(seconds: i64) -> Failure {
-    let message = format!(
-        "The run took longer than {seconds} s and was stopped; finished routes are kept. Make the agent faster, or ask the host for more time."
-    );
-    participant(reasons::TIME_LIMIT, message)
+    let what = format!("The run took longer than {seconds} s and was stopped; finished routes are kept.");
+    participant(reasons::TIME_LIMIT, &what, &faster())
+}
+
+fn faster() -> Steps {
+    for_both("Make the agent faster, or ask the host for more time.")
 }
 
 pub(super) fn results_not_stored() -> Failure {
@@ -93,13 +89,11 @@ pub(super) fn results_not_stored() -> Failure {
 }
 
 pub(super) fn invalid_results(why: &str) -> Failure {
-    let words = sentence(why);
-    let message = format!(
-        "The results cannot be used: {words} Check what the agent writes into its checkpoint, and submit again."
-    );
+    let what = format!("The results cannot be used: {}", sentence(why));
+    let next = for_both("Check what the agent writes into its checkpoint, and submit again.");
     Failure {
         pair: pair_named(why),
-        ..participant(reasons::INVALID_RESULTS, message)
+        ..participant(reasons::INVALID_RESULTS, &what, &next)
     }
 }
 
@@ -125,11 +119,9 @@ pub(super) fn not_eligible(entry_status: &str) -> Failure {
             "The simulation crashed during a route, so the results do not count.",
         );
     }
-    let message = format!(
-        "The run ended as {entry_status}, so its results do not count. Compare the agent's sensors with those the track \
-         allows, and submit again."
-    );
-    participant(reasons::NOT_ELIGIBLE, message)
+    let what = format!("The run ended as {entry_status}, so its results do not count.");
+    let next = for_both("Compare the agent's sensors with those the track allows, and submit again.");
+    participant(reasons::NOT_ELIGIBLE, &what, &next)
 }
 
 /// A Pod that was evicted because the agent's side filled its disk. Another Pod would run into it again.
@@ -137,10 +129,9 @@ pub(super) fn disk_full(pod: &PodView) -> Option<Failure> {
     let (reason, message) = pod.ended_by_node.as_ref()?;
     let is_agents = reason == "Evicted" && is_agents_disk(message);
     is_agents.then(|| {
-        let words = sentence(message);
-        let message =
-            format!("The Pod was evicted because it filled its disk: {words} Write less to disk or to the log.");
-        participant(reasons::DISK_FULL, message)
+        let what = format!("The Pod was evicted because it filled its disk: {}", sentence(message));
+        let next = for_both("Write less to disk or to the log.");
+        participant(reasons::DISK_FULL, &what, &next)
     })
 }
 
@@ -302,7 +293,8 @@ pub(super) fn of_job(status: &SubmissionStatus, end: &JobEnd, pod: Option<&PodVi
         JobEnd::Complete { .. } => results_not_stored(),
         JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" => participant(
             reasons::TIME_LIMIT,
-            "The Pod reached its time limit; finished routes are kept. Make the agent faster, or ask the host for more time.",
+            "The Pod reached its time limit; finished routes are kept.",
+            &faster(),
         ),
         JobEnd::Failed { reason, message, .. } => worst_pair(status).unwrap_or_else(|| {
             let what = format!("Its Job failed with {reason}: {}", sentence(message));
@@ -330,41 +322,34 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
     } else {
         format!("{crashes} times")
     };
-    let (reason, message) = match word {
+    let (reason, what, next) = match word {
         "OOMKilled" => (
             reasons::OUT_OF_MEMORY,
-            format!(
-                "Agent {id} crashed {times}, the last time for lack of memory. Make it smaller; the limit is in the \
-                 track's description."
-            ),
+            format!("Agent {id} crashed {times}, the last time for lack of memory."),
+            smaller(),
         ),
         "idle" => (
             reasons::IDLE,
-            format!(
-                "Agent {id} ended too early {times}, the last time because it printed nothing for too long. Look for a \
-                 dead end in its code."
-            ),
+            format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
+            in_the_log_of(id),
         ),
         FORGED => (
             reasons::AGENT_CRASHED,
-            format!(
-                "Agent {id} ended {times} by a status file that says it crashed, which it has not. Leave the folder of the \
-                 status files to the evaluator's runner, and submit again."
-            ),
+            format!("Agent {id} ended {times} by a status file that says it crashed, which it has not."),
+            for_both("Leave the folder of the status files to the evaluator's runner, and submit again."),
         ),
         "incomplete" => (
             reasons::INVALID_RESULTS,
             format!(
                 "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
-                 no global record. Look at agent/agent{id}/leaderboard.log of the results, mend it and submit again."
+                 no global record."
             ),
+            in_the_log_of(id),
         ),
         "cannotStart" | "startError" => (
             reasons::CANNOT_START,
-            format!(
-                "Agent {id} could not be started: its command is missing in the image or not for this machine. Rebuild \
-                 the image for linux/amd64."
-            ),
+            format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
+            for_both("Rebuild the image for linux/amd64."),
         ),
         "notReady" | FOLLOWED | "simulator" => {
             let what = if word == "notReady" {
@@ -377,13 +362,11 @@ fn cause_of_pair(id: i32, crashes: i32, word: &str) -> Failure {
         }
         _ => (
             reasons::AGENT_CRASHED,
-            format!(
-                "Agent {id} crashed {times}. Look at agent/agent{id}/leaderboard.log of the results, mend it and submit \
-                 again."
-            ),
+            format!("Agent {id} crashed {times}."),
+            in_the_log_of(id),
         ),
     };
-    participant(reason, message)
+    participant(reason, &what, &next)
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]

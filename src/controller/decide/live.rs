@@ -67,6 +67,7 @@ fn in_line(draft: &mut Draft<'_>) {
     if !accept::decide(draft) {
         return draft.requeue_in(BACKSTOP);
     }
+    note_original(draft);
     if waits_for_next_try(draft) {
         return;
     }
@@ -91,6 +92,14 @@ fn in_line(draft: &mut Draft<'_>) {
     // Who waits in EvalAI's eyes too: only what it was told to be queued is looked for among the cancelled.
     tell(draft);
     draft.requeue_in(BACKSTOP);
+}
+
+/// Remembers which submission this one re-runs, so that the other learns of it.
+fn note_original(draft: &mut Draft<'_>) {
+    let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
+    if draft.status.rerun_of.is_none() {
+        draft.status.rerun_of = info.and_then(|info| info.rerun_of.clone());
+    }
 }
 
 /// What was said of this place. A wait that is only estimated anew is not worth a write; it follows the place.

@@ -76,7 +76,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
             Some(stored(names::CONTAINER_LOGCOPY, crate::pod::ownlog::OWN_LOG.into())),
         ],
         // It never ran.
-        reasons::IMAGE_PULL | reasons::CONTAINER_CONFIG => Vec::new(),
+        reasons::IMAGE_INVALID | reasons::IMAGE_PULL | reasons::CONTAINER_CONFIG => Vec::new(),
         _ if failure.class == FailureClass::Participant => vec![Some(agent()), on_node(&format!("agent-{pair}"))],
         _ => Vec::new(),
     };

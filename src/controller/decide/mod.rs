@@ -2,7 +2,7 @@
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `live`, `start`, `stop`, `end`, `after`; `failure`
-//! names the causes of an end, `trouble` those of a wait.
+//! names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
 mod after;
@@ -11,6 +11,7 @@ mod end;
 mod failure;
 mod live;
 mod log;
+mod next_steps;
 mod start;
 mod stop;
 #[cfg(test)]
@@ -22,6 +23,7 @@ use std::time::Duration;
 use super::view::View;
 use crate::api::{SubmissionStatus, names};
 use crate::pod::run::Stop;
+pub use after::previous_controller;
 use draft::Draft;
 pub use log::{LogAt, LogPlace};
 

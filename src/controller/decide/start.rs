@@ -8,6 +8,7 @@ use jiff::Timestamp;
 
 use super::draft::{Draft, after};
 use super::failure::{self, infrastructure, participant};
+use super::next_steps::for_both;
 use super::trouble::{self, Trouble};
 use crate::api::conditions::{self, Truth};
 use crate::api::{Failure, State, names, reasons};
@@ -212,8 +213,10 @@ fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &s
 }
 
 fn too_late(found: &Trouble, seconds: i64) -> Failure {
-    if found.reason == reasons::PREFIX_IN_USE {
-        return infrastructure(found.reason, &found.message);
+    match found.reason {
+        reasons::PREFIX_IN_USE => return infrastructure(found.reason, &found.message),
+        reasons::IMAGE_INVALID => return failure::image_invalid(&found.message),
+        _ => {}
     }
     let reason = if found.reason == reasons::PREPARING {
         reasons::START_DEADLINE
@@ -222,8 +225,8 @@ fn too_late(found: &Trouble, seconds: i64) -> Failure {
     };
     let what = format!("{} It was tried for {seconds} s.", found.message);
     if found.is_participants {
-        let next = "Push the image again and check that it runs on linux/amd64.";
-        participant(reason, format!("{what} {next}"))
+        let next = for_both("Push the image again and check that it runs on linux/amd64.");
+        participant(reason, &what, &next)
     } else {
         infrastructure(reason, &what)
     }

@@ -67,6 +67,14 @@ fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {
         .as_ref()
         .map_or(("", ""), |(reason, words)| (reason.as_str(), words.as_str()));
     match reason {
+        // The host's images are the Leaderboard's to fix, and are waited for.
+        "InvalidImageName" if is_agent(name) => {
+            let message = format!("The image of {name} is no reference to an image: {words}");
+            Some(Trouble {
+                is_hopeless: true,
+                ..trouble(reasons::IMAGE_INVALID, &message, true)
+            })
+        }
         "ErrImagePull" | "ImagePullBackOff" | "InvalidImageName" | "ErrImageNeverPull" => {
             let words = pull_error(words);
             let message = format!("The image of {name} cannot be pulled: {words}");

@@ -12,7 +12,7 @@ pub mod fence;
 pub mod record;
 
 #[cfg(test)]
-mod fake_server;
+pub(crate) mod fake_server;
 #[cfg(test)]
 mod simulation;
 #[cfg(test)]
@@ -135,7 +135,7 @@ pub struct Leader {
     fence: Fence,
     drained: watch::Sender<bool>,
     release: oneshot::Sender<oneshot::Sender<Result<(), String>>>,
-    task: JoinHandle<()>,
+    task: JoinHandle<Option<()>>,
 }
 
 /// A client for the Lease alone: no retries of its own, since the election decides what is tried again.
@@ -164,11 +164,8 @@ pub fn start(client: kube::Client, settings: Settings, seen: &Observability) -> 
         is_drained,
     };
     let elector = elector::Elector::new(client, settings, outlets, seen);
-    let guard = seen.liveness.task("lease");
-    let task = tokio::spawn(async move {
-        elector.run(released).await;
-        guard.finished();
-    });
+    // Its orderly end says that the Lease is lost or released.
+    let task = seen.tasks.may_end("lease", elector.run(released));
     Leader {
         name,
         leadership,

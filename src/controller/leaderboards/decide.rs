@@ -10,7 +10,8 @@ use kube::ResourceExt;
 use super::reach::Unreachable;
 use crate::api::conditions::{self, Truth};
 use crate::api::leaderboard::Counts;
-use crate::api::{Leaderboard, LeaderboardStatus, effective, names, reasons};
+use crate::api::{Evalai, Leaderboard, LeaderboardStatus, effective, names, reasons};
+use crate::controller::decide::previous_controller;
 
 /// What one pass saw of a Leaderboard.
 #[derive(Clone, Debug)]
@@ -27,6 +28,8 @@ pub struct LeaderboardView {
     /// What of its bucket, table and queues cannot be reached.
     pub unreachable: Option<Unreachable>,
     pub evalai: EvalaiStanding,
+    /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
+    pub evalai_writes_from: Option<Timestamp>,
     /// Requests of the last minute and the limit.
     pub budget: Option<(u32, u32)>,
 }
@@ -65,7 +68,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.budget = view.budget.map(|(used, limit)| format!("{used}/{limit}"));
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
-    let (truth, reason, message) = ready(view);
+    let (truth, reason, message) = with_delay(view, ready(view));
     conditions::set(
         &mut status.conditions,
         conditions::READY,
@@ -119,6 +122,19 @@ fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
     }
 }
 
+/// A Leaderboard stays ready while a new controller waits with its first write to EvalAI, and says so.
+fn with_delay(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
+    let (truth, reason, message) = ready;
+    let until = view
+        .evalai_writes_from
+        .filter(|_| view.leaderboard.spec.evalai.is_some());
+    let Some(until) = until.filter(|_| truth == Truth::True) else {
+        return (truth, reason, message);
+    };
+    let message = format!("{message} {}", previous_controller(until));
+    (truth, reason, message.trim_start().to_owned())
+}
+
 /// What is wrong with the Leaderboard as it is written.
 fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     let no = |reason, message: String| Some((Truth::False, reason, message));
@@ -164,7 +180,7 @@ fn phase_conflict(view: &LeaderboardView) -> Option<String> {
     let mine = &view.leaderboard;
     let server = server(mine)?;
     let phases: Vec<i64> = mine.spec.tracks.iter().filter_map(|t| t.phase).collect();
-    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && age(l) < age(mine));
+    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && is_older(l, mine));
     others
         .filter(|l| {
             l.spec
@@ -185,7 +201,7 @@ fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
             l.spec.storage.endpoint.clone(),
         )
     };
-    let others = others(view).filter(|l| place(l) == place(mine) && age(l) < age(mine));
+    let others = others(view).filter(|l| place(l) == place(mine) && is_older(l, mine));
     let foreign = |l: &&Arc<Leaderboard>| matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
     others.filter(|l| foreign(l)).map(|l| qualified(l)).next()
 }
@@ -197,18 +213,11 @@ fn others(view: &LeaderboardView) -> impl Iterator<Item = &Arc<Leaderboard>> {
 }
 
 fn server(leaderboard: &Leaderboard) -> Option<String> {
-    leaderboard
-        .spec
-        .evalai
-        .as_ref()
-        .map(|e| e.api_server.trim_end_matches('/').to_owned())
+    leaderboard.spec.evalai.as_ref().map(Evalai::server)
 }
 
-fn age(leaderboard: &Leaderboard) -> (Option<Timestamp>, String) {
-    (
-        leaderboard.metadata.creation_timestamp.as_ref().map(|t| t.0),
-        leaderboard.name_any(),
-    )
+fn is_older(one: &Leaderboard, other: &Leaderboard) -> bool {
+    one.seniority() < other.seniority()
 }
 
 fn qualified(leaderboard: &Leaderboard) -> String {
@@ -264,6 +273,7 @@ mod tests {
             invalid_pod: None,
             unreachable: None,
             evalai: EvalaiStanding::Fits { note: None },
+            evalai_writes_from: None,
             budget: Some((3, 54)),
         }
     }
@@ -367,6 +377,38 @@ mod tests {
             assert_eq!(
                 reason(&decide(&broken)),
                 ("False".to_owned(), reasons::INVALID_POD.to_owned())
+            );
+        }
+    }
+
+    #[test]
+    fn a_leaderboard_says_until_when_nothing_is_written_to_evalai() {
+        let one = leaderboard("one", 1, 7, "https://e", "a/");
+        let note = || Some("EvalAI's token ends on 2026-12-01.".to_owned());
+        for (evalai, ready, message) in [
+            (
+                EvalaiStanding::Fits { note: None },
+                "True",
+                "The controller before may still have requests under way; EvalAI is written to again from 00:17:55 UTC on.",
+            ),
+            (
+                EvalaiStanding::Fits { note: note() },
+                "True",
+                "EvalAI's token ends on 2026-12-01. The controller before may still have requests under way; EvalAI is written to \
+                 again from 00:17:55 UTC on.",
+            ),
+            (EvalaiStanding::NoToken("x".into()), "False", "x"),
+        ] {
+            let seen = LeaderboardView {
+                evalai,
+                evalai_writes_from: Timestamp::from_second(1075).ok(),
+                ..view(&one, &[])
+            };
+            let plan = decide(&seen);
+            let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+            assert_eq!(
+                (condition.status.as_str(), condition.message.as_str()),
+                (ready, message)
             );
         }
     }

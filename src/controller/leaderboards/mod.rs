@@ -23,6 +23,7 @@ use super::network_policy::network_policy;
 use super::observe::uid_of;
 use crate::api::leaderboard::Counts;
 use crate::api::{Leaderboard, State, Submission, conditions, names};
+use crate::observability::text;
 use crate::services::ObjectKey;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use probe::Probe;
@@ -37,7 +38,7 @@ const RESYNC: Duration = Duration::from_mins(1);
 /// What could not be done for a Leaderboard.
 #[derive(thiserror::Error, Debug)]
 pub enum LeaderboardError {
-    #[error("{what} of Leaderboard {name} failed: {source}")]
+    #[error("{what} of Leaderboard {name} failed: {}", text::kube(source))]
     Kubernetes {
         what: &'static str,
         name: String,
@@ -129,6 +130,7 @@ fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now
         invalid_pod: probe.invalid_pod(),
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(context, leaderboard, &key, now),
+        evalai_writes_from: context.sync.hub.writes_from(),
         budget: context.sync.hub.budget_used(&key),
     }
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 use futures::future::{BoxFuture, FutureExt, join_all};
 use jiff::Timestamp;
 
+use super::key_of;
 use super::reach::{Finding, Place, Reach};
 use crate::api::Leaderboard;
 use crate::controller::context::Context;
@@ -39,8 +40,8 @@ pub(super) async fn look(context: &Context, leaderboard: &Leaderboard, mut reach
         }
     });
     for (place, address, found) in join_all(asked).await {
-        if found != Finding::Good {
-            tracing::warn!(leaderboard = ?leaderboard.metadata.name, ?found, "a place cannot be reached");
+        if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
+            tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "a place cannot be reached");
         }
         reach.take(place, &address, generation, found, now);
     }

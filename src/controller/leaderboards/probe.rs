@@ -17,8 +17,9 @@ use crate::controller::context::{CALL_TIMEOUT, Context};
 use crate::controller::job_spec::{self, JobInput};
 use crate::controller::pod_overlay;
 use crate::services::ObjectKey;
-use crate::services::evalai::Target;
+use crate::services::evalai::{Labels, Target};
 use crate::services::token::{Token, TokenSource};
+use crate::text::sentence;
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -112,11 +113,22 @@ impl Probe {
                 let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
                 EvalaiStanding::Misfit(problems.join("; "))
             }
-            (Some(_), _) => EvalaiStanding::Fits {
-                note: ends_soon(token, now),
+            (Some(labels), _) => EvalaiStanding::Fits {
+                note: note(&labels, ends_soon(token, now)),
             },
         }
     }
+}
+
+/// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
+fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
+    let of_labels = labels.problems.iter().map(|problem| {
+        let text = problem.to_string();
+        let capital: String = text.chars().take(1).flat_map(char::to_uppercase).collect();
+        sentence(&format!("{capital}{}", text.chars().skip(1).collect::<String>()))
+    });
+    let notes: Vec<String> = of_labels.chain(of_token).collect();
+    (!notes.is_empty()).then(|| notes.join(" "))
 }
 
 fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
@@ -170,7 +182,7 @@ fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &
         ResultsFormat::V2 => leaderboard_results::Format::V2,
     };
     let target = Target {
-        api_server: evalai.api_server.clone(),
+        api_server: evalai.server(),
         challenge: evalai.challenge,
         split: evalai.split.clone(),
         token: Arc::clone(token),
@@ -235,4 +247,31 @@ fn sample_job(context: &Context, leaderboard: &Leaderboard) -> Option<DynamicObj
         image_pull_policy: context.settings.image_pull_policy.as_deref(),
         region: context.settings.region.as_deref(),
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::services::evalai::Misfit;
+
+    #[test]
+    fn columns_that_stay_empty_and_a_token_that_ends_soon_are_said() {
+        let labels = |problems| Labels {
+            at: Timestamp::UNIX_EPOCH,
+            problems,
+        };
+        let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
+        assert_eq!(note(&labels(vec![]), None), None);
+        assert_eq!(note(&labels(vec![]), ends()), ends());
+        let unsent = Misfit::Unsent {
+            phase: 2,
+            labels: vec!["Speed".into(), "Comfort".into()],
+        };
+        let said = note(&labels(vec![unsent]), ends()).unwrap();
+        assert_eq!(
+            said,
+            "The leaderboard of phase 2 also has Speed, Comfort, which stay empty; check spec.results. EvalAI's token ends \
+             on 2027-01-01."
+        );
+    }
 }

@@ -44,12 +44,15 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let record = leaderboard
         .as_ref()
         .and_then(|l| context.sync.record_view(l, &submission));
-    let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission);
+    let known = |name: &str| context.stores.submissions.get(&ObjectRef::new(name).within(&namespace));
+    let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission, known);
     let is_asked = evalai.as_ref().is_none_or(|e| e.info.is_some());
     let all = || context.stores.submissions.state();
     let turn = context.board.turn(all, &submission, leaderboard.as_deref(), is_asked);
     let partial_told = context.memory.partial_told(&submission);
     let unread = context.memory.unread(&submission);
+    let rerun_as = context.reruns.of(&submission);
+    let evalai_writes_from = context.sync.hub.writes_from();
     View {
         now,
         submission,
@@ -63,6 +66,8 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         record,
         partial_told,
         unread,
+        rerun_as,
+        evalai_writes_from,
     }
 }
 

@@ -12,6 +12,7 @@ use tokio::time::Instant;
 
 use crate::controller::context::{CALL_TIMEOUT, Context};
 use crate::controller::view::{NodeSight, PodView};
+use crate::observability::text;
 
 /// How long what a node has said is passed on to the Pods that run on it.
 const FRESH: Duration = Duration::from_secs(15);
@@ -56,7 +57,8 @@ pub(super) async fn sight(context: &Context, pod: &PodView) -> NodeSight {
         Ok(Ok(Some(node))) => of(&node),
         Ok(Ok(None)) => NodeSight::Gone,
         Ok(Err(error)) => {
-            tracing::debug!(node = %name, %error, "the node of a lost Pod cannot be looked at");
+            let error = text::kube(&error);
+            tracing::debug!(node = %name, error, "the node of a lost Pod cannot be read");
             NodeSight::Unknown
         }
         Err(_) => NodeSight::Unknown,

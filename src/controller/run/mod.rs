@@ -1,24 +1,25 @@
 //! Wires the controller: watches, lease, services, passes. Called by the command line; decides nothing.
 //!
-//! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error: the kubelet
-//! starts it again with empty hands.
+//! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error, and so does one
+//! that has lost one of its tasks: the kubelet starts it again with empty hands.
 
 mod counts;
 mod marks;
 mod passes;
+mod sweep;
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures::future::FusedFuture;
-use futures::{FutureExt, StreamExt};
+use futures::StreamExt;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
-use kube::{Api, Client, ResourceExt};
+use kube::{Client, ResourceExt};
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::context::{Context, Settings, Stores};
@@ -26,11 +27,11 @@ use super::leader::{self, Leader, Leadership};
 use super::observe::board::Places;
 use super::observe::children_selector;
 use super::sync::Sync;
-use super::watches::preflight::{Need, await_kinds, watch_access};
+use super::watches::preflight::{self, Need, await_kinds, watch_access};
 use super::watches::{Touch, Touches, Watch, Watchable, guarded, spawn_watch};
 use crate::api::{GROUP, Leaderboard, Submission};
-use crate::bridge::ingest::{self, Incoming, Source};
 use crate::observability::Observability;
+use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
@@ -45,8 +46,8 @@ const DRAIN: Duration = Duration::from_secs(20);
 pub enum RunError {
     #[error("this process no longer leads: {0}")]
     LostLease(String),
-    #[error("a part of the controller has ended by itself; the process starts anew")]
-    PartEnded,
+    #[error(transparent)]
+    TaskFailed(#[from] TaskFailed),
 }
 
 /// Something has changed for an object.
@@ -66,14 +67,31 @@ pub async fn run(
     aws: Aws,
     seen: Observability,
 ) -> Result<(), RunError> {
+    preflight::register(&seen);
+    let tasks = seen.tasks.clone();
+    let work = Box::pin(work(clients, lease, settings, aws, seen));
+    tokio::select! {
+        biased;
+        failed = tasks.failed() => Err(failed.into()),
+        result = work => result,
+    }
+}
+
+async fn work(
+    clients: Clients,
+    lease: leader::Settings,
+    settings: Settings,
+    aws: Aws,
+    seen: Observability,
+) -> Result<(), RunError> {
     let client = &clients.api;
     if !await_kinds(client, &["leaderboards", "submissions"], &seen).await {
         return Ok(());
     }
-    let access = client.clone();
-    let (namespace, watcher) = (settings.namespace.clone(), seen.clone());
-    tokio::spawn(watch_rights(access, namespace, watcher));
+    let rights = watch_rights(client.clone(), settings.namespace.clone(), seen.clone());
+    seen.tasks.may_end("permissions", rights);
     let watches = Watches::start(&clients.watch, settings.namespace.as_deref(), &seen);
+    seen.readiness.registered();
     let leader = leader::start(clients.lease, lease, &seen);
     let parts = Parts {
         client: clients.api,
@@ -157,7 +175,7 @@ impl Watches {
     }
 
     async fn synced(&self) {
-        // An error means that the watch's task is gone; liveness sees that.
+        // An error means that the watch's task is gone, which ends the process.
         let _ = self.leaderboards.store.wait_until_ready().await;
         let _ = self.submissions.store.wait_until_ready().await;
         let _ = self.jobs.store.wait_until_ready().await;
@@ -165,9 +183,10 @@ impl Watches {
     }
 
     /// Tells everything that is there now, then everything that is touched.
-    fn feed(&self, touched: &mpsc::UnboundedSender<Touched>, context: &Arc<Context>) {
+    fn feed(&self, touched: &mpsc::UnboundedSender<Touched>, context: &Arc<Context>, tasks: &Tasks) {
         let mut boards = Fingerprints::default();
         forward(
+            tasks,
             self.leaderboards.subscribe(),
             touched,
             move |touch: Touch<Leaderboard>| {
@@ -186,6 +205,7 @@ impl Watches {
         let (mut submissions, mut places) = (Fingerprints::default(), Places::default());
         let context = Arc::clone(context);
         forward(
+            tasks,
             self.submissions.subscribe(),
             touched,
             move |touch: Touch<Submission>| {
@@ -196,6 +216,7 @@ impl Watches {
                 if places.moved(object, touch.is_gone) {
                     context.board.moved(&namespace, &object.spec.leaderboard);
                 }
+                let original = context.reruns.moved(object, touch.is_gone);
                 if touch.is_gone {
                     return vec![Touched::Gone(submissions.drop(object)), Touched::Leaderboard(board)];
                 }
@@ -205,13 +226,14 @@ impl Watches {
                     .then(|| Touched::Submission(ObjectRef::from_obj(object)));
                 own.into_iter()
                     .chain(moved.in_line.then_some(Touched::Leaderboard(board)))
+                    .chain(original.map(Touched::Submission))
                     .collect()
             },
         );
-        forward(self.jobs.subscribe(), touched, |touch: Touch<Job>| {
+        forward(tasks, self.jobs.subscribe(), touched, |touch: Touch<Job>| {
             owner(touch.object.as_ref())
         });
-        forward(self.pods.subscribe(), touched, |touch: Touch<Pod>| {
+        forward(tasks, self.pods.subscribe(), touched, |touch: Touch<Pod>| {
             owner(touch.object.as_ref())
         });
     }
@@ -251,12 +273,13 @@ fn key(object: &impl ResourceExt) -> ObjectKey {
 }
 
 fn forward<K: Watchable>(
+    tasks: &Tasks,
     mut touches: Touches<K>,
     touched: &mpsc::UnboundedSender<Touched>,
     mut map: impl FnMut(Touch<K>) -> Vec<Touched> + Send + 'static,
 ) {
     let touched = touched.clone();
-    tokio::spawn(async move {
+    tasks.stay(format!("events of {}", K::plural(&())), async move {
         while let Some(touch) = touches.next().await {
             for each in map(touch) {
                 // Without a receiver the process is ending.
@@ -290,7 +313,7 @@ impl Parts {
             &self.watches.leaderboards.store,
             &self.seen,
         );
-        let recorder = recorder(&fence, &touched, self.aws.clone(), &self.seen);
+        let recorder = recorder(&fence, &touched, self.aws.clone(), &self.seen.tasks);
         let instance = std::env::var("POD_NAME").ok();
         let reporter = Reporter {
             controller: "leaderboard.carla.org/controller".into(),
@@ -298,20 +321,20 @@ impl Parts {
         };
         let events = EventRecorder::new(self.client.clone(), reporter);
         let sync = Sync::new(hub.clone(), recorder);
-        tokio::spawn(counts::keep(
-            hub.clone(),
-            self.watches.submissions.store.clone(),
-            self.seen.clone(),
-        ));
+        let gauges = counts::keep(hub.clone(), self.watches.submissions.store.clone(), self.seen.clone());
+        self.seen.tasks.stay("gauges", gauges);
         let stores = self.watches.stores();
         let context = Arc::new(Context::new(self.client, self.settings, stores, sync, self.aws, events));
-        self.watches.feed(&touched, &context);
+        self.watches.feed(&touched, &context, &self.seen.tasks);
         let mut leadership = leader.leadership();
-        let mut passes = std::pin::pin!(passes::run(context, inbox, self.seen.clone()).fuse());
+        let passes = passes::run(context, inbox, self.seen.clone());
+        let passes = self.seen.tasks.stay("reconciles", passes);
         tokio::select! {
             () = self.seen.stop.wait() => {}
-            why = lost(&mut leadership) => return Err(RunError::LostLease(why)),
-            () = &mut passes => if !self.seen.stop.is_set() { return Err(RunError::PartEnded) },
+            why = lost(&mut leadership) => {
+                passes.abort();
+                return Err(RunError::LostLease(why));
+            }
         }
         finish(passes).await;
         if hub.drain().await {
@@ -321,28 +344,23 @@ impl Parts {
     }
 }
 
-/// Passes end by the stop; what they have begun is finished. They may have ended already, in the very moment of the stop.
-async fn finish(passes: impl FusedFuture<Output = ()>) {
-    if !passes.is_terminated() {
-        let _ = tokio::time::timeout(DRAIN, passes).await;
+/// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.
+async fn finish<T>(mut passes: JoinHandle<T>) {
+    if tokio::time::timeout(DRAIN, &mut passes).await.is_err() {
+        passes.abort();
     }
 }
 
-fn recorder(
-    fence: &leader::Fence,
-    touched: &mpsc::UnboundedSender<Touched>,
-    aws: Aws,
-    seen: &Observability,
-) -> Recorder {
+fn recorder(fence: &leader::Fence, touched: &mpsc::UnboundedSender<Touched>, aws: Aws, tasks: &Tasks) -> Recorder {
     let (changed, mut rows) = mpsc::unbounded_channel::<ObjectKey>();
     let touched = touched.clone();
-    tokio::spawn(async move {
+    tasks.stay("changes of rows", async move {
         while let Some(key) = rows.recv().await {
             let _ = touched.send(Touched::Submission(ObjectRef::new(&key.name).within(&key.namespace)));
         }
     });
     let fence = fence.clone();
-    Recorder::new(aws, move || fence.may_write(), changed, seen.stop.receiver())
+    Recorder::new(aws, move || fence.may_write(), changed, tasks.clone())
 }
 
 /// Waits to become the leader. False if told to stop before.
@@ -356,16 +374,23 @@ async fn await_lead(leader: &Leader, seen: &Observability) -> Result<bool, RunEr
         }
         tokio::select! {
             () = seen.stop.wait() => return Ok(false),
-            changed = leadership.changed() => if changed.is_err() { return Err(RunError::PartEnded) },
+            changed = leadership.changed() => if changed.is_err() { std::future::pending().await },
         }
     }
 }
 
 async fn lost(leadership: &mut tokio::sync::watch::Receiver<Leadership>) -> String {
-    let ended = leadership.wait_for(|l| !matches!(l, Leadership::Leader { .. })).await;
-    match ended.as_deref() {
-        Ok(Leadership::Lost { why }) => why.clone(),
-        _ => "the lease's task has ended".into(),
+    let why = {
+        let ended = leadership.wait_for(|l| !matches!(l, Leadership::Leader { .. })).await;
+        ended.map(|leadership| match &*leadership {
+            Leadership::Lost { why } => why.clone(),
+            _ => "the Lease was released".into(),
+        })
+    };
+    match why {
+        Ok(why) => why,
+        // The task of the Lease has failed, and ends the process by its name.
+        Err(_) => std::future::pending().await,
     }
 }
 
@@ -379,7 +404,7 @@ fn hub(
     let (changed, mut changes) = mpsc::unbounded_channel::<Changed>();
     let (sweep, rows) = mpsc::unbounded_channel::<SweepRow>();
     let forward = touched.clone();
-    tokio::spawn(async move {
+    seen.tasks.stay("changes of EvalAI", async move {
         while let Some(change) = changes.recv().await {
             let _ = forward.send(match change {
                 Changed::Submission(key) => Touched::Submission(ObjectRef::new(&key.name).within(&key.namespace)),
@@ -387,12 +412,11 @@ fn hub(
             });
         }
     });
-    tokio::spawn(sweep_into_cluster(
-        client.clone(),
-        leaderboards.clone(),
-        rows,
-        seen.clone(),
-    ));
+    let sweeping = sweep::into_cluster(client.clone(), leaderboards.clone(), rows);
+    let stop = seen.stop.clone();
+    seen.tasks.stay("sweep", async move {
+        tokio::select! { () = stop.wait() => {}, () = sweeping => {} }
+    });
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
@@ -403,70 +427,9 @@ fn hub(
         timing: Timing::default(),
         timeouts: Timeouts::default(),
         meter: counts::meter(seen),
+        tasks: seen.tasks.clone(),
     })
 }
 
-/// Submissions whose message was lost go the same way as those of messages.
-async fn sweep_into_cluster(
-    client: Client,
-    leaderboards: Store<Leaderboard>,
-    mut rows: mpsc::UnboundedReceiver<SweepRow>,
-    seen: Observability,
-) {
-    loop {
-        let row = tokio::select! {
-            () = seen.stop.wait() => return,
-            row = rows.recv() => match row { Some(row) => row, None => return },
-        };
-        let all = leaderboards.state();
-        let Some(board) = serving(&all, &row) else { continue };
-        let api: Api<Submission> = Api::namespaced(client.clone(), &board.namespace().unwrap_or_default());
-        let incoming = Incoming {
-            challenge: row.challenge,
-            phase: row.phase,
-            submission: row.submission,
-            image: None,
-            source: Source::Sweep,
-            sent_ms: row.time.as_millisecond(),
-        };
-        match ingest::apply(&api, &board.name_any(), &incoming).await {
-            Ok(outcome) => tracing::info!(
-                submission = row.submission,
-                ?outcome,
-                "EvalAI waits for a submission whose message was lost"
-            ),
-            Err(error) => tracing::warn!(submission = row.submission, "{error}"),
-        }
-    }
-}
-
-/// The oldest Leaderboard that serves a row's phase.
-fn serving<'a>(all: &'a [Arc<Leaderboard>], row: &SweepRow) -> Option<&'a Arc<Leaderboard>> {
-    let serves = |l: &&Arc<Leaderboard>| {
-        l.spec.evalai.as_ref().is_some_and(|e| e.challenge == row.challenge)
-            && l.spec.tracks.iter().any(|t| t.phase == Some(row.phase))
-            && l.metadata.deletion_timestamp.is_none()
-    };
-    all.iter()
-        .filter(serves)
-        .min_by_key(|l| (l.metadata.creation_timestamp.as_ref().map(|t| t.0), l.name_any()))
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[tokio::test(start_paused = true)]
-    async fn passes_that_ended_in_the_moment_of_the_stop_are_not_waited_for() {
-        let began = Instant::now();
-        let mut passes = std::pin::pin!(async {}.fuse());
-        passes.as_mut().await;
-        finish(passes).await;
-        assert_eq!(began.elapsed(), Duration::ZERO);
-        let mut passes = std::pin::pin!(tokio::time::sleep(Duration::from_secs(3)).fuse());
-        finish(passes.as_mut()).await;
-        assert_eq!(began.elapsed(), Duration::from_secs(3));
-        finish(std::pin::pin!(std::future::pending::<()>().fuse())).await;
-        assert_eq!(began.elapsed(), Duration::from_secs(3) + DRAIN);
-    }
-}
+mod tests;

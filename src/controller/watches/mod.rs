@@ -115,12 +115,8 @@ pub fn spawn_watch<K: Watchable>(
         is_synced: false,
     };
     task.missing("the first list has not come yet");
-    let guard = seen.liveness.task(&format!("watch of {}", K::plural(&())));
-    let stop = seen.stop.clone();
-    tokio::spawn(async move {
-        task.run(api, config, stop).await;
-        guard.finished();
-    });
+    let name = format!("watch of {}", K::plural(&()));
+    seen.tasks.stay(name, task.run(api, config, seen.stop.clone()));
     watch
 }
 
@@ -149,7 +145,7 @@ impl<K: Watchable> Task<K> {
             match event {
                 Some(Ok(event)) => self.event(event),
                 Some(Err(error)) => self.error(&error),
-                // The stream has no end; should it find one, the dropped guard tells the probe.
+                // The stream has no end; should it find one, this task ends, and with it the process.
                 None => break,
             }
         }

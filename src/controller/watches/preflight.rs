@@ -54,6 +54,13 @@ impl fmt::Display for Need<'_> {
     }
 }
 
+/// Registers both checks, so that the process is not ready before they are answered.
+pub fn register(seen: &Observability) {
+    for check in [KINDS_CHECK, ACCESS_CHECK] {
+        seen.readiness.set(check, Err("not asked yet".to_owned()));
+    }
+}
+
 /// Waits until the API server serves our kinds. False: the process was stopped meanwhile.
 pub async fn await_kinds(client: &Client, plurals: &[&str], seen: &Observability) -> bool {
     let mut last = String::new();

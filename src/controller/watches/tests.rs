@@ -96,6 +96,7 @@ fn rig(answers: Vec<Answer>) -> Rig {
     let (client, script) = scripted(answers);
     let (stop, receiver) = Stop::new();
     let seen = Observability::new(receiver);
+    seen.readiness.registered();
     let trim = |board: &mut Leaderboard| board.metadata.annotations = None;
     let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), trim, &seen);
     let touches = watch.subscribe();
@@ -261,6 +262,7 @@ async fn the_preflight_waits_for_the_kinds_and_names_the_missing_one() {
     let (client, script) = scripted(vec![Answer::Json(404, none), served(&["leaderboards"])]);
     let (stop, receiver) = Stop::new();
     let seen = Observability::new(receiver);
+    seen.readiness.registered();
     let waiting = tokio::spawn({
         let seen = seen.clone();
         async move { await_kinds(&client, &["leaderboards", "submissions"], &seen).await }

@@ -78,8 +78,8 @@ fn running() -> Value {
 
 /// Its agent crashed; EvalAI does not know yet.
 fn crashed() -> Value {
-    let message =
-        "Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results, mend it and submit again.";
+    let message = "Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the participant fixes the \
+                   agent and submits again.";
     json!({
         "state": "Failed", "attempt": 1, "reason": "AgentCrashed", "message": message, "track": "sensors",
         "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "job": "submission-42-1",

@@ -56,8 +56,8 @@ submission-42 is Failed since 2026-11-01 11:57:00 UTC (3 min ago).
 
 Track:       sensors of Leaderboard carla-20; submission 42 of phase 7 in EvalAI
 Reason:      AgentCrashed: An agent crashed as often as retries.pair allows.
-Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results, mend it
-             and submit again.
+Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the
+             participant fixes the agent and submits again.
 Failure:     AgentCrashed, the participant's, charged, in pair 2.
 Attempt:     1.
 Routes:      12/20 done, driving score ~41.20 so far.
@@ -72,8 +72,20 @@ Log:         the agent's of pair 2: the end of agent/agent2/leaderboard.log. For
              it may show the routes:
              aws s3 cp s3://results/v2/42/evalai/environment_log.txt -
 
-Next:        Look at agent/agent2/leaderboard.log of the results, mend the agent, submit again."
+Next:        Look at agent/agent2/leaderboard.log of the results; the participant fixes the agent
+             and submits again."
     );
+}
+
+#[test]
+fn both_submissions_of_a_rerun_name_each_other() {
+    let other = |name: &str| json!({"submissionName": name, "time": "2026-11-01T11:57:00Z"});
+    let old = told(&with(finished(), &json!({"rerunAs": other("submission-99")})));
+    let line = "Re-run:      as submission-99, 2026-11-01 11:57:00 UTC (3 min ago); EvalAI has cancelled this one.\n";
+    assert!(old.contains(line), "{old}");
+    let new = told(&with(waiting(), &json!({"rerunOf": other("submission-7")})));
+    let line = "Re-run:      of submission-7, 2026-11-01 11:57:00 UTC (3 min ago).\n";
+    assert!(new.contains(line), "{new}");
 }
 
 #[test]

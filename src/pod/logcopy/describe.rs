@@ -49,6 +49,7 @@ pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&E
         why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
         warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
         results: gathered.files.results_json.clone(),
+        partial_results: gathered.files.partial_json.clone().filter(|_| ending.is_none()),
         files: gathered.digests(),
     }
 }

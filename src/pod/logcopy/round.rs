@@ -13,7 +13,8 @@ use leaderboard_runner::protocol::{self, Side, StatusFile};
 use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
-use super::{LogcopyError, cancel};
+use super::{LogcopyError, create};
+use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer, checkpoint_path};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
 use crate::pod::ownlog::OWN_LOG;
@@ -64,7 +65,7 @@ pub(super) struct Rounds {
     uploader: Uploader,
     stop: watch::Receiver<Option<Stop>>,
     judge: Judge,
-    folders: Option<Watch>,
+    folders: Option<Arc<Watch>>,
     epoch: Instant,
     last: Instant,
     round: u64,
@@ -97,7 +98,7 @@ impl Rounds {
             uploader,
             stop,
             judge: Judge::default(),
-            folders: Watch::new(is_news).ok(),
+            folders: Watch::new(is_news).ok().map(Arc::new),
             epoch: Instant::now(),
             last: Instant::now(),
             round: 0,
@@ -130,7 +131,7 @@ impl Rounds {
         if self.finished || self.fenced {
             return std::future::pending().await;
         }
-        self.watch_folders();
+        self.watch_folders().await;
         let folders = self.folders.as_ref();
         let changed = async {
             match folders {
@@ -150,17 +151,16 @@ impl Rounds {
     }
 
     /// The kubelet makes the folders when it makes the containers, so they are looked for again each time.
-    fn watch_folders(&self) {
-        let Some(watch) = &self.folders else { return };
+    async fn watch_folders(&self) {
+        let Some(watch) = self.folders.clone() else { return };
         let status = self.setting.places.status();
-        watch.add(&status);
-        watch.add(&self.tree.path().join("agent"));
+        let mut folders = vec![status.clone(), self.tree.path().join("agent")];
         for pair in 1..=self.pairs() {
-            watch.add(&self.tree.path().join(format!("agent/agent{pair}")));
-            for side in [Side::Simulator, Side::Agent] {
-                watch.add(&status.join(format!("{side}-{pair}")));
-            }
+            folders.push(self.tree.path().join(format!("agent/agent{pair}")));
+            folders.extend([Side::Simulator, Side::Agent].map(|side| status.join(format!("{side}-{pair}"))));
         }
+        // Without a watch the period is all there is.
+        let _ = blocking(move || folders.iter().for_each(|folder| _ = watch.add(folder))).await;
     }
 
     fn pairs(&self) -> usize {
@@ -174,9 +174,9 @@ impl Rounds {
             return Ok(self.period());
         }
         let look = self.look().await?;
-        let pause = self.judge(&look);
+        let pause = self.judge(&look).await;
         if !self.owns_prefix().await? {
-            self.give_up();
+            self.give_up().await;
             return Ok(self.period());
         }
         if self.finished {
@@ -192,7 +192,7 @@ impl Rounds {
             self.store_logs(look.logs, true).await?;
             // Storing logs can take minutes, in which another Pod may have come.
             if !self.owns_prefix().await? {
-                self.give_up();
+                self.give_up().await;
                 return Ok(self.period());
             }
             self.report(&look.gathered).await?;
@@ -222,16 +222,14 @@ impl Rounds {
                 activity,
             }
         };
-        let looked = tokio::task::spawn_blocking(look).await;
-        Ok(looked.map_err(std::io::Error::other)?)
+        Ok(blocking(look).await?)
     }
 
     /// Draws the consequences of what was seen. Returns how long the next look may wait.
-    fn judge(&mut self, look: &Look) -> Duration {
-        let status = self.setting.places.status();
+    async fn judge(&mut self, look: &Look) -> Duration {
         let outside = Outside {
             stop: *self.stop.borrow_and_update(),
-            cancelled: StatusFile::Cancel.exists(&status),
+            cancelled: look.statuses.contains(&StatusFile::Cancel),
             activity: look.activity,
             now: self.epoch.elapsed(),
         };
@@ -243,7 +241,7 @@ impl Rounds {
         match decide(&seen, &self.setting.pace, longest) {
             Step::GoOn => {}
             Step::Cancel => {
-                cancel(&status);
+                create(StatusFile::Cancel, &self.setting.places.status()).await;
             }
             Step::Finish(ending) => {
                 tracing::info!("{ending}; storing the rest");
@@ -279,15 +277,13 @@ impl Rounds {
     }
 
     /// Another Pod has taken over: this one ends, and nothing of it is stored any more.
-    fn give_up(&mut self) {
+    async fn give_up(&mut self) {
         tracing::warn!("another Pod owns this run's prefix; this one stores nothing more and stops");
         self.fenced = true;
         let status = self.setting.places.status();
-        cancel(&status);
+        create(StatusFile::Cancel, &status).await;
         // Frees the simulators from waiting for a store that will not come.
-        if let Err(error) = StatusFile::Stored.create(&status) {
-            tracing::error!("logcopy.done can't be written: {error}");
-        }
+        create(StatusFile::Stored, &status).await;
     }
 
     /// The status files, flat, as they have always been stored.
@@ -338,7 +334,8 @@ impl Rounds {
     /// The final report is stored: says so to the Pod, and ends whoever is still at it.
     async fn finish(&mut self, gathered: &Gathered) -> Result<(), LogcopyError> {
         let status = self.setting.places.status();
-        StatusFile::Stored.create(&status)?;
+        let folder = status.clone();
+        blocking(move || StatusFile::Stored.create(&folder)).await??;
         self.finished = true;
         tracing::info!("the final report is stored");
         if let Err(error) = self.store_statuses(&[StatusFile::Stored]).await {
@@ -346,7 +343,7 @@ impl Rounds {
         }
         if gathered.seen.iter().any(|pair| !pair.agent.done) {
             // Nobody needs to run for results that are complete.
-            cancel(&status);
+            create(StatusFile::Cancel, &status).await;
         }
         Ok(())
     }

@@ -4,7 +4,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::os::unix::fs::FileExt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -14,8 +13,9 @@ use futures::StreamExt;
 use sha2::{Digest, Sha256};
 
 use super::{Decision, Haste, Memory, Stored, decide_upload, fingerprint, hex};
+use crate::pod::blocking;
 use crate::pod::tree::{Stamp, Tree, TreeError};
-use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART};
+use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};
 
 /// Files in the air at once.
 const AT_ONCE: usize = 4;
@@ -133,7 +133,7 @@ impl Uploader {
         let mut sent = Sent::default();
         let failed = self.settle(fates, &mut sent);
         if sent.objects > 0 || failed.is_some() {
-            self.remember();
+            self.remember().await;
         }
         failed.map_or(Ok(sent), Err)
     }
@@ -165,7 +165,7 @@ impl Uploader {
         let fates: Vec<(String, Fate)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
         let failed = self.settle(fates, &mut sent);
         if sent.objects > 0 || failed.is_some() {
-            self.remember();
+            self.remember().await;
         }
         failed.map_or(Ok(sent), Err)
     }
@@ -236,8 +236,10 @@ impl Uploader {
         }
     }
 
-    fn remember(&self) {
-        if let Err(error) = self.memory.save(&self.tree) {
+    async fn remember(&self) {
+        let (memory, tree) = (self.memory.clone(), Arc::clone(&self.tree));
+        let saved = blocking(move || memory.save(&tree)).await;
+        if let Err(error) = saved.map_err(TreeError::from).flatten() {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
     }
@@ -287,6 +289,30 @@ struct Job {
     now: Duration,
 }
 
+/// A file that is open, and what its beginning looked like.
+struct Opened {
+    file: Arc<File>,
+    stamp: Stamp,
+    fingerprint: String,
+    /// Of as many bytes as were stored before.
+    of_known: String,
+}
+
+impl Opened {
+    /// None if there is no such file.
+    fn open(tree: &Tree, path: &str, known_size: u64) -> Result<Option<Self>, TreeError> {
+        let Some((file, stamp)) = tree.file(path)? else {
+            return Ok(None);
+        };
+        Ok(Some(Self {
+            of_known: fingerprint(&file, known_size.min(stamp.size))?,
+            fingerprint: fingerprint(&file, stamp.size)?,
+            file: Arc::new(file),
+            stamp,
+        }))
+    }
+}
+
 enum Problem {
     Local(TreeError),
     Archive(ArchiveError),
@@ -298,6 +324,12 @@ impl From<std::io::Error> for Problem {
     }
 }
 
+impl From<TreeError> for Problem {
+    fn from(error: TreeError) -> Self {
+        Self::Local(error)
+    }
+}
+
 impl From<ArchiveError> for Problem {
     fn from(error: ArchiveError) -> Self {
         Self::Archive(error)
@@ -306,12 +338,7 @@ impl From<ArchiveError> for Problem {
 
 impl Job {
     async fn store(&self) -> Fate {
-        let opened = match self.tree.file(&self.wanted.path) {
-            Ok(Some(opened)) => opened,
-            Ok(None) => return Fate::LeftOut("it is gone".to_owned()),
-            Err(error) => return Fate::LeftOut(error.to_string()),
-        };
-        match self.send(opened).await {
+        match self.send().await {
             Ok(fate) => fate,
             Err(Problem::Local(error)) => Fate::LeftOut(error.to_string()),
             Err(Problem::Archive(error)) => match error.cause {
@@ -323,18 +350,19 @@ impl Job {
     }
 
     /// Sends the first bytes of the file, as many as it had when it was opened.
-    async fn send(&self, (file, stamp): (File, Stamp)) -> Result<Fate, Problem> {
-        let file = Arc::new(file);
+    async fn send(&self) -> Result<Fate, Problem> {
         let known_size = self.known.as_ref().map_or(0, |known| known.stamp.size);
-        let marks = {
-            let file = Arc::clone(&file);
-            let marks = move || {
-                let of_known = fingerprint(&file, known_size.min(stamp.size))?;
-                Ok::<_, std::io::Error>((fingerprint(&file, stamp.size)?, of_known))
-            };
-            tokio::task::spawn_blocking(marks)
+        let (tree, path) = (Arc::clone(&self.tree), self.wanted.path.clone());
+        let opened = blocking(move || Opened::open(&tree, &path, known_size)).await??;
+        let Some(opened) = opened else {
+            return Ok(Fate::LeftOut("it is gone".to_owned()));
         };
-        let (fingerprint, of_known) = marks.await.map_err(std::io::Error::other)??;
+        let Opened {
+            file,
+            stamp,
+            fingerprint,
+            of_known,
+        } = opened;
         let stored = |etag| {
             Box::new(Stored {
                 stamp,
@@ -356,8 +384,7 @@ impl Job {
         };
         let key = &self.wanted.key;
         let etag = if kept.is_none() && stamp.size <= PART {
-            let mut bytes = vec![0; usize::try_from(stamp.size).map_err(std::io::Error::other)?];
-            file.read_exact_at(&mut bytes, 0)?;
+            let bytes = read_range(&file, 0..stamp.size).await?;
             self.archive.put(key, bytes).await?
         } else {
             self.archive.upload(key, &file, kept, stamp.size).await?

@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use serde_json::{Map, Value};
 
+/// EvalAI's words to a user who is no host, whatever is asked for.
+const NOT_AUTHORIZED: &str = "you are not authorized to";
 /// Longest text taken over from an answer, in characters.
 const LONGEST: usize = 400;
 /// Taken when the server throttles without saying for how long.
@@ -44,6 +46,8 @@ pub struct Refusal {
 pub enum About {
     /// The token: every request would be refused.
     Token,
+    /// The token's rights on one challenge: its user is no host of it. For others it may be good.
+    Challenge,
     /// The submission: EvalAI has none of that id.
     Missing,
     /// The request.
@@ -91,6 +95,20 @@ impl<T> Answer<T> {
             Self::Broken(message) => Answer::Broken(message),
             Self::Throttled(wait) => Answer::Throttled(wait),
             Self::Unanswered(silence) => Answer::Unanswered(silence),
+        }
+    }
+
+    /// The same answer to a request that every host of a challenge may make, and that is about nothing else: EvalAI refuses
+    /// others in words of its own, with status 400 or 401. Of one submission the same words may mean another challenge's.
+    pub(super) fn of_hosts(self) -> Self {
+        match self {
+            Self::Refused(refusal) if refusal.about == About::Request && refusal.message.contains(NOT_AUTHORIZED) => {
+                Self::Refused(Refusal {
+                    about: About::Challenge,
+                    ..refusal
+                })
+            }
+            other => other,
         }
     }
 
@@ -213,9 +231,11 @@ fn next_step(status: u16, said: &Said) -> Option<&'static str> {
             Some("these metrics are no labels of the phase's leaderboard: add them there")
         }
         _ if has("Challenge Phase Split does not exist") => Some("check evalai.split and the track's phase"),
-        _ if has("not authorized to make this request") => {
-            Some("the token's user is no host of this challenge, or there is no such challenge")
-        }
+        _ if has("not authorized to access this submission") => Some("the token's user is no host of its challenge"),
+        _ if has(NOT_AUTHORIZED) => Some(
+            "the token's user is no host of this challenge, or there is no such challenge: check evalai.challenge, and \
+             store a host's token where evalai.token says",
+        ),
         _ if status == 404 && matches!(said, Said::Page(_)) => Some("check evalai.apiServer"),
         _ => None,
     }
@@ -335,6 +355,42 @@ mod tests {
             ),
         ] {
             assert_eq!(refused(status, body).about, about, "{status} {body}");
+        }
+    }
+
+    #[test]
+    fn a_user_who_is_no_host_is_refused_for_the_challenge_alone() {
+        for (status, body) in [
+            (
+                401,
+                r#"{"error":"Sorry, you are not authorized to access these challenge phases."}"#,
+            ),
+            (
+                400,
+                r#"{"error":"Sorry, you are not authorized to make this request!"}"#,
+            ),
+        ] {
+            let Answer::Refused(refusal) = classify(status, None, body.as_bytes()).of_hosts() else {
+                panic!("{body}");
+            };
+            assert_eq!(refusal.about, About::Challenge, "{body}");
+            assert!(
+                refusal.message.contains("no host of this challenge"),
+                "{}",
+                refusal.message
+            );
+            assert_eq!(
+                refused(status, body).about,
+                About::Request,
+                "about a submission: {body}"
+            );
+        }
+        for (status, body) in [
+            (400, r#"{"error":"Invalid submission status archived"}"#),
+            (401, r#"{"detail":"Invalid token"}"#),
+        ] {
+            let before = classify(status, None, body.as_bytes());
+            assert_eq!(before.clone().of_hosts(), before, "{body}");
         }
     }
 

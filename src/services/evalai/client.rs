@@ -14,7 +14,7 @@ use serde::de::DeserializeOwned;
 use super::answer::{About, Answer, Refusal, Silence, classify};
 use super::request::{Reply, Request, Subject};
 use super::row::image;
-use super::types::Payload;
+use super::types::{ImageAnswer, Payload};
 use crate::services::meter::Meter;
 use crate::services::token::Token;
 
@@ -90,6 +90,9 @@ impl Client {
                 .connect_timeout(timeouts.connect)
                 .user_agent(concat!("leaderboard-operator/", env!("CARGO_PKG_VERSION")))
                 .retry(reqwest::retry::never())
+                // A server closes idle connections when it likes. A write that is sent on one in that moment has no answer, and
+                // may have been served: nothing is written for over a minute. At some 54 requests a minute nothing is kept open.
+                .pool_max_idle_per_host(0)
         };
         let made = |builder: reqwest::ClientBuilder| builder.build().map_err(|e| ClientError(chain(&e)));
         Ok(Self {
@@ -144,9 +147,13 @@ impl Client {
                 challenge,
                 purpose,
                 after,
-            } => Reply::Rows(self.get(token, &list(*challenge, purpose.status(), *after)).await),
+            } => {
+                let path = list(*challenge, purpose.status(), *after);
+                Reply::Rows(self.get(token, &path).await.of_hosts())
+            }
             Request::Phases(challenge) => {
-                Reply::Phases(self.get(token, &format!("challenges/{challenge}/phases/")).await)
+                let path = format!("challenges/{challenge}/phases/");
+                Reply::Phases(self.get(token, &path).await.of_hosts())
             }
             Request::Splits(challenge) => {
                 let path = format!("challenges/{challenge}/challenge_phase_split");
@@ -186,13 +193,26 @@ impl Client {
     }
 
     /// Downloads the participant's uploaded file, without the token: it may lie with a storage provider.
-    async fn upload(&self, url: &str) -> Answer<String> {
+    async fn upload(&self, url: &str) -> Answer<ImageAnswer> {
         if !url.starts_with("https://") && !url.starts_with("http://") {
-            return no_image("its address is neither http nor https");
+            return Answer::Refused(Refusal {
+                about: About::Request,
+                status: 0,
+                message: "the address of the uploaded file is neither http nor https; check EvalAI's MEDIA_URL".into(),
+            });
         }
         let request = self.files.get(url).timeout(self.timeouts.read);
-        let answer = answer(request, LARGEST_UPLOAD, Need::Body).await;
-        answer.and_then(|(_, body)| image(&body).map_or_else(|why| no_image(&why), Answer::Done))
+        match answer(request, LARGEST_UPLOAD, Need::Body).await {
+            // The file is there, and too large for what names an image.
+            Answer::Refused(refusal) if (200..300).contains(&refusal.status) => {
+                let why = format!("the uploaded file is larger than {LARGEST_UPLOAD} bytes");
+                Answer::Done(ImageAnswer::NotAnImage(why))
+            }
+            other => other.and_then(|(_, body)| {
+                let named = image(&body).map(ImageAnswer::Named);
+                Answer::Done(named.unwrap_or_else(ImageAnswer::NotAnImage))
+            }),
+        }
     }
 }
 
@@ -242,14 +262,6 @@ async fn body(mut response: Response, largest: usize) -> Result<Vec<u8>, Unread>
     Ok(body)
 }
 
-fn no_image(why: &str) -> Answer<String> {
-    Answer::Refused(Refusal {
-        about: About::Request,
-        status: 200,
-        message: format!("the uploaded file names no image ({why}); set spec.image, or have it submitted again"),
-    })
-}
-
 fn silence(error: reqwest::Error) -> Silence {
     let error = error.without_url();
     let what = match () {
@@ -290,3 +302,7 @@ fn put<'a>(subject: &Subject, status: &'a str, results: bool, payload: &'a Paylo
         environment_log: Some(&payload.environment_log),
     }
 }
+
+#[cfg(test)]
+#[path = "client_tests.rs"]
+mod tests;

@@ -41,6 +41,8 @@ pub enum End {
     Done(Status),
     /// EvalAI has ended it otherwise: the outcome becomes Cancelled, nothing is written.
     Amend(Status),
+    /// It was deleted there before its end: `cancelled` is written in place of the outcome, which becomes Cancelled.
+    Cancel,
     /// EvalAI's word is not known: read again later.
     Wait,
 }
@@ -48,19 +50,9 @@ pub enum End {
 /// Whether this attempt may run.
 pub fn start(status: Status, attempt: i64, begun: bool) -> Start {
     match standing(status, attempt, begun) {
-        Status::Submitted
-        | Status::Submitting
-        | Status::Resuming
-        | Status::Queued
-        | Status::Running
-        | Status::PartiallyEvaluated => Start::Run,
-        Status::Finished
-        | Status::Failed
-        | Status::Cancelled
-        | Status::Archived
-        | Status::Ignored
-        | Status::Missing => Start::Drop(status),
         Status::Unknown => Start::Unclear,
+        standing if standing.is_live() => Start::Run,
+        _ => Start::Drop(status),
     }
 }
 
@@ -89,6 +81,7 @@ pub fn partial(status: Status, attempt: i64, begun: bool) -> Verdict {
 pub fn end(status: Status, attempt: i64, begun: bool, wanted: Outcome) -> End {
     match (standing(status, attempt, begun), wanted) {
         (Status::Unknown, _) => End::Wait,
+        (Status::Deleted, Outcome::Finished | Outcome::Failed) => End::Cancel,
         (Status::Failed, Outcome::Failed | Outcome::Cancelled)
         | (Status::Cancelled | Status::Archived | Status::Ignored | Status::Missing, Outcome::Cancelled) => {
             End::Done(status)
@@ -127,6 +120,7 @@ mod tests {
         S::PartiallyEvaluated,
     ];
     const GONE: [S; 3] = [S::Archived, S::Ignored, S::Missing];
+    const DELETED: [S; 1] = [S::Deleted];
 
     #[test]
     fn what_starts_and_what_drops() {
@@ -135,7 +129,7 @@ mod tests {
                 for status in LIVE {
                     assert_eq!(start(status, attempt, begun), Start::Run, "{status} {attempt} {begun}");
                 }
-                for status in GONE.into_iter().chain([S::Finished]) {
+                for status in GONE.into_iter().chain(DELETED).chain([S::Finished]) {
                     assert_eq!(
                         start(status, attempt, begun),
                         Start::Drop(status),
@@ -181,6 +175,16 @@ mod tests {
             assert_eq!(end(status, 2, true, Finished), End::Amend(status));
         }
         assert_eq!(end(S::Unknown, 1, true, Finished), End::Wait);
+    }
+
+    #[test]
+    fn a_submission_deleted_before_its_end_is_cancelled_whatever_its_outcome() {
+        for (attempt, begun) in [(1, false), (1, true), (2, false), (2, true)] {
+            for wanted in [Outcome::Finished, Outcome::Failed] {
+                assert_eq!(end(S::Deleted, attempt, begun, wanted), End::Cancel);
+            }
+            assert_eq!(end(S::Deleted, attempt, begun, Outcome::Cancelled), End::Put);
+        }
     }
 
     #[test]
@@ -245,7 +249,11 @@ mod tests {
         for status in LIVE {
             assert_eq!(partial(status, 1, false), Verdict::Send);
         }
-        for status in GONE.into_iter().chain([S::Cancelled, S::Failed, S::Finished]) {
+        for status in GONE
+            .into_iter()
+            .chain(DELETED)
+            .chain([S::Cancelled, S::Failed, S::Finished])
+        {
             assert_eq!(partial(status, 1, true), Verdict::Ended(status));
         }
         assert_eq!(partial(S::Cancelled, 2, false), Verdict::Wait);

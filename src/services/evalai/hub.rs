@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -16,6 +16,7 @@ use super::labels::Labels;
 use super::queue::{Queue, Timing};
 use super::task::{Outlets, Shared, now, run};
 use super::types::{Changed, Key, Run, SweepRow, Target, View, Wish};
+use crate::observability::tasks::Tasks;
 use crate::services::meter::Meter;
 
 /// Says, right before each write, whether this process still leads.
@@ -43,6 +44,8 @@ pub struct Options {
     pub timeouts: Timeouts,
     /// Counts the requests.
     pub meter: Meter,
+    /// Starts the task of each token.
+    pub tasks: Tasks,
 }
 
 /// See the module's text. Clones are the same hub.
@@ -53,6 +56,8 @@ struct Inner {
     options: Options,
     /// All queues count time from here, so that a moment means the same in each.
     start: Instant,
+    /// `not_before` on the clock of people.
+    writes_from: Timestamp,
     outlets: Outlets,
     closing: watch::Sender<bool>,
     state: Mutex<State>,
@@ -71,7 +76,7 @@ type Account = (String, String);
 struct Entry {
     shared: Arc<Shared>,
     /// None once its end is waited for.
-    task: Option<JoinHandle<bool>>,
+    task: Option<JoinHandle<Option<bool>>>,
 }
 
 impl Hub {
@@ -82,12 +87,20 @@ impl Hub {
             sweep: options.sweep.clone(),
         };
         Self(Arc::new(Inner {
+            writes_from: wall(options.not_before),
             options,
             start: Instant::now(),
             outlets,
             closing: watch::Sender::new(false),
             state: Mutex::default(),
         }))
+    }
+
+    /// From when on EvalAI is written to, while it is not yet: the process before has not confirmed its last requests. Then
+    /// every Leaderboard that is served and every submission with something to write is woken.
+    pub fn writes_from(&self) -> Option<Timestamp> {
+        let inner = &self.0;
+        (Instant::now() < inner.options.not_before).then_some(inner.writes_from)
     }
 
     /// A Leaderboard serves its challenge: it is swept, checked, and its token is renewed by calling this again.
@@ -171,9 +184,12 @@ impl Hub {
         })
     }
 
-    /// What EvalAI says of a Leaderboard's token, while it refuses it.
+    /// What EvalAI says of a Leaderboard's token, while it refuses it, at all or for the challenge.
     pub fn token_refused(&self, leaderboard: &Key) -> Option<String> {
-        self.place(leaderboard)?.queue().token_refused().map(str::to_owned)
+        let shared = self.place(leaderboard)?;
+        let queue = shared.queue();
+        let refused = queue.token_refused().or_else(|| queue.challenge_refused(leaderboard));
+        refused.map(str::to_owned)
     }
 
     /// Takes nothing new and waits for what is on its way, at most 70 s. True if every write is answered, so that the next
@@ -188,7 +204,8 @@ impl Hub {
             .collect();
         let mut drained = true;
         for task in tasks {
-            drained &= task.await.unwrap_or(false);
+            // A task that has panicked may have left a write without its answer.
+            drained &= matches!(task.await, Ok(Some(true)));
         }
         drained
     }
@@ -278,16 +295,74 @@ impl Hub {
             now(inner.start),
         );
         let shared = Arc::new(Shared::new(queue, target.token.clone(), inner.start));
-        let task = tokio::spawn(run(
+        let work = run(
             shared.clone(),
             client.counted_by(inner.options.meter.clone()),
             inner.options.fence.clone(),
             inner.outlets.clone(),
             inner.closing.subscribe(),
-        ));
+        );
+        let name = format!("EvalAI requests of {}", target.token.identity());
+        let task = inner.options.tasks.stay(name, work);
         Ok(Entry {
             shared,
             task: Some(task),
         })
+    }
+}
+
+/// A moment on the clock of people, if it is still to come.
+fn wall(at: Instant) -> Timestamp {
+    let now = Timestamp::now();
+    let wait = SignedDuration::try_from(at.saturating_duration_since(Instant::now())).unwrap_or_default();
+    now.checked_add(wait).unwrap_or(now)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::observability::shutdown::Stop;
+    use crate::services::token::Token;
+
+    #[tokio::test(start_paused = true)]
+    async fn the_task_of_each_token_is_one_of_the_process() {
+        let (_stop, signal) = Stop::new();
+        let tasks = Tasks::new(signal);
+        let hub = Hub::new(Options {
+            // Nothing is sent anywhere: the fence's panic stands for any of the task's own.
+            fence: Arc::new(|| -> bool { panic!("on purpose") }),
+            not_before: Instant::now(),
+            changed: mpsc::unbounded_channel().0,
+            sweep: mpsc::unbounded_channel().0,
+            timing: Timing::default(),
+            timeouts: Timeouts::default(),
+            meter: Meter::default(),
+            tasks: tasks.clone(),
+        });
+        let target = Target {
+            api_server: "http://127.0.0.1:9".into(),
+            challenge: 1,
+            split: "leaderboard".into(),
+            token: Arc::new(Token::parse("x").unwrap()),
+            requests_per_minute: 54,
+            sweep: std::time::Duration::from_mins(1),
+            period: std::time::Duration::from_secs(10),
+            phases: [1].into(),
+            labels: [].into(),
+            since: Timestamp::UNIX_EPOCH,
+        };
+        let key = Key {
+            namespace: "ns".into(),
+            name: "board".into(),
+            uid: "u".into(),
+        };
+        hub.serve(&key, &target).unwrap();
+        let failed = tokio::time::timeout(std::time::Duration::from_mins(1), tasks.failed()).await;
+        let failed = failed.unwrap().to_string();
+        assert!(
+            failed.starts_with("the task EvalAI requests of token-") && failed.contains("has panicked: on purpose"),
+            "{failed}"
+        );
+        assert!(!hub.drain().await, "a write of it may have no answer");
     }
 }

@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use super::answer::Answer;
 use super::row::{DatasetSplit, Phase, Row, Split};
 use super::status::{Outcome, Progress};
-use super::types::{Key, Payload};
+use super::types::{ImageAnswer, Key, Payload};
 
 /// Whom a request is about.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -136,7 +136,8 @@ pub enum Reply {
     Row(Answer<Row>),
     Rows(Answer<Vec<Row>>),
     Written(Answer<()>),
-    Image(Answer<String>),
+    /// Done only if the file was read.
+    Image(Answer<ImageAnswer>),
     Phases(Answer<Vec<Phase>>),
     Splits(Answer<Vec<Split>>),
     DatasetSplit(Answer<DatasetSplit>),

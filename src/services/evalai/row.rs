@@ -8,13 +8,14 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use super::status::Status;
+use crate::api::ImageReference;
 
 /// A submission as EvalAI shows it to a host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Row {
     /// Its id.
     pub id: i64,
-    /// Where it stands; [`Status::Ignored`] if it was deleted.
+    /// Where it stands; [`Status::Deleted`] or [`Status::Ignored`] if it was deleted.
     pub status: Status,
     /// Id of its phase.
     pub phase: Option<i64>,
@@ -90,10 +91,10 @@ impl<'de> Deserialize<'de> for Row {
         let jobs = raw.job_name.as_array().into_iter().flatten();
         Ok(Self {
             id: raw.id,
-            status: if ignored {
-                Status::Ignored
-            } else {
-                Status::parse(&raw.status)
+            status: match Status::parse(&raw.status) {
+                status if ignored && status.is_live() => Status::Deleted,
+                _ if ignored => Status::Ignored,
+                status => status,
             },
             phase: raw.challenge_phase.as_i64(),
             team_id: raw.participant_team.as_i64(),
@@ -147,11 +148,9 @@ pub fn image(file: &[u8]) -> Result<String, String> {
     let image = image
         .ok_or_else(|| "the uploaded file has no submitted_image_uri".to_owned())?
         .trim();
-    let plausible = !image.is_empty() && image.len() <= 512 && image.bytes().all(|byte| byte.is_ascii_graphic());
-    if plausible {
-        Ok(image.to_owned())
-    } else {
-        Err("submitted_image_uri in the uploaded file is no image".to_owned())
+    match ImageReference::parse(image) {
+        Ok(_) => Ok(image.to_owned()),
+        Err(why) => Err(format!("submitted_image_uri in the uploaded file is no image: {why}")),
     }
 }
 
@@ -190,10 +189,18 @@ mod tests {
     }
 
     #[test]
-    fn a_deleted_submission_keeps_its_status_and_is_ignored() {
-        let row: Row =
-            serde_json::from_value(json!({"id": 7, "status": "running", "ignore_submission": true})).unwrap();
-        assert_eq!(row.status, Status::Ignored);
+    fn a_deleted_submission_is_told_by_whether_it_had_come_to_its_end() {
+        for (status, deleted) in [
+            ("submitted", Status::Deleted),
+            ("running", Status::Deleted),
+            ("partially_evaluated", Status::Deleted),
+            ("finished", Status::Ignored),
+            ("cancelled", Status::Ignored),
+            ("evaluating", Status::Ignored),
+        ] {
+            let row = json!({"id": 7, "status": status, "ignore_submission": true});
+            assert_eq!(serde_json::from_value::<Row>(row).unwrap().status, deleted, "{status}");
+        }
     }
 
     #[test]
@@ -207,7 +214,13 @@ mod tests {
             (json!({}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": 1}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": "two words"}), "no image"),
-            (json!({"submitted_image_uri": ""}), "no image"),
+            (json!({"submitted_image_uri": ""}), "no image: it is empty"),
+            (json!({"submitted_image_uri": "  "}), "no image: it is empty"),
+            (json!({"submitted_image_uri": null}), "no submitted_image_uri"),
+            (json!({"submitted_image_uri": {"a": 1}}), "no submitted_image_uri"),
+            (json!({"submitted_image_uri": "x".repeat(513)}), "512 characters"),
+            (json!({"submitted_image_uri": "team/Agent:1"}), "upper-case"),
+            (json!({"submitted_image_uri": "ägent:1"}), "not ASCII"),
         ] {
             assert!(of(value).unwrap_err().contains(part));
         }

@@ -17,7 +17,10 @@ pub enum Status {
     Failed,
     Cancelled,
     Archived,
-    /// Deleted by its participant: EvalAI keeps the row and its status, and sets `ignore_submission`.
+    /// Deleted by its participant before its end. EvalAI keeps the row and its status, sets `ignore_submission`, and goes on
+    /// counting it as being processed: three of them, and the team may submit nothing more.
+    Deleted,
+    /// Deleted by its participant after its end.
     Ignored,
     /// EvalAI has no such submission.
     Missing,
@@ -27,7 +30,7 @@ pub enum Status {
 
 impl Status {
     /// All of them.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::Submitted,
         Self::Submitting,
         Self::Resuming,
@@ -38,6 +41,7 @@ impl Status {
         Self::Failed,
         Self::Cancelled,
         Self::Archived,
+        Self::Deleted,
         Self::Ignored,
         Self::Missing,
         Self::Unknown,
@@ -46,11 +50,24 @@ impl Status {
     /// Reads EvalAI's word.
     pub fn parse(word: &str) -> Self {
         let word = word.to_ascii_lowercase();
-        let ours = |status: &Self| matches!(status, Self::Ignored | Self::Missing | Self::Unknown);
+        let ours = |status: &Self| matches!(status, Self::Deleted | Self::Ignored | Self::Missing | Self::Unknown);
         let found = Self::ALL
             .into_iter()
             .find(|status| !ours(status) && status.as_str() == word);
         found.unwrap_or(Self::Unknown)
+    }
+
+    /// Whether EvalAI waits for an end of it.
+    pub fn is_live(self) -> bool {
+        matches!(
+            self,
+            Self::Submitted
+                | Self::Submitting
+                | Self::Resuming
+                | Self::Queued
+                | Self::Running
+                | Self::PartiallyEvaluated
+        )
     }
 
     /// The word, EvalAI's where it has one.
@@ -66,6 +83,7 @@ impl Status {
             Self::Failed => "failed",
             Self::Cancelled => "cancelled",
             Self::Archived => "archived",
+            Self::Deleted => "deleted",
             Self::Ignored => "ignored",
             Self::Missing => "missing",
             Self::Unknown => "unknown",
@@ -122,7 +140,10 @@ mod tests {
     #[test]
     fn evalais_words_are_read_and_ours_are_not() {
         for status in Status::ALL {
-            let ours = matches!(status, Status::Ignored | Status::Missing | Status::Unknown);
+            let ours = matches!(
+                status,
+                Status::Deleted | Status::Ignored | Status::Missing | Status::Unknown
+            );
             let expected = if ours { Status::Unknown } else { status };
             assert_eq!(Status::parse(status.as_str()), expected);
         }

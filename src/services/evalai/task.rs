@@ -113,6 +113,7 @@ pub(super) async fn run(
                 Next::Wait(until) => break until,
             }
         };
+        shared.publish(&outlets);
         let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
         tokio::select! {
             Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &outlets, &ticket, reply),

@@ -86,15 +86,16 @@ pub struct View {
     pub read_at: Option<Timestamp>,
     /// The newest attempt whose `ask` the row answers; 0 is none.
     pub answered: i64,
-    /// The image of the uploaded file, if it was asked for; or why there is none.
-    pub image: Option<Result<String, String>>,
+    /// What the uploaded file says of the image; none before it was asked for and answered.
+    pub image: Option<ImageAnswer>,
     /// The attempt that all below speaks of.
     pub attempt: i64,
     /// How far EvalAI knows this attempt to be.
     pub progress: Option<Progress>,
     /// EvalAI has ended this attempt, by somebody else's hand.
     pub ended: Option<Status>,
-    /// A write of ours was under way when EvalAI ended it, and may have undone that there.
+    /// EvalAI may yet say otherwise: a write of ours was under way when it was ended there and may have undone that, or it was
+    /// deleted, which ends nothing there.
     pub overtaken: bool,
     /// What became of the wish for an end.
     pub end: Option<Ended>,
@@ -106,6 +107,17 @@ pub struct View {
     pub unanswered_until: Option<Timestamp>,
 }
 
+/// What the uploaded file says of the image.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ImageAnswer {
+    /// It names this one.
+    Named(String),
+    /// It was read and names none that could be pulled, and why: no later read changes that.
+    NotAnImage(String),
+    /// It could not be read yet, and why. It is tried again.
+    Unread(String),
+}
+
 /// What became of a wish for an end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ended {
@@ -115,7 +127,8 @@ pub enum Ended {
     Agreed(Status),
     /// EvalAI has ended the run itself: the outcome becomes Cancelled, nothing was written.
     Otherwise(Status),
-    /// EvalAI refuses it. It is tried again from time to time, and at once with other texts.
+    /// EvalAI refuses it, or would file it wrongly. It is tried again from time to time, and at once with other texts; a cancel
+    /// that such a try finds makes it `Otherwise`.
     Refused(String),
 }
 
@@ -131,9 +144,13 @@ pub enum Changed {
 /// A submission that asks to be run and that nobody here knows: its message may be lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SweepRow {
+    /// Root of the server that has the row, as in [`Target::api_server`]: ids are unique within a server only.
+    pub server: String,
     pub challenge: i64,
     pub phase: i64,
     pub submission: i64,
+    /// EvalAI says `resuming`, not `submitted`.
+    pub is_resuming: bool,
     /// When it asked to be run: its re-run or resume, else its submission.
     pub time: Timestamp,
 }

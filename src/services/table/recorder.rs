@@ -9,12 +9,13 @@ use std::time::Duration;
 
 use futures::FutureExt;
 use futures::future::BoxFuture;
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{Notify, mpsc};
 use tokio::time::Instant;
 
 use super::ledger::{Ledger, TableId, View, Wish};
 use super::{Row, Table, TableError, Written};
 use crate::api;
+use crate::observability::tasks::Tasks;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 
@@ -42,31 +43,30 @@ struct Shared {
     store: Box<dyn Store>,
     may_write: Box<dyn Fn() -> bool + Send + Sync>,
     wake: mpsc::UnboundedSender<ObjectKey>,
-    shutdown: watch::Receiver<bool>,
-    runtime: tokio::runtime::Handle,
+    tasks: Tasks,
 }
 
 impl Recorder {
-    /// A recorder whose tasks run on the present runtime until `shutdown` becomes true. `may_write` is asked right
-    /// before each write; `wake` is told of each object whose view has changed.
+    /// A recorder whose tasks run until the stop of `tasks`. `may_write` is asked right before each write; `wake` gets each
+    /// object whose view has changed.
     pub fn new(
         aws: Aws,
         may_write: impl Fn() -> bool + Send + Sync + 'static,
         wake: mpsc::UnboundedSender<ObjectKey>,
-        shutdown: watch::Receiver<bool>,
+        tasks: Tasks,
     ) -> Self {
         let store = Dynamo {
             aws,
             known: Arc::default(),
         };
-        Self::with_store(Box::new(store), may_write, wake, shutdown)
+        Self::with_store(Box::new(store), may_write, wake, tasks)
     }
 
     fn with_store(
         store: Box<dyn Store>,
         may_write: impl Fn() -> bool + Send + Sync + 'static,
         wake: mpsc::UnboundedSender<ObjectKey>,
-        shutdown: watch::Receiver<bool>,
+        tasks: Tasks,
     ) -> Self {
         let shared = Shared {
             ledger: Mutex::default(),
@@ -74,8 +74,7 @@ impl Recorder {
             store,
             may_write: Box::new(may_write),
             wake,
-            shutdown,
-            runtime: tokio::runtime::Handle::current(),
+            tasks,
         };
         Self { shared: shared.into() }
     }
@@ -97,7 +96,7 @@ impl Recorder {
                 id,
                 notify: notify.clone(),
             };
-            self.shared.runtime.spawn(worker.run());
+            self.shared.tasks.stay(format!("table {}", table.name), worker.run());
             notify
         });
         notify.notify_one();
@@ -135,9 +134,9 @@ struct Worker {
 impl Worker {
     /// Ends between two writes: one that has begun is finished.
     async fn run(self) {
-        let mut stop = self.shared.shutdown.clone();
+        let stop = self.shared.tasks.stop();
         let mut failures: u32 = 0;
-        while !*stop.borrow() {
+        while !stop.is_set() {
             let next = self.shared.ledger().next(&self.id);
             let pause = match next {
                 None => None,
@@ -156,7 +155,7 @@ impl Worker {
                 }
             };
             tokio::select! {
-                _ = stop.wait_for(|stop| *stop) => {}
+                () = stop.wait() => {}
                 () = wait => {}
             }
         }

@@ -2,7 +2,10 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use tokio::sync::watch;
+
 use super::*;
+use crate::observability::shutdown::Stop;
 
 type Log = Arc<Mutex<Vec<(Duration, String, String)>>>;
 
@@ -31,7 +34,7 @@ struct Bench {
 
 fn bench(answers: Vec<Result<Written, TableError>>) -> Bench {
     let (sender, wake) = mpsc::unbounded_channel();
-    let (shutdown, stopped) = watch::channel(false);
+    let (shutdown, stop) = Stop::new();
     let (log, fence) = (Log::default(), Arc::new(AtomicBool::new(true)));
     let fake = Fake {
         begun: Instant::now(),
@@ -44,7 +47,7 @@ fn bench(answers: Vec<Result<Written, TableError>>) -> Bench {
             Box::new(fake),
             move || may_write.load(Ordering::SeqCst),
             sender,
-            stopped,
+            Tasks::new(stop),
         ),
         log,
         wake,
@@ -154,4 +157,25 @@ fn pauses_stay_within_their_limits() {
     assert_eq!(pause(1, 0.0), SPACING);
     assert_eq!(pause(1, 1.0), Duration::from_secs(4));
     assert_eq!(pause(50, 1.0), LONGEST_PAUSE);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_worker_that_panics_is_a_failed_task_of_the_process() {
+    struct Broken;
+    impl Store for Broken {
+        fn write(&self, _table: &api::Table, _row: Arc<Row>) -> BoxFuture<'static, Result<Written, TableError>> {
+            async { panic!("no such row") }.boxed()
+        }
+    }
+    let (_stop, signal) = Stop::new();
+    let tasks = Tasks::new(signal);
+    let recorder = Recorder::with_store(Box::new(Broken), || true, mpsc::unbounded_channel().0, tasks.clone());
+    recorder.record(&table("t"), &key("a"), row("1"), false);
+    let failed = tokio::time::timeout(Duration::from_mins(1), tasks.failed())
+        .await
+        .unwrap();
+    assert_eq!(
+        (failed.task.as_str(), failed.why.as_str()),
+        ("table t", "has panicked: no such row")
+    );
 }

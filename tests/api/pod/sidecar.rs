@@ -22,6 +22,10 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
         (report.score, report.is_final, report.pairs[0].state.as_str()),
         (Some(100.0), false, "Running")
     );
+    let stored = pod.stored("evalai/results.json").await.unwrap();
+    assert_eq!(stored, report.results.as_bytes(), "what is stored stays the original's");
+    assert_eq!(driving_score(&report.results), 0);
+    assert_eq!(driving_score(report.partial_results.as_ref().unwrap()), 100.0);
     pod.checkpoint(1, 2);
     pod.checkpoint(2, 2);
     for pair in [1, 2] {
@@ -33,6 +37,7 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     // It was stored before logcopy.done was written.
     let report = pod.report().await.unwrap();
     assert!(report.is_final && report.eligible && report.stopped.is_none() && report.why.is_none());
+    assert_eq!(report.partial_results, None);
     assert_eq!(
         (report.done, report.total, report.entry_status.as_str()),
         (4, 4, "Finished")
@@ -45,6 +50,11 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     assert!(!pod.has(StatusFile::Cancel));
     logcopy.end().await;
     assert_layout(&pod, &report).await;
+}
+
+fn driving_score(results: &str) -> serde_json::Value {
+    let results: serde_json::Value = serde_json::from_str(results).unwrap();
+    results[0]["accuracies"]["Driving score"].clone()
 }
 
 async fn assert_layout(pod: &Pod, report: &Report) {

@@ -269,6 +269,7 @@ fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
         why: None,
         warnings: Vec::new(),
         results: String::new(),
+        partial_results: None,
         files: BTreeMap::new(),
     };
     assert!(!stage.props.labels.is_empty());

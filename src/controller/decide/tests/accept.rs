@@ -5,11 +5,11 @@ use std::sync::Arc;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Pending};
-use crate::api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, STALLED};
-use crate::api::{LeaderboardStatus, conditions, reasons};
+use crate::api::State::{Cancelled, Failed, Pending};
+use crate::api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
+use crate::api::{FailureClass, LeaderboardStatus, conditions, reasons};
 use crate::controller::decide::{Action, Tell};
-use crate::controller::view::Standing;
+use crate::controller::view::{Standing, Turn};
 
 #[test]
 fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
@@ -64,9 +64,17 @@ fn an_image_is_taken_from_evalai_where_the_object_names_none() {
     let mut world = World::evalai();
     world.submission().spec.image = None;
     world.in_evalai().info.as_mut().unwrap().image = None;
+    world.in_evalai().error = Some("EvalAI answered 404: not found".into());
     let plan = world.pass_to(Pending, reasons::IMAGE_MISSING);
     assert_eq!(condition(&plan, ACCEPTED).0, "False");
     assert!(!creates(&plan));
+    let message = plan.status.message.unwrap();
+    assert!(
+        message.contains("it is tried again. The last request failed: EvalAI answered 404"),
+        "{message}"
+    );
+    world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
 }
 
 #[test]
@@ -171,4 +179,118 @@ fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
         &now,
     );
     assert!(creates(&world.pass()), "a blocked queue is the bridge's affair");
+}
+
+#[test]
+fn an_image_that_can_never_be_pulled_fails_at_once_without_a_job() {
+    let long = "x".repeat(513);
+    let of_object = ["team/Agent:1", "team/agent:", "ägent", &long].map(|image| (Some(image), None));
+    let of_file = (None, Some("the uploaded file has no submitted_image_uri"));
+    for (image, problem) in of_object.into_iter().chain([of_file]) {
+        for mut world in [World::local(), World::evalai()] {
+            world.submission().spec.image = image.map(str::to_owned);
+            let is_evalais = world.view.evalai.is_some();
+            if let Some(info) = world.in_evalai().info.as_mut() {
+                (info.image, info.image_problem) = (None, problem.map(str::to_owned));
+            }
+            if !is_evalais {
+                world.view.evalai = None;
+                if image.is_none() {
+                    continue;
+                }
+            }
+            let plan = world.pass_to(Failed, reasons::IMAGE_INVALID);
+            assert!(!creates(&plan), "{image:?}");
+            assert_eq!(
+                condition(&plan, ACCEPTED),
+                ("False".into(), reasons::IMAGE_INVALID.into())
+            );
+            let failure = plan.status.failure.clone().unwrap();
+            assert_eq!((failure.class, failure.charged), (FailureClass::Participant, true));
+            let said = problem.map_or("can never be pulled", |_| "no submitted_image_uri");
+            assert!(failure.message.contains(said), "{}", failure.message);
+            assert!(failure.message.contains("Submit again"), "{}", failure.message);
+            let wanted: &[Tell] = if is_evalais { &[Tell::Failed] } else { &[] };
+            assert_eq!(tells(&plan), wanted);
+            world.published();
+            if !is_evalais {
+                world.view.evalai = None;
+            }
+            let plan = world.pass();
+            assert!(has(&plan, |a| *a == Action::Record { end: true }), "{:?}", plan.actions);
+            world.recorded();
+            assert!(has(&world.pass(), |a| *a == Action::ForgetEvalai));
+        }
+    }
+}
+
+#[test]
+fn a_later_attempt_with_an_image_runs_that_image() {
+    let mut world = World::evalai();
+    world.submission().spec.image = None;
+    let info = world.in_evalai().info.as_mut().unwrap();
+    (info.image, info.image_problem) = (None, Some("the uploaded file is no JSON".into()));
+    world.pass_to(Failed, reasons::IMAGE_INVALID);
+    world.submission().spec.attempt = 2;
+    world.pass();
+    world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert_eq!(world.status().plan.unwrap().image, "ecr/agent:9");
+}
+
+/// EvalAI's row is of this phase.
+fn moved_to(world: &mut World, phase: i64) {
+    world.in_evalai().info.as_mut().unwrap().phase = Some(phase);
+}
+
+#[test]
+fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
+    let mut world = World::evalai();
+    moved_to(&mut world, 9);
+    let plan = world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    assert!(!creates(&plan) && tells(&plan).is_empty());
+    assert_eq!(
+        condition(&plan, ACCEPTED),
+        ("False".into(), reasons::PHASE_DIFFERS.into())
+    );
+    let message = plan.status.message.unwrap();
+    assert!(
+        message.contains("submission 77 belongs to phase 9, not to phase 7"),
+        "{message}"
+    );
+    world.go_to(3599);
+    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    let mut back = world.clone();
+    moved_to(&mut back, 7);
+    assert!(creates(&back.pass_to(Pending, reasons::PREPARING)));
+    world.go_to(3600);
+    let plan = world.pass_to(Failed, reasons::PHASE_DIFFERS);
+    assert_eq!(plan.status.failure.unwrap().class, FailureClass::Infrastructure);
+    assert_eq!(tells(&world.pass()), [Tell::Failed], "the participant has an end");
+    world.published();
+    let plan = world.pass();
+    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::NOT_WANTED.into()));
+    assert!(has(&plan, |a| *a == Action::ForgetEvalai));
+}
+
+#[test]
+fn a_submission_with_a_wrong_phase_is_taken_back_without_ending_the_row() {
+    let mut world = World::evalai();
+    moved_to(&mut world, 9);
+    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    world.delete();
+    let plan = world.pass_to(Cancelled, reasons::DELETED);
+    assert_eq!(tells(&plan), []);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_WANTED);
+    assert!(has(&plan, |a| *a == Action::ReleaseFinalizer), "{:?}", plan.actions);
+
+    // It was accepted, and EvalAI has heard that it is queued.
+    let mut world = World::evalai();
+    let (position, eta) = (3, None);
+    world.view.turn = Turn::Wait { position, eta };
+    world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+    moved_to(&mut world, 9);
+    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    world.submission().spec.cancel = true;
+    assert_eq!(tells(&world.pass_to(Cancelled, reasons::CANCELLED)), [Tell::Cancelled]);
 }

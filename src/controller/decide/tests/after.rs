@@ -1,11 +1,14 @@
 //! After the end: EvalAI, the table, the Job's time to live.
 
+use jiff::SignedDuration;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
 use super::builders::*;
 use crate::api::State::{Cancelled, Failed, Finished};
 use crate::api::conditions::{self, PUBLISHED, RECORDED};
-use crate::api::reasons;
+use crate::api::{Rerun, reasons};
 use crate::controller::decide::{Action, Plan, Tell};
-use crate::controller::view::{EvalaiEnd, ReportSight};
+use crate::controller::view::{EvalaiEnd, EvalaiInfo, ReportSight, Standing};
 
 fn finished() -> World {
     let mut world = World::evalai().running();
@@ -215,10 +218,133 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
         == Action::ReleaseFinalizer));
 }
 
+/// What EvalAI says of a row, as it was just read.
+fn says(world: &mut World, status: &str) {
+    world.in_evalai().info = Some(EvalaiInfo {
+        standing: Standing::Ended,
+        status: status.into(),
+        ..info()
+    });
+}
+
+#[test]
+fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
+    for (mut world, state) in [(finished(), Finished), (failed(), Failed)] {
+        world.job().has_ttl = true;
+        world.published();
+        world.recorded();
+        world.pass();
+        let before = world.pass().status;
+        world.view.evalai = None;
+        let rerun = Rerun {
+            submission_name: "submission-99".into(),
+            time: Some(Time(at(500))),
+        };
+        world.view.rerun_as = Some(rerun.clone());
+        let plan = world.pass();
+        assert_eq!(plan.actions, [Action::AskEvalai], "the row of a re-run is no proof");
+        assert!(plan.requeue.is_some() && plan.status.rerun_as.is_none());
+
+        says(&mut world, "finished");
+        let plan = world.pass();
+        assert_eq!((plan.actions, plan.status.rerun_as), (vec![Action::ForgetEvalai], None));
+
+        says(&mut world, "cancelled");
+        let plan = world.pass();
+        let text = "EvalAI has cancelled it: it was re-run as submission-99.";
+        assert_eq!(plan.status.rerun_as, Some(rerun));
+        assert_eq!(
+            (plan.status.state, plan.status.score.clone(), plan.status.reason.clone()),
+            (Some(state), before.score, before.reason)
+        );
+        assert_eq!(plan.status.message, Some(format!("{} {text}", before.message.unwrap())));
+        let published = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+        assert_eq!((published.status.as_str(), published.message.as_str()), ("True", text));
+        assert_eq!(events(&plan), [reasons::RERUN_IN_EVALAI]);
+        assert_eq!(plan.actions, [Action::ForgetEvalai]);
+
+        world.view.evalai = None;
+        let again = world.pass();
+        assert_eq!(
+            (again.actions.as_slice(), again.events.len()),
+            ([Action::ForgetEvalai].as_slice(), 0)
+        );
+        assert_eq!(again.status, plan.status, "it is said once");
+    }
+}
+
+#[test]
+fn a_submission_remembers_which_one_it_reruns() {
+    let mut world = World::evalai();
+    let of = Rerun {
+        submission_name: "submission-7".into(),
+        time: None,
+    };
+    let known = world.in_evalai().info.as_mut().unwrap();
+    known.rerun_of = Some(of.clone());
+    assert_eq!(world.pass().status.rerun_of, Some(of.clone()));
+    world.in_evalai().info.as_mut().unwrap().rerun_of = None;
+    assert_eq!(world.pass().status.rerun_of, Some(of));
+}
+
+#[test]
+fn an_end_says_until_when_it_waits_for_the_controller_before() {
+    let mut world = finished();
+    world.view.evalai_writes_from = world.view.now.checked_add(SignedDuration::from_secs(20)).ok();
+    let plan = world.pass();
+    let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert_eq!(shown.reason, reasons::WAITING_FOR_PREVIOUS_CONTROLLER);
+    let until = world.view.evalai_writes_from.unwrap().strftime("%H:%M:%S").to_string();
+    assert!(
+        shown.message.contains(&format!("from {until} UTC on")),
+        "{}",
+        shown.message
+    );
+    assert_eq!(tells(&plan), [Tell::Finished], "it is the first to be sent then");
+    assert!(plan.requeue.unwrap() <= std::time::Duration::from_secs(21));
+    world.view.evalai_writes_from = None;
+    assert_eq!(
+        condition(&world.pass(), PUBLISHED),
+        ("False".into(), reasons::WAITING.into())
+    );
+}
+
 #[test]
 fn a_finished_job_gets_its_time_to_live_once() {
     let mut world = finished();
     assert!(has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
     world.job().has_ttl = true;
     assert!(!has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
+}
+
+#[test]
+fn a_row_that_has_gone_to_another_team_is_said_with_its_end() {
+    let mut world = finished();
+    world.in_evalai().team_id = Some("42".into());
+    let mut same = world.clone();
+    same.published();
+    assert_eq!(events(&same.pass()), ["Published"]);
+
+    world.in_evalai().team_id = Some("43".into());
+    world.published();
+    let plan = world.pass();
+    assert_eq!(events(&plan), ["Published", reasons::TEAM_DIFFERS]);
+    let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert!(
+        shown.message.contains("team 43") && shown.message.contains("team 42"),
+        "{}",
+        shown.message
+    );
+}
+
+#[test]
+fn the_team_is_that_of_the_acceptance() {
+    let mut world = World::evalai();
+    let (position, eta) = (1, None);
+    world.view.turn = crate::controller::view::Turn::Wait { position, eta };
+    world.pass();
+    let info = world.in_evalai().info.as_mut().unwrap();
+    (info.team_id, info.team_name) = ("43".into(), Some("Other".into()));
+    let team = world.pass().status.team.unwrap();
+    assert_eq!((team.id.as_deref(), team.name.as_deref()), (Some("42"), Some("Team")));
 }

@@ -69,10 +69,13 @@ pub fn info() -> EvalaiInfo {
     EvalaiInfo {
         standing: Standing::Wanted,
         status: "submitted".into(),
+        phase: Some(7),
         team_id: "42".into(),
         team_name: Some("Team".into()),
         submitted_at: Some(at(-60)),
+        rerun_of: None,
         image: Some("ecr/agent:9".into()),
+        image_problem: None,
     }
 }
 
@@ -102,6 +105,8 @@ impl World {
                 record: Some(RecordView::default()),
                 partial_told: None,
                 unread: None,
+                rerun_as: None,
+                evalai_writes_from: None,
             },
         }
     }
@@ -326,6 +331,7 @@ pub fn report(done: u32) -> Report {
         why: None,
         warnings: Vec::new(),
         results: "[]".into(),
+        partial_results: None,
         files: std::collections::BTreeMap::new(),
     }
 }

@@ -1,7 +1,9 @@
 //! Sentences: each failure has its own, with a next step that a retry leaves out.
 
-use crate::api::reasons;
+use super::builders::*;
+use crate::api::{Failure, FailureClass, reasons};
 use crate::controller::decide::failure::{infrastructure, invalid_results, participant, what_happened};
+use crate::controller::decide::next_steps::for_both;
 use crate::text::sentence;
 
 #[test]
@@ -21,7 +23,7 @@ fn a_next_step_is_added_and_taken_off_again() {
         "Taken. Empty it."
     );
     assert_eq!(
-        what_happened(&participant(reasons::IDLE, "Slow. Hurry.")),
+        what_happened(&participant(reasons::IDLE, "Slow.", &for_both("Hurry."))),
         "Slow. Hurry."
     );
 }
@@ -32,4 +34,90 @@ fn words_become_one_sentence() {
         assert_eq!(sentence(words), wanted);
     }
     assert!(!invalid_results("a score of NaN.").message.contains(".."));
+}
+
+/// The failure of a run whose agent 2 has ended like this as often as it may.
+fn failure_of(what: &str, reason: &str) -> Failure {
+    let mut world = World::evalai().running();
+    let mut end = ended("agent-2", 4, what, 1, 100);
+    if let Some(last) = end.last.as_mut() {
+        reason.clone_into(&mut last.reason);
+    }
+    world.see(end);
+    world.pass().status.failure.unwrap()
+}
+
+#[test]
+fn a_participant_is_sent_to_nothing_that_only_hosts_can_read() {
+    let infrastructure = [
+        reasons::IMAGE_PULL,
+        reasons::CONTAINER_CONFIG,
+        reasons::NODE_LOST,
+        reasons::RESULTS_NOT_STORED,
+        reasons::SIMULATION_CRASHED,
+        reasons::START_DEADLINE,
+        reasons::SCHEDULE_DEADLINE,
+        reasons::JOB_DELETED,
+        reasons::JOB_FAILED,
+        reasons::PREFIX_IN_USE,
+        reasons::CANNOT_START,
+    ]
+    .map(|reason| {
+        infrastructure(
+            reason,
+            "Its Job on node gpu-3 broke: see logcopy/report.json in s3://results.",
+        )
+    });
+    let agents = [
+        ("exited", "Error"),
+        ("exited", "OOMKilled"),
+        ("idle", "Error"),
+        ("incomplete", "Completed"),
+        ("cannotStart", "Error"),
+    ]
+    .map(|(what, reason)| failure_of(what, reason));
+    for failure in infrastructure.iter().chain(&agents) {
+        let text = failure.participant_message.as_ref().unwrap_or(&failure.message);
+        let of_the_hosts = [
+            "leaderboard.log of",
+            "agent/agent",
+            "logcopy",
+            "s3://",
+            "gpu-3",
+            "Look at",
+            "Job",
+            "agent.resources",
+        ];
+        for word in of_the_hosts {
+            assert!(!text.contains(word), "{}: {text}", failure.reason);
+        }
+        let next = ["submit again", "Rebuild"];
+        assert!(
+            next.iter().any(|step| text.contains(step)),
+            "{}: {text}",
+            failure.reason
+        );
+        assert_eq!(
+            failure.class == FailureClass::Infrastructure,
+            text.contains("Your agent is not the cause."),
+            "{text}"
+        );
+    }
+}
+
+#[test]
+fn hosts_are_sent_to_the_log_and_the_participant_to_the_agent() {
+    let crashed = failure_of("exited", "Error");
+    assert_eq!(
+        crashed.message,
+        "Agent 2 crashed 5 times. Look at agent/agent2/leaderboard.log of the results; the participant fixes the agent and \
+         submits again."
+    );
+    assert_eq!(
+        crashed.participant_message.as_deref(),
+        Some(
+            "Agent 2 crashed 5 times. Run the agent on routes of your own, fix it and submit again; the challenge's hosts have \
+             its log."
+        )
+    );
 }

@@ -198,6 +198,10 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         told(Standing::Wanted),
         told(Standing::Resumed),
         told(Standing::Ended),
+        Some(crate::controller::view::EvalaiInfo {
+            phase: Some(9),
+            ..info()
+        }),
     ];
     let ends = vec![
         None,
@@ -216,6 +220,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
             .collect::<Vec<_>>(),
     );
     (select(infos), cancels, select(ends), error).prop_map(|(info, (cancelled, overtaken), end, error)| EvalaiView {
+        team_id: None,
         info,
         cancelled,
         overtaken,

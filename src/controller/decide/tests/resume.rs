@@ -1,9 +1,11 @@
 //! Higher attempts: what is kept, what is renewed, and what is not theirs.
 
+use serde_json::json;
+
 use super::builders::*;
 use crate::api::State::{Cancelled, Failed, Finished, Pending, Resumed};
-use crate::api::conditions::{FINISHED, PUBLISHED};
-use crate::api::reasons;
+use crate::api::conditions::{FINISHED, PUBLISHED, STALLED};
+use crate::api::{names, reasons};
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{EvalaiView, ReportSight};
 
@@ -146,4 +148,50 @@ fn the_image_is_the_first_attempts() {
         ..EvalaiView::default()
     });
     assert_eq!(world.pass().status.plan.unwrap().image, "team/agent:1");
+}
+
+fn note(world: &mut World, record: &serde_json::Value) {
+    let annotations = world.submission().metadata.annotations.get_or_insert_default();
+    annotations.insert(names::ANNOTATION_INGESTED.into(), record.to_string());
+}
+
+#[test]
+fn an_attempt_that_no_message_has_announced_is_shown() {
+    for (numbers, shown) in [(json!([2]), true), (json!([]), false), (json!([1]), false)] {
+        let mut world = failed();
+        note(
+            &mut world,
+            &json!({"message": "sweep", "sent": 1_767_225_600_000_i64, "withoutMessage": numbers}),
+        );
+        world.submission().spec.attempt = 2;
+        let plan = world.pass_to(Pending, reasons::PREPARING);
+        let found = plan
+            .events
+            .iter()
+            .find(|e| e.reason == reasons::ATTEMPT_WITHOUT_MESSAGE);
+        assert_eq!(found.is_some(), shown);
+        if let Some(found) = found {
+            assert!(
+                found.warning && found.message.contains("since 2026-01-01T00:00:00Z"),
+                "{}",
+                found.message
+            );
+        }
+    }
+}
+
+#[test]
+fn an_attempt_that_does_not_begin_is_shown_until_a_person_begins_it() {
+    let mut world = failed();
+    let refused = json!({"attempt": 2, "at": 1_767_225_600_000_i64});
+    note(&mut world, &json!({"message": "a", "sent": 1, "refused": refused}));
+    let plan = world.pass_to(Failed, reasons::AGENT_CRASHED);
+    let said = reasons::ATTEMPT_WITHOUT_MESSAGE;
+    assert_eq!(condition(&plan, STALLED), ("True".into(), said.into()));
+    assert_eq!(events(&plan), [said]);
+    assert_eq!(events(&world.pass()), [""; 0], "once");
+    world.submission().spec.attempt = 2;
+    world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass();
+    assert_ne!(condition(&plan, STALLED).1, said);
 }

@@ -324,3 +324,25 @@ fn a_pull_that_fails_in_mid_run_is_shown_and_does_not_end_it() {
     let plan = world.pass_to(Running, reasons::IMAGE_PULL);
     assert_eq!(plan.status.failure, None);
 }
+
+#[test]
+fn an_image_name_that_the_kubelet_refuses_fails_at_once() {
+    let words = "Failed to apply default image tag \"team/Agent\": couldn't parse image name";
+    let mut world = World::local().with_pod();
+    world.see(waiting("agent-1", "InvalidImageName", words));
+    world.pass_to(Pending, reasons::STOPPING);
+    world.job_gone();
+    let failure = world.pass_to(Failed, reasons::IMAGE_INVALID).status.failure.unwrap();
+    assert_eq!(failure.class, Participant);
+    assert!(
+        failure.message.contains("couldn't parse image name. Submit again"),
+        "{}",
+        failure.message
+    );
+    is_shown_then_fails(
+        waiting("simulator-1", "InvalidImageName", words),
+        reasons::IMAGE_PULL,
+        Infrastructure,
+        reasons::IMAGE_PULL,
+    );
+}

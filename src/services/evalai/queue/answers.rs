@@ -8,14 +8,14 @@ use std::time::Duration;
 use jiff::SignedDuration;
 
 use super::poll::pause;
-use super::sub::Sub;
+use super::sub::{RETRY_END, Sub};
 use super::{Busy, Now, Queue, Ticket};
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::payload::digest;
 use crate::services::evalai::request::{Reply, Request, Subject};
 use crate::services::evalai::row::Row;
-use crate::services::evalai::status::Status;
-use crate::services::evalai::types::{Changed, Ended};
+use crate::services::evalai::status::{Outcome, Status};
+use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
 
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);
@@ -72,7 +72,7 @@ impl Queue {
 
     fn took_row(&mut self, subject: &Subject, requested: Duration, answer: Answer<Row>, now: &Now) {
         let lane = self.lanes.entry(subject.pk).or_default();
-        lane.busy = None;
+        let for_write = lane.busy.take() == Some(Busy::ReadForWrite);
         let row = match answer {
             Answer::Done(row) if row.id == subject.pk => row,
             Answer::Refused(Refusal {
@@ -85,6 +85,7 @@ impl Queue {
             lane.unsure = false;
         }
         let sure = !lane.unsure;
+        lane.checked = (for_write && sure).then_some(now.at);
         self.spread(&Arc::new(row), requested, now, |sub| {
             if sure {
                 sub.view.unanswered_until = None;
@@ -109,19 +110,20 @@ impl Queue {
         }
     }
 
-    fn took_image(&mut self, subject: &Subject, answer: Answer<String>, now: &Now) {
+    fn took_image(&mut self, subject: &Subject, answer: Answer<ImageAnswer>, now: &Now) {
         self.lanes.entry(subject.pk).or_default().busy = None;
         self.change(subject, |sub| {
-            let error = answer.error();
-            sub.view.image = match answer {
-                Answer::Done(image) => Some(Ok(image)),
+            sub.view.image = Some(match answer {
+                Answer::Done(image) => {
+                    sub.view.last_error = None;
+                    image
+                }
                 other => {
                     let why = other.error().unwrap_or_default();
                     sub.read_failed(why.clone(), now);
-                    Some(Err(why))
+                    ImageAnswer::Unread(why)
                 }
-            };
-            sub.view.last_error = error;
+            });
         });
     }
 
@@ -146,12 +148,11 @@ impl Queue {
             Answer::Throttled(_) => {}
             Answer::Refused(refusal) => self.refused(subject, request, refusal, now),
             Answer::Broken(why) => {
-                let retry = self.timing.retry_end;
                 self.change(subject, |sub| {
                     // Part of it may have been done.
                     (sub.outdated, sub.wrote_at) = (true, now.at);
                     drop_partial(sub, request);
-                    sub.write_failed(why, broken_pause(sub.write_failures, retry), now);
+                    sub.write_failed(why, broken_pause(sub.write_failures), now);
                 });
             }
             Answer::Unanswered(silence) => self.unanswered(subject, silence, now),
@@ -159,15 +160,11 @@ impl Queue {
     }
 
     fn refused(&mut self, subject: &Subject, request: &Request, refusal: Refusal, now: &Now) {
-        let retry = self.timing.retry_end;
         self.change(subject, |sub| match (refusal.about, request) {
             (About::Token, _) => {}
             (About::Missing, _) => sub.outdated = true,
-            (About::Request, Request::Final(..)) => {
-                sub.view.end = Some(Ended::Refused(refusal.message.clone()));
-                sub.write_failed(refusal.message, retry, now);
-            }
-            (About::Request, _) => {
+            (About::Request, Request::Final(..)) => sub.refuse_end(refusal.message, now),
+            (About::Request | About::Challenge, _) => {
                 drop_partial(sub, request);
                 sub.write_failed(refusal.message, pause(sub.write_failures), now);
             }
@@ -214,11 +211,11 @@ impl Queue {
 
 /// The wait before a write that EvalAI broke down over is tried again: short while it may be an outage, whose end nobody
 /// announces; long once it must be this row, which only EvalAI's own people can mend.
-fn broken_pause(failures: u32, of_the_row: Duration) -> Duration {
+fn broken_pause(failures: u32) -> Duration {
     if failures < OUTAGE_TRIES {
         (pause(failures) * 6).min(OUTAGE_PAUSE)
     } else {
-        of_the_row
+        RETRY_END
     }
 }
 
@@ -238,9 +235,16 @@ fn done(sub: &mut Sub, request: &Request, now: &Now) {
         }
         Request::Final(_, outcome, _) => {
             let (outcome, at) = (*outcome, now.wall);
+            let wanted = sub.end.as_ref().map_or(outcome, |want| want.what.0);
+            let deleted = sub.view.row.as_ref().map(|row| row.status);
+            let deleted = deleted.filter(|status| *status == Status::Deleted);
             sub.wrote(Status::parse(outcome.as_str()), now);
-            // A newer wish that came meanwhile is too late: what EvalAI has taken stands.
-            sub.close(Ended::Published { outcome, at });
+            sub.close(if outcome == Outcome::Cancelled && wanted != outcome {
+                Ended::Otherwise(deleted.unwrap_or(Status::Cancelled))
+            } else {
+                // A newer wish that came meanwhile is too late: what EvalAI has taken stands.
+                Ended::Published { outcome, at }
+            });
         }
         _ => {}
     }

@@ -8,9 +8,8 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use super::poll::Challenge;
-use super::sub::Sub;
+use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
-use crate::services::evalai::guard::{End, Verdict};
 use crate::services::evalai::request::{Purpose, Request, Subject};
 use crate::services::evalai::status::{Outcome, Progress};
 use crate::services::evalai::types::Key;
@@ -29,10 +28,8 @@ const RECHECK: Duration = Duration::from_secs(1);
 pub(super) enum Priority {
     /// Not of the API.
     Free,
-    /// An end whose read has just been answered.
-    EndNow,
-    /// A partial result whose read has: it would be worth nothing a moment later.
-    PartialNow,
+    /// A write whose read has just been answered: it would be worth nothing a moment later.
+    Write,
     End,
     CancelList,
     Acceptance,
@@ -55,13 +52,9 @@ enum What {
 enum Step {
     Get,
     /// A read that is worth nothing without the write that follows it.
-    GetForEnd,
-    /// The same for a partial result.
-    GetForPartial,
+    GetForWrite,
     Image,
-    Progress,
-    Partial,
-    End,
+    Write(Write),
 }
 
 /// A request that is due at `ready`.
@@ -76,13 +69,14 @@ struct Offer {
 impl Queue {
     /// The next request, and marks it as sent. `may_write` is the fence: false keeps every write back.
     pub fn next(&mut self, now: Now, may_write: bool) -> Next {
+        self.open_writes(&now);
         let (due, later): (Vec<_>, Vec<_>) = self
             .offers(&now, may_write)
             .into_iter()
             .partition(|offer| offer.ready <= now.at);
         let first = |one: &&Offer, other: &&Offer| (one.priority, one.since).cmp(&(other.priority, other.since));
         let best = due.iter().min_by(first);
-        // Ends wait for room for two requests; the list of the runs that are to stop goes in between.
+        // Writes wait for room for two requests; the list of the runs that are to stop goes in between.
         let list = due
             .iter()
             .filter(|offer| offer.priority == Priority::CancelList)
@@ -96,7 +90,8 @@ impl Queue {
                 .iter()
                 .map(|offer| offer.ready)
                 .chain(not_yet.iter().map(|(at, _)| *at));
-            return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).min());
+            let opens = (!self.open).then_some(self.not_before);
+            return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).chain(opens).min());
         };
         match self.start(&best.what, &now) {
             Some(request) => {
@@ -112,23 +107,23 @@ impl Queue {
         }
     }
 
-    /// When the budget has room: every read for an end keeps one request back for the write that follows it.
+    /// When the budget has room: every read for a write keeps one request back for the write that follows it.
     fn affordable_at(&self, now: &Now, offer: &Offer) -> Duration {
         let reserved = self
             .lanes
             .values()
-            .filter(|lane| lane.busy == Some(Busy::ReadForEnd))
+            .filter(|lane| lane.busy == Some(Busy::ReadForWrite))
             .count();
         let reserved = u32::try_from(reserved).unwrap_or(u32::MAX);
         let count = match (&offer.what, offer.priority) {
             (_, Priority::Free) => return now.at,
-            (_, Priority::EndNow | Priority::PartialNow) => 1,
-            (What::Sub(_, Step::GetForEnd | Step::GetForPartial), _) => reserved.saturating_add(2),
+            (_, Priority::Write) => 1,
+            (What::Sub(_, Step::GetForWrite), _) => reserved.saturating_add(2),
             _ => reserved.saturating_add(1),
         };
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
         // A list that is due, and a write whose read is made, may use what the others leave.
-        let urgent = [Priority::EndNow, Priority::PartialNow, Priority::CancelList].contains(&offer.priority);
+        let urgent = [Priority::Write, Priority::CancelList].contains(&offer.priority);
         let keep = if urgent { 0 } else { self.budget.kept() };
         self.budget.ready_keeping(now.at, count, keep).max(token)
     }
@@ -189,105 +184,47 @@ impl Queue {
         may_write: bool,
         by_list: bool,
     ) -> Option<(Priority, Duration, bool, Step)> {
-        if may_write {
-            if let Some(want) = &sub.end {
-                return Some(self.step_to_end(sub, lane, now, want.what.0, want.since));
-            }
-            if let Some(step) = self.step_to_progress(sub, lane, now) {
-                return Some(step);
-            }
+        let write = if may_write {
+            self.step_to_write(sub, lane, now)
+        } else {
+            None
+        };
+        if write.is_some_and(|(priority, ..)| priority != Priority::Rest) {
+            return write;
         }
         if let Some(asked) = &sub.asked {
             let alone = asked.listed || !by_list;
             return alone.then_some((Priority::Acceptance, asked.since, false, Step::Get));
         }
-        if sub.image
-            && !matches!(sub.view.image, Some(Ok(_)))
-            && sub.view.row.as_ref().is_some_and(|row| row.input_file.is_some())
-        {
+        if sub.wants_image() {
             return Some((Priority::Free, now.at, false, Step::Image));
         }
-        let read_at = sub.read.map_or(Duration::ZERO, |read| read.requested);
-        if may_write && let Some(partial) = &sub.partial {
-            if lane.unsure || sub.outdated || sub.read.is_none() {
-                return Some((Priority::Rest, partial.since, true, Step::Get));
-            }
-            let window = self.timing.window;
-            if sub.partial_verdict() == Some(Verdict::Send) {
-                if within(sub.clear_at, window, now) {
-                    let is_read = within(sub.read.map(|read| read.answered), window, now);
-                    let priority = if is_read && sub.read_for_partial {
-                        Priority::PartialNow
-                    } else {
-                        Priority::Rest
-                    };
-                    return Some((priority, partial.since, true, Step::Partial));
-                }
-                if self.lists_are_late(sub, window) || partial.since + self.timing.patience <= now.at {
-                    return Some((Priority::Rest, partial.since, true, Step::GetForPartial));
-                }
-            }
+        if write.is_some() {
+            return write;
         }
-        let stale = sub.read.is_none() || sub.outdated || read_at + self.timing.refresh <= now.at;
-        (sub.live.is_some() && stale).then_some((Priority::Rest, read_at, false, Step::Get))
+        let due = sub.read.unwrap_or_default() + self.timing.refresh;
+        let stale = sub.read.is_none() || sub.outdated || due <= now.at;
+        (sub.live.is_some() && stale).then_some((Priority::Rest, due, false, Step::Get))
     }
 
-    fn step_to_end(
-        &self,
-        sub: &Sub,
-        lane: &Lane,
-        now: &Now,
-        outcome: Outcome,
-        since: Duration,
-    ) -> (Priority, Duration, bool, Step) {
-        let fresh = within(sub.read.map(|read| read.answered), self.fresh(), now);
-        if !lane.unsure && fresh && sub.end_verdict() == Some(End::Put) {
-            return (Priority::EndNow, since, true, Step::End);
+    /// What the next write needs: a read, then at once the write, if the read allows it.
+    fn step_to_write(&self, sub: &Sub, lane: &Lane, now: &Now) -> Option<(Priority, Duration, bool, Step)> {
+        let (write, since) = sub.next_write()?;
+        let is_checked = lane
+            .checked
+            .is_some_and(|at| now.at.saturating_sub(at) <= self.timing.fresh);
+        if is_checked && sub.may_write(write) {
+            return Some((Priority::Write, since, true, Step::Write(write)));
         }
-        // Ends that EvalAI breaks down over must not keep it from being asked for cancellations.
-        let priority = if outcome == Outcome::Cancelled || sub.write_failures > 1 {
-            Priority::Cancelled
-        } else {
-            Priority::End
+        let is_cancel = sub.end.as_ref().is_some_and(|end| end.what.0 == Outcome::Cancelled);
+        let priority = match write {
+            // Ends that EvalAI breaks down over must not keep it from being asked for cancellations.
+            Write::End if is_cancel || sub.write_failures > 1 => Priority::Cancelled,
+            Write::End => Priority::End,
+            Write::Progress => Priority::Progress,
+            Write::Partial => Priority::Rest,
         };
-        (priority, since, true, Step::GetForEnd)
-    }
-
-    /// Progress waits for the next list of cancelled ones where that comes soon; else it is worth a read of its own.
-    fn step_to_progress(&self, sub: &Sub, lane: &Lane, now: &Now) -> Option<(Priority, Duration, bool, Step)> {
-        let since = sub.progress.as_ref()?.since;
-        let get = Some((Priority::Progress, since, true, Step::Get));
-        let verdict = sub.progress_verdict();
-        if lane.unsure || sub.outdated || verdict.is_none() {
-            return get;
-        }
-        let late = self.lists_are_late(sub, self.timing.slow_list);
-        let seen = if late {
-            sub.read.map(|read| read.answered)
-        } else {
-            sub.fresh_at
-        };
-        if verdict == Some(Verdict::Send) && within(seen, self.fresh(), now) {
-            return Some((Priority::Progress, since, true, Step::Progress));
-        }
-        if late {
-            return Some((Priority::Progress, since, true, Step::GetForEnd));
-        }
-        let soon = |challenge: &Challenge| challenge.period <= self.timing.fresh * 2 && !challenge.cancel.is_failing();
-        let listed = sub.live.is_some() && self.challenges.get(&sub.challenge).is_some_and(soon);
-        if listed { None } else { get }
-    }
-
-    /// Whether lists take so long that somebody may have cancelled since they were asked for: a read of one's own tells of
-    /// a past that is nearer.
-    fn lists_are_late(&self, sub: &Sub, window: Duration) -> bool {
-        let late = |challenge: &Challenge| challenge.cancel.is_late_for(window);
-        sub.live.is_some() && self.challenges.get(&sub.challenge).is_some_and(late)
-    }
-
-    /// How old a read may be when an end or progress follows it: a small budget needs its time.
-    fn fresh(&self) -> Duration {
-        self.timing.fresh + self.budget.interval() * 2
+        Some((priority, since, true, Step::GetForWrite))
     }
 
     fn offers_of(&self, id: i64, challenge: &Challenge, by_list: bool) -> Vec<Offer> {
@@ -345,7 +282,6 @@ impl Queue {
 
     fn start_sub(&mut self, key: &Key, step: Step) -> Option<Request> {
         let sub = self.subs.get_mut(key)?;
-        sub.read_for_partial = step == Step::GetForPartial;
         let subject = Subject {
             key: key.clone(),
             challenge: sub.challenge,
@@ -353,25 +289,23 @@ impl Queue {
             attempt: sub.run.attempt,
         };
         let request = match step {
-            Step::Get | Step::GetForEnd | Step::GetForPartial => Request::Get(subject),
+            Step::Get | Step::GetForWrite => Request::Get(subject),
             Step::Image => Request::Image(subject, sub.view.row.as_ref()?.input_file.clone()?),
-            Step::Progress => {
+            Step::Write(Write::Progress) => {
                 let progress = sub.progress.as_ref()?.what;
                 let named = sub.view.row.as_ref().is_some_and(|row| row.names(&sub.run.job));
                 Request::Progress(subject, progress, (!named).then(|| sub.run.job.clone()))
             }
-            Step::Partial => Request::Partial(subject, sub.partial.as_ref()?.what.clone()),
-            Step::End => {
-                let (outcome, payload) = sub.end.as_ref()?.what.clone();
-                Request::Final(subject, outcome, payload)
-            }
+            Step::Write(Write::Partial) => Request::Partial(subject, sub.partial.as_ref()?.what.clone()),
+            Step::Write(Write::End) => Request::Final(subject, sub.outcome()?, sub.end.as_ref()?.what.1.clone()),
         };
-        let busy = match step {
-            Step::GetForEnd | Step::GetForPartial => Busy::ReadForEnd,
+        let lane = self.lanes.entry(sub.pk).or_default();
+        lane.checked = None;
+        lane.busy = Some(match step {
+            Step::GetForWrite => Busy::ReadForWrite,
             _ if request.is_write() => Busy::Write,
             _ => Busy::Read,
-        };
-        self.lanes.entry(sub.pk).or_default().busy = Some(busy);
+        });
         Some(request)
     }
 
@@ -398,10 +332,6 @@ impl Queue {
 /// Earlier, or as it is at the beginning of time.
 fn back(at: Timestamp, by: SignedDuration) -> Timestamp {
     at.checked_sub(by).unwrap_or(at)
-}
-
-fn within(answered: Option<Duration>, limit: Duration, now: &Now) -> bool {
-    answered.is_some_and(|at| now.at.saturating_sub(at) <= limit)
 }
 
 impl Progress {

@@ -5,13 +5,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::SignedDuration;
 
-use super::sub::Sub;
 use super::{Now, Queue};
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
 use crate::services::evalai::row::{Row, Split};
+use crate::services::evalai::status::Status;
 use crate::services::evalai::types::{Changed, SweepRow};
 
 /// What the sweep has found is not handed out again for so long.
@@ -23,14 +23,9 @@ impl Queue {
     /// Takes in what is not about one submission.
     pub(super) fn took_of_challenge(&mut self, request: &Request, requested: Duration, reply: Reply, now: &Now) {
         match (request, reply) {
-            (
-                Request::List {
-                    challenge,
-                    purpose,
-                    after,
-                },
-                Reply::Rows(answer),
-            ) => self.took_list(*challenge, *purpose, *after, requested, answer, now),
+            (Request::List { challenge, purpose, .. }, Reply::Rows(answer)) => {
+                self.took_list(*challenge, *purpose, requested, answer, now)
+            }
             (Request::Phases(id), Reply::Phases(answer)) => {
                 self.looked(*id, answer, now, |look, phases| {
                     look.phases = Some(phases.iter().map(|phase| phase.id).collect());
@@ -53,15 +48,7 @@ impl Queue {
         }
     }
 
-    fn took_list(
-        &mut self,
-        id: i64,
-        purpose: Purpose,
-        after: Timestamp,
-        requested: Duration,
-        answer: Answer<Vec<Row>>,
-        now: &Now,
-    ) {
+    fn took_list(&mut self, id: i64, purpose: Purpose, requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
         let accept = self.timing.accept;
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
@@ -87,24 +74,11 @@ impl Queue {
             }
         };
         challenge.poll(purpose).done(requested, now.at, every);
-        let mut cancelled = std::collections::BTreeSet::new();
         for row in rows {
-            cancelled.insert(row.id);
             if matches!(purpose, Purpose::SweepSubmitted | Purpose::SweepResuming) {
                 self.sweep_row(id, &row, now);
             }
             self.spread(&Arc::new(row), requested, now, |_| {});
-        }
-        if purpose == Purpose::Cancel {
-            let covered = |sub: &&mut Sub| sub.challenge == id && sub.submitted_at().is_some_and(|at| at > after);
-            for sub in self
-                .subs
-                .values_mut()
-                .filter(covered)
-                .filter(|sub| !cancelled.contains(&sub.pk))
-            {
-                sub.not_cancelled(requested, now);
-            }
         }
         self.listed(id, purpose, requested);
     }
@@ -139,11 +113,17 @@ impl Queue {
         if age < lost || time < since || said || self.pks.contains_key(&row.id) {
             return;
         }
+        // All that this queue serves is of one server.
+        let Some(target) = self.served.values().find(|target| target.challenge == id) else {
+            return;
+        };
         challenge.swept.insert(row.id, (time, now.at));
         self.sweep.push(SweepRow {
+            server: target.api_server.clone(),
             challenge: id,
             phase,
             submission: row.id,
+            is_resuming: row.status == Status::Resuming,
             time,
         });
     }
@@ -166,6 +146,7 @@ impl Queue {
             }
             Answer::Throttled(_) => look.poll.busy = false,
             other => {
+                look.is_forbidden = matches!(&other, Answer::Refused(refusal) if refusal.about == About::Challenge);
                 look.error = other.error();
                 look.restart();
                 look.poll.failed(now.at, RETRY_LOOK);

@@ -6,7 +6,8 @@
 //! - the budget of the token, priorities by [`choose`], oldest first within one;
 //! - one request in flight for a submission, whatever it is, and [`MAX_IN_FLIGHT`] in all;
 //! - after a write without an answer nothing for that submission until the server must have given up, then a read;
-//! - each write follows a read (or a list of cancelled ones) that is only moments old, judged by [`super::guard`].
+//! - each write follows at once a read of its own, judged by [`super::guard`]: the server overwrites whatever it was told in
+//!   between, a cancel above all.
 
 mod answers;
 mod choose;
@@ -51,39 +52,29 @@ pub struct Now {
 pub struct Timing {
     /// Nothing for a submission after a write without an answer: the server's own limit of 60 s, and a margin.
     pub hold: Duration,
-    /// Partial results follow a list or read by no more: a cancel in between is lost.
-    pub window: Duration,
-    /// A partial result that has missed the lists for so long is worth a read of its own.
-    pub patience: Duration,
-    /// Progress follows a list that takes no more than half of this; else a read of its own.
-    pub slow_list: Duration,
-    /// An end and progress follow a read by no more, plus what two requests cost.
+    /// A write follows the answer to its read by no more; else it is read again.
     pub fresh: Duration,
     /// Between two lists of new submissions.
     pub accept: Duration,
     /// A message that has not come for so long is lost.
     pub lost: Duration,
-    /// A live submission is read again, in case somebody else has ended it.
+    /// A live submission is read again, in case somebody has ended it in a way that no list tells. Above all its participant
+    /// may have deleted it: that leaves its status as it is, so the list of cancelled ones never holds it; and no list has
+    /// those that are partially evaluated.
     pub refresh: Duration,
     /// Between two checks of a challenge's leaderboards.
     pub check: Duration,
-    /// Before a refused or broken end is tried again.
-    pub retry_end: Duration,
 }
 
 impl Default for Timing {
     fn default() -> Self {
         Self {
             hold: Duration::from_secs(75),
-            window: Duration::from_millis(500),
-            patience: Duration::from_secs(45),
-            slow_list: Duration::from_secs(2),
-            fresh: Duration::from_secs(5),
+            fresh: Duration::from_secs(1),
             accept: Duration::from_secs(5),
             lost: Duration::from_mins(2),
-            refresh: Duration::from_mins(10),
+            refresh: Duration::from_mins(1),
             check: Duration::from_hours(1),
-            retry_end: Duration::from_mins(10),
         }
     }
 }
@@ -112,12 +103,14 @@ struct Lane {
     hold_until: Duration,
     /// A write was not answered: read before anything is written.
     unsure: bool,
+    /// Answer of a read that was made for a write, until anything else is sent.
+    checked: Option<Duration>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Busy {
     Read,
-    ReadForEnd,
+    ReadForWrite,
     Write,
 }
 
@@ -128,6 +121,8 @@ pub struct Queue {
     budget: Budget,
     /// No write before.
     not_before: Duration,
+    /// That moment has come, and everything that waited for it knows.
+    open: bool,
     subs: BTreeMap<Key, Sub>,
     pks: BTreeMap<i64, BTreeSet<Key>>,
     lanes: BTreeMap<i64, Lane>,
@@ -146,6 +141,7 @@ impl Queue {
             timing,
             budget: Budget::new(requests_per_minute, now.at),
             not_before,
+            open: not_before <= now.at,
             subs: BTreeMap::new(),
             pks: BTreeMap::new(),
             lanes: BTreeMap::new(),
@@ -205,6 +201,18 @@ impl Queue {
         self.lanes.values().any(|lane| lane.hold_until > now.at)
     }
 
+    /// Wakes what waited for the first write, once, when it may be sent.
+    fn open_writes(&mut self, now: &Now) {
+        if self.open || now.at < self.not_before {
+            return;
+        }
+        self.open = true;
+        let waiting = self.subs.iter().filter(|(_, sub)| sub.next_write().is_some());
+        let waiting = waiting.map(|(key, _)| Changed::Submission(key.clone()));
+        let boards = self.served.keys().cloned().map(Changed::Leaderboard);
+        self.changes.extend(waiting.chain(boards));
+    }
+
     /// Wants to know whether an attempt may run, and its image where the object has none. This and the two below say
     /// whether they brought anything new.
     pub fn ask(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, image: bool, now: Now) -> bool {
@@ -228,7 +236,7 @@ impl Queue {
         let Some(sub) = self.enter(target, key, pk, run) else {
             return false;
         };
-        let news = !sub.is_over() && sub.live != Some(submitted_at);
+        let news = !sub.has_end() && sub.live != Some(submitted_at);
         if news {
             sub.live = Some(submitted_at);
         }
@@ -305,6 +313,13 @@ impl Queue {
         self.token_refused.as_ref().map(|(why, _)| why.as_str())
     }
 
+    /// What EvalAI last said of the token's rights on the challenge of a Leaderboard, if it has none.
+    pub fn challenge_refused(&self, leaderboard: &Key) -> Option<&str> {
+        let target = self.served.get(leaderboard)?;
+        let look = &self.challenges.get(&target.challenge)?.look;
+        look.error.as_deref().filter(|_| look.is_forbidden)
+    }
+
     /// Objects to wake.
     pub fn take_changes(&mut self) -> BTreeSet<Changed> {
         std::mem::take(&mut self.changes)
@@ -348,20 +363,18 @@ impl Queue {
 
 fn wish_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
     let further = sub.view.progress >= Some(wanted) || sub.progress.as_ref().is_some_and(|p| p.what >= wanted);
-    if further || has_end(sub) {
+    if further || sub.has_end() {
         return false;
     }
-    sub.progress = Some(Wanted {
-        what: wanted,
-        since: now.at,
-    });
+    let since = sub.progress.as_ref().map_or(now.at, |progress| progress.since);
+    sub.progress = Some(Wanted { what: wanted, since });
     sub.settle(&now);
     true
 }
 
 fn wish_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
     let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == payload);
-    if has_end(sub) || pending || sub.partial_sent == Some(digest(&payload)) {
+    if sub.has_end() || pending || sub.partial_sent == Some(digest(&payload)) {
         return false;
     }
     if let Err(why) = check(&payload, &target.split, &target.labels) {
@@ -380,25 +393,17 @@ fn wish_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Paylo
         .end
         .as_ref()
         .is_some_and(|end| !matches!(end, Ended::Refused(_)));
-    let refused = outcome == Outcome::Finished && sub.end_refused == Some(digest(&payload));
     let want = (outcome, payload);
-    if closed || refused || sub.end.as_ref().is_some_and(|end| end.what == want) {
+    if closed || sub.end.as_ref().is_some_and(|end| end.what == want) {
         return false;
     }
-    let whole = match outcome {
-        Outcome::Finished => check(&want.1, &target.split, &target.labels),
-        Outcome::Failed | Outcome::Cancelled => Ok(()),
+    sub.misfit = match outcome {
+        Outcome::Finished => check(&want.1, &target.split, &target.labels).err(),
+        Outcome::Failed | Outcome::Cancelled => None,
     };
     let since = now.at;
     sub.end = Some(Wanted { what: want, since });
-    (sub.progress, sub.partial, sub.view.end, sub.end_refused) = (None, None, None, None);
+    (sub.progress, sub.partial, sub.view.end) = (None, None, None);
     sub.retry_at = sub.retry_at.min(now.at);
-    if let Err(why) = whole {
-        sub.refuse_end(why);
-    }
     true
-}
-
-fn has_end(sub: &Sub) -> bool {
-    sub.end.is_some() || sub.view.end.is_some() || sub.is_over()
 }

@@ -21,8 +21,6 @@ const FIRST_PAUSE: Duration = Duration::from_secs(5);
 pub(super) struct Poll {
     pub busy: bool,
     pub due: Duration,
-    /// How long the last answer took.
-    took: Duration,
     failures: u32,
 }
 
@@ -33,19 +31,8 @@ impl Poll {
         *self = Self {
             busy: false,
             due: (requested + every).max(now + every / 4),
-            took: now.saturating_sub(requested),
             failures: 0,
         };
-    }
-
-    /// Whether too little is left of `window` after its answer to act on it.
-    pub fn is_late_for(&self, window: Duration) -> bool {
-        self.took * 2 > window
-    }
-
-    /// Whether it went wrong last time.
-    pub fn is_failing(&self) -> bool {
-        self.failures > 0
     }
 
     /// It went wrong: again later, and later each time.
@@ -114,6 +101,8 @@ pub(super) struct Look {
     pub catalog: Option<Catalog>,
     /// Why there is no newer one.
     pub error: Option<String>,
+    /// It is that the token's user is no host of the challenge.
+    pub is_forbidden: bool,
 }
 
 impl Look {
@@ -146,7 +135,7 @@ impl Look {
             return;
         };
         let codenames = std::mem::take(&mut self.codenames);
-        self.error = None;
+        (self.error, self.is_forbidden) = (None, false);
         self.catalog = Some(Catalog {
             at,
             phases,

@@ -10,13 +10,14 @@ use jiff::Timestamp;
 use super::Now;
 use super::poll::pause;
 use crate::services::evalai::guard::{self, End, Start, Verdict};
-use crate::services::evalai::payload::digest;
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
-use crate::services::evalai::types::{Ended, Payload, Run, View};
+use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, View};
 
 /// Wait before an unknown word of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
+/// Wait before an end is tried again that was refused, or that EvalAI breaks down over again and again.
+pub(super) const RETRY_END: Duration = Duration::from_mins(10);
 
 /// A wish and since when it is wished.
 #[derive(Debug, Clone)]
@@ -33,11 +34,12 @@ pub(super) struct Asked {
     pub listed: bool,
 }
 
-/// The last read of the row.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Read {
-    pub requested: Duration,
-    pub answered: Duration,
+/// What is written of a submission.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Write {
+    Progress,
+    Partial,
+    End,
 }
 
 #[derive(Debug)]
@@ -54,15 +56,10 @@ pub(super) struct Sub {
     pub end: Option<Wanted<(Outcome, Arc<Payload>)>>,
     /// Digest of the partial results that were last answered.
     pub partial_sent: Option<u64>,
-    /// Digest of the end that was last refused here, before it was sent.
-    pub end_refused: Option<u64>,
-    pub read: Option<Read>,
-    /// The last request of it was a read that reserved the write of a partial result.
-    pub read_for_partial: bool,
-    /// Answer of the last read of it, or of the last list that would have held it, had it been cancelled.
-    pub fresh_at: Option<Duration>,
-    /// Answer of the last read, or request of the last list, that says that it is not cancelled, by whatever attempt.
-    pub clear_at: Option<Duration>,
+    /// Why the end's results are not sent, whatever EvalAI says.
+    pub misfit: Option<String>,
+    /// Request of the last read of the row.
+    pub read: Option<Duration>,
     /// The row is known to be outdated.
     pub outdated: bool,
     /// From when on EvalAI knows of this attempt.
@@ -96,11 +93,8 @@ impl Sub {
             partial: None,
             end: None,
             partial_sent: None,
-            end_refused: None,
+            misfit: None,
             read: None,
-            read_for_partial: false,
-            fresh_at: None,
-            clear_at: None,
             outdated: false,
             known_at: None,
             live_at: None,
@@ -118,21 +112,24 @@ impl Sub {
         let fresh = Self::new(self.pk, self.challenge, run);
         *self = Self {
             read: self.read,
-            read_for_partial: false,
-            fresh_at: self.fresh_at,
-            clear_at: self.clear_at,
             outdated: self.outdated,
             wrote_at: self.wrote_at,
             view: View {
                 row: old.row,
                 read_at: old.read_at,
                 answered: old.answered,
-                image: old.image,
+                // A file that named no image is read once more for each attempt.
+                image: old.image.filter(|image| matches!(image, ImageAnswer::Named(_))),
                 unanswered_until: old.unanswered_until,
                 ..fresh.view.clone()
             },
             ..fresh
         };
+    }
+
+    /// Whether this attempt has come to its end, published or not.
+    pub fn has_end(&self) -> bool {
+        self.end.is_some() || self.view.end.is_some() || self.is_over()
     }
 
     /// Whether nothing more is to be said of this attempt.
@@ -143,6 +140,42 @@ impl Sub {
                 .end
                 .as_ref()
                 .is_some_and(|end| !matches!(end, Ended::Refused(_)))
+    }
+
+    /// What is written next, and since when it is wanted.
+    pub fn next_write(&self) -> Option<(Write, Duration)> {
+        let end = self.end.as_ref().map(|want| (Write::End, want.since));
+        let progress = self.progress.as_ref().map(|want| (Write::Progress, want.since));
+        // Partial results of an attempt that EvalAI does not know yet wait for its `queued` or `running`.
+        let may_follow = self.partial_verdict() != Some(Verdict::Wait);
+        let partial = self.partial.as_ref().filter(|_| may_follow);
+        end.or(progress)
+            .or_else(|| partial.map(|want| (Write::Partial, want.since)))
+    }
+
+    /// Whether the row, as last read, allows it.
+    pub fn may_write(&self, write: Write) -> bool {
+        match write {
+            Write::Progress => self.progress_verdict() == Some(Verdict::Send),
+            Write::Partial => self.partial_verdict() == Some(Verdict::Send),
+            Write::End => self.outcome().is_some(),
+        }
+    }
+
+    /// The end that EvalAI is told: of a submission that was deleted before its end it is `cancelled`, whatever it was here.
+    pub fn outcome(&self) -> Option<Outcome> {
+        match self.end_verdict()? {
+            End::Put if self.problem().is_none() => Some(self.end.as_ref()?.what.0),
+            End::Cancel => Some(Outcome::Cancelled),
+            _ => None,
+        }
+    }
+
+    /// Whether the uploaded file is to be read: until it was read, and for nothing that has come to its end.
+    pub fn wants_image(&self) -> bool {
+        let unread = matches!(self.view.image, None | Some(ImageAnswer::Unread(_)));
+        let has_file = self.view.row.as_ref().is_some_and(|row| row.input_file.is_some());
+        self.image && unread && has_file && !self.has_end()
     }
 
     /// When it was submitted, EvalAI's own word first.
@@ -166,24 +199,19 @@ impl Sub {
         let before = self.view.clone();
         let begun = self.begun(row, requested);
         let start = guard::start(row.status, self.run.attempt, begun);
-        let outdated = requested < self.wrote_at || self.read.is_some_and(|read| requested < read.requested);
+        let outdated = requested < self.wrote_at || self.read.is_some_and(|read| requested < read);
         if outdated {
             // A cancel may since have been overwritten by one of our writes: it still was one.
-            if let Start::Drop(status @ (Status::Cancelled | Status::Archived | Status::Ignored)) = start {
+            if let Start::Drop(status @ (Status::Cancelled | Status::Archived | Status::Ignored | Status::Deleted)) =
+                start
+            {
                 self.stop(status, !calm || requested < self.wrote_at);
             }
             return self.view != before;
         }
         self.view.row = Some(row.clone());
         self.view.read_at = Some(now.wall);
-        self.read = Some(Read {
-            requested,
-            answered: now.at,
-        });
-        self.fresh_at = Some(now.at);
-        if row.status != Status::Cancelled {
-            self.clear_at = Some(now.at);
-        }
+        self.read = Some(requested);
         self.outdated = false;
         match start {
             Start::Unclear => {
@@ -211,21 +239,6 @@ impl Sub {
         self.view != before
     }
 
-    /// A list that would hold it if it were cancelled does not.
-    pub fn not_cancelled(&mut self, requested: Duration, now: &Now) {
-        let cancelled = self
-            .view
-            .row
-            .as_ref()
-            .is_some_and(|row| row.status == Status::Cancelled);
-        if !cancelled {
-            // What it tells may be as old as its request.
-            (self.fresh_at, self.clear_at) = (Some(now.at), self.clear_at.max(Some(requested)));
-        } else if self.read.is_none_or(|read| requested >= read.requested) {
-            self.outdated = true;
-        }
-    }
-
     fn answer(&mut self, requested: Duration) {
         if self.asked.as_ref().is_some_and(|asked| requested >= asked.since) {
             self.asked = None;
@@ -235,7 +248,8 @@ impl Sub {
 
     fn stop(&mut self, status: Status, overtaken: bool) {
         if self.end.is_none() && !self.is_over() {
-            (self.view.ended, self.view.overtaken) = (Some(status), overtaken);
+            self.view.ended = Some(status);
+            self.view.overtaken = overtaken || status == Status::Deleted;
         }
         (self.live, self.progress, self.partial) = (None, None, None);
     }
@@ -243,7 +257,7 @@ impl Sub {
     /// Grants wishes that EvalAI grants already.
     pub fn settle(&mut self, now: &Now) {
         if let Some((Verdict::There, wanted)) = self.progress_verdict().zip(self.progress.clone()) {
-            let known = self.read.map_or(now.at, |read| read.requested);
+            let known = self.read.unwrap_or(now.at);
             self.known_at = Some(self.known_at.unwrap_or(known));
             self.view.progress = self.view.progress.max(Some(wanted.what));
             self.progress = None;
@@ -252,12 +266,13 @@ impl Sub {
             Some(End::Done(status)) => self.close(Ended::Agreed(status)),
             Some(End::Amend(status)) => self.close(Ended::Otherwise(status)),
             Some(End::Wait) => self.retry_at = now.at + UNCLEAR_PAUSE,
-            Some(End::Put) => {
-                if let Some(why) = self.foreign_phase() {
-                    self.refuse_end(why);
+            // A list that brings the row meanwhile does not put the next try off.
+            Some(End::Put) if self.retry_at <= now.at => {
+                if let Some(why) = self.problem() {
+                    self.refuse_end(why, now);
                 }
             }
-            None => {}
+            Some(End::Put | End::Cancel) | None => {}
         }
     }
 
@@ -268,19 +283,19 @@ impl Sub {
         (self.end, self.live, self.progress, self.partial) = (None, None, None, None);
     }
 
-    /// The end can't be had with these texts.
-    pub fn refuse_end(&mut self, why: String) {
-        self.end_refused = self.end.as_ref().map(|want| digest(&want.what.1));
+    /// The end can't be had now. It is tried again from time to time, after a read that finds a later cancel too: so no list
+    /// of cancelled ones is asked for it.
+    pub fn refuse_end(&mut self, why: String, now: &Now) {
         self.view.end = Some(Ended::Refused(why.clone()));
-        self.view.last_error = Some(why);
-        self.end = None;
+        self.live = None;
+        self.write_failed(why, RETRY_END, now);
     }
 
     /// What becomes of the wish for progress; none without one, or without a row.
     pub fn progress_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         let wanted = self.progress.as_ref()?.what;
-        let (begun, told) = (self.begun(row, read.requested), self.told(row, read.requested));
+        let (begun, told) = (self.begun(row, read), self.told(row, read));
         Some(guard::progress(row.status, self.run.attempt, begun, told, wanted))
     }
 
@@ -288,19 +303,20 @@ impl Sub {
     pub fn partial_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         self.partial.as_ref()?;
-        Some(guard::partial(
-            row.status,
-            self.run.attempt,
-            self.begun(row, read.requested),
-        ))
+        Some(guard::partial(row.status, self.run.attempt, self.begun(row, read)))
     }
 
     /// What becomes of the wish for an end; none without one, or without a read since.
     pub fn end_verdict(&self) -> Option<End> {
         let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
-        let since = !self.outdated && read.requested >= want.since && read.requested >= self.wrote_at;
-        let begun = self.begun(row, read.requested);
+        let since = !self.outdated && read >= want.since && read >= self.wrote_at;
+        let begun = self.begun(row, read);
         since.then(|| guard::end(row.status, self.run.attempt, begun, want.what.0))
+    }
+
+    /// Why the end is not sent although EvalAI waits for it.
+    fn problem(&self) -> Option<String> {
+        self.misfit.clone().or_else(|| self.foreign_phase())
     }
 
     /// EvalAI would put the results on another phase's leaderboard without a word.
@@ -310,7 +326,7 @@ impl Sub {
         (*outcome == Outcome::Finished && phase != payload.phase).then(|| {
             let (pk, ours) = (self.pk, payload.phase);
             format!(
-                "EvalAI says that submission {pk} belongs to phase {phase}, not {ours}; apply it with the right phase"
+                "EvalAI says that submission {pk} belongs to phase {phase}, not {ours}; give it the right phase there"
             )
         })
     }

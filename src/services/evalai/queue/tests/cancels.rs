@@ -67,6 +67,7 @@ fn partial_under_way() -> (Bench, Ticket) {
     bench.wait(10.0);
     bench.list("list of cancelled", vec![]);
     bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.get(7, row(7, Status::Running));
     let write = bench.expect("partial 7");
     (bench, write)
 }
@@ -109,6 +110,7 @@ fn an_old_cancellation_does_not_end_a_resumed_attempt() {
     let early = bench.expect("list of cancelled");
     assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, None));
     bench.wish(7, 2, Wish::Queued);
+    bench.get(7, old.clone());
     bench.write("queued 7");
     // Requested before EvalAI answered the PATCH: it shows the end of attempt 1.
     bench.answer(&early, Reply::Rows(Answer::Done(vec![old.clone()])));
@@ -154,9 +156,7 @@ fn after_a_restart_the_job_name_tells_whose_cancellation_it_is() {
 fn a_cancellation_that_a_write_overtook_still_counts() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wait(9.0);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.wait(1.0);
+    bench.wait(10.0);
     let early = bench.expect("list of cancelled");
     bench.expect_nothing();
     bench.wish(7, 1, Wish::Final(Outcome::Failed, results(0.0)));
@@ -173,48 +173,6 @@ fn a_cancellation_that_a_write_overtook_still_counts() {
     bench.write("failed 7");
     bench.answer(&early, Reply::Rows(Answer::Done(vec![row(7, Status::Cancelled)])));
     assert_eq!(bench.view(7).ended, None, "what was published stands");
-}
-
-#[test]
-fn partials_follow_a_list_by_two_seconds_at_most() {
-    let mut bench = Bench::new();
-    bench.running(7);
-    bench.wait(2.1);
-    bench.wish(7, 1, Wish::Partial(results(40.0)));
-    bench.expect_nothing();
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.wait(7.9);
-    bench.list("list of cancelled", vec![]);
-    bench.wait(0.4);
-    let ticket = bench.write("partial 7");
-    assert!(
-        matches!(&ticket.request, Request::Partial(_, payload) if *payload == results(41.0)),
-        "the newest of both"
-    );
-    bench.expect_nothing();
-}
-
-#[test]
-fn a_list_that_does_not_reach_back_far_enough_opens_no_window() {
-    let mut bench = Bench::new();
-    bench.running(7);
-    bench.wait(3.0);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.wait(7.0);
-    let ticket = bench.expect("list of cancelled");
-    let Request::List { challenge, purpose, .. } = ticket.request else {
-        panic!("no list")
-    };
-    let short = Ticket {
-        request: Request::List {
-            challenge,
-            purpose,
-            after: wall(-59),
-        },
-        ..ticket
-    };
-    bench.answer(&short, Reply::Rows(Answer::Done(vec![])));
-    bench.expect_nothing();
 }
 
 #[test]
@@ -238,100 +196,153 @@ fn somebody_elses_end_is_noticed_by_a_read_now_and_then() {
 }
 
 #[test]
-fn a_slow_list_is_too_old_for_partials_and_a_read_takes_its_place() {
+fn a_deleted_submission_is_noticed_within_a_minute_and_cancelled_in_evalai() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wait(10.0);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    let list = bench.expect("list of cancelled");
-    bench.wait(3.0);
-    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
-    bench.get(7, row(7, Status::Running));
-    bench.wait(0.4);
-    bench.write("partial 7");
-    bench.wish(7, 1, Wish::Partial(results(42.0)));
-    bench.wait(0.2);
-    bench.get(7, row(7, Status::Cancelled));
-    bench.expect_nothing();
-    assert_eq!(
-        bench.view(7).ended,
-        Some(Status::Cancelled),
-        "and the read finds the cancellation before the next list"
-    );
-}
-
-#[test]
-fn a_partials_own_read_is_followed_at_once_by_the_partial() {
-    let mut bench = Bench::new();
-    bench.all_running(&[7, 8]);
-    bench.wait(10.0);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    let list = bench.expect("list of cancelled");
-    bench.wait(3.0);
-    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
-    let read = bench.expect("submission 7");
-    // Meanwhile there is what would otherwise come first.
-    bench.ask(9, 1);
-    bench.wish(8, 1, Wish::Final(Outcome::Finished, results(50.0)));
-    bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Running))));
-    bench.write("partial 7");
-    bench.expect("submission 8");
-}
-
-#[test]
-fn a_partial_that_misses_every_list_gets_a_read_of_its_own() {
-    let mut bench = Bench::new();
-    bench.running(7);
-    bench.wait(1.0);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
     let begun = bench.at;
-    loop {
-        bench.wait(5.0);
-        match bench.next() {
-            None => {}
-            Some((name, list)) if name == "list of cancelled" => {
-                bench.answer(&list, Reply::Rows(Answer::Broken("EvalAI answered 500".into())));
-            }
-            Some((name, read)) => {
-                assert_eq!(name, "submission 7");
-                bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Running))));
-                break;
-            }
+    while bench.view(7).ended.is_none() {
+        bench.wait(1.0);
+        // Deleted after the last read, it is in no list of cancelled ones.
+        while let Some((_, ticket)) = bench.next() {
+            let reply = match ticket.request {
+                Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
+                _ => Reply::Row(Answer::Done(row(7, Status::Deleted))),
+            };
+            bench.answer(&ticket, reply);
         }
+        let waited = bench.at.checked_sub(begun).unwrap();
+        assert!(waited <= Duration::from_secs(61), "{waited:?}");
     }
-    let waited = bench.at.checked_sub(begun).unwrap();
-    assert!((45..=55).contains(&waited.as_secs()), "{waited:?}");
-    bench.write("partial 7");
-}
-
-#[test]
-fn the_time_that_a_list_takes_is_taken_off_its_window() {
-    let mut bench = Bench::new();
-    bench.running(7);
-    bench.wait(10.0);
-    let list = bench.expect("list of cancelled");
-    bench.wait(0.2);
-    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
-    bench.wait(0.2);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.write("partial 7");
-    bench.wish(7, 1, Wish::Partial(results(42.0)));
-    bench.wait(0.2);
+    let view = bench.view(7);
+    assert_eq!((view.ended, view.overtaken), (Some(Status::Deleted), true));
+    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(41.0)));
+    bench.get(7, row(7, Status::Deleted));
+    bench.write("cancelled 7");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+    bench.wait(600.0);
     bench.expect_nothing();
 }
 
 #[test]
-fn with_slow_lists_progress_follows_a_read_of_its_own() {
+fn the_end_of_a_deleted_submission_is_cancelled_once_whatever_it_was() {
+    for outcome in [Outcome::Finished, Outcome::Failed] {
+        let mut bench = Bench::new();
+        bench.running(7);
+        bench.wish(7, 1, Wish::Final(outcome, results(43.0)));
+        bench.get(7, row(7, Status::Deleted));
+        bench.write("cancelled 7");
+        assert_eq!(bench.view(7).end, Some(Ended::Otherwise(Status::Deleted)));
+        bench.wait(600.0);
+        bench.expect_nothing();
+    }
+    for outcome in [Outcome::Finished, Outcome::Cancelled] {
+        let mut bench = Bench::new();
+        bench.running(7);
+        bench.wish(7, 1, Wish::Final(outcome, results(43.0)));
+        bench.get(7, row(7, Status::Ignored));
+        bench.expect_nothing();
+        assert!(
+            bench.view(7).end.is_some(),
+            "it had come to its end before it was deleted"
+        );
+    }
+}
+
+#[test]
+fn a_deleted_submission_that_waits_is_found_by_the_sweep() {
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    bench.get(7, row(7, Status::Submitted));
+    bench.serve();
+    bench.list("sweep of submitted", vec![row(7, Status::Deleted)]);
+    assert_eq!(bench.view(7).ended, Some(Status::Deleted));
+}
+
+#[test]
+fn each_write_follows_at_once_a_read_of_its_own() {
+    for (wish, write) in [
+        (Wish::Partial(results(41.0)), "partial 7"),
+        (Wish::Final(Outcome::Cancelled, results(41.0)), "cancelled 7"),
+    ] {
+        let mut bench = Bench::new();
+        bench.all_running(&[7, 8]);
+        bench.wish(7, 1, wish);
+        let read = bench.expect("submission 7");
+        // Meanwhile there is what would otherwise come first.
+        bench.ask(9, 1);
+        bench.wish(8, 1, Wish::Final(Outcome::Finished, results(50.0)));
+        bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Running))));
+        bench.write(write);
+    }
+}
+
+#[test]
+fn a_read_that_is_not_followed_at_once_is_made_again() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.get(7, row(7, Status::Running));
+    // The lease is away for a moment.
+    let now = bench.now();
+    assert!(matches!(bench.queue.next(now, false), Next::Wait(_)));
+    bench.wait(1.1);
+    bench.get(7, row(7, Status::Running));
+    bench.write("partial 7");
+}
+
+/// How long the server works on a write, from its read of the row to its answer.
+const WORK: Duration = Duration::from_millis(80);
+/// One way to the server.
+const WAY: Duration = Duration::from_millis(5);
+
+/// A cancel so long after a list was answered, and a wish two seconds after that list. How long before the server began with
+/// the write that undid the cancel it had come; none if it stands.
+fn undone(wish: &Wish, offset: Duration) -> Option<Duration> {
     let mut bench = Bench::new();
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Submitted));
     bench.live(7, 1);
-    let list = bench.expect("list of cancelled");
-    bench.wait(3.0);
-    bench.answer(&list, Reply::Rows(Answer::Done(vec![])));
-    bench.wait(5.0);
-    bench.wish(7, 1, Wish::Running);
-    bench.get(7, row(7, Status::Submitted));
-    bench.write("running 7");
-    bench.expect_nothing();
+    bench.list("list of cancelled", vec![]);
+    let cancel = bench.at + offset;
+    bench.wait(2.0);
+    bench.wish(7, 1, wish.clone());
+    while let Some((_, ticket)) = bench.next() {
+        bench.at += WAY;
+        let arrived = bench.at;
+        if ticket.request.is_write() {
+            return (cancel <= arrived + WORK).then(|| arrived.saturating_sub(cancel));
+        }
+        bench.at += WAY;
+        let cancelled = cancel <= arrived;
+        let status = if cancelled {
+            Status::Cancelled
+        } else {
+            Status::Submitted
+        };
+        bench.answer(&ticket, Reply::Row(Answer::Done(row(7, status))));
+    }
+    assert_eq!(bench.view(7).ended, Some(Status::Cancelled));
+    None
+}
+
+#[test]
+fn forty_cancels_aimed_between_a_list_and_a_write_are_undone_only_while_the_server_works_on_it() {
+    // The way of the read's answer and of the write; all moments of this clock differ by a little.
+    let on_the_way = WAY * 2 + Duration::from_millis(1);
+    for wish in [Wish::Queued, Wish::Running, Wish::Partial(results(41.0))] {
+        // From the list to the wish in steps of 100 ms, then through read and write in steps of 10 ms.
+        let offsets = (0..20)
+            .map(|step| step * 100)
+            .chain((0..20).map(|step| 1_990 + step * 10));
+        let undone: Vec<_> = offsets
+            .filter_map(|offset| undone(&wish, Duration::from_millis(offset)))
+            .collect();
+        let before = undone.iter().filter(|before| **before > on_the_way).count();
+        println!(
+            "{} of 40 undone, {before} of them before the write was on its way",
+            undone.len()
+        );
+        assert_eq!(before, 0, "{wish:?}: {undone:?}");
+        assert!((5..12).contains(&undone.len()), "{wish:?}: {undone:?}");
+    }
 }

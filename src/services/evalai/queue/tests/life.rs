@@ -8,9 +8,10 @@ fn a_whole_life() {
     bench.running(7);
     assert_eq!(bench.view(7).progress, Some(Progress::Running));
     bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.write("partial 7");
+    bench.read_and_write(7, "partial");
     bench.wish(7, 1, Wish::Partial(results(41.0)));
     bench.expect_nothing();
+    bench.wait(3.0);
     bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
     bench.get(7, row(7, Status::PartiallyEvaluated));
     bench.write("finished 7");
@@ -55,8 +56,24 @@ fn progress_names_the_job_once() {
     let ticket = bench.write("queued 7");
     assert!(matches!(&ticket.request, Request::Progress(_, _, Some(job)) if job == "submission-7-1"));
     bench.wish(7, 1, Wish::Running);
+    let named = Row {
+        jobs: vec!["submission-7-1".into()],
+        ..row(7, Status::Queued)
+    };
+    bench.get(7, named);
     let ticket = bench.write("running 7");
     assert!(matches!(&ticket.request, Request::Progress(_, _, None)));
+}
+
+#[test]
+fn queued_is_left_out_where_running_is_wanted_already() {
+    let mut bench = Bench::new();
+    bench.wish(7, 1, Wish::Queued);
+    let read = bench.expect("submission 7");
+    bench.wish(7, 1, Wish::Running);
+    bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Submitted))));
+    bench.write("running 7");
+    bench.expect_nothing();
 }
 
 #[test]
@@ -73,6 +90,7 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
     for status in [
         Status::Cancelled,
         Status::Archived,
+        Status::Deleted,
         Status::Ignored,
         Status::Finished,
         Status::Failed,
@@ -116,6 +134,7 @@ fn results_that_cannot_be_right_are_not_sent() {
         ..Payload::default()
     });
     bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
+    bench.get(7, row(7, Status::Running));
     assert!(matches!(bench.view(7).end, Some(Ended::Refused(_))));
     bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
     bench.expect_nothing();
@@ -189,12 +208,56 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
     let used = bench.queue.budget_used(now);
     let ticket = bench.expect("image 7");
     bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
-    assert!(matches!(bench.view(7).image, Some(Err(_))));
+    assert!(matches!(bench.view(7).image, Some(ImageAnswer::Unread(_))));
     bench.wait(5.0);
     let ticket = bench.expect("image 7");
-    bench.answer(&ticket, Reply::Image(Answer::Done("registry.example/a:1".into())));
-    assert_eq!(bench.view(7).image, Some(Ok("registry.example/a:1".into())));
+    let named = ImageAnswer::Named("registry.example/a:1".into());
+    bench.answer(&ticket, Reply::Image(Answer::Done(named.clone())));
+    assert_eq!(bench.view(7).image, Some(named));
     assert_eq!(bench.queue.budget_used(now), used);
     bench.wait(100.0);
     bench.expect_nothing();
+}
+
+/// A submission whose image is asked for, up to the download of its file.
+fn image_wanted(bench: &mut Bench, attempt: i64) -> Ticket {
+    let now = bench.now();
+    bench.queue.ask(&target(), &key(7), 7, &run(7, attempt), true, now);
+    let found = Row {
+        input_file: Some("http://files/x.json".into()),
+        ..row(7, Status::Resuming)
+    };
+    bench.get(7, found);
+    bench.expect("image 7")
+}
+
+#[test]
+fn a_file_that_was_read_and_names_no_image_is_not_read_again_in_that_attempt() {
+    let mut bench = Bench::new();
+    let ticket = image_wanted(&mut bench, 1);
+    let problem = ImageAnswer::NotAnImage("the uploaded file is no JSON".into());
+    bench.answer(&ticket, Reply::Image(Answer::Done(problem.clone())));
+    assert_eq!(
+        (bench.view(7).image, bench.view(7).last_error),
+        (Some(problem), None),
+        "it is an answer, not a failed request"
+    );
+    for _ in 0..20 {
+        bench.wait(60.0);
+        bench.expect_nothing();
+    }
+    image_wanted(&mut bench, 2);
+}
+
+#[test]
+fn the_file_of_a_submission_that_is_over_is_not_fetched() {
+    let mut bench = Bench::new();
+    let ticket = image_wanted(&mut bench, 1);
+    bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
+    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(0.0)));
+    bench.get(7, row(7, Status::Cancelled));
+    for _ in 0..20 {
+        bench.wait(60.0);
+        bench.expect_nothing();
+    }
 }

@@ -13,6 +13,7 @@ use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
 use crate::services::evalai::status::Status;
+use crate::services::evalai::types::ImageAnswer;
 use crate::services::token::Token;
 
 /// A queue whose time is ours.
@@ -194,30 +195,42 @@ impl Bench {
         ticket
     }
 
+    /// The next requests have to be the read of a running submission and this write, which EvalAI takes.
+    fn read_and_write(&mut self, pk: i64, name: &str) -> Ticket {
+        self.get(pk, row(pk, Status::Running));
+        self.write(&format!("{name} {pk}"))
+    }
+
     fn list(&mut self, name: &str, rows: Vec<Row>) -> Ticket {
         let ticket = self.expect(name);
         self.answer(&ticket, Reply::Rows(Answer::Done(rows)));
         ticket
     }
 
-    /// Several submissions that run, with the budget at rest after it.
+    /// Several submissions that run, each of them read once more.
     fn all_running(&mut self, pks: &[i64]) {
         for pk in pks {
             self.live(*pk, 1);
             self.wish(*pk, 1, Wish::Running);
-            while let Some((_, ticket)) = self.next() {
-                let reply = match ticket.request {
-                    Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
-                    Request::Get(_) => Reply::Row(Answer::Done(row(*pk, Status::Submitted))),
-                    _ => Reply::Written(Answer::Done(())),
-                };
-                self.answer(&ticket, reply);
-            }
+            self.answer_all(Status::Submitted);
             self.wait(5.0);
         }
-        self.wait(60.0);
-        self.list("list of cancelled", vec![]);
-        self.expect_nothing();
+        for _ in 0..30 {
+            self.wait(2.0);
+            self.answer_all(Status::Running);
+        }
+    }
+
+    /// Answers all that is sent now: nothing was cancelled, every row says this, every write is taken.
+    fn answer_all(&mut self, status: Status) {
+        while let Some((_, ticket)) = self.next() {
+            let reply = match &ticket.request {
+                Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
+                Request::Get(subject) => Reply::Row(Answer::Done(row(subject.pk, status))),
+                _ => Reply::Written(Answer::Done(())),
+            };
+            self.answer(&ticket, reply);
+        }
     }
 
     /// A submission of attempt 1 that runs in EvalAI's eyes too, after the first list.
@@ -227,8 +240,10 @@ impl Bench {
         self.live(pk, 1);
         self.list("list of cancelled", vec![]);
         self.wish(pk, 1, Wish::Queued);
+        self.get(pk, row(pk, Status::Submitted));
         self.write(&format!("queued {pk}"));
         self.wish(pk, 1, Wish::Running);
+        self.get(pk, row(pk, Status::Queued));
         self.write(&format!("running {pk}"));
         self.expect_nothing();
     }

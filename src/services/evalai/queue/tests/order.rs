@@ -39,7 +39,7 @@ fn priorities() {
     bench.write("failed 3");
     bench.wait(0.5);
     bench.expect_nothing();
-    bench.wait(1.4);
+    bench.wait(1.9);
     let ticket = bench.expect("submission 2");
     bench.answer(&ticket, Reply::Row(Answer::Done(row(2, Status::Running))));
     bench.write("cancelled 2");
@@ -102,6 +102,7 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         ..row(pk, Status::Submitted)
     };
     let resumed = Row {
+        status: Status::Resuming,
         resumed_at: Some(wall(-200)),
         ..at(5, -1_000_000)
     };
@@ -117,9 +118,13 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         .queue
         .take_sweep()
         .into_iter()
-        .map(|row| (row.submission, row.time))
+        .map(|row| (row.server, row.submission, row.is_resuming, row.time))
         .collect();
-    assert_eq!(swept, [(1, wall(-1000)), (5, wall(-200))]);
+    let server = target().api_server;
+    assert_eq!(
+        swept,
+        [(server.clone(), 1, false, wall(-1000)), (server, 5, true, wall(-200))]
+    );
     let mut again = 0;
     for _ in 0..11 {
         bench.wait(60.0);
@@ -199,6 +204,7 @@ fn lists_keep_their_period_however_slow_they_are() {
     }
     // A server that needs longer than that is never asked twice at the same time, and is given a rest.
     let ticket = bench.expect("list of cancelled");
+    bench.get(7, row(7, Status::Running));
     bench.wait(25.0);
     bench.expect_nothing();
     bench.answer(&ticket, Reply::Rows(Answer::Done(vec![])));

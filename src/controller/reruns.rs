@@ -1,0 +1,149 @@
+//! Re-runs: EvalAI cancels the row of a submission that a host re-runs, and makes a new row under a new id. The new row keeps the
+//! Job names of the old one, which lead from the new Submission to the old.
+//!
+//! `observe` finds the original of a new submission, the feed of the watches notes it from the status, and the reconcile of the
+//! original takes it from here. Pure; knows no client.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::ResourceExt;
+use kube::runtime::reflector::ObjectRef;
+
+use crate::api::{Rerun, Submission};
+use crate::services::evalai::row::Row;
+
+/// The newest Submission that a row is a re-run of; `known` looks a Submission of the same namespace up by its name. A
+/// participant can edit the row, so only a Submission of the same Leaderboard, phase and team is taken.
+pub(super) fn original(
+    row: &Row,
+    submission: &Submission,
+    known: impl Fn(&str) -> Option<Arc<Submission>>,
+) -> Option<Rerun> {
+    let time = row.resumed_at?;
+    let is_original = |other: &Submission| {
+        let team = other.status.as_ref().and_then(|s| s.team.as_ref()?.id.clone());
+        let of_phase = |s: &Submission| s.spec.evalai.map(|e| (e.challenge, e.phase));
+        other.spec.leaderboard == submission.spec.leaderboard
+            && of_phase(other) == of_phase(submission)
+            && team.is_some()
+            && team == row.team_id.map(|id| id.to_string())
+    };
+    let names = row.jobs.iter().rev().filter_map(|job| submission_of(job));
+    let mut others = names.filter(|name| *name != submission.name_any());
+    let name = others.find(|name| known(name).is_some_and(|other| is_original(&other)))?;
+    Some(Rerun {
+        submission_name: name.to_owned(),
+        time: Some(Time(time)),
+    })
+}
+
+/// The Submission of the first Job of an attempt, `<name>-<attempt>`.
+fn submission_of(job: &str) -> Option<&str> {
+    let (name, attempt) = job.rsplit_once('-')?;
+    attempt.parse::<i64>().ok()?;
+    Some(name)
+}
+
+/// Which submissions were re-run, by namespace and name of the original: the re-run's name and when.
+#[derive(Default)]
+pub struct Reruns(Mutex<HashMap<(String, String), Rerun>>);
+
+impl Reruns {
+    /// Takes in a Submission that was changed or is gone. Returns the original that has to know of it.
+    pub fn moved(&self, submission: &Submission, is_gone: bool) -> Option<ObjectRef<Submission>> {
+        let of = submission.status.as_ref()?.rerun_of.as_ref()?;
+        let namespace = submission.namespace().unwrap_or_default();
+        let key = (namespace.clone(), of.submission_name.clone());
+        let rerun = Rerun {
+            submission_name: submission.name_any(),
+            time: of.time.clone(),
+        };
+        let mut known = self.lock();
+        if is_gone {
+            if known.get(&key) == Some(&rerun) {
+                known.remove(&key);
+            }
+            return None;
+        }
+        let is_new = known.insert(key, rerun.clone()).as_ref() != Some(&rerun);
+        is_new.then(|| ObjectRef::new(&of.submission_name).within(&namespace))
+    }
+
+    /// What a submission was re-run as.
+    pub fn of(&self, submission: &Submission) -> Option<Rerun> {
+        let key = (submission.namespace().unwrap_or_default(), submission.name_any());
+        self.lock().get(&key).cloned()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<(String, String), Rerun>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn submission(id: i64, leaderboard: &str, phase: i64, team: &str) -> Submission {
+        let spec = json!({"leaderboard": leaderboard, "evalai": {"challenge": 1, "phase": phase, "submission": id}});
+        let mut submission = Submission::new(&format!("submission-{id}"), serde_json::from_value(spec).unwrap());
+        submission.metadata.namespace = Some("ns".into());
+        submission.status = Some(serde_json::from_value(json!({"team": {"id": team}})).unwrap());
+        submission
+    }
+
+    fn row(jobs: &[&str], is_again: bool) -> Row {
+        let again = is_again.then_some("2026-11-20T10:00:00Z");
+        let row =
+            json!({"id": 9, "status": "submitted", "participant_team": 3, "rerun_resumed_at": again, "job_name": jobs});
+        serde_json::from_value(row).unwrap()
+    }
+
+    #[test]
+    fn the_job_names_of_a_row_lead_to_its_original() {
+        let all = [
+            submission(7, "lb", 2, "3"),
+            submission(8, "lb", 2, "3"),
+            submission(4, "other", 2, "3"),
+            submission(5, "lb", 1, "3"),
+            submission(6, "lb", 2, "66"),
+        ];
+        let known = |name: &str| all.iter().find(|s| s.name_any() == name).cloned().map(Arc::new);
+        let new = submission(9, "lb", 2, "3");
+        let found = |row: &Row| original(row, &new, known).map(|rerun| rerun.submission_name);
+        for (jobs, expected) in [
+            (&["submission-7-1"][..], Some("submission-7")),
+            (&["submission-7-1", "submission-7-2"], Some("submission-7")),
+            (&["submission-7-1", "submission-8-1"], Some("submission-8")),
+            (&["submission-7-1", "submission-9-1"], Some("submission-7")),
+            (&["submission-4-1", "submission-5-1", "submission-6-1"], None),
+            (&["submission-1-1", "nothing", "-", "submission-7-x"], None),
+            (&[], None),
+        ] {
+            assert_eq!(found(&row(jobs, true)).as_deref(), expected, "{jobs:?}");
+        }
+        assert_eq!(found(&row(&["submission-7-1"], false)), None, "it was not re-run");
+    }
+
+    #[test]
+    fn an_original_is_woken_once_by_its_rerun() {
+        let reruns = Reruns::default();
+        let mut new = submission(9, "lb", 2, "3");
+        assert_eq!(reruns.moved(&new, false), None);
+        let of = json!({"submissionName": "submission-7", "time": "2026-11-20T10:00:00Z"});
+        new.status.as_mut().unwrap().rerun_of = serde_json::from_value(of).unwrap();
+        let woken = reruns.moved(&new, false).unwrap();
+        assert_eq!(
+            (woken.name.as_str(), woken.namespace.as_deref()),
+            ("submission-7", Some("ns"))
+        );
+        assert_eq!(reruns.moved(&new, false), None, "it knows");
+        let rerun = reruns.of(&submission(7, "lb", 2, "3")).unwrap();
+        assert_eq!(rerun.submission_name, "submission-9");
+        reruns.moved(&new, true);
+        assert_eq!(reruns.of(&submission(7, "lb", 2, "3")), None);
+    }
+}

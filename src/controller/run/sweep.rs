@@ -1,0 +1,173 @@
+//! Submissions whose message was lost: each row that EvalAI's lists show becomes a Submission of the Leaderboard that serves it.
+//!
+//! Started by the controller's leader. What a row means for the object of its name is decided by `ingest`.
+
+use std::sync::Arc;
+
+use kube::runtime::reflector::Store;
+use kube::{Api, Client, ResourceExt};
+use tokio::sync::mpsc;
+
+use crate::api::{Evalai, Leaderboard, Submission, names};
+use crate::bridge::ingest::{self, Incoming, Outcome, Source};
+use crate::services::evalai::SweepRow;
+
+/// Takes rows in until their sender is gone.
+pub(super) async fn into_cluster(
+    client: Client,
+    leaderboards: Store<Leaderboard>,
+    mut rows: mpsc::UnboundedReceiver<SweepRow>,
+) {
+    while let Some(row) = rows.recv().await {
+        let all = leaderboards.state();
+        let Some(board) = serving(&all, &row) else { continue };
+        take(&client, board, &row).await;
+    }
+}
+
+async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
+    let namespace = board.namespace().unwrap_or_default();
+    let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
+    let incoming = Incoming {
+        challenge: row.challenge,
+        phase: row.phase,
+        submission: row.submission,
+        image: None,
+        source: Source::Sweep {
+            is_resuming: row.is_resuming,
+        },
+        sent_ms: row.time.as_millisecond(),
+    };
+    let (server, leaderboard) = (&row.server, board.name_any());
+    let submission = format!("{namespace}/{}", names::submission(row.submission));
+    match ingest::apply(&api, &leaderboard, &incoming).await {
+        Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "it is known"),
+        Ok(Outcome::Refused) => {
+            tracing::warn!(
+                server,
+                submission,
+                leaderboard,
+                "EvalAI's row asks for another attempt, and no message has announced it: none begins"
+            );
+        }
+        Ok(Outcome::IdTaken(owner)) => {
+            tracing::warn!(server, submission, leaderboard, owner, "the name is taken");
+        }
+        Ok(outcome) => {
+            tracing::info!(
+                server,
+                submission,
+                leaderboard,
+                %outcome,
+                "EvalAI waits for a submission whose message was lost"
+            );
+        }
+        Err(error) => tracing::warn!(server, submission, leaderboard, %error, "not ingested"),
+    }
+}
+
+/// The oldest Leaderboard of the row's server that serves its phase: the same one that the bridge and `Ready` name.
+fn serving<'a>(all: &'a [Arc<Leaderboard>], row: &SweepRow) -> Option<&'a Arc<Leaderboard>> {
+    let serves = |l: &&Arc<Leaderboard>| {
+        let is_of_server = l.spec.evalai.as_ref().map(Evalai::server).as_ref() == Some(&row.server);
+        is_of_server && l.serves(row.challenge, row.phase) && l.metadata.deletion_timestamp.is_none()
+    };
+    all.iter().filter(serves).min_by_key(|l| l.seniority())
+}
+
+#[cfg(test)]
+mod tests {
+    use http::{Request, Response};
+    use jiff::Timestamp;
+    use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+    use kube::client::Body;
+    use kube::runtime::reflector::store::Writer;
+    use kube::runtime::watcher::Event;
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    /// A Leaderboard of challenge 1 with phase 2, created at this second, in a namespace of its own name.
+    fn board(name: &str, second: i64, server: &str) -> Leaderboard {
+        let spec = json!({
+            "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}],
+            "results": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+        });
+        let mut board = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
+        board.metadata.namespace = Some(name.into());
+        board.metadata.creation_timestamp = Some(Time(Timestamp::from_second(second).unwrap()));
+        board
+    }
+
+    fn row(server: &str, phase: i64) -> SweepRow {
+        SweepRow {
+            server: server.into(),
+            challenge: 1,
+            phase,
+            submission: 7,
+            is_resuming: false,
+            time: Timestamp::from_second(100).unwrap(),
+        }
+    }
+
+    #[test]
+    fn a_row_belongs_to_the_oldest_leaderboard_of_its_own_server() {
+        let mut going = board("going", 0, "https://staging");
+        going.metadata.deletion_timestamp = Some(Time(Timestamp::from_second(50).unwrap()));
+        let all = [
+            going,
+            board("old", 1, "https://eval.ai/"),
+            board("staging", 2, "https://Staging"),
+            board("younger", 3, "https://staging/"),
+        ];
+        let all: Vec<_> = all.into_iter().map(Arc::new).collect();
+        for (row, wanted) in [
+            (row("https://eval.ai", 2), Some("old")),
+            (row("https://staging", 2), Some("staging")),
+            (row("https://staging", 3), None),
+            (row("https://other", 2), None),
+        ] {
+            let found = serving(&all, &row).map(|l| l.name_any());
+            assert_eq!(found.as_deref(), wanted, "{row:?}");
+        }
+    }
+
+    /// Answers with what was sent, and hands back each path.
+    fn cluster() -> (Client, mpsc::UnboundedReceiver<(String, Value)>) {
+        let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
+        let (tell, asked) = mpsc::unbounded_channel();
+        tokio::spawn(async move {
+            while let Some((request, answer)) = handle.next_request().await {
+                let line = format!("{} {}", request.method(), request.uri().path());
+                let body = request.into_body().collect_bytes().await.unwrap();
+                let _ = tell.send((line, serde_json::from_slice(&body).unwrap()));
+                answer.send_response(Response::new(Body::from(body.to_vec())));
+            }
+        });
+        (Client::new(service, "default"), asked)
+    }
+
+    #[tokio::test]
+    async fn two_servers_with_the_same_ids_are_kept_apart() {
+        let mut writer = Writer::<Leaderboard>::default();
+        writer.apply_watcher_event(&Event::Init);
+        for board in [board("stand-in", 1, "http://one"), board("real", 2, "http://two")] {
+            writer.apply_watcher_event(&Event::InitApply(board));
+        }
+        writer.apply_watcher_event(&Event::InitDone);
+        let (client, mut asked) = cluster();
+        let (sender, rows) = mpsc::unbounded_channel();
+        for server in ["http://two", "http://one"] {
+            sender.send(row(server, 2)).unwrap();
+        }
+        drop(sender);
+        into_cluster(client, writer.as_reader(), rows).await;
+        for name in ["real", "stand-in"] {
+            let (line, object) = asked.recv().await.unwrap();
+            let path = "/apis/leaderboard.carla.org/v1alpha1/namespaces";
+            assert_eq!(line, format!("POST {path}/{name}/submissions"));
+            assert_eq!(object["spec"]["leaderboard"], name);
+        }
+    }
+}

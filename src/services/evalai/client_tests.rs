@@ -1,0 +1,106 @@
+//! The client against a server of the test's own, that treats connections as servers do.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+
+use super::super::request::Purpose;
+use super::super::status::{Outcome, Progress};
+use super::super::types::Key;
+use super::*;
+
+/// Reads one request, with its body. False at the end of the connection.
+async fn read(stream: &mut TcpStream) -> bool {
+    let mut seen = Vec::new();
+    let mut buffer = [0; 4096];
+    loop {
+        match stream.read(&mut buffer).await {
+            Ok(0) | Err(_) => return false,
+            Ok(count) => seen.extend_from_slice(&buffer[..count]),
+        }
+        let text = String::from_utf8_lossy(&seen).to_ascii_lowercase();
+        let Some((head, body)) = text.split_once("\r\n\r\n") else {
+            continue;
+        };
+        let length = head
+            .split("content-length: ")
+            .nth(1)
+            .and_then(|rest| rest.split("\r\n").next());
+        if body.len() >= length.map_or(0, |length| length.parse().unwrap()) {
+            return true;
+        }
+    }
+}
+
+/// Serves one request a connection, and keeps it open as if for more. The next bytes on it come when it has just been given up.
+async fn serve(listener: TcpListener, reused: Arc<AtomicUsize>) {
+    while let Ok((mut stream, _)) = listener.accept().await {
+        let reused = reused.clone();
+        tokio::spawn(async move {
+            if read(&mut stream).await {
+                let answer = b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\ncontent-length: 2\r\n\r\n[]";
+                stream.write_all(answer).await.unwrap();
+            }
+            if read(&mut stream).await {
+                reused.fetch_add(1, Ordering::SeqCst);
+            }
+        });
+    }
+}
+
+fn subject() -> Subject {
+    Subject {
+        key: Key {
+            namespace: "carla".into(),
+            name: "submission-7".into(),
+            uid: "7".into(),
+        },
+        challenge: 1,
+        pk: 7,
+        attempt: 1,
+    }
+}
+
+#[tokio::test]
+async fn no_request_is_lost_on_a_connection_that_the_server_gives_up() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let reused = Arc::new(AtomicUsize::new(0));
+    tokio::spawn(serve(listener, reused.clone()));
+    let client = Client::new(&url, Timeouts::default()).unwrap();
+    let token = Token::parse("x").unwrap();
+    let list = Request::List {
+        challenge: 1,
+        purpose: Purpose::Cancel,
+        after: Timestamp::UNIX_EPOCH,
+    };
+    let requests = [
+        list.clone(),
+        Request::Progress(subject(), Progress::Queued, None),
+        list.clone(),
+        Request::Progress(subject(), Progress::Running, None),
+        Request::Final(subject(), Outcome::Failed, Arc::default()),
+        list,
+    ];
+    for request in requests {
+        let answer = client.send(&token, &request).await.answer();
+        assert_eq!(answer, Answer::Done(()), "{}", request.name());
+    }
+    assert_eq!(reused.load(Ordering::SeqCst), 0);
+}
+
+#[tokio::test]
+async fn a_write_to_a_server_that_is_not_there_was_not_sent() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    drop(listener);
+    let client = Client::new(&url, Timeouts::default()).unwrap();
+    let write = Request::Progress(subject(), Progress::Queued, None);
+    let answer = client.send(&Token::parse("x").unwrap(), &write).await.answer();
+    assert!(
+        matches!(&answer, Answer::Unanswered(silence) if !silence.sent),
+        "{answer:?}"
+    );
+}
