@@ -136,8 +136,7 @@ pub async fn run(client: Client, aws: Aws, tasks: Tasks, settings: Settings) -> 
             biased;
             failed = tasks.failed() => return Err(failed),
             () = tasks.stop().wait() => break,
-            // The watch's task holds the sender: its end is a failed task.
-            changed = world.changed() => if changed.is_err() { std::future::pending().await },
+            () = changed(&mut world) => {}
         }
         let wished = wished(&world.borrow_and_update());
         pollers.adjust(&wished);
@@ -145,6 +144,13 @@ pub async fn run(client: Client, aws: Aws, tasks: Tasks, settings: Settings) -> 
     pollers.drain().await;
     watch_task.abort();
     Ok(())
+}
+
+/// Waits for another world. The watch's task holds the sender: when that is gone, the task has failed.
+async fn changed(world: &mut watch::Receiver<World>) {
+    if world.changed().await.is_err() {
+        std::future::pending::<()>().await;
+    }
 }
 
 /// The queues that Leaderboards name, each reached as the oldest of them says.
@@ -282,6 +288,7 @@ mod tests {
         assert_eq!(shared.check_pulse().await, Err("no answer within 5 s".to_owned()));
         assert_eq!(begun.elapsed(), PULSE_LIMIT);
     }
+
     /// Lists one Leaderboard to the watch; answers nothing else, so that no queue is asked.
     async fn list_one(mut handle: Handle) {
         let board = crate::bridge::route::tests::board("a", 1);

@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex};
 
 use axum::http::{Request, StatusCode};
 use evalai_stand_in::Config;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{Api, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_operator::api::{Leaderboard, Submission, conditions};
@@ -77,6 +78,12 @@ async fn start(elsewhere: &Elsewhere, folder: &Path, namespace: &str, program: &
     command.spawn().unwrap()
 }
 
+fn is_true(conditions: Option<&Vec<Condition>>, kind: &str) -> bool {
+    conditions
+        .and_then(|conditions| conditions::get(conditions, kind))
+        .is_some_and(|condition| condition.status == "True")
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_leaderboards_places_go_before_those_of_the_environment() {
     let (aws, elsewhere) = (StandIn::start().await, Elsewhere::start().await);
@@ -128,10 +135,7 @@ async fn a_leaderboards_places_go_before_those_of_the_environment() {
     // Bucket, table, both queues and the token answer.
     let boards: Api<Leaderboard> = Api::namespaced(client.clone(), &namespace);
     let is_ready = |board: Option<&Leaderboard>| {
-        let status = board.and_then(|board| board.status.as_ref());
-        status
-            .and_then(|status| conditions::get(&status.conditions, conditions::READY))
-            .is_some_and(|condition| condition.status == "True")
+        board.is_some_and(|board| is_true(board.status.as_ref().map(|s| &s.conditions), conditions::READY))
     };
     let ready = timeout(LIMIT, await_condition(boards.clone(), "board", is_ready)).await;
     if ready.is_err() {
@@ -171,10 +175,7 @@ async fn a_leaderboards_places_go_before_those_of_the_environment() {
         .await
         .unwrap();
     let is_recorded = |object: Option<&Submission>| {
-        let status = object.and_then(|object| object.status.as_ref());
-        status
-            .and_then(|status| conditions::get(&status.conditions, conditions::RECORDED))
-            .is_some_and(|condition| condition.status == "True")
+        object.is_some_and(|object| is_true(object.status.as_ref().map(|s| &s.conditions), conditions::RECORDED))
     };
     let recorded = await_condition(submissions.clone(), "one", is_recorded);
     if timeout(LIMIT, recorded).await.is_err() {
