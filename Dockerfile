@@ -4,11 +4,14 @@
 
 FROM rust:1.95-bookworm AS build
 WORKDIR /src
+# The commit, for the first line of the log: --build-arg REVISION="$(git rev-parse --short HEAD)"
+ARG REVISION=""
 COPY . .
 # Two builds, as the runner is static and small: it is copied into every Pod and runs inside any image.
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/src/target \
     triple="$(rustc -vV | sed -n 's/^host: //p')" \
-    && cargo build --locked --release -p leaderboard-operator --bin leaderboard-operator \
+    && LEADERBOARD_REVISION="$REVISION" \
+       cargo build --locked --release -p leaderboard-operator --bin leaderboard-operator \
     && RUSTFLAGS="-C target-feature=+crt-static" \
        cargo build --locked --release --target "$triple" -p leaderboard-runner \
     && install -D -t /out target/release/leaderboard-operator "target/$triple/release/leaderboard-runner"

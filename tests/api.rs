@@ -14,6 +14,7 @@ mod api {
     mod bridge;
     mod columns;
     mod definitions;
+    mod endpoints;
     mod evalai;
     mod examples;
     mod failures;

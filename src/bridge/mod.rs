@@ -136,8 +136,7 @@ pub async fn run(client: Client, aws: Aws, tasks: Tasks, settings: Settings) -> 
             biased;
             failed = tasks.failed() => return Err(failed),
             () = tasks.stop().wait() => break,
-            // The watch's task holds the sender: its end is a failed task.
-            changed = world.changed() => if changed.is_err() { std::future::pending().await },
+            () = changed(&mut world) => {}
         }
         let wished = wished(&world.borrow_and_update());
         pollers.adjust(&wished);
@@ -145,6 +144,13 @@ pub async fn run(client: Client, aws: Aws, tasks: Tasks, settings: Settings) -> 
     pollers.drain().await;
     watch_task.abort();
     Ok(())
+}
+
+/// Waits for another world. The watch's task holds the sender: when that is gone, the task has failed.
+async fn changed(world: &mut watch::Receiver<World>) {
+    if world.changed().await.is_err() {
+        std::future::pending::<()>().await;
+    }
 }
 
 /// The queues that Leaderboards name, each reached as the oldest of them says.
@@ -281,5 +287,48 @@ mod tests {
         let begun = Instant::now();
         assert_eq!(shared.check_pulse().await, Err("no answer within 5 s".to_owned()));
         assert_eq!(begun.elapsed(), PULSE_LIMIT);
+    }
+
+    /// Lists one Leaderboard to the watch; answers nothing else, so that no queue is asked.
+    async fn list_one(mut handle: Handle) {
+        let board = crate::bridge::route::tests::board("a", 1);
+        let board = crate::bridge::route::tests::with_queue(board, QUEUE);
+        let list = serde_json::json!({"apiVersion": "v1", "kind": "List", "metadata": {"resourceVersion": "1"},
+            "items": [&*board]});
+        let mut held = Vec::new();
+        while let Some((request, send)) = handle.next_request().await {
+            if request.uri().query().is_some_and(|query| query.contains("limit=500")) {
+                send.send_response(http::Response::new(list.to_string().into_bytes().into()));
+            } else {
+                held.push(send);
+            }
+        }
+    }
+
+    const QUEUE: &str = "https://q/1";
+
+    #[tokio::test(start_paused = true)]
+    async fn the_end_of_a_task_ends_the_bridge_by_its_name() {
+        for name in ["watch of leaderboards", "queue https://q/1"] {
+            let (service, handle) = tower_test::mock::pair();
+            tokio::spawn(list_one(handle));
+            let (_stop, signal) = crate::observability::shutdown::Stop::new();
+            let tasks = Tasks::new(signal);
+            let settings = Settings {
+                namespace: None,
+                health: Arc::default(),
+                observer: Arc::new(()),
+            };
+            let aws = Aws::load().await;
+            let bridge = tokio::spawn(run(Client::new(service, "ns"), aws, tasks.clone(), settings));
+            // Tasks have no event for their start.
+            while !tasks.names().iter().any(|known| known == name) {
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+            tasks.end(name);
+            let ended = tokio::time::timeout(Duration::from_mins(1), bridge).await;
+            let result = ended.unwrap_or_else(|_| panic!("the bridge goes on without {name}"));
+            assert_eq!(result.unwrap().unwrap_err().task, name);
+        }
     }
 }

@@ -58,7 +58,7 @@ fn setting(options: &InPod) -> Result<Setting, String> {
     Setting::read(Places::below(&options.root), pace).map_err(|e| e.to_string())
 }
 
-/// Logs, then works until the end; an error is said once and is the exit code.
+/// Logs, then works until the end; an error is the last line of the log and the exit code.
 fn start<W>(program: &'static str, format: Format, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
@@ -88,11 +88,13 @@ where
             return ExitCode::FAILURE;
         }
     };
-    match runtime.block_on(async { work().await }) {
+    let result = runtime.block_on(async { work().await });
+    // What still runs has no one to work for; a thread that hangs on a disk must not keep the process.
+    runtime.shutdown_background();
+    match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             tracing::error!("{error}");
-            eprintln!("leaderboard-operator: {error}");
             ExitCode::FAILURE
         }
     }

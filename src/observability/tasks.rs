@@ -101,7 +101,7 @@ impl Tasks {
         task
     }
 
-    /// The first failure is the one that is told: others may follow from it.
+    /// The first failure is the one that is reported: others may follow from it.
     fn fail(&self, task: &str, why: String) {
         let failed = TaskFailed {
             task: task.to_owned(),

@@ -15,6 +15,7 @@ use std::time::{Duration, Instant};
 use leaderboard_results::Refusal;
 use leaderboard_runner::protocol::StatusFile;
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
 
 use super::blocking;
 use super::gather::{Gatherer, results_plan};
@@ -25,6 +26,8 @@ use super::ship::Shipper;
 use super::tree::{Tree, TreeError};
 use super::upload::send::Uploader;
 use super::watch::Watch;
+use crate::observability::shutdown;
+use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
 use crate::services::logs::LogClient;
@@ -52,6 +55,9 @@ pub enum LogcopyError {
     /// S3, in a round.
     #[error(transparent)]
     Storage(#[from] ArchiveError),
+    /// Without one of its tasks it would miss a stop, or lines.
+    #[error(transparent)]
+    Task(#[from] TaskFailed),
 }
 
 impl From<std::io::Error> for LogcopyError {
@@ -80,11 +86,18 @@ pub async fn work(
     let limit = u64::try_from(setting.run.plan.storage.limit).unwrap_or(u64::MAX);
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), limit);
 
-    let (shipped, shipping) = ship(&setting, aws, &tree, &uploader);
-    let (stop, stop_watch) = watch_stop(setting.places.clone());
+    let (end, ending) = shutdown::Stop::new();
+    let tasks = Tasks::new(ending);
+    let (shipped, shipping) = ship(&setting, aws, &tree, &uploader, &tasks);
+    let (stop, stop_watch) = watch_stop(setting.places.clone(), &tasks);
     let rounds = Rounds::new(setting, archive, tree, gatherer, uploader, stop);
-    let result = keep_going(rounds, shutdown).await;
+    let result = tokio::select! {
+        biased;
+        failed = tasks.failed() => Err(failed.into()),
+        result = keep_going(rounds, shutdown) => result,
+    };
 
+    end.send_replace(true);
     stop_watch.abort();
     // The task has its own bound on its last pass; nothing to do about one that fails.
     let _ = shipped.send(true);
@@ -100,23 +113,24 @@ fn ship(
     aws: &Aws,
     tree: &Arc<Tree>,
     uploader: &Uploader,
-) -> (watch::Sender<bool>, Option<tokio::task::JoinHandle<()>>) {
+    tasks: &Tasks,
+) -> (watch::Sender<bool>, Option<JoinHandle<Option<()>>>) {
     let (sender, receiver) = watch::channel(false);
     let task = setting.run.log_group.as_ref().map(|group| {
         let plan = &setting.run.plan;
         let client = LogClient::of_group(aws, group);
         let pairs = plan.slices.len();
         let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, uploader.memory());
-        tokio::spawn(shipper.run(SHIP_PERIOD, receiver))
+        tasks.stay("logs to CloudWatch", shipper.run(SHIP_PERIOD, receiver))
     });
     (sender, task)
 }
 
 /// Obeys the stop annotation at once, whatever a round is waiting for: a task reads the downward API's file, writes
 /// `simulation.cancel`, and tells the rounds.
-fn watch_stop(places: Places) -> (watch::Receiver<Option<Stop>>, tokio::task::JoinHandle<()>) {
+fn watch_stop(places: Places, tasks: &Tasks) -> (watch::Receiver<Option<Stop>>, JoinHandle<Option<()>>) {
     let (sender, receiver) = watch::channel(None);
-    let task = tokio::spawn(async move {
+    let task = tasks.stay("watch of the stop annotation", async move {
         let folder = Watch::new(|_| true).ok();
         let status = places.status();
         let mut obeyed = false;
@@ -285,7 +299,9 @@ mod tests {
         let nowhere = "http://127.0.0.1:9";
         let s3 = fixtures::aws(nowhere).await.s3(None, Some(nowhere));
         let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), 1 << 20);
-        let (mut stop, watching) = watch_stop(places.clone());
+        let (_end, ending) = shutdown::Stop::new();
+        let tasks = Tasks::new(ending);
+        let (mut stop, watching) = watch_stop(places.clone(), &tasks);
 
         let (hangs, disk_hangs) = mpsc::channel();
         let (seen, stop_seen) = mpsc::channel();
@@ -307,6 +323,8 @@ mod tests {
             disk.join().unwrap(),
             "the stop was seen only when the disk answered again"
         );
+        // Without the watch no stop would be seen any more, so logcopy ends and starts anew.
         watching.abort();
+        assert_eq!(tasks.failed().await.task, "watch of the stop annotation");
     }
 }

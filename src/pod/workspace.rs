@@ -128,7 +128,6 @@ impl WorkspaceError {
 pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
     let result = prepare_with_own_identity(&setting).await;
     if let Err(error) = &result {
-        tracing::error!("{error}");
         let verdict = error.verdict().to_json();
         if let Err(error) = fs::write(&setting.places.termination_log, verdict) {
             tracing::warn!("the termination log can't be written: {error}");

@@ -142,19 +142,24 @@ impl World {
     }
 
     async fn make_table(&self) {
-        let client = self.aws.aws.dynamodb(None, Some(&self.aws.endpoint));
-        let mut request = client.create_table().table_name(self.table());
-        for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
-            let definition = AttributeDefinition::builder()
-                .attribute_name(key)
-                .attribute_type(ScalarAttributeType::S);
-            let element = KeySchemaElement::builder().attribute_name(key).key_type(role);
-            request = request
-                .attribute_definitions(definition.build().unwrap())
-                .key_schema(element.build().unwrap());
-        }
-        request.billing_mode(BillingMode::PayPerRequest).send().await.unwrap();
+        make_table(&self.aws, &self.table()).await;
     }
+}
+
+/// Makes a table as a Leaderboard expects it.
+pub(super) async fn make_table(aws: &StandIn, name: &str) {
+    let client = aws.aws.dynamodb(None, Some(&aws.endpoint));
+    let mut request = client.create_table().table_name(name);
+    for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
+        let definition = AttributeDefinition::builder()
+            .attribute_name(key)
+            .attribute_type(ScalarAttributeType::S);
+        let element = KeySchemaElement::builder().attribute_name(key).key_type(role);
+        request = request
+            .attribute_definitions(definition.build().unwrap())
+            .key_schema(element.build().unwrap());
+    }
+    request.billing_mode(BillingMode::PayPerRequest).send().await.unwrap();
 }
 
 fn ready(board: Option<&Leaderboard>) -> Option<Condition> {

@@ -3,6 +3,7 @@
 
 mod archives;
 mod cloudwatch;
+mod endpoints;
 mod hostile;
 mod measure;
 mod preparing;

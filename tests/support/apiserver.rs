@@ -74,6 +74,11 @@ impl ApiServer {
         name
     }
 
+    /// The file that programs reach it by, with all rights.
+    pub fn kubeconfig(&self) -> PathBuf {
+        kubeconfig(&self.folder)
+    }
+
     /// A kubectl that speaks to this server and keeps nothing in the user's home.
     pub fn kubectl(&self) -> Command {
         let mut command = Command::new(self.programs.join("kubectl"));

@@ -374,7 +374,8 @@ async fn await_lead(leader: &Leader, seen: &Observability) -> Result<bool, RunEr
         }
         tokio::select! {
             () = seen.stop.wait() => return Ok(false),
-            changed = leadership.changed() => if changed.is_err() { std::future::pending().await },
+            // The task of the Lease has failed, which ends the process.
+            changed = leadership.changed() => if changed.is_err() { seen.stop.wait().await },
         }
     }
 }

@@ -9,7 +9,7 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 use tokio::sync::mpsc;
 
-use super::Touched;
+use super::{Touched, key};
 use crate::api::{Leaderboard, Submission};
 use crate::controller::act::{ActError, act};
 use crate::controller::backoff::BackoffMap;
@@ -146,7 +146,7 @@ fn wake_waiting(
 
 async fn submission_pass(submission: Arc<Submission>, shared: Arc<Shared>) -> Result<Action, PassError> {
     let started = Instant::now();
-    let name = submission.name_any();
+    let name = key(submission.as_ref()).to_string();
     let work = async {
         let view = observe(&shared.context, Arc::clone(&submission)).await;
         let plan = decide(&view);
@@ -170,7 +170,7 @@ async fn submission_pass(submission: Arc<Submission>, shared: Arc<Shared>) -> Re
 
 async fn board_pass(leaderboard: Arc<Leaderboard>, shared: Arc<Shared>) -> Result<Action, PassError> {
     let started = Instant::now();
-    let (name, uid) = (leaderboard.name_any(), uid_of(leaderboard.as_ref()));
+    let (name, uid) = (key(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
     let work = leaderboards::reconcile(leaderboard, Arc::clone(&shared.context));
     let result = match tokio::time::timeout(PASS_LIMIT, work).await {
         Ok(result) => result.map(Some).map_err(PassError::from),
