@@ -10,6 +10,7 @@ use evalai_stand_in::submissions::{NewSubmission, create, rerun};
 use evalai_stand_in::{Config, Handle};
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::coordination::v1::Lease;
 use k8s_openapi::api::core::v1::{Node, Pod, Secret};
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
@@ -363,6 +364,41 @@ async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() 
         "{message}"
     );
     assert!(world.shown(&name).await.contains("re-run as"));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn after_a_controller_that_did_not_confirm_its_requests_everybody_reads_until_when_nothing_is_written() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    // Handed over in order, but without an answer to the last requests.
+    let lease = json!({
+        "metadata": {"name": "operator", "annotations": {leader::ANNOTATION_RELEASED: "1"}},
+        "spec": {"leaseTransitions": 1},
+    });
+    let lease: Lease = serde_json::from_value(lease).unwrap();
+    world.api().create(&PostParams::default(), &lease).await.unwrap();
+    let _controller = world.controller();
+
+    let text = "The controller before may still have requests under way; EvalAI is written to again from ";
+    let says = |board: Option<&Leaderboard>| {
+        let status = board.and_then(|board| board.status.as_ref());
+        let ready = status.and_then(|s| conditions::get(&s.conditions, conditions::READY));
+        ready.is_some_and(|c| c.status == "True" && c.message.starts_with(text))
+    };
+    let seen = timeout(LIMIT, await_condition(world.api::<Leaderboard>(), "lb", says)).await;
+    seen.expect("Ready stays True and has a note").unwrap();
+
+    let (pk, name) = world.submit("lb", 1).await;
+    world.run_that_crashes(pk, &name).await;
+    let waits = |s: &SubmissionStatus| {
+        let published = conditions::get(&s.conditions, conditions::PUBLISHED);
+        published.is_some_and(|c| {
+            c.status == "False" && c.reason == "WaitingForPreviousController" && c.message.starts_with(text)
+        })
+    };
+    world.until(&name, "Published says until when", waits).await;
+    let writes = world.evalai.requests().into_iter().filter(|r| r.method != "GET");
+    assert_eq!(writes.count(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

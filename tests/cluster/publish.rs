@@ -5,7 +5,7 @@ use std::time::Duration;
 use evalai_stand_in::log::Entry;
 use evalai_stand_in::model::Status;
 use leaderboard_operator::api::Submission;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::expected::{assert_finished, assert_results, assert_row, metrics};
 use crate::evalai::Evalai;
@@ -40,6 +40,7 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
         assert_eq!(scene.jobs().await, [format!("{name}-1")]);
         assert_published(scene, &evalai, pk).await;
         assert_requests(&evalai.requests());
+        assert_partials(&evalai.requests());
         for status in ["queued", "running"] {
             assert_eq!(
                 evalai.told("PATCH", status),
@@ -92,6 +93,17 @@ async fn assert_published(scene: &Scene, evalai: &Evalai, pk: u64) {
         assert_eq!(evalai.file(path.as_ref()), scene.cloud.text(&run, key).await, "{key}");
     }
     assert_eq!(evalai.file(row.stderr_file.as_ref()).trim(), "", "nothing went wrong");
+}
+
+/// Before the end EvalAI gets the metrics over the routes so far, not the zeros of the stored file.
+fn assert_partials(requests: &[Entry]) {
+    let is_partial = |entry: &&Entry| entry.method == "PUT" && entry.path.contains("partially_evaluated");
+    for partial in requests.iter().filter(is_partial) {
+        let results: Value = serde_json::from_str(partial.body["result"].as_str().unwrap()).unwrap();
+        let accuracies = results[0]["accuracies"].as_object().unwrap();
+        assert!(accuracies.keys().eq(metrics().keys()), "{accuracies:?}");
+        assert!(accuracies["Driving score"].as_f64() > Some(0.0), "{accuracies:?}");
+    }
 }
 
 /// No minute holds more requests than the budget, and none was refused.
