@@ -5,6 +5,51 @@
 
 use super::*;
 
+/// Submissions that no list will show any more, the way they are after a list that was just answered.
+async fn just_listed(world: &mut World, count: usize) -> Vec<i64> {
+    world.target.period = Duration::from_mins(10);
+    let pks: Vec<i64> = (0..count).map(|_| world.submit()).collect();
+    for pk in &pks {
+        world.ask(*pk, false);
+    }
+    for pk in &pks {
+        world.until(*pk, |view| view.answered == 1).await;
+        world.live(*pk);
+    }
+    world
+        .server
+        .wait_until(|_, log| {
+            let mut lists = log.entries().filter(|entry| entry.path.contains("status=cancelled"));
+            lists.any(|list| list.answered.is_some())
+        })
+        .await;
+    pks
+}
+
+#[tokio::test]
+async fn cancels_between_a_list_and_a_write_are_found_by_the_read_of_that_write() {
+    let mut world = World::new().await;
+    for (index, pk) in just_listed(&mut world, 40).await.into_iter().enumerate() {
+        world.set(pk, Stored::Cancelled);
+        let cancelled = Timestamp::now();
+        let wish = match index % 3 {
+            0 => Wish::Queued,
+            1 => Wish::Running,
+            _ => Wish::Partial(results(&world.target, 41.0)),
+        };
+        world.wish(pk, wish);
+        let view = world.until(pk, |view| {
+            view.ended.is_some() || view.progress.is_some() || view.partial_at.is_some()
+        });
+        let view = view.await;
+        assert_eq!(
+            (view.ended, world.stored(pk)),
+            (Some(Status::Cancelled), Stored::Cancelled)
+        );
+        assert_eq!(written_knowingly(&world.server.requests(), pk, cancelled), None);
+    }
+}
+
 const CANCELS: usize = 1000;
 const OVER: Duration = Duration::from_mins(4);
 /// How long the server works on partial results.
