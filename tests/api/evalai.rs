@@ -247,22 +247,6 @@ fn results(target: &Target, score: f64) -> Arc<Payload> {
     })
 }
 
-/// The write that undid a cancel knowingly: the first one that the server had not answered when it came, if the read right
-/// before it was made after it. What follows a cancel that is undone knows nothing of it.
-fn written_knowingly(log: &[Entry], pk: i64, cancelled: Timestamp) -> Option<&Entry> {
-    let path = format!("/jobs/submission/{pk}");
-    let is_write = |entry: &&Entry| entry.method != "GET" && entry.body["submission"] == json!(pk);
-    let write = log
-        .iter()
-        .filter(is_write)
-        .find(|write| write.answered.is_none_or(|at| at > cancelled))?;
-    let reads = log
-        .iter()
-        .filter(|entry| entry.method == "GET" && entry.path.ends_with(&path));
-    let read = reads.filter(|read| read.time <= write.time).last();
-    (write.time > cancelled && read.is_none_or(|read| read.time > cancelled)).then_some(write)
-}
-
 #[tokio::test]
 async fn a_submission_lives_through_all_of_it() {
     let mut world = World::new().await;
@@ -372,52 +356,6 @@ async fn the_table_of_ends() {
             .count();
         assert_eq!(puts, 0, "{status} {wanted:?} was {before:?}");
     }
-}
-
-#[tokio::test]
-async fn cancels_during_partial_traffic_are_lost_only_inside_a_request() {
-    let world = World::new().await;
-    world.server.set_knobs(Knobs {
-        put_delay_ms: 20,
-        ..Knobs::default()
-    });
-    let pks: Vec<_> = (0..40).map(|_| world.submit()).collect();
-    for pk in &pks {
-        world.set(*pk, Stored::Running);
-        world.live(*pk);
-    }
-    let mut cancelled: BTreeMap<i64, Timestamp> = BTreeMap::new();
-    for (round, pk) in pks.iter().enumerate() {
-        for other in &pks {
-            let score = f64::from(u32::try_from(round).unwrap());
-            world.wish(*other, Wish::Partial(results(&world.target, score)));
-        }
-        // Those that are cancelled get none.
-        let wanted = world.sent("PUT").len() + 5.min(pks.len() - round);
-        world
-            .server
-            .wait_until(|_, log| log.entries().filter(|entry| entry.method == "PUT").count() >= wanted)
-            .await;
-        cancelled.insert(*pk, Timestamp::now());
-        world.set(*pk, Stored::Cancelled);
-    }
-    // Everything that was on its way is answered, and no more is begun.
-    assert!(world.hub.drain().await);
-    let log = world.server.requests();
-    let puts: Vec<_> = log.iter().filter(|entry| entry.method == "PUT").collect();
-    assert!(puts.len() > 100, "{} partials", puts.len());
-    let lost = cancelled
-        .keys()
-        .filter(|pk| world.stored(**pk) != Stored::Cancelled)
-        .count();
-    for (pk, at) in &cancelled {
-        assert_eq!(written_knowingly(&log, *pk, *at), None, "the cancel of submission {pk}");
-    }
-    println!(
-        "{} partials, {} cancels, {lost} overwritten",
-        puts.len(),
-        cancelled.len()
-    );
 }
 
 #[tokio::test]
@@ -555,23 +493,4 @@ async fn a_file_that_names_no_image_is_read_once() {
         assert!(matches!(view.image, Some(ImageAnswer::NotAnImage(_))), "{view:?}");
         assert_eq!(view.last_error, None);
     }
-}
-
-#[tokio::test]
-async fn writes_that_wait_for_the_process_before_are_named_and_their_start_wakes() {
-    let opens = Instant::now() + Duration::from_secs(1);
-    let mut world = World::opened_at(opens).await;
-    let pk = world.submit();
-    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
-    let from = world.hub.writes_from().unwrap();
-    assert!(from > Timestamp::now() && from < Timestamp::now() + SignedDuration::from_secs(2));
-    loop {
-        let Changed::Submission(_) = world.changed.recv().await.unwrap() else {
-            continue;
-        };
-        if world.hub.writes_from().is_none() {
-            break;
-        }
-    }
-    assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
 }
