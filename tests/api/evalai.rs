@@ -143,6 +143,12 @@ impl World {
             .with_state(|state| state.submissions.get_mut(&pk).unwrap().status = status);
     }
 
+    fn delete(&self, pk: i64) {
+        let pk = u64::try_from(pk).unwrap();
+        self.server
+            .with_state(|state| state.submissions.get_mut(&pk).unwrap().ignore_submission = true);
+    }
+
     fn stored(&self, pk: i64) -> Stored {
         self.server.state().submissions[&u64::try_from(pk).unwrap()].status
     }
@@ -298,13 +304,16 @@ async fn the_table_of_ends() {
             world.set(pk, status);
             cases.push((pk, Status::parse(status.as_str()), wanted));
         }
-        let pk = world.submit();
-        let id = u64::try_from(pk).unwrap();
-        world
-            .server
-            .with_state(|state| state.submissions.get_mut(&id).unwrap().ignore_submission = true);
-        cases.push((pk, Status::Ignored, wanted));
-        cases.push((90_000 + pk, Status::Missing, wanted));
+        for (status, seen) in [
+            (Stored::PartiallyEvaluated, Status::Deleted),
+            (Stored::Finished, Status::Ignored),
+        ] {
+            let pk = world.submit();
+            world.set(pk, status);
+            world.delete(pk);
+            cases.push((pk, seen, wanted));
+        }
+        cases.push((90_000 + i64::try_from(cases.len()).unwrap(), Status::Missing, wanted));
     }
     for (pk, _, wanted) in &cases {
         world.wish(*pk, Wish::Final(*wanted, results(&world.target, 43.0)));
@@ -322,6 +331,15 @@ async fn the_table_of_ends() {
             Status::Cancelled | Status::Archived | Status::Ignored | Status::Missing
         );
         match (status, wanted) {
+            (Status::Deleted, Finished | Failed) => {
+                assert_eq!(end, Ended::Otherwise(status), "{wanted:?}");
+                assert_eq!(
+                    world.stored(pk),
+                    Stored::Cancelled,
+                    "it counts as being processed no more"
+                );
+                continue;
+            }
             (Status::Failed, Failed | Cancelled) => assert_eq!(end, Ended::Agreed(status), "{status} {wanted:?}"),
             _ if gone && wanted == Cancelled => assert_eq!(end, Ended::Agreed(status), "{status} {wanted:?}"),
             _ if gone => assert_eq!(end, Ended::Otherwise(status), "{status} {wanted:?}"),
@@ -344,71 +362,27 @@ async fn the_table_of_ends() {
 }
 
 #[tokio::test]
-async fn cancels_during_partial_traffic_are_lost_only_inside_a_request() {
-    let world = World::new().await;
-    world.server.set_knobs(Knobs {
-        put_delay_ms: 20,
-        ..Knobs::default()
-    });
-    let pks: Vec<_> = (0..40).map(|_| world.submit()).collect();
-    for pk in &pks {
-        world.set(*pk, Stored::Running);
-        world.live(*pk);
-    }
-    let mut cancelled: BTreeMap<i64, Timestamp> = BTreeMap::new();
-    for (round, pk) in pks.iter().enumerate() {
-        for other in &pks {
-            let score = f64::from(u32::try_from(round).unwrap());
-            world.wish(*other, Wish::Partial(results(&world.target, score)));
-        }
-        let written = world.sent("PUT").len();
-        world
-            .server
-            .wait_until(|_, log| log.entries().filter(|entry| entry.method == "PUT").count() > written + 4)
-            .await;
-        cancelled.insert(*pk, Timestamp::now());
-        world.set(*pk, Stored::Cancelled);
-    }
-    // Everything that was on its way is answered, and no more is begun.
-    assert!(world.hub.drain().await);
-    let log = world.server.requests();
-    let puts: Vec<_> = log.iter().filter(|entry| entry.method == "PUT").collect();
-    assert!(puts.len() > 100, "{} partials", puts.len());
-    let mut lost = 0;
-    for (pk, at) in &cancelled {
-        let lists: Vec<_> = log
-            .iter()
-            .filter(|e| e.path.contains("status=cancelled") && e.time > *at)
-            .collect();
-        // Sent although a list that was asked for after the cancel had been answered, long enough ago to have arrived.
-        let arrived = |put: &Entry| put.time - SignedDuration::from_secs(1);
-        let knowingly = |put: &Entry| {
-            lists
-                .iter()
-                .any(|list| list.answered.is_some_and(|at| at < arrived(put)))
-        };
-        let mut after = puts
-            .iter()
-            .filter(|put| put.body["submission"] == json!(pk) && put.answered > Some(*at));
-        if world.stored(*pk) == Stored::Cancelled {
-            assert!(
-                !after.any(|put| knowingly(put)),
-                "submission {pk} was written after a list that held it"
-            );
-        } else {
-            // Whoever was overwritten is in no later list: the first write is the one that did it.
-            assert!(
-                !knowingly(after.next().unwrap()),
-                "the cancel of submission {pk} was overwritten knowingly"
-            );
-            lost += 1;
-        }
-    }
-    println!(
-        "{} partials, {} cancels, {lost} overwritten",
-        puts.len(),
-        cancelled.len()
+async fn a_submission_that_was_deleted_while_it_ran_is_noticed_and_cancelled() {
+    let timing = Timing {
+        refresh: Duration::from_millis(100),
+        ..timing()
+    };
+    let mut world = World::with(timing, timeouts()).await;
+    let pk = world.submit();
+    world.live(pk);
+    world.wish(pk, Wish::Partial(results(&world.target, 41.0)));
+    world.until(pk, |view| view.partial_at.is_some()).await;
+    world.delete(pk);
+    let view = world.until(pk, |view| view.ended.is_some()).await;
+    assert_eq!((view.ended, view.overtaken), (Some(Status::Deleted), true));
+    assert_eq!(
+        world.stored(pk),
+        Stored::PartiallyEvaluated,
+        "its deletion ended nothing"
     );
+    world.wish(pk, Wish::Final(Outcome::Cancelled, results(&world.target, 41.0)));
+    assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
+    assert_eq!(world.stored(pk), Stored::Cancelled);
 }
 
 #[tokio::test]
@@ -584,23 +558,4 @@ async fn a_file_that_names_no_image_is_read_once() {
         assert!(matches!(view.image, Some(ImageAnswer::NotAnImage(_))), "{view:?}");
         assert_eq!(view.last_error, None);
     }
-}
-
-#[tokio::test]
-async fn writes_that_wait_for_the_process_before_are_named_and_their_start_wakes() {
-    let opens = Instant::now() + Duration::from_secs(1);
-    let mut world = World::opened_at(opens).await;
-    let pk = world.submit();
-    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
-    let from = world.hub.writes_from().unwrap();
-    assert!(from > Timestamp::now() && from < Timestamp::now() + SignedDuration::from_secs(2));
-    loop {
-        let Changed::Submission(_) = world.changed.recv().await.unwrap() else {
-            continue;
-        };
-        if world.hub.writes_from().is_none() {
-            break;
-        }
-    }
-    assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
 }

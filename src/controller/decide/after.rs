@@ -18,8 +18,8 @@ const AGAIN: Duration = Duration::from_secs(30);
 const FAREWELL_SECONDS: i64 = 120;
 /// What EvalAI calls a row that was cancelled.
 const CANCELLED: &str = "cancelled";
-const TOLD_AGAIN: &str =
-    "A request that was under way may have undone EvalAI's own end; EvalAI is asked, and told again.";
+const TOLD_AGAIN: &str = "EvalAI's own end may not stand there: a request was under way that may have undone it, or the \
+                           submission was deleted before its end. EvalAI is asked, and `cancelled` is written if need be.";
 
 /// Decides for a submission in a terminal state.
 pub(super) fn decide(draft: &mut Draft<'_>) {
@@ -166,10 +166,7 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             published(draft, view.team_id.as_deref());
             Sync::Done
         }
-        Some(EvalaiEnd::Ended { status }) => {
-            amend(draft, &status);
-            Sync::Done
-        }
+        Some(EvalaiEnd::Ended { status }) => amend(draft, &status),
         Some(EvalaiEnd::Refused { message }) => {
             refused(draft, &message);
             Sync::Refused
@@ -268,15 +265,22 @@ fn refused(draft: &mut Draft<'_>, message: &str) {
 }
 
 /// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
-fn amend(draft: &mut Draft<'_>, status: &str) {
+fn amend(draft: &mut Draft<'_>, status: &str) -> Sync {
     draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
     if draft.status.state == Some(State::Cancelled) {
-        return;
+        return Sync::Done;
     }
     draft.status.failure = None;
     let message = format!("EvalAI says {status}, so the result is not published.");
     draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
     draft.say(State::Cancelled, reasons::ENDED_IN_EVALAI, message);
+    if !conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
+        return Sync::Done;
+    }
+    // While EvalAI refused the result, its row was written with the outcome that no longer holds.
+    draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    draft.act(Action::Record { end: true });
+    Sync::Waiting
 }
 
 fn record(draft: &mut Draft<'_>) -> Sync {

@@ -5,6 +5,113 @@
 
 use super::*;
 
+/// The write that undid a cancel knowingly: the first one that the server had not answered when it came, if the read right
+/// before it was made after it. What follows a cancel that is undone knows nothing of it.
+fn written_knowingly(log: &[Entry], pk: i64, cancelled: Timestamp) -> Option<&Entry> {
+    let path = format!("/jobs/submission/{pk}");
+    let is_write = |entry: &&Entry| entry.method != "GET" && entry.body["submission"] == json!(pk);
+    let write = log
+        .iter()
+        .filter(is_write)
+        .find(|write| write.answered.is_none_or(|at| at > cancelled))?;
+    let mut reads = log
+        .iter()
+        .filter(|entry| entry.method == "GET" && entry.path.ends_with(&path));
+    let read = reads.rfind(|read| read.time <= write.time);
+    (write.time > cancelled && read.is_none_or(|read| read.time > cancelled)).then_some(write)
+}
+
+/// Submissions that no list will show any more, the way they are after a list that was just answered.
+async fn just_listed(world: &mut World, count: usize) -> Vec<i64> {
+    world.target.period = Duration::from_mins(10);
+    let pks: Vec<i64> = (0..count).map(|_| world.submit()).collect();
+    for pk in &pks {
+        world.ask(*pk, false);
+    }
+    for pk in &pks {
+        world.until(*pk, |view| view.answered == 1).await;
+        world.live(*pk);
+    }
+    world
+        .server
+        .wait_until(|_, log| {
+            let mut lists = log.entries().filter(|entry| entry.path.contains("status=cancelled"));
+            lists.any(|list| list.answered.is_some())
+        })
+        .await;
+    pks
+}
+
+#[tokio::test]
+async fn cancels_between_a_list_and_a_write_are_found_by_the_read_of_that_write() {
+    let mut world = World::new().await;
+    for (index, pk) in just_listed(&mut world, 40).await.into_iter().enumerate() {
+        world.set(pk, Stored::Cancelled);
+        let cancelled = Timestamp::now();
+        let wish = match index % 3 {
+            0 => Wish::Queued,
+            1 => Wish::Running,
+            _ => Wish::Partial(results(&world.target, 41.0)),
+        };
+        world.wish(pk, wish);
+        let view = world.until(pk, |view| {
+            view.ended.is_some() || view.progress.is_some() || view.partial_at.is_some()
+        });
+        let view = view.await;
+        assert_eq!(
+            (view.ended, world.stored(pk)),
+            (Some(Status::Cancelled), Stored::Cancelled)
+        );
+        assert_eq!(written_knowingly(&world.server.requests(), pk, cancelled), None);
+    }
+}
+
+#[tokio::test]
+async fn cancels_during_partial_traffic_are_lost_only_inside_a_request() {
+    let world = World::new().await;
+    world.server.set_knobs(Knobs {
+        put_delay_ms: 20,
+        ..Knobs::default()
+    });
+    let pks: Vec<_> = (0..40).map(|_| world.submit()).collect();
+    for pk in &pks {
+        world.set(*pk, Stored::Running);
+        world.live(*pk);
+    }
+    let mut cancelled: BTreeMap<i64, Timestamp> = BTreeMap::new();
+    for (round, pk) in pks.iter().enumerate() {
+        for other in &pks {
+            let score = f64::from(u32::try_from(round).unwrap());
+            world.wish(*other, Wish::Partial(results(&world.target, score)));
+        }
+        // Those that are cancelled get none.
+        let wanted = world.sent("PUT").len() + 5.min(pks.len() - round);
+        world
+            .server
+            .wait_until(|_, log| log.entries().filter(|entry| entry.method == "PUT").count() >= wanted)
+            .await;
+        cancelled.insert(*pk, Timestamp::now());
+        world.set(*pk, Stored::Cancelled);
+    }
+    // Everything that was on its way is answered, and no more is begun.
+    assert!(world.hub.drain().await);
+    let log = world.server.requests();
+    let puts: Vec<_> = log.iter().filter(|entry| entry.method == "PUT").collect();
+    assert!(puts.len() > 100, "{} partials", puts.len());
+    let lost = cancelled
+        .keys()
+        .filter(|pk| world.stored(**pk) != Stored::Cancelled)
+        .count();
+    for (pk, at) in &cancelled {
+        assert_eq!(written_knowingly(&log, *pk, *at), None, "the cancel of submission {pk}");
+    }
+    println!(
+        "{} partials, {} cancels, {lost} overwritten",
+        puts.len(),
+        cancelled.len()
+    );
+}
+
 const CANCELS: usize = 1000;
 const OVER: Duration = Duration::from_mins(4);
 /// How long the server works on partial results.

@@ -214,3 +214,22 @@ async fn retry_after_is_obeyed_and_a_torn_answer_is_none() {
     );
     world.until(7, |view| view.answered == 1).await;
 }
+
+#[tokio::test]
+async fn writes_that_wait_for_the_process_before_are_named_and_their_start_wakes() {
+    let opens = Instant::now() + Duration::from_secs(1);
+    let mut world = World::opened_at(opens).await;
+    let pk = world.submit();
+    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+    let from = world.hub.writes_from().unwrap();
+    assert!(from > Timestamp::now() && from < Timestamp::now() + SignedDuration::from_secs(2));
+    loop {
+        let Changed::Submission(_) = world.changed.recv().await.unwrap() else {
+            continue;
+        };
+        if world.hub.writes_from().is_none() {
+            break;
+        }
+    }
+    assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
+}

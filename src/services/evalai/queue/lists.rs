@@ -24,7 +24,7 @@ impl Queue {
     pub(super) fn took_of_challenge(&mut self, request: &Request, requested: Duration, reply: Reply, now: &Now) {
         match (request, reply) {
             (Request::List { challenge, purpose, .. }, Reply::Rows(answer)) => {
-                self.took_list(*challenge, *purpose, requested, answer, now)
+                self.took_list(*challenge, *purpose, requested, answer, now);
             }
             (Request::Phases(id), Reply::Phases(answer)) => {
                 self.looked(*id, answer, now, |look, phases| {

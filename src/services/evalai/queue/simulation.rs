@@ -16,6 +16,8 @@ use crate::services::evalai::status::Status;
 use crate::services::token::Token;
 
 const SUBMISSIONS: i64 = 12;
+/// Those that their participant deletes at some time.
+const DELETED: [i64; 2] = [11, 12];
 const MINUTE_LIMIT: usize = 54;
 /// Faults, cancellations and new attempts end here; what is left must come to its end after it.
 const PEACE: Duration = Duration::from_mins(40);
@@ -34,6 +36,8 @@ struct Record {
     jobs: Vec<String>,
     /// Rows of the leaderboard.
     rows: u32,
+    /// Its participant has deleted it, which leaves its status.
+    deleted: bool,
     /// When the participant last cancelled it.
     cancelled_at: Option<Duration>,
 }
@@ -60,6 +64,7 @@ enum Event {
     Answer(Ticket, Reply),
     Pass,
     Cancel(i64),
+    Delete(i64),
     Lease(bool),
     Wake,
 }
@@ -91,6 +96,7 @@ struct World {
     /// Cancellations overwritten by our writes: while the server worked on one, and between a read and one.
     lost: (usize, usize),
     cancels: usize,
+    deleted: usize,
     published: u32,
 }
 
@@ -122,8 +128,13 @@ fn key(pk: i64) -> Key {
 }
 
 fn row(pk: i64, record: &Record) -> Row {
+    let status = match record.status {
+        status if record.deleted && status.is_live() => Status::Deleted,
+        _ if record.deleted => Status::Ignored,
+        status => status,
+    };
     Row {
-        status: record.status,
+        status,
         phase: Some(1),
         submitted_at: Some(submitted_at()),
         jobs: record.jobs.clone(),
@@ -149,6 +160,7 @@ impl World {
             status: Status::Submitted,
             jobs: vec![],
             rows: 0,
+            deleted: false,
             cancelled_at: None,
         };
         let mut world = Self {
@@ -166,6 +178,7 @@ impl World {
             actors: BTreeMap::new(),
             lost: (0, 0),
             cancels: 0,
+            deleted: 0,
             published: 0,
         };
         for pk in 1..=SUBMISSIONS {
@@ -175,6 +188,10 @@ impl World {
                 let at = world.random(0.0, PEACE.as_secs_f64());
                 world.push(at, Event::Cancel(pk));
             }
+        }
+        for pk in DELETED {
+            let at = world.random(0.0, PEACE.as_secs_f64());
+            world.push(at, Event::Delete(pk));
         }
         for _ in 0..5 {
             let at = world.random(0.0, PEACE.as_secs_f64());
@@ -283,6 +300,11 @@ impl World {
                     record.cancelled_at = Some(self.at);
                     self.cancels += 1;
                 }
+            }
+            Event::Delete(pk) => {
+                let record = self.table.get_mut(&pk).unwrap();
+                record.deleted = true;
+                self.deleted += usize::from(record.status.is_live());
             }
             Event::Lease(lease) => self.lease = lease,
             Event::Wake => {}
@@ -443,6 +465,11 @@ impl World {
             return;
         }
         let Some(began) = actor.began else {
+            if view.ended.is_some() && view.overtaken {
+                let cancelled = Wish::Final(Outcome::Cancelled, results(0));
+                self.queue.wish(&target, &key, pk, &run, cancelled, now);
+                return;
+            }
             if view.ended.is_some() {
                 return self.settle(pk, &Ended::Otherwise(Status::Cancelled));
             }
@@ -473,9 +500,13 @@ impl World {
             );
             assert!(*outcome != Outcome::Finished || record.rows == 1);
         }
+        assert!(
+            !record.deleted || !record.status.is_live(),
+            "submission {pk} counts as being processed, although it was deleted: {end:?}"
+        );
         let now = self.now();
         self.queue.forget(&key(pk), now);
-        let again = self.at < PEACE && record.status != Status::Finished;
+        let again = self.at < PEACE && record.status != Status::Finished && !record.deleted;
         let attempt = self.actors[&pk].attempt + 1;
         let actor = if again {
             self.actor(attempt)
@@ -491,7 +522,7 @@ impl World {
 
 #[test]
 fn a_bad_network_breaks_no_promise() {
-    let (mut meanwhile, mut between, mut cancels, mut published, mut attempts) = (0, 0, 0, 0, 0);
+    let (mut meanwhile, mut between, mut cancels, mut published, mut attempts, mut deleted) = (0, 0, 0, 0, 0, 0);
     for seed in 0..20 {
         let world = World::new(seed).run();
         let open: Vec<_> = world.actors.iter().filter(|(_, actor)| !actor.settled).collect();
@@ -499,12 +530,15 @@ fn a_bad_network_breaks_no_promise() {
         meanwhile += world.lost.0;
         between += world.lost.1;
         cancels += world.cancels;
+        deleted += world.deleted;
         published += world.published;
         attempts += world.actors.values().map(|actor| actor.attempt).sum::<i64>();
     }
-    println!("{attempts} attempts, {published} published; of {cancels} cancels {meanwhile} and {between} overwritten");
+    println!(
+        "{attempts} attempts, {published} published; of {cancels} cancels {meanwhile} and {between} overwritten; {deleted} deleted"
+    );
     // The world must be as bad as it is meant to be.
-    assert!(published > 500 && attempts > 800 && cancels > 200);
+    assert!(published > 500 && attempts > 800 && cancels > 200 && deleted > 15);
     // What falls into a request, which takes up to a minute here, can't be saved; what falls between a read and its write
     // is rare.
     assert!(between * 100 < cancels && meanwhile * 5 < cancels);

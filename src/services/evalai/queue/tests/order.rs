@@ -248,3 +248,41 @@ fn many_ends_do_not_keep_the_list_of_cancelled_ones_waiting() {
     assert!(longest < Duration::from_secs(16), "{longest:?} without a list");
     assert!(ends > 80, "{ends} ends in four minutes");
 }
+
+/// The longest times without a read of one live submission and without a list, of so many, in twenty minutes.
+fn longest_gaps(live: i64) -> (Duration, Duration) {
+    let mut bench = Bench::new();
+    for pk in 1..=live {
+        bench.live(pk, 1);
+    }
+    let begun = bench.at;
+    let mut reads = vec![begun; usize::try_from(live).unwrap() + 1];
+    let (mut listed, mut unread, mut unlisted) = (begun, Duration::ZERO, Duration::ZERO);
+    while bench.at < begun + Duration::from_mins(20) {
+        bench.wait(0.1);
+        while let Some((_, ticket)) = bench.next() {
+            let reply = if let Request::Get(subject) = &ticket.request {
+                let read = &mut reads[usize::try_from(subject.pk).unwrap()];
+                unread = unread.max(bench.at.checked_sub(*read).unwrap());
+                *read = bench.at;
+                Reply::Row(Answer::Done(row(subject.pk, Status::Running)))
+            } else {
+                unlisted = unlisted.max(bench.at.checked_sub(listed).unwrap());
+                listed = bench.at;
+                Reply::Rows(Answer::Done(vec![]))
+            };
+            bench.answer(&ticket, reply);
+        }
+    }
+    (unread, unlisted)
+}
+
+#[test]
+fn each_live_submission_is_read_each_minute_as_far_as_the_budget_allows() {
+    for (live, minutes) in [(10, 1), (40, 1), (300, 8)] {
+        let (unread, unlisted) = longest_gaps(live);
+        println!("{live} live: {unread:?} without a read, {unlisted:?} without a list");
+        assert!(unread <= Duration::from_secs(minutes * 60 + 5), "{live}: {unread:?}");
+        assert!(unlisted < Duration::from_secs(16), "{live}: {unlisted:?}");
+    }
+}
