@@ -17,6 +17,7 @@ mod api {
     mod evalai;
     mod examples;
     mod failures;
+    mod isolation;
     mod leader;
     mod objects;
     mod operator;

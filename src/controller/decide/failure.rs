@@ -38,7 +38,7 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
 fn next_step(reason: &str) -> &'static str {
     match reason {
         // The words of `workspace` hold it already.
-        reasons::PREFIX_IN_USE => "",
+        reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => "",
         reasons::JOB_DELETED => "Find out who deletes Jobs in this namespace, then resume it.",
         reasons::NODE_LOST => "Look at the node, then resume it.",
         reasons::RESULTS_NOT_STORED => "Look at the log of logcopy and at the bucket, then resume it.",

@@ -212,7 +212,7 @@ fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &s
 }
 
 fn too_late(found: &Trouble, seconds: i64) -> Failure {
-    if found.reason == reasons::PREFIX_IN_USE {
+    if [reasons::PREFIX_IN_USE, reasons::NOT_ISOLATED].contains(&found.reason) {
         return infrastructure(found.reason, &found.message);
     }
     let reason = if found.reason == reasons::PREPARING {

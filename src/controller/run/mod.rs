@@ -5,8 +5,10 @@
 
 mod counts;
 mod marks;
+mod needs;
 mod passes;
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,6 +16,7 @@ use futures::future::FusedFuture;
 use futures::{FutureExt, StreamExt};
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
+use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
@@ -23,12 +26,13 @@ use tokio::time::Instant;
 
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
+use super::leaderboards::isolation;
 use super::observe::board::Places;
 use super::observe::children_selector;
 use super::sync::Sync;
-use super::watches::preflight::{Need, await_kinds, watch_access};
+use super::watches::preflight::{await_kinds, watch_access};
 use super::watches::{Touch, Touches, Watch, Watchable, guarded, spawn_watch};
-use crate::api::{GROUP, Leaderboard, Submission};
+use crate::api::{Leaderboard, Submission};
 use crate::bridge::ingest::{self, Incoming, Source};
 use crate::observability::Observability;
 use crate::services::ObjectKey;
@@ -39,6 +43,9 @@ use marks::{Fingerprints, standing};
 
 /// Passes in hand may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
+
+/// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
+const POLICIES_LIMIT: Duration = Duration::from_secs(5);
 
 /// Why the controller ended.
 #[derive(thiserror::Error, Debug)]
@@ -72,7 +79,7 @@ pub async fn run(
     }
     let access = client.clone();
     let (namespace, watcher) = (settings.namespace.clone(), seen.clone());
-    tokio::spawn(watch_rights(access, namespace, watcher));
+    tokio::spawn(watch_rights(access, namespace, lease.clone(), watcher));
     let watches = Watches::start(&clients.watch, settings.namespace.as_deref(), &seen);
     let leader = leader::start(clients.lease, lease, &seen);
     let parts = Parts {
@@ -91,35 +98,9 @@ pub async fn run(
     result
 }
 
-async fn watch_rights(client: Client, namespace: Option<String>, seen: Observability) {
-    let needs = needs(namespace.as_deref());
+async fn watch_rights(client: Client, namespace: Option<String>, lease: leader::Settings, seen: Observability) {
+    let needs = needs::needs(namespace.as_deref(), &lease);
     watch_access(client, &needs, &seen).await;
-}
-
-/// What the controller will have to do; /readyz names what is not allowed.
-fn needs(namespace: Option<&str>) -> Vec<Need<'_>> {
-    let need = |group, resource, verb| Need {
-        group,
-        resource,
-        verb,
-        namespace,
-    };
-    vec![
-        need(GROUP, "leaderboards", "watch"),
-        need(GROUP, "leaderboards/status", "patch"),
-        need(GROUP, "submissions", "watch"),
-        need(GROUP, "submissions", "patch"),
-        need(GROUP, "submissions", "create"),
-        need(GROUP, "submissions/status", "patch"),
-        need("batch", "jobs", "watch"),
-        need("batch", "jobs", "create"),
-        need("batch", "jobs", "patch"),
-        need("batch", "jobs", "delete"),
-        need("", "pods", "watch"),
-        need("", "pods", "patch"),
-        need("", "pods", "delete"),
-        need("networking.k8s.io", "networkpolicies", "patch"),
-    ]
 }
 
 /// One client for calls, one whose dead connections end for watches, one without retries for the lease.
@@ -134,6 +115,7 @@ struct Watches {
     submissions: Watch<Submission>,
     jobs: Watch<Job>,
     pods: Watch<Pod>,
+    policies: Watch<NetworkPolicy>,
 }
 
 impl Watches {
@@ -144,6 +126,7 @@ impl Watches {
             submissions: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, seen),
             jobs: spawn_watch(guarded(client.clone(), namespace), children(), trim_job, seen),
             pods: spawn_watch(guarded(client.clone(), namespace), children(), trim_pod, seen),
+            policies: spawn_watch(guarded(client.clone(), namespace), children(), |_| {}, seen),
         }
     }
 
@@ -153,6 +136,7 @@ impl Watches {
             submissions: self.submissions.store.clone(),
             jobs: self.jobs.store.clone(),
             pods: self.pods.store.clone(),
+            policies: self.policies.store.clone(),
         }
     }
 
@@ -162,6 +146,7 @@ impl Watches {
         let _ = self.submissions.store.wait_until_ready().await;
         let _ = self.jobs.store.wait_until_ready().await;
         let _ = self.pods.store.wait_until_ready().await;
+        let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
     }
 
     /// Tells everything that is there now, then everything that is touched.
@@ -184,7 +169,7 @@ impl Watches {
             },
         );
         let (mut submissions, mut places) = (Fingerprints::default(), Places::default());
-        let context = Arc::clone(context);
+        let (policies_of, context) = (Arc::clone(context), Arc::clone(context));
         forward(
             self.submissions.subscribe(),
             touched,
@@ -211,8 +196,21 @@ impl Watches {
         forward(self.jobs.subscribe(), touched, |touch: Touch<Job>| {
             owner(touch.object.as_ref())
         });
-        forward(self.pods.subscribe(), touched, |touch: Touch<Pod>| {
-            owner(touch.object.as_ref())
+        let mut measured = HashSet::new();
+        forward(self.pods.subscribe(), touched, move |touch: Touch<Pod>| {
+            let pod = touch.object.as_ref();
+            let uid = pod.uid().unwrap_or_default();
+            let mut concerned = owner(pod);
+            if touch.is_gone {
+                measured.remove(&uid);
+            } else if isolation::finding(pod).is_some() && measured.insert(uid) {
+                concerned.extend(board(pod));
+            }
+            concerned
+        });
+        tokio::spawn(isolation::restore(self.policies.subscribe(), policies_of));
+        forward(self.policies.subscribe(), touched, |touch: Touch<NetworkPolicy>| {
+            board(touch.object.as_ref()).into_iter().collect()
         });
     }
 }
@@ -240,6 +238,10 @@ pub(super) fn trim_pod(pod: &mut Pod) {
 
 fn owner(child: &impl ResourceExt) -> Vec<Touched> {
     Stores::owner_of(child).map(Touched::Submission).into_iter().collect()
+}
+
+fn board(child: &impl ResourceExt) -> Option<Touched> {
+    Stores::leaderboard_of(child).map(Touched::Leaderboard)
 }
 
 fn key(object: &impl ResourceExt) -> ObjectKey {
