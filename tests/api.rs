@@ -18,6 +18,7 @@ mod api {
     mod evalai;
     mod examples;
     mod failures;
+    mod isolation;
     mod leader;
     mod objects;
     mod operator;

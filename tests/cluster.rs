@@ -35,6 +35,7 @@ mod cluster {
     mod edits;
     mod expected;
     mod failures;
+    mod isolation;
     mod losses;
     mod matrix;
     mod matrix_evalai;

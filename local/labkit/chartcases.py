@@ -68,7 +68,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "get", "pods:log", namespace),
         *may(controller, "get list", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
-        *may(controller, "get create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may(controller, "get list watch create patch", "networking.k8s.io/networkpolicies", namespace),
         *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
     ]
 

@@ -23,6 +23,8 @@ pub const PLAUSIBLE: &str = "Plausible";
 pub const FINISHED: &str = "Finished";
 /// A Leaderboard can run submissions.
 pub const READY: &str = "Ready";
+/// The Pods of a Leaderboard reach nothing that its policy forbids: measured, not assumed.
+pub const ISOLATED: &str = "Isolated";
 /// A Leaderboard that is being deleted waits for its submissions.
 pub const TERMINATING: &str = "Terminating";
 

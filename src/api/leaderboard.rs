@@ -173,7 +173,7 @@ pub struct LeaderboardStatus {
     /// What each track effectively runs, as `pairs x routes x repetitions`.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub tracks: BTreeMap<String, String>,
-    /// `Ready`, `Terminating`.
+    /// `Ready`, `Isolated`, `Terminating`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]
     pub conditions: Vec<Condition>,

@@ -244,9 +244,46 @@ pub struct PodIdentity {
     pub secret_ref: Option<String>,
 }
 
+/// Who makes the NetworkPolicy of the Pods.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum PolicySource {
+    /// The operator applies one and restores it; no Job is made without it.
+    #[default]
+    Managed,
+    /// The cluster has policies of its own: the operator applies none and trusts them.
+    External,
+}
+
+/// What follows from the measurement of a run's Pod, made before anything of a stranger runs: whether it can reach an
+/// address that the policy forbids.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Enforcement {
+    /// A Pod that can reach it stops there.
+    Require,
+    /// The run goes on, and the condition `Isolated` shows it.
+    #[default]
+    Warn,
+    /// Nothing is measured.
+    Off,
+}
+
 /// What the Pods of strangers may reach, by NetworkPolicy.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
+#[x_kube(validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed: what the cluster's own policies forbid is not known"))]
 pub struct Network {
+    /// Whether the operator applies the policy or the cluster has its own.
+    #[serde(default)]
+    pub policy: PolicySource,
+    /// Whether a run may go on in a Pod whose policy is not enforced.
+    #[serde(default)]
+    pub enforcement: Enforcement,
+    /// What the Pod tries to reach to measure that, as `10.0.0.1:443`. Default: the API server's service address. Set it where `egress` allows the API server.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(
+        length(max = 64),
+        regex(pattern = r"^([0-9]{1,3}([.][0-9]{1,3}){3}|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}$")
+    )]
+    pub probe: Option<String>,
     /// Addresses, S3's first of all: where policies are enforced, nothing can be stored without them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(length(max = 32))]
@@ -309,6 +346,9 @@ impl Default for Retries {
 impl Default for Network {
     fn default() -> Self {
         Self {
+            policy: PolicySource::default(),
+            enforcement: Enforcement::default(),
+            probe: None,
             egress: Vec::new(),
             dns: true,
         }

@@ -10,6 +10,7 @@ pub mod leaderboard;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
 pub mod names;
+pub mod ranges;
 pub mod reasons;
 pub mod submission;
 pub mod submission_status;

@@ -24,6 +24,9 @@ pub const ANNOTATION_STOP: &str = "leaderboard.carla.org/stop";
 /// Annotation on a Job: which infrastructure retry of the attempt it is.
 pub const ANNOTATION_RETRY: &str = "leaderboard.carla.org/retry";
 
+/// Annotation on a Pod: generation of the Leaderboard that its Job was made from.
+pub const ANNOTATION_GENERATION: &str = "leaderboard.carla.org/leaderboard-generation";
+
 /// Finalizer of a Submission: held until its end is published and recorded.
 pub const FINALIZER_SUBMISSION: &str = "leaderboard.carla.org/publish";
 /// Finalizer of a Leaderboard: held while live or unpublished Submissions refer to it.

@@ -19,6 +19,8 @@ pub const PREPARING: &str = "Preparing";
 pub const ASKING_EVALAI: &str = "AskingEvalAI";
 /// A Job of the same name belongs to an older object and is going away.
 pub const JOB_NAME_TAKEN: &str = "JobNameTaken";
+/// The Leaderboard's NetworkPolicy is not in place, or a Pod could reach what it forbids.
+pub const NOT_ISOLATED: &str = "NotIsolated";
 
 // Why a submission is not accepted.
 pub const LEADERBOARD_NOT_FOUND: &str = "LeaderboardNotFound";
@@ -85,6 +87,14 @@ pub const PREFIX_CONFLICT: &str = "PrefixConflict";
 pub const INVALID_POD: &str = "InvalidPod";
 pub const QUEUE_BLOCKED: &str = "QueueBlocked";
 pub const IN_USE: &str = "InUse";
+
+// Of a Leaderboard's condition `Isolated`.
+pub const ENFORCED: &str = "Enforced";
+pub const NOT_ENFORCED: &str = "NotEnforced";
+pub const NOT_MEASURED: &str = "NotMeasured";
+pub const EXTERNAL: &str = "External";
+pub const FORBIDDEN: &str = "Forbidden";
+pub const NOT_APPLIED: &str = "NotApplied";
 
 // Events only.
 pub const JOB_CREATED: &str = "JobCreated";

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Event, Pod};
+use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::ListParams;
 use kube::runtime::events::Recorder;
 use kube::runtime::reflector::{ObjectRef, Store};
@@ -15,6 +16,7 @@ use super::bucket::{self, Buckets};
 use super::failure_log::FailureLogs;
 use super::leaderboards::Desk;
 use super::memory::Memory;
+use super::network_policy;
 use super::observe::board::Board;
 use super::observe::is_pod_of;
 use super::observe::node::Nodes;
@@ -34,6 +36,7 @@ pub struct Stores {
     pub submissions: Store<Submission>,
     pub jobs: Store<Job>,
     pub pods: Store<Pod>,
+    pub policies: Store<NetworkPolicy>,
 }
 
 impl Stores {
@@ -43,9 +46,23 @@ impl Stores {
         pods.max_by_key(|pod| (pod.metadata.creation_timestamp.clone().map(|t| t.0), pod.name_any()))
     }
 
+    /// Whether the policy that a Leaderboard's present spec asks for is in place.
+    pub fn is_policy_in_place(&self, leaderboard: &Leaderboard) -> bool {
+        let namespace = leaderboard.namespace().unwrap_or_default();
+        let name = network_policy::name(leaderboard);
+        let found = self.policies.get(&ObjectRef::new(&name).within(&namespace));
+        found.is_some_and(|found| network_policy::is_in_place(&found, leaderboard))
+    }
+
     /// The Submission that a child belongs to.
     pub fn owner_of(child: &impl ResourceExt) -> Option<ObjectRef<Submission>> {
         let name = child.labels().get(crate::api::names::LABEL_SUBMISSION)?;
+        Some(ObjectRef::new(name).within(&child.namespace()?))
+    }
+
+    /// The Leaderboard that a Pod or a policy belongs to.
+    pub fn leaderboard_of(child: &impl ResourceExt) -> Option<ObjectRef<Leaderboard>> {
+        let name = child.labels().get(crate::api::names::LABEL_LEADERBOARD)?;
         Some(ObjectRef::new(name).within(&child.namespace()?))
     }
 }

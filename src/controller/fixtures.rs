@@ -100,6 +100,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         submissions: store(cluster.submissions),
         jobs: store(cluster.jobs),
         pods: store(Vec::new()),
+        policies: store(Vec::new()),
     };
     let settings = Settings {
         image: "operator:1".into(),

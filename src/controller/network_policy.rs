@@ -1,11 +1,10 @@
-//! The NetworkPolicy of a Leaderboard: nothing in, out only what its `network` names. Pure; called by the controller when a
-//! Leaderboard changes.
+//! The NetworkPolicy of a Leaderboard: nothing in, out only what its `network` names. Pure; called by the controller in each
+//! reconcile of a Leaderboard, and before each Job.
 //!
-//! It holds for whole Pods, so what logcopy may reach the agents may reach too. Whether it is enforced is the cluster's
-//! network plugin to say.
+//! It holds for whole Pods, so what logcopy may reach the agents may reach too. Whether it is enforced depends on the
+//! cluster's network plugin, which `pod::isolation` measures.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
 
 use k8s_openapi::api::networking::v1::{
     IPBlock, NetworkPolicy, NetworkPolicyEgressRule, NetworkPolicyPeer, NetworkPolicyPort, NetworkPolicySpec,
@@ -14,21 +13,28 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{LabelSelector, ObjectMeta, 
 use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
 use kube::Resource;
 
+use crate::api::ranges::{self, Range};
 use crate::api::{Egress, Leaderboard, names};
 
-/// Where clouds hand out credentials of nodes and Pods: all link-local addresses, and AWS's own of IPv6.
-const FORBIDDEN: [(&str, u8); 3] = [("169.254.0.0", 16), ("fe80::", 10), ("fd00:ec2::", 64)];
 /// Where NodeLocal DNSCache answers.
 const NODE_LOCAL_DNS: &str = "169.254.20.10/32";
 const DNS_PORT: i32 = 53;
 
-/// The policy for all Pods of a Leaderboard, named `leaderboard-<name>` and owned by it.
+/// Name of a Leaderboard's policy.
+pub fn name(leaderboard: &Leaderboard) -> String {
+    format!(
+        "leaderboard-{}",
+        leaderboard.metadata.name.as_deref().unwrap_or_default()
+    )
+}
+
+/// The policy for all Pods of a Leaderboard, owned by it.
 pub fn network_policy(leaderboard: &Leaderboard) -> NetworkPolicy {
     let name = leaderboard.metadata.name.clone().unwrap_or_default();
     let labels = |value: &str, key: &str| BTreeMap::from([(key.to_owned(), value.to_owned())]);
     NetworkPolicy {
         metadata: ObjectMeta {
-            name: Some(format!("leaderboard-{name}")),
+            name: Some(self::name(leaderboard)),
             namespace: leaderboard.metadata.namespace.clone(),
             labels: Some(
                 [
@@ -55,9 +61,35 @@ pub fn network_policy(leaderboard: &Leaderboard) -> NetworkPolicy {
                 match_expressions: None,
             }),
             policy_types: Some(vec!["Ingress".into(), "Egress".into()]),
-            ingress: None,
+            // Empty, not absent: an apply leaves a field alone that it does not name, and with it a rule that somebody added.
+            ingress: Some(Vec::new()),
             egress: Some(egress(leaderboard)),
         }),
+    }
+}
+
+/// Whether a policy, as the API server has it, is the one that the Leaderboard's present spec asks for.
+pub fn is_in_place(found: &NetworkPolicy, leaderboard: &Leaderboard) -> bool {
+    let wanted = network_policy(leaderboard);
+    let has_labels = wanted.metadata.labels.iter().flatten().all(|(key, value)| {
+        let labels = found.metadata.labels.as_ref();
+        labels.is_some_and(|labels| labels.get(key) == Some(value))
+    });
+    // One of an older Leaderboard of this name is going away with its owner.
+    let owners = found.metadata.owner_references.iter().flatten();
+    let is_owned = owners
+        .into_iter()
+        .any(|owner| Some(&owner.uid) == leaderboard.metadata.uid.as_ref());
+    let is_going = found.metadata.deletion_timestamp.is_some();
+    has_labels && is_owned && !is_going && found.spec.clone().map(plain) == wanted.spec.map(plain)
+}
+
+/// The API server drops empty lists.
+fn plain(spec: NetworkPolicySpec) -> NetworkPolicySpec {
+    NetworkPolicySpec {
+        ingress: spec.ingress.filter(|rules| !rules.is_empty()),
+        egress: spec.egress.filter(|rules| !rules.is_empty()),
+        ..spec
     }
 }
 
@@ -85,10 +117,7 @@ fn dns() -> NetworkPolicyEgressRule {
 
 fn rule(egress: &Egress) -> Option<NetworkPolicyEgressRule> {
     let range = Range::parse(&egress.cidr)?;
-    let forbidden: Vec<Range> = FORBIDDEN
-        .iter()
-        .filter_map(|(address, bits)| Range::new(address.parse().ok()?, *bits))
-        .collect();
+    let forbidden: Vec<Range> = ranges::forbidden().collect();
     if forbidden.iter().any(|forbidden| forbidden.contains(range)) {
         return None;
     }
@@ -118,58 +147,14 @@ fn port(protocol: &str, number: i32) -> NetworkPolicyPort {
     }
 }
 
-/// A range of addresses. Both kinds are kept as 128 bits, the number left-aligned.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Range {
-    v6: bool,
-    start: u128,
-    bits: u8,
-}
-
-impl Range {
-    fn parse(text: &str) -> Option<Self> {
-        let (address, bits) = text.split_once('/')?;
-        Self::new(address.parse().ok()?, bits.parse().ok()?)
-    }
-
-    fn new(address: IpAddr, bits: u8) -> Option<Self> {
-        let (v6, number, width) = match address {
-            IpAddr::V4(address) => (false, u128::from(address.to_bits()) << 96, 32),
-            IpAddr::V6(address) => (true, address.to_bits(), 128),
-        };
-        (bits <= width).then(|| Self {
-            v6,
-            start: number & mask(bits),
-            bits,
-        })
-    }
-
-    fn contains(self, other: Self) -> bool {
-        self.v6 == other.v6 && self.bits <= other.bits && other.start & mask(self.bits) == self.start
-    }
-
-    fn text(self) -> String {
-        let address = if self.v6 {
-            IpAddr::V6(self.start.into())
-        } else {
-            IpAddr::V4(u32::try_from(self.start >> 96).unwrap_or_default().into())
-        };
-        format!("{address}/{}", self.bits)
-    }
-}
-
-fn mask(bits: u8) -> u128 {
-    u128::MAX.checked_shl(128 - u32::from(bits)).unwrap_or_default()
-}
-
 #[cfg(test)]
 mod tests {
     use serde_json::{Value, json};
 
     use super::*;
 
-    fn policy(network: &Value) -> Value {
-        let leaderboard: Leaderboard = serde_json::from_value(json!({
+    fn leaderboard(network: &Value) -> Leaderboard {
+        let leaderboard = serde_json::from_value(json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
             "metadata": {"name": "carla-2", "namespace": "challenge", "uid": "u-1"},
             "spec": {
@@ -177,9 +162,12 @@ mod tests {
                 "contents": {"image": "contents"}, "simulator": {"image": "simulator"},
                 "storage": {"bucket": "bucket"}, "network": network,
             },
-        }))
-        .unwrap();
-        serde_json::to_value(network_policy(&leaderboard)).unwrap()
+        }));
+        leaderboard.unwrap()
+    }
+
+    fn policy(network: &Value) -> Value {
+        serde_json::to_value(network_policy(&leaderboard(network))).unwrap()
     }
 
     #[test]
@@ -194,6 +182,7 @@ mod tests {
             json!({
                 "podSelector": {"matchLabels": {"leaderboard.carla.org/leaderboard": "carla-2"}},
                 "policyTypes": ["Ingress", "Egress"],
+                "ingress": [],
                 "egress": [{
                     "to": [{"namespaceSelector": {}}, {"ipBlock": {"cidr": "169.254.20.10/32"}}],
                     "ports": [{"protocol": "UDP", "port": 53}, {"protocol": "TCP", "port": 53}],
@@ -254,25 +243,41 @@ mod tests {
     }
 
     #[test]
-    fn ranges_are_read_exactly() {
-        for bad in [
-            "",
-            "10.0.0.0",
-            "10.0.0.0/33",
-            "::/129",
-            "a/8",
-            "10.0.0/8",
-            "10.0.0.0/-1",
-        ] {
-            assert_eq!(Range::parse(bad), None, "{bad}");
-        }
-        for (text, expected) in [
-            ("10.9.8.7/8", "10.0.0.0/8"),
-            ("0.0.0.0/0", "0.0.0.0/0"),
-            ("2001:DB8::1/32", "2001:db8::/32"),
-            ("1.2.3.4/32", "1.2.3.4/32"),
-        ] {
-            assert_eq!(Range::parse(text).map(Range::text).as_deref(), Some(expected));
+    fn a_policy_is_in_place_only_as_the_present_spec_asks_for_it() {
+        let asked = leaderboard(&json!({"egress": [{"cidr": "10.1.2.3/32", "ports": [443]}]}));
+        let applied = serde_json::to_value(network_policy(&asked)).unwrap();
+        let is_in_place = |found: &Value, leaderboard: &Leaderboard| {
+            super::is_in_place(&serde_json::from_value(found.clone()).unwrap(), leaderboard)
+        };
+        assert!(is_in_place(&applied, &asked));
+        // As it comes back from the API server.
+        let mut stored = applied.clone();
+        stored["spec"].as_object_mut().unwrap().remove("ingress");
+        stored["metadata"]["labels"]["team"] = json!("somebody's");
+        assert!(is_in_place(&stored, &asked));
+        assert!(!is_in_place(
+            &stored,
+            &leaderboard(&json!({"egress": [{"cidr": "10.1.2.4/32", "ports": [443]}]}))
+        ));
+
+        let edits: [(&str, Value); 8] = [
+            ("/spec/ingress", json!([{}])),
+            ("/spec/egress", json!([{}])),
+            ("/spec/egress", Value::Null),
+            ("/spec/policyTypes", json!(["Ingress"])),
+            (
+                "/spec/podSelector/matchExpressions",
+                json!([{"key": "x", "operator": "Exists"}]),
+            ),
+            ("/metadata/labels/app.kubernetes.io~1managed-by", json!("somebody")),
+            ("/metadata/ownerReferences/0/uid", json!("u-0")),
+            ("/metadata/deletionTimestamp", json!("2026-11-01T12:00:00Z")),
+        ];
+        for (place, value) in edits {
+            let mut edited = applied.clone();
+            let (parent, field) = place.rsplit_once('/').unwrap();
+            edited.pointer_mut(parent).unwrap()[field.replace("~1", "/")] = value;
+            assert!(!is_in_place(&edited, &asked), "{place}");
         }
     }
 }

@@ -99,6 +99,7 @@ async fn bench(state: State) -> Bench {
         now,
         submission: Arc::new(submission),
         leaderboard: Some(Arc::new(board)),
+        is_policy_in_place: true,
         turn: Turn::Go,
         job: JobSight::Absent,
         pod: None,

@@ -14,6 +14,8 @@ pub struct View {
     pub now: Timestamp,
     pub submission: Arc<Submission>,
     pub leaderboard: Option<Arc<Leaderboard>>,
+    /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place.
+    pub is_policy_in_place: bool,
     /// Whether it may start now; only meaningful while it has no Job.
     pub turn: Turn,
     pub job: JobSight,

@@ -118,6 +118,12 @@ impl WatchProbe {
         });
     }
 
+    /// The API server has refused it: a restart would give it no right, and readiness names the one that is missing.
+    pub fn refused(&self) {
+        self.change(|state, _| *state = WatchState::default());
+        self.liveness.answered();
+    }
+
     fn change(&self, change: impl FnOnce(&mut WatchState, Instant)) {
         let mut state = self.liveness.lock();
         change(state.watches.entry(self.name.clone()).or_default(), Instant::now());
@@ -166,6 +172,19 @@ mod tests {
         assert_eq!(liveness.problems().len(), 1);
         watch.running();
         assert!(liveness.problems().is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_watch_that_is_refused_is_no_reason_to_restart() {
+        let liveness = Liveness::default();
+        let watch = liveness.watch("networkpolicies");
+        for _ in 0..12 {
+            watch.listing();
+            watch.refused();
+            advance(MINUTE).await;
+        }
+        liveness.answered();
+        assert_eq!(liveness.problems(), Vec::<String>::new());
     }
 
     #[tokio::test(start_paused = true)]

@@ -41,6 +41,7 @@ pub(crate) fn run() -> Run {
         flush_seconds: 60,
         cancel_seconds: 20,
         log_group: None,
+        isolation: None,
     }
 }
 

@@ -7,6 +7,7 @@
 pub(crate) mod fixtures;
 pub mod gather;
 pub mod identity;
+pub mod isolation;
 pub mod judge;
 pub mod logcopy;
 pub mod ownlog;

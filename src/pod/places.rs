@@ -2,6 +2,7 @@
 //!
 //! Made by the programs' entry points from [`super::run`]'s constants, and by tests from temporary folders.
 
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -57,7 +58,7 @@ impl Places {
     }
 }
 
-/// How long logcopy waits for what cannot be seen.
+/// How long the programs wait for what cannot be seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Pace {
     /// From complete results to the end, when an agent does not say that it is done.
@@ -70,6 +71,8 @@ pub struct Pace {
     pub least: Duration,
     /// Longest pause after rounds that failed.
     pub backoff: Duration,
+    /// How long a network plugin may take until it enforces the policy of a new Pod.
+    pub enforced_within: Duration,
 }
 
 impl Default for Pace {
@@ -80,6 +83,7 @@ impl Default for Pace {
             grace: Duration::from_secs(25),
             least: Duration::from_secs(1),
             backoff: Duration::from_mins(1),
+            enforced_within: Duration::from_mins(1),
         }
     }
 }
@@ -95,6 +99,7 @@ impl Pace {
             grace: self.grace / times,
             least: self.least / times,
             backoff: self.backoff / times,
+            enforced_within: self.enforced_within / times,
         }
     }
 }
@@ -106,6 +111,8 @@ pub struct Setting {
     pub run: Run,
     /// UID of the Pod.
     pub pod_uid: String,
+    /// The API server's service address, which the kubelet gives to every container.
+    pub api_server: Option<SocketAddr>,
     /// Role to assume, if the identity is one.
     pub role_arn: Option<String>,
     /// Mounts.
@@ -132,9 +139,19 @@ impl Setting {
         Ok(Self {
             run: serde_json::from_str(&variable(ENV_RUN)?)?,
             pod_uid: variable(ENV_POD_UID)?,
+            api_server: api_server(),
             role_arn: std::env::var(ENV_ROLE_ARN).ok().filter(|arn| !arn.is_empty()),
             places,
             pace,
         })
     }
+}
+
+fn api_server() -> Option<SocketAddr> {
+    let variable = |name| std::env::var(name).ok();
+    let host: IpAddr = variable("KUBERNETES_SERVICE_HOST")?.parse().ok()?;
+    Some(SocketAddr::new(
+        host,
+        variable("KUBERNETES_SERVICE_PORT")?.parse().ok()?,
+    ))
 }

@@ -5,7 +5,7 @@
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 
-use crate::api::{LogGroup, RunPlan, Verify};
+use crate::api::{Enforcement, LogGroup, RunPlan, Verify};
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";
@@ -67,6 +67,26 @@ pub struct Run {
     /// CloudWatch log group, if container logs go there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub log_group: Option<LogGroup>,
+    /// How `workspace` measures whether the Pod's NetworkPolicy is enforced; absent: not at all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub isolation: Option<Isolation>,
+}
+
+/// What is to be measured, and what follows.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct Isolation {
+    /// Whether the run may go on where the policy is not enforced.
+    pub enforcement: Enforcement,
+    /// The address to try, as `10.0.0.1:443`; absent: the API server's service address.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub probe: Option<String>,
+    /// Ranges that the policy allows: an address in one of them shows nothing.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub egress: Vec<String>,
+    /// A Pod before this one has waited in vain for the policy to be enforced, so one look is enough.
+    #[serde(default)]
+    pub is_known_open: bool,
 }
 
 /// Why a Pod is to stop: the value of the stop annotation.

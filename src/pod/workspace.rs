@@ -18,10 +18,12 @@ use serde::{Deserialize, Serialize};
 
 use super::gather::results_plan;
 use super::identity;
+use super::isolation::{self, Finding};
 use super::places::{Places, Setting};
 use super::report::{FAILURE_LOG_KEY, MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Tree, TreeError};
+use crate::api::Enforcement;
 use crate::services::archive::{Archive, ArchiveError};
 
 /// Folders that no mount makes. The others are the kubelet's.
@@ -33,7 +35,7 @@ const TRIES: u32 = 6;
 /// Most bytes of a verdict: eleven containers share 12 KiB.
 const VERDICT_BYTES: usize = 1000;
 
-/// Why the workspace could not be prepared, as the controller needs to know it.
+/// Why the workspace could not be prepared, or what it has found, as the controller needs to know it.
 #[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WorkspaceReason {
     /// The prefix holds another submission's results.
@@ -44,6 +46,14 @@ pub enum WorkspaceReason {
     StorageFailed,
     /// A volume of the Pod can't be used.
     VolumeFailed,
+    /// The Pod's NetworkPolicy has to be enforced, and is not as far as is known.
+    NotIsolated,
+    /// No failure: the policy is enforced.
+    Enforced,
+    /// No failure: it is not.
+    NotEnforced,
+    /// No failure: it is not known.
+    NotMeasured,
 }
 
 /// What the container says in its termination message.
@@ -69,6 +79,18 @@ impl WorkspaceVerdict {
         }
     }
 
+    /// What a Pod that goes on says of its isolation.
+    fn of(finding: &Finding) -> Self {
+        Self {
+            reason: match finding {
+                Finding::Enforced(_) => WorkspaceReason::Enforced,
+                Finding::Open(_) => WorkspaceReason::NotEnforced,
+                Finding::Unmeasured(_) => WorkspaceReason::NotMeasured,
+            },
+            message: finding.to_string(),
+        }
+    }
+
     /// Reads a container's termination message; `None` if it is not one of these.
     pub fn parse(message: &str) -> Option<Self> {
         (message.len() <= VERDICT_BYTES).then(|| serde_json::from_str(message).ok())?
@@ -84,6 +106,9 @@ pub enum WorkspaceError {
          empty the prefix."
     )]
     PrefixInUse(String),
+    /// `network.enforcement` is `Require`.
+    #[error("{0} The run is not started, because network.enforcement is Require.")]
+    NotIsolated(Finding),
     /// The plan does not hold.
     #[error("{0}. {next}", next = .0.next_step())]
     Plan(#[from] Refusal),
@@ -113,6 +138,7 @@ impl WorkspaceError {
     pub fn verdict(&self) -> WorkspaceVerdict {
         let reason = match self {
             Self::PrefixInUse(_) => WorkspaceReason::PrefixInUse,
+            Self::NotIsolated(_) => WorkspaceReason::NotIsolated,
             Self::Plan(_) => WorkspaceReason::PlanInvalid,
             Self::Storage(_) => WorkspaceReason::StorageFailed,
             Self::Volume { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
@@ -124,23 +150,41 @@ impl WorkspaceError {
     }
 }
 
-/// Prepares the Pod. A failure is also written to the termination log.
+/// Prepares the Pod. A failure, and what was found of the Pod's isolation, are also written to the termination log.
 pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
-    let result = prepare_with_own_identity(&setting).await;
-    if let Err(error) = &result {
-        let verdict = error.verdict().to_json();
-        if let Err(error) = fs::write(&setting.places.termination_log, verdict) {
-            tracing::warn!("the termination log can't be written: {error}");
-        }
+    let result = measure_and_prepare(&setting).await;
+    let verdict = match &result {
+        Ok(finding) => finding.as_ref().map(WorkspaceVerdict::of),
+        Err(error) => Some(error.verdict()),
+    };
+    if let Some(verdict) = verdict
+        && let Err(error) = fs::write(&setting.places.termination_log, verdict.to_json())
+    {
+        tracing::warn!("the termination log can't be written: {error}");
     }
-    result
+    result.map(|_| ())
 }
 
-async fn prepare_with_own_identity(setting: &Setting) -> Result<(), WorkspaceError> {
+async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
     let plan = &setting.run.plan;
     results_plan(&setting.run)?;
+    let finding = measure(setting).await?;
     let aws = identity::aws(setting).await;
-    prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await
+    prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await?;
+    Ok(finding)
+}
+
+/// Whether the Pod's NetworkPolicy is enforced; an error if the run may not go on as it is.
+async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
+    let Some(asked) = &setting.run.isolation else {
+        return Ok(None);
+    };
+    let finding = isolation::find(asked, setting.api_server, setting.pace.enforced_within).await;
+    tracing::info!("{finding}");
+    if asked.enforcement == Enforcement::Require && !matches!(finding, Finding::Enforced(_)) {
+        return Err(WorkspaceError::NotIsolated(finding));
+    }
+    Ok(Some(finding))
 }
 
 /// Does the work, again and again while S3 does not answer.
@@ -301,6 +345,30 @@ mod tests {
         let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
         assert!(read.belongs_to("uid-1", 1) && !read.is_final);
         assert_eq!((read.total, read.pairs.len(), read.pairs[1].total), (4, 2, 2));
+    }
+
+    #[test]
+    fn what_a_pod_found_of_its_isolation_is_no_failure_unless_it_has_to_be_isolated() {
+        let address = "10.96.0.1:443".parse().unwrap();
+        for (finding, reason) in [
+            (Finding::Enforced(address), WorkspaceReason::Enforced),
+            (Finding::Open(address), WorkspaceReason::NotEnforced),
+            (
+                Finding::Unmeasured("No address.".to_owned()),
+                WorkspaceReason::NotMeasured,
+            ),
+        ] {
+            let verdict = WorkspaceVerdict::of(&finding);
+            assert_eq!(verdict.reason, reason);
+            assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
+            let verdict = WorkspaceError::NotIsolated(finding).verdict();
+            assert_eq!(verdict.reason, WorkspaceReason::NotIsolated);
+            assert!(
+                verdict.message.contains("network.enforcement is Require"),
+                "{}",
+                verdict.message
+            );
+        }
     }
 
     #[test]

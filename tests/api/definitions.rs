@@ -85,7 +85,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
                 "flushSeconds": 1800,
             },
             "storage": {"bucket": "results", "limit": 21_474_836_480_i64},
-            "network": {"dns": true},
+            "network": {"policy": "Managed", "enforcement": "Warn", "dns": true},
             "running": {},
             "paused": false,
             "verify": "Warn",
@@ -147,9 +147,18 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         (
             "network",
             json!({"egress": [{"cidr": "10.0.0.0/16"}]}),
-            json!({"egress": [{"cidr": "10.0.0.0/16"}], "dns": true}),
+            json!({
+                "policy": "Managed",
+                "enforcement": "Warn",
+                "egress": [{"cidr": "10.0.0.0/16"}],
+                "dns": true,
+            }),
         ),
-        ("network", json!({"dns": false}), json!({"dns": false})),
+        (
+            "network",
+            json!({"dns": false, "policy": "External"}),
+            json!({"dns": false, "policy": "External", "enforcement": "Warn"}),
+        ),
         ("running", json!({"total": 3}), json!({"total": 3})),
     ]
 }

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use kube::{Client, Config};
 use leaderboard_operator::controller::context::Settings;
 use leaderboard_operator::controller::leader::{self, Identity, Timing};
 use leaderboard_operator::controller::run::{self, Clients, RunError};
@@ -30,12 +31,15 @@ pub struct Operator {
 impl Operator {
     /// Starts one for a namespace.
     pub async fn start(namespace: &str, aws: Aws) -> Self {
-        let server = server().await;
+        Self::start_as(namespace, aws, server().await.config())
+    }
+
+    /// Starts one with the rights that this configuration gives.
+    pub fn start_as(namespace: &str, aws: Aws, config: Config) -> Self {
         let (stop, signal) = Stop::new();
         let seen = Observability::new(signal);
-        let config = server.config();
         let clients = Clients {
-            api: server.client(),
+            api: Client::try_from(config.clone()).unwrap(),
             watch: watch_client(config.clone()).unwrap(),
             lease: leader::lease_client(config).unwrap(),
         };

@@ -72,6 +72,7 @@ impl Pod {
             setting: Setting {
                 run,
                 pod_uid: "pod-1".to_owned(),
+                api_server: None,
                 role_arn: None,
                 places: Places {
                     logs: at("logs"),
@@ -87,6 +88,7 @@ impl Pod {
                     grace: Duration::from_secs(5),
                     least: Duration::from_millis(100),
                     backoff: Duration::from_millis(500),
+                    enforced_within: Duration::from_secs(2),
                 },
             },
             folder,
@@ -253,6 +255,7 @@ fn run(bucket: &str) -> Run {
         flush_seconds: 60,
         cancel_seconds: 20,
         log_group: None,
+        isolation: None,
     }
 }
 

@@ -292,6 +292,7 @@ fn queue() -> Vec<Case> {
 
 fn pods_and_tables() -> Vec<Case> {
     let to = |cidr: &str| json!({"network": {"egress": [{"cidr": cidr, "ports": [443]}]}});
+    let policy = |policy: &str, enforcement: &str| json!({"network": {"policy": policy, "enforcement": enforcement}});
     let identity = |identity: Value| json!({ "podIdentity": identity });
     let role = "arn:aws:iam::123456789012:role/pods";
     let secret = identity(json!({"secretRef": "aws", "serviceAccountName": "pods"}));
@@ -302,6 +303,11 @@ fn pods_and_tables() -> Vec<Case> {
     let one_way = "exactly one of roleArn and secretRef";
     vec![
         case("is not a range of addresses", &to("2001:db8::/32"), &to("10.0.0.1")),
+        case(
+            "Require needs network.policy Managed",
+            &policy("Managed", "Require"),
+            &policy("External", "Require"),
+        ),
         case(one_way, &secret, &identity(json!({"roleArn": role}))),
         case(one_way, &secret, &identity(json!({"secretRef": null}))),
         case(

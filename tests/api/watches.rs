@@ -76,6 +76,7 @@ async fn the_preflight_finds_the_kinds_and_the_permissions_of_an_administrator()
         resource,
         verb,
         namespace: None,
+        name: None,
     };
     let needs = [need("submissions", "watch"), need("submissions/status", "patch")];
     assert_eq!(access_missing(&client, &needs).await, Vec::<String>::new());

@@ -72,14 +72,26 @@ async fn cancelled_at_the_worst_moment(scene: &Scene, evalai: &Evalai, phase: u6
         let mut lists = log.entries().filter(|entry| entry.id > before && entry.method == "GET");
         lists.any(|entry| entry.path.contains("submission/?status=submitted") && entry.answered.is_some())
     });
-    tokio::time::timeout(LIMIT, listed).await.expect("no list of new submissions is asked for");
+    tokio::time::timeout(LIMIT, listed)
+        .await
+        .expect("no list of new submissions is asked for");
     let cancelled_at = evalai.handle.with_state(|state| {
         state.submissions.get_mut(&pk).unwrap().status = Status::Cancelled;
         Timestamp::now()
     });
     let ended = |s: &Submission| state(s).is_some_and(State::is_terminal) || reason(s) == "Paused";
-    scene.submission(&format!("submission-{pk}"), "its cancel was observed or undone", LIMIT, ended).await;
-    let writes = evalai.requests().into_iter().filter(|entry| entry.method != "GET" && entry.body["submission"] == pk);
+    scene
+        .submission(
+            &format!("submission-{pk}"),
+            "its cancel was observed or undone",
+            LIMIT,
+            ended,
+        )
+        .await;
+    let writes = evalai
+        .requests()
+        .into_iter()
+        .filter(|entry| entry.method != "GET" && entry.body["submission"] == pk);
     let mut under_way = writes.filter(|write| write.time <= cancelled_at);
     evalai.submission(pk).status == Status::Cancelled || under_way.next().is_some()
 }
@@ -100,7 +112,9 @@ async fn deleted_by_the_participant(scene: &Scene, evalai: &Evalai, phase: u64) 
     let begun = tokio::time::Instant::now();
     evalai.delete(pk).await;
     let stopping = |s: &Submission| s.status.as_ref().is_some_and(|s| s.times.stopping.is_some());
-    scene.submission(&name, "its deletion is observed", LIMIT, stopping).await;
+    scene
+        .submission(&name, "its deletion is observed", LIMIT, stopping)
+        .await;
     let noticed = begun.elapsed() <= NOTICED;
     case.ends(scene, &name, LIMIT).await;
     evalai.await_status(pk, Status::Cancelled, LIMIT).await;
@@ -133,7 +147,11 @@ async fn resumed_by_the_participant(scene: &Scene, evalai: &Evalai, phase: u64) 
     let attempts = scene.settled(&name, LIMIT).await.spec.attempt;
     case.also(&format!(
         "attempts without a message: {}",
-        if attempts <= 2 { "at most 1".to_owned() } else { (attempts - 1).to_string() }
+        if attempts <= 2 {
+            "at most 1".to_owned()
+        } else {
+            (attempts - 1).to_string()
+        }
     ));
     case.close();
 }
@@ -146,17 +164,32 @@ async fn images_that_are_none(scene: &Scene, evalai: &Evalai, phase: u64) {
     );
     board(scene, evalai, phase, json!({})).await;
     scene.ready(&format!("lb-{phase}")).await;
-    let images = ["", "   ", "registry.example/Team-A/Agent:1", "registry.example/téam/agent:1", "a b"];
+    let images = [
+        "",
+        "   ",
+        "registry.example/Team-A/Agent:1",
+        "registry.example/téam/agent:1",
+        "a b",
+    ];
     let ends = images.map(|image| async move {
         let pk = evalai.submit(image, phase).await;
         let settled = scene.settled(&format!("submission-{pk}"), LIMIT).await;
-        (pk, reason(&settled) == "ImageInvalid" && state(&settled) == Some(State::Failed))
+        (
+            pk,
+            reason(&settled) == "ImageInvalid" && state(&settled) == Some(State::Failed),
+        )
     });
     let ends = join_all(ends).await;
     let failed = ends.iter().filter(|(_, failed)| *failed).count();
-    let published = ends.iter().filter(|(pk, _)| evalai.submission(*pk).status == Status::Failed).count();
+    let published = ends
+        .iter()
+        .filter(|(pk, _)| evalai.submission(*pk).status == Status::Failed)
+        .count();
     let jobs = scene.jobs().await;
-    let made = ends.iter().filter(|(pk, _)| jobs.contains(&format!("submission-{pk}-1"))).count();
+    let made = ends
+        .iter()
+        .filter(|(pk, _)| jobs.contains(&format!("submission-{pk}-1")))
+        .count();
     case.also(&format!("{failed} Failed ImageInvalid"));
     case.also(&format!("{published} EvalAI failed"));
     case.also(&format!("{made} Jobs"));
@@ -197,9 +230,19 @@ async fn two_servers_with_the_same_ids_stay_apart() {
             case.ends(scene, &name, LIMIT).await;
             evalai.await_status(pk, Status::Finished, LIMIT).await;
         }
-        let boards: Vec<_> = scene.all::<Submission>().await.into_iter().map(|s| s.spec.leaderboard).collect();
-        let right = apart && boards.len() == 2 && boards.contains(&"one".to_owned()) && boards.contains(&"other".to_owned());
-        case.also(if right { "each published where it was submitted" } else { "mixed up" });
+        let boards: Vec<_> = scene
+            .all::<Submission>()
+            .await
+            .into_iter()
+            .map(|s| s.spec.leaderboard)
+            .collect();
+        let right =
+            apart && boards.len() == 2 && boards.contains(&"one".to_owned()) && boards.contains(&"other".to_owned());
+        case.also(if right {
+            "each published where it was submitted"
+        } else {
+            "mixed up"
+        });
         case.close();
     })
     .await;
@@ -223,7 +266,11 @@ async fn a_server_that_closes_idle_connections_loses_no_write() {
         case.ends(scene, &format!("submission-{pk}"), LIMIT).await;
         case.evalai(evalai.submission(pk).status);
         let told = ["queued", "running"].map(|status| format!("{} {status}", evalai.told("PATCH", status)));
-        case.also(&format!("{}, {} finished", told.join(", "), evalai.told("PUT", "finished")));
+        case.also(&format!(
+            "{}, {} finished",
+            told.join(", "),
+            evalai.told("PUT", "finished")
+        ));
         case.close();
     })
     .await;

@@ -57,7 +57,9 @@ async fn the_endpoints_of_a_leaderboard_win_over_the_environment() {
         let evalai = Evalai::start(scene).await;
         let elsewhere = Gate::open("127.0.0.1", &scene.cloud.endpoint).await;
         elsewhere.shut();
-        scene.evalai_leaderboard("lb", &evalai, json!({"pairs": 1, "routes": 2})).await;
+        scene
+            .evalai_leaderboard("lb", &evalai, json!({"pairs": 1, "routes": 2}))
+            .await;
         let _operator = both_with(scene, "AWS_ENDPOINT_URL", &elsewhere.url);
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");

@@ -236,6 +236,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: ResultsFormat) -> Run {
         flush_seconds: 60,
         cancel_seconds: 20,
         log_group: None,
+        isolation: None,
     }
 }
 

@@ -150,7 +150,8 @@ impl Evalai {
     /// Deletes a submission as its participant does. No message is sent.
     pub async fn delete(&self, pk: u64) {
         let path = format!("/api/jobs/submission/{pk}");
-        self.call_as(PARTICIPANT, reqwest::Method::DELETE, &path, &Value::Null).await;
+        self.call_as(PARTICIPANT, reqwest::Method::DELETE, &path, &Value::Null)
+            .await;
     }
 
     /// Writes fields of a submission's row as somebody may.

@@ -6,7 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
 use super::failure::{self, infrastructure};
-use super::{Action, end};
+use super::{Action, end, isolation};
 use crate::api::conditions::{self, Truth};
 use crate::api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
 use crate::controller::view::{EvalaiInfo, Standing};
@@ -63,6 +63,9 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
     };
     if let Some(message) = not_ready(draft) {
         return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
+    }
+    if let Some(message) = isolation::missing(draft) {
+        return refuse(draft, reasons::NOT_ISOLATED, &message);
     }
     pin(draft, leaderboard, track, image, info.as_ref());
     draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");

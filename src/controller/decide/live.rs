@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 
 use super::draft::{Draft, after};
-use super::{Action, Tell, accept, end, failure, job_name, start, stop};
+use super::{Action, Tell, accept, end, failure, isolation, job_name, start, stop};
 use crate::api::conditions::{self, Truth};
 use crate::api::{PairStatus, Progress, State, Waiting, reasons};
 use crate::controller::view::{JobSight, JobView, PodView, Turn};
@@ -152,7 +152,11 @@ fn start_job(draft: &mut Draft<'_>) {
 /// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
 /// crash or a slow watch looks the same. `start_job` sets the mark, `start::watch` takes it away.
 fn was_seen(draft: &Draft<'_>) -> bool {
-    const BEFORE_IT: [&str; 2] = [reasons::JOB_NAME_TAKEN, reasons::LEADERBOARD_NOT_FOUND];
+    const BEFORE_IT: [&str; 3] = [
+        reasons::JOB_NAME_TAKEN,
+        reasons::LEADERBOARD_NOT_FOUND,
+        reasons::NOT_ISOLATED,
+    ];
     let seen = |c: &Condition| match c.status.as_str() {
         "True" => !BEFORE_IT.contains(&c.reason.as_str()),
         _ => c.reason != reasons::PREPARING,
@@ -172,6 +176,11 @@ fn without_its_job(draft: &mut Draft<'_>) {
         let message = accept::no_leaderboard(draft);
         let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
         draft.say(draft.live_state(), reasons::LEADERBOARD_NOT_FOUND, message);
+        return draft.requeue_in(BACKSTOP);
+    }
+    if let Some(message) = isolation::missing(draft) {
+        let message = draft.stall(reasons::NOT_ISOLATED, &message);
+        draft.say(draft.live_state(), reasons::NOT_ISOLATED, message);
         return draft.requeue_in(BACKSTOP);
     }
     if was_seen(draft) {

@@ -9,6 +9,7 @@ mod after;
 mod draft;
 mod end;
 mod failure;
+mod isolation;
 mod live;
 mod log;
 mod next_steps;

@@ -42,7 +42,7 @@ pub(super) fn smaller() -> Steps {
 pub(super) fn of_infrastructure(reason: &str) -> &'static str {
     match reason {
         // The words of `workspace` hold it already.
-        reasons::PREFIX_IN_USE => "",
+        reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => "",
         reasons::JOB_DELETED => "Find out who deletes Jobs in this namespace, then resume it.",
         reasons::NODE_LOST => "Look at the node, then resume it.",
         reasons::RESULTS_NOT_STORED => "Look at the log of logcopy and at the bucket, then resume it.",
@@ -67,6 +67,7 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
         reasons::JOB_DELETED | reasons::JOB_FAILED => "The cluster ended the run.",
         reasons::PHASE_DIFFERS => "The submission belongs to another phase than the one it was to be run for.",
+        reasons::NOT_ISOLATED => "The run could not be isolated from the network.",
         reasons::PREFIX_IN_USE => "The place for the results is in use.",
         _ => "The run could not be set up.",
     };

@@ -214,7 +214,7 @@ fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &s
 
 fn too_late(found: &Trouble, seconds: i64) -> Failure {
     match found.reason {
-        reasons::PREFIX_IN_USE => return infrastructure(found.reason, &found.message),
+        reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => return infrastructure(found.reason, &found.message),
         reasons::IMAGE_INVALID => return failure::image_invalid(&found.message),
         _ => {}
     }

@@ -10,6 +10,10 @@ use crate::text::sentence;
 const PREFIX_IN_USE: &str = "The run's place in the bucket holds another object's results. Apply it with attempt: 2 to take \
                              them up, or empty the prefix.";
 
+/// The same for a Pod that was not isolated.
+const NOT_ISOLATED: &str =
+    "The Pod could reach what its NetworkPolicy forbids. Use a network plugin that enforces policies.";
+
 /// A container that does not start.
 pub(super) struct Trouble {
     pub(super) reason: &'static str,
@@ -109,6 +113,13 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
         return Some(Trouble {
             is_hopeless: true,
             ..trouble(reasons::PREFIX_IN_USE, why, false)
+        });
+    }
+    if name == names::CONTAINER_WORKSPACE && end.what.as_deref() == Some(reasons::NOT_ISOLATED) {
+        // Another try of the same Pod would find the same; the next Pod may get another node.
+        return Some(Trouble {
+            is_hopeless: true,
+            ..trouble(reasons::NOT_ISOLATED, end.why.as_deref().unwrap_or(NOT_ISOLATED), false)
         });
     }
     let code = || format!("it ended with code {} ({})", end.exit_code, end.reason);

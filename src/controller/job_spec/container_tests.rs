@@ -4,6 +4,7 @@ use serde_json::{Value, json};
 
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
 use super::{JobInput, build_json, run_document};
+use crate::api::names;
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
 
@@ -293,6 +294,45 @@ fn the_hosts_variables_win_but_not_over_the_plan() {
     unique.sort_unstable();
     unique.dedup();
     assert_eq!(names.len(), unique.len(), "{names:?}");
+}
+
+#[test]
+fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
+    let asked = |network: Value, found: Option<(&str, i64)>| {
+        let mut case = Case::new("V2", json!({ "network": network }));
+        case.leaderboard.metadata.generation = Some(3);
+        if let Some((reason, generation)) = found {
+            let condition = json!({"type": "Isolated", "status": "False", "reason": reason, "message": "",
+                                   "observedGeneration": generation, "lastTransitionTime": "2026-11-01T12:00:00Z"});
+            case.leaderboard.status = serde_json::from_value(json!({"conditions": [condition]})).unwrap();
+        }
+        let annotation = &case.json()["spec"]["template"]["metadata"]["annotations"][names::ANNOTATION_GENERATION];
+        assert_eq!(annotation, "3");
+        serde_json::to_value(run_document(&case.input()).isolation).unwrap()
+    };
+    assert_eq!(
+        asked(json!({}), None),
+        json!({"enforcement": "Warn", "isKnownOpen": false})
+    );
+    assert_eq!(
+        asked(
+            json!({"enforcement": "Require", "probe": "192.0.2.1:80", "egress": [{"cidr": "10.0.0.0/8"}]}),
+            None
+        ),
+        json!({"enforcement": "Require", "probe": "192.0.2.1:80", "egress": ["10.0.0.0/8"], "isKnownOpen": false})
+    );
+    for unmeasured in [json!({"enforcement": "Off"}), json!({"policy": "External"})] {
+        assert_eq!(asked(unmeasured, None), Value::Null);
+    }
+    for (enforcement, reason, generation, expected) in [
+        ("Warn", "NotEnforced", 3, true),
+        ("Warn", "NotEnforced", 2, false),
+        ("Warn", "Forbidden", 3, false),
+        ("Require", "NotEnforced", 3, false),
+    ] {
+        let told = asked(json!({"enforcement": enforcement}), Some((reason, generation)));
+        assert_eq!(told["isKnownOpen"], expected, "{enforcement} {reason} of {generation}");
+    }
 }
 
 #[test]

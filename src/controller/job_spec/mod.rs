@@ -25,8 +25,11 @@ use kube::api::{DynamicObject, TypeMeta};
 use serde_json::{Value, json};
 
 use super::pod_overlay;
-use crate::api::{Deadlines, Leaderboard, LeaderboardSpec, RunPlan, Submission, Track, names};
-use crate::pod::run::Run;
+use crate::api::{
+    Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions, names,
+    reasons,
+};
+use crate::pod::run::{Isolation, Run};
 
 pub(super) use pairs::FIXED_ENV;
 pub(super) use volumes::{CONTENTS_VOLUMES, OWN_VOLUMES, protected_mounts};
@@ -140,7 +143,28 @@ pub fn run_document(input: &JobInput<'_>) -> Run {
         flush_seconds: unsigned(spec.deadlines.flush_seconds),
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
         log_group: spec.log_group.clone(),
+        isolation: isolation(input.leaderboard),
     }
+}
+
+/// How the Pod measures whether its policy is enforced. What policies of the cluster's own forbid is not known.
+fn isolation(leaderboard: &Leaderboard) -> Option<Isolation> {
+    let network = &leaderboard.spec.network;
+    if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
+        return None;
+    }
+    let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
+    let found = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
+    let is_open = found.is_some_and(|found| {
+        found.reason == reasons::NOT_ENFORCED && found.observed_generation == leaderboard.metadata.generation
+    });
+    Some(Isolation {
+        enforcement: network.enforcement,
+        probe: network.probe.clone(),
+        egress: network.egress.iter().map(|egress| egress.cidr.clone()).collect(),
+        // A run that must not go on is given every chance.
+        is_known_open: is_open && network.enforcement == Enforcement::Warn,
+    })
 }
 
 fn ours(input: &JobInput<'_>) -> Job {
@@ -222,11 +246,16 @@ fn template(input: &JobInput<'_>) -> PodTemplateSpec {
             annotations: Some(BTreeMap::from([
                 ("cluster-autoscaler.kubernetes.io/safe-to-evict".into(), "false".into()),
                 ("karpenter.sh/do-not-disrupt".into(), "true".into()),
+                (names::ANNOTATION_GENERATION.into(), generation(input).to_string()),
             ])),
             ..ObjectMeta::default()
         }),
         spec: Some(pod(input)),
     }
+}
+
+fn generation(input: &JobInput<'_>) -> i64 {
+    input.leaderboard.metadata.generation.unwrap_or_default()
 }
 
 fn pod(input: &JobInput<'_>) -> PodSpec {

@@ -7,11 +7,13 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
+use super::isolation::{self, Policy};
 use super::reach::Unreachable;
 use crate::api::conditions::{self, Truth};
 use crate::api::leaderboard::Counts;
 use crate::api::{Evalai, Leaderboard, LeaderboardStatus, effective, names, reasons};
 use crate::controller::decide::previous_controller;
+use crate::pod::workspace::WorkspaceVerdict;
 
 /// What one pass saw of a Leaderboard.
 #[derive(Clone, Debug)]
@@ -23,6 +25,10 @@ pub struct LeaderboardView {
     pub counts: Counts,
     /// Submissions that are live or not yet published and recorded.
     pub in_use: usize,
+    /// How the NetworkPolicy of its Pods stands.
+    pub policy: Policy,
+    /// What the last of its Pods has found of its isolation.
+    pub measured: Option<WorkspaceVerdict>,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
     /// What of its bucket, table and queues cannot be reached.
@@ -68,16 +74,11 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.budget = view.budget.map(|(used, limit)| format!("{used}/{limit}"));
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
-    let (truth, reason, message) = with_delay(view, ready(view));
-    conditions::set(
-        &mut status.conditions,
-        conditions::READY,
-        truth,
-        reason,
-        &message,
-        generation,
-        &now,
-    );
+    let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
+    let ready = with_delay(view, ready(view));
+    for (type_, (truth, reason, message)) in [(conditions::READY, ready), (conditions::ISOLATED, isolated)] {
+        conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
+    }
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
     if deleting && view.in_use > 0 {
         let message = format!(
@@ -155,7 +156,10 @@ fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     if let Some(why) = &view.invalid_pod {
         return no(reasons::INVALID_POD, why.clone());
     }
-    None
+    match &view.policy {
+        Policy::Refused(why) | Policy::NotApplied(why) => no(reasons::NOT_ISOLATED, why.clone()),
+        Policy::InPlace | Policy::External => None,
+    }
 }
 
 fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
@@ -270,6 +274,8 @@ mod tests {
             all: all.to_vec(),
             counts: Counts::default(),
             in_use: 0,
+            policy: Policy::InPlace,
+            measured: None,
             invalid_pod: None,
             unreachable: None,
             evalai: EvalaiStanding::Fits { note: None },
@@ -410,6 +416,30 @@ mod tests {
                 (condition.status.as_str(), condition.message.as_str()),
                 (ready, message)
             );
+        }
+    }
+
+    #[test]
+    fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
+        let one = leaderboard("one", 1, 7, "https://e", "a/");
+        for (policy, ready, isolated) in [
+            (Policy::InPlace, reasons::READY, reasons::NOT_MEASURED),
+            (Policy::External, reasons::READY, reasons::EXTERNAL),
+            (Policy::Refused("No.".into()), reasons::NOT_ISOLATED, reasons::FORBIDDEN),
+            (
+                Policy::NotApplied("No.".into()),
+                reasons::NOT_ISOLATED,
+                reasons::NOT_APPLIED,
+            ),
+        ] {
+            let seen = LeaderboardView {
+                policy,
+                ..view(&one, &[])
+            };
+            let plan = decide(&seen);
+            assert_eq!(reason(&plan).1, ready);
+            let shown = conditions::get(&plan.status.conditions, conditions::ISOLATED).unwrap();
+            assert_eq!(shown.reason, isolated);
         }
     }
 

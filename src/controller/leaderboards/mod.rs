@@ -1,9 +1,11 @@
-//! A pass of one Leaderboard: its token and checks, the policy of its Pods, its status and finalizer.
+//! A pass of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
-//! Reads the token (every five minutes, or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands
-//! the way to EvalAI to `sync`. `decide` and `reach` are pure.
+//! Applies the policy before it waits for anything else, since no Job is made without it. Reads the token (every five minutes,
+//! or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands the way to EvalAI to `sync`. `decide`
+//! and `reach` are pure.
 
 pub mod decide;
+pub mod isolation;
 mod places;
 mod probe;
 mod reach;
@@ -13,25 +15,26 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{Patch, PatchParams};
 use kube::{Api, Resource, ResourceExt};
 use serde_json::json;
 
 use super::context::{CALL_TIMEOUT, Context};
-use super::network_policy::network_policy;
 use super::observe::uid_of;
 use crate::api::leaderboard::Counts;
 use crate::api::{Leaderboard, State, Submission, conditions, names};
 use crate::observability::text;
 use crate::services::ObjectKey;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
+use isolation::{Applied, Policy};
 use probe::Probe;
 
 /// A status whose counts alone have changed is written at most this often.
 const COUNTS_EVERY: Duration = Duration::from_secs(5);
 /// A pass that something is due for is at least so far away.
 const SOONEST: Duration = Duration::from_secs(1);
+/// A policy that the API server did not take is applied again after this long.
+const POLICY_AGAIN: Duration = Duration::from_secs(10);
 /// A Leaderboard is looked at this often without any cause.
 const RESYNC: Duration = Duration::from_mins(1);
 
@@ -53,6 +56,7 @@ pub enum LeaderboardError {
 pub struct Desk {
     probes: Mutex<HashMap<String, Probe>>,
     written: Mutex<HashMap<String, Timestamp>>,
+    policies: Mutex<HashMap<String, Applied>>,
 }
 
 impl Desk {
@@ -60,6 +64,17 @@ impl Desk {
     pub fn forget(&self, uid: &str) {
         self.probes.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
         self.written.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
+        self.policies.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
+    }
+
+    fn applied(&self, uid: &str) -> Option<Applied> {
+        let policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
+        policies.get(uid).cloned()
+    }
+
+    fn note_applied(&self, uid: &str, applied: Applied) {
+        let mut policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
+        policies.insert(uid.to_owned(), applied);
     }
 
     fn probe(&self, uid: &str) -> Probe {
@@ -100,13 +115,12 @@ impl Desk {
 pub async fn reconcile(leaderboard: Arc<Leaderboard>, context: Arc<Context>) -> Result<Duration, LeaderboardError> {
     let uid = uid_of(leaderboard.as_ref());
     let now = Timestamp::now();
+    // One that is being deleted keeps it too: its submissions may still run.
+    let policy = isolation::keep(&context, &leaderboard, now).await;
     let probe = context.desk.probe(&uid).refresh(&context, &leaderboard, now).await;
     context.desk.keep(&uid, probe.clone());
-    let view = observe(&context, &leaderboard, &probe, now);
+    let view = observe(&context, &leaderboard, policy, &probe, now);
     let plan = decide(&view);
-    if leaderboard.metadata.deletion_timestamp.is_none() {
-        apply_policy(&context, &leaderboard).await?;
-    }
     set_finalizer(&context, &leaderboard, &plan).await?;
     if plan.finalizer == Some(false) {
         context.sync.set_target(&leaderboard, None);
@@ -115,10 +129,28 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, context: Arc<Context>) -> 
     }
     let again = write_status(&context, &leaderboard, &plan, now).await?;
     let next = probe.next(now).map(|at| at.duration_since(now).unsigned_abs());
+    let policy = policy_again(&context, &view);
+    let next = next.into_iter().chain(policy).min();
     Ok(next.map_or(again, |next| next.max(SOONEST).min(again)))
 }
 
-fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now: Timestamp) -> LeaderboardView {
+/// When a policy that is not in place, or is not seen to be, is applied again.
+fn policy_again(context: &Context, view: &LeaderboardView) -> Option<Duration> {
+    match view.policy {
+        Policy::External => None,
+        Policy::InPlace if context.stores.is_policy_in_place(&view.leaderboard) => None,
+        Policy::InPlace => Some(SOONEST),
+        Policy::Refused(_) | Policy::NotApplied(_) => Some(POLICY_AGAIN),
+    }
+}
+
+fn observe(
+    context: &Context,
+    leaderboard: &Arc<Leaderboard>,
+    policy: Policy,
+    probe: &Probe,
+    now: Timestamp,
+) -> LeaderboardView {
     let (counts, in_use) = census(context, leaderboard);
     let key = key_of(leaderboard);
     LeaderboardView {
@@ -127,6 +159,8 @@ fn observe(context: &Context, leaderboard: &Arc<Leaderboard>, probe: &Probe, now
         all: context.stores.leaderboards.state(),
         counts,
         in_use,
+        policy,
+        measured: isolation::measured(&context.stores, leaderboard),
         invalid_pod: probe.invalid_pod(),
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(context, leaderboard, &key, now),
@@ -169,24 +203,6 @@ fn needs_leaderboard(submission: &Submission) -> bool {
     !conditions::is_true(conditions, conditions::FINISHED)
         || waits(conditions::PUBLISHED)
         || waits(conditions::RECORDED)
-}
-
-async fn apply_policy(context: &Context, leaderboard: &Leaderboard) -> Result<(), LeaderboardError> {
-    let policy = network_policy(leaderboard);
-    let uid = uid_of(leaderboard);
-    if context.desk.probe(&uid).policy_is_applied(leaderboard) {
-        return Ok(());
-    }
-    let namespace = leaderboard.namespace().unwrap_or_default();
-    let api: Api<NetworkPolicy> = Api::namespaced(context.client.clone(), &namespace);
-    let params = PatchParams::apply(names::MANAGER_CHILDREN).force();
-    let name = policy.name_any();
-    let patch = Patch::Apply(&policy);
-    let call_result = call("the NetworkPolicy", leaderboard, api.patch(&name, &params, &patch)).await;
-    call_result?;
-    let probe = context.desk.probe(&uid).with_policy(leaderboard);
-    context.desk.keep(&uid, probe);
-    Ok(())
 }
 
 async fn set_finalizer(

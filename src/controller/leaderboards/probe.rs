@@ -34,8 +34,6 @@ pub(super) struct Probe {
     reach: Reach,
     /// Generation whose Pod was tried, and why it was refused.
     pod: Option<(i64, Option<String>)>,
-    /// Generation whose policy was applied.
-    policy: Option<i64>,
 }
 
 impl Probe {
@@ -78,15 +76,6 @@ impl Probe {
         let waits = self.token.as_ref().is_some_and(Result::is_err);
         let token = self.token_at.filter(|_| waits).and_then(|at| at.checked_add(SOON).ok());
         [self.reach.next(now), token].into_iter().flatten().min()
-    }
-
-    pub(super) fn policy_is_applied(&self, leaderboard: &Leaderboard) -> bool {
-        self.policy.is_some() && self.policy == leaderboard.metadata.generation
-    }
-
-    pub(super) fn with_policy(mut self, leaderboard: &Leaderboard) -> Self {
-        self.policy = leaderboard.metadata.generation;
-        self
     }
 
     pub(super) fn evalai_standing(

@@ -25,6 +25,9 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
     let leaderboard = leaderboard(context, &submission, &namespace);
+    let is_policy_in_place = leaderboard
+        .as_ref()
+        .is_some_and(|l| context.stores.is_policy_in_place(l));
     let status = submission.status.clone().unwrap_or_default();
     let name = job_name(&submission.name_any(), &status);
     let (job, pod) = children(context, &submission, &namespace, &name);
@@ -57,6 +60,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         now,
         submission,
         leaderboard,
+        is_policy_in_place,
         turn,
         job,
         pod,

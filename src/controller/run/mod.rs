@@ -5,15 +5,18 @@
 
 mod counts;
 mod marks;
+mod needs;
 mod passes;
 mod sweep;
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
+use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
@@ -24,12 +27,13 @@ use tokio::time::Instant;
 
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
+use super::leaderboards::isolation;
 use super::observe::board::Places;
 use super::observe::children_selector;
 use super::sync::Sync;
-use super::watches::preflight::{self, Need, await_kinds, watch_access};
+use super::watches::preflight::{self, await_kinds, watch_access};
 use super::watches::{Touch, Touches, Watch, Watchable, guarded, spawn_watch};
-use crate::api::{GROUP, Leaderboard, Submission};
+use crate::api::{Leaderboard, Submission};
 use crate::observability::Observability;
 use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::ObjectKey;
@@ -40,6 +44,9 @@ use marks::{Fingerprints, standing};
 
 /// Passes in hand may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
+
+/// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
+const POLICIES_LIMIT: Duration = Duration::from_secs(5);
 
 /// Why the controller ended.
 #[derive(thiserror::Error, Debug)]
@@ -88,7 +95,7 @@ async fn work(
     if !await_kinds(client, &["leaderboards", "submissions"], &seen).await {
         return Ok(());
     }
-    let rights = watch_rights(client.clone(), settings.namespace.clone(), seen.clone());
+    let rights = watch_rights(client.clone(), settings.namespace.clone(), lease.clone(), seen.clone());
     seen.tasks.may_end("permissions", rights);
     let watches = Watches::start(&clients.watch, settings.namespace.as_deref(), &seen);
     seen.readiness.registered();
@@ -109,35 +116,9 @@ async fn work(
     result
 }
 
-async fn watch_rights(client: Client, namespace: Option<String>, seen: Observability) {
-    let needs = needs(namespace.as_deref());
+async fn watch_rights(client: Client, namespace: Option<String>, lease: leader::Settings, seen: Observability) {
+    let needs = needs::needs(namespace.as_deref(), &lease);
     watch_access(client, &needs, &seen).await;
-}
-
-/// What the controller will have to do; /readyz names what is not allowed.
-fn needs(namespace: Option<&str>) -> Vec<Need<'_>> {
-    let need = |group, resource, verb| Need {
-        group,
-        resource,
-        verb,
-        namespace,
-    };
-    vec![
-        need(GROUP, "leaderboards", "watch"),
-        need(GROUP, "leaderboards/status", "patch"),
-        need(GROUP, "submissions", "watch"),
-        need(GROUP, "submissions", "patch"),
-        need(GROUP, "submissions", "create"),
-        need(GROUP, "submissions/status", "patch"),
-        need("batch", "jobs", "watch"),
-        need("batch", "jobs", "create"),
-        need("batch", "jobs", "patch"),
-        need("batch", "jobs", "delete"),
-        need("", "pods", "watch"),
-        need("", "pods", "patch"),
-        need("", "pods", "delete"),
-        need("networking.k8s.io", "networkpolicies", "patch"),
-    ]
 }
 
 /// One client for calls, one whose dead connections end for watches, one without retries for the lease.
@@ -152,6 +133,7 @@ struct Watches {
     submissions: Watch<Submission>,
     jobs: Watch<Job>,
     pods: Watch<Pod>,
+    policies: Watch<NetworkPolicy>,
 }
 
 impl Watches {
@@ -162,6 +144,7 @@ impl Watches {
             submissions: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, seen),
             jobs: spawn_watch(guarded(client.clone(), namespace), children(), trim_job, seen),
             pods: spawn_watch(guarded(client.clone(), namespace), children(), trim_pod, seen),
+            policies: spawn_watch(guarded(client.clone(), namespace), children(), |_| {}, seen),
         }
     }
 
@@ -171,6 +154,7 @@ impl Watches {
             submissions: self.submissions.store.clone(),
             jobs: self.jobs.store.clone(),
             pods: self.pods.store.clone(),
+            policies: self.policies.store.clone(),
         }
     }
 
@@ -180,6 +164,7 @@ impl Watches {
         let _ = self.submissions.store.wait_until_ready().await;
         let _ = self.jobs.store.wait_until_ready().await;
         let _ = self.pods.store.wait_until_ready().await;
+        let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
     }
 
     /// Tells everything that is there now, then everything that is touched.
@@ -203,7 +188,7 @@ impl Watches {
             },
         );
         let (mut submissions, mut places) = (Fingerprints::default(), Places::default());
-        let context = Arc::clone(context);
+        let (policies_of, context) = (Arc::clone(context), Arc::clone(context));
         forward(
             tasks,
             self.submissions.subscribe(),
@@ -233,9 +218,25 @@ impl Watches {
         forward(tasks, self.jobs.subscribe(), touched, |touch: Touch<Job>| {
             owner(touch.object.as_ref())
         });
-        forward(tasks, self.pods.subscribe(), touched, |touch: Touch<Pod>| {
-            owner(touch.object.as_ref())
+        let mut measured = HashSet::new();
+        forward(tasks, self.pods.subscribe(), touched, move |touch: Touch<Pod>| {
+            let pod = touch.object.as_ref();
+            let uid = pod.uid().unwrap_or_default();
+            let mut concerned = owner(pod);
+            if touch.is_gone {
+                measured.remove(&uid);
+            } else if isolation::finding(pod).is_some() && measured.insert(uid) {
+                concerned.extend(board(pod));
+            }
+            concerned
         });
+        tasks.stay("policies", isolation::restore(self.policies.subscribe(), policies_of));
+        forward(
+            tasks,
+            self.policies.subscribe(),
+            touched,
+            |touch: Touch<NetworkPolicy>| board(touch.object.as_ref()).into_iter().collect(),
+        );
     }
 }
 
@@ -262,6 +263,10 @@ pub(super) fn trim_pod(pod: &mut Pod) {
 
 fn owner(child: &impl ResourceExt) -> Vec<Touched> {
     Stores::owner_of(child).map(Touched::Submission).into_iter().collect()
+}
+
+fn board(child: &impl ResourceExt) -> Option<Touched> {
+    Stores::leaderboard_of(child).map(Touched::Leaderboard)
 }
 
 fn key(object: &impl ResourceExt) -> ObjectKey {

@@ -13,20 +13,23 @@ use crate::controller::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 15] = [
+const TASKS: [&str; 18] = [
     "changes of EvalAI",
     "changes of rows",
     "events of jobs",
     "events of leaderboards",
+    "events of networkpolicies",
     "events of pods",
     "events of submissions",
     "gauges",
     "lease",
     "permissions",
+    "policies",
     "reconciles",
     "sweep",
     "watch of jobs",
     "watch of leaderboards",
+    "watch of networkpolicies",
     "watch of pods",
     "watch of submissions",
 ];

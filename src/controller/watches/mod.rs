@@ -281,6 +281,11 @@ impl<K: Watchable> Task<K> {
         match error {
             // Both come from a watch that had been let in.
             Error::WatchError(_) | Error::WatchFailed(_) => self.probe.running(),
+            Error::InitialListFailed(kube::Error::Api(status)) | Error::WatchStartFailed(kube::Error::Api(status))
+                if status.code == 403 =>
+            {
+                self.probe.refused();
+            }
             _ => self.probe.failed(),
         }
         let told = text::watch(error);

@@ -37,8 +37,10 @@ pub struct Need<'a> {
     /// Plural; a sub-resource follows after a slash.
     pub resource: &'a str,
     pub verb: &'a str,
-    /// None: in every namespace.
+    /// None: in every namespace, or of a kind that has none.
     pub namespace: Option<&'a str>,
+    /// The one object that it is about; None: any.
+    pub name: Option<&'a str>,
 }
 
 impl fmt::Display for Need<'_> {
@@ -46,6 +48,9 @@ impl fmt::Display for Need<'_> {
         write!(f, "{} {}", self.verb, self.resource)?;
         if !self.group.is_empty() {
             write!(f, " of {}", self.group)?;
+        }
+        if let Some(name) = self.name {
+            write!(f, " {name}")?;
         }
         match self.namespace {
             Some(namespace) => write!(f, " in namespace {namespace}"),
@@ -144,6 +149,7 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
         subresource,
         verb: Some(need.verb.to_owned()),
         namespace: need.namespace.map(str::to_owned),
+        name: need.name.map(str::to_owned),
         ..ResourceAttributes::default()
     };
     let spec = SelfSubjectAccessReviewSpec {

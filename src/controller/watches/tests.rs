@@ -300,18 +300,21 @@ async fn the_preflight_names_each_missing_verb() {
             resource: "jobs",
             verb: "create",
             namespace: None,
+            name: None,
         },
         Need {
             group: "leaderboard.carla.org",
             resource: "submissions/status",
             verb: "patch",
             namespace: Some("ns"),
+            name: None,
         },
         Need {
             group: "",
             resource: "pods",
             verb: "list",
             namespace: None,
+            name: None,
         },
     ];
     let missing = access_missing(&client, &needs).await;

@@ -1,5 +1,12 @@
 //! The init container: whose prefix it is, and what comes back from it.
 
+use std::time::Instant;
+
+use leaderboard_operator::api::Enforcement;
+use leaderboard_operator::pod::run::Isolation;
+use tokio::io::AsyncReadExt;
+use tokio::net::{TcpListener, TcpStream};
+
 use super::*;
 
 #[tokio::test]
@@ -139,4 +146,72 @@ async fn a_failure_is_said_in_the_termination_log() {
     let verdict = WorkspaceVerdict::parse(&said).unwrap();
     assert_eq!(verdict.reason, WorkspaceReason::PlanInvalid);
     assert!(verdict.message.contains("overlap"), "{said}");
+}
+
+#[tokio::test]
+async fn a_pod_that_has_to_be_isolated_and_is_not_touches_nothing() {
+    let mut pod = Pod::new().await;
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    pod.setting.api_server = listener.local_addr().ok();
+    pod.setting.run.isolation = Some(Isolation {
+        enforcement: Enforcement::Require,
+        probe: None,
+        egress: Vec::new(),
+        is_known_open: false,
+    });
+    let began = Instant::now();
+    workspace::main(pod.setting.clone()).await.unwrap_err();
+    assert!(
+        began.elapsed() >= pod.setting.pace.enforced_within,
+        "a network plugin may be late"
+    );
+    let said = fs::read_to_string(&pod.setting.places.termination_log).unwrap();
+    let verdict = WorkspaceVerdict::parse(&said).unwrap();
+    assert_eq!(verdict.reason, WorkspaceReason::NotIsolated);
+    for part in ["could connect to 127.0.0.1:", "network.enforcement is Require"] {
+        assert!(verdict.message.contains(part), "{}", verdict.message);
+    }
+    assert!(pod.keys().await.is_empty() && !pod.setting.places.runner_for_all().exists());
+}
+
+/// A way to the stand-in on which the first connections are cut in the middle of an answer, as a network plugin does that
+/// begins to enforce a policy.
+async fn cutting(connections: u32) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let beyond = server().await.endpoint();
+    let beyond = beyond.trim_start_matches("http://").to_owned();
+    tokio::spawn(async move {
+        for number in 0.. {
+            let (mut near, _) = listener.accept().await.unwrap();
+            let mut far = TcpStream::connect(&beyond).await.unwrap();
+            tokio::spawn(async move {
+                if number >= connections {
+                    let _ = tokio::io::copy_bidirectional(&mut near, &mut far).await;
+                    return;
+                }
+                let (mut asks, mut answers) = (near.split(), far.split());
+                let forth = tokio::io::copy(&mut asks.0, &mut answers.1);
+                let mut some = answers.0.take(64 << 10);
+                let back = tokio::io::copy(&mut some, &mut asks.1);
+                tokio::select! { _ = forth => {}, _ = back => {} }
+                near.set_zero_linger().unwrap();
+            });
+        }
+    });
+    endpoint
+}
+
+#[tokio::test]
+async fn connections_that_are_cut_in_mid_transfer_are_made_anew() {
+    let lost = Pod::new().await;
+    lost.prepare().await.unwrap();
+    let log = "agent/agent1/leaderboard.log";
+    lost.archive.put(log, noise(6 * MIB, 3)).await.unwrap();
+    let bucket = lost.setting.run.plan.storage.bucket.clone();
+    let mut next = Pod::on(&cutting(3).await, &bucket, lost.setting.run.clone()).await;
+    "pod-2".clone_into(&mut next.setting.pod_uid);
+    next.prepare().await.unwrap();
+    assert_eq!(fs::read(next.path(log)).unwrap(), noise(6 * MIB, 3));
+    assert_eq!(lost.stored(OWNER_KEY).await.unwrap(), b"pod-2");
 }

@@ -96,6 +96,7 @@ impl World {
                 now: at(0),
                 submission: Arc::new(submission(evalai)),
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
+                is_policy_in_place: true,
                 turn: Turn::Go,
                 job: JobSight::Absent,
                 pod: None,

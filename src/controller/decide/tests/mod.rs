@@ -7,6 +7,7 @@ mod crashes;
 mod docs;
 mod end;
 mod failure;
+mod isolation;
 mod line;
 mod log;
 mod nodes;

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 
 use crate::api::conditions::{self, FINISHED, PUBLISHED};
-use crate::api::{FailureClass, State, SubmissionStatus};
+use crate::api::{FailureClass, PolicySource, State, SubmissionStatus};
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{JobSight, NodeSight, View};
 
@@ -66,7 +66,12 @@ fn one_job(view: &View, plan: &Plan) {
         assert_eq!((plan.status.attempt, plan.status.retry), (Some(*attempt), *retry));
         assert_eq!(plan.status.job, Some(job_name("sub", &plan.status)));
         assert!(plan.status.plan.is_some(), "a Job without a plan");
-        assert!(view.leaderboard.is_some(), "a Job without a Leaderboard");
+        let leaderboard = view.leaderboard.as_ref().expect("a Job without a Leaderboard");
+        let is_external = leaderboard.spec.network.policy == PolicySource::External;
+        assert!(
+            is_external || view.is_policy_in_place,
+            "a Job without its NetworkPolicy"
+        );
     }
     for action in &plan.actions {
         if let Action::DeleteJob { name, uid, .. } = action {

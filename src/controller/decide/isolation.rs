@@ -1,0 +1,31 @@
+//! No Job without the NetworkPolicy of its Leaderboard, as the Leaderboard's present spec asks for it.
+
+use super::draft::Draft;
+use crate::api::PolicySource;
+use crate::api::conditions;
+use crate::text::sentence;
+
+/// Why no Job may be made, if the policy is not in place. It is restored by the Leaderboard's reconcile, which wakes the
+/// submission.
+pub(super) fn missing(draft: &Draft<'_>) -> Option<String> {
+    let leaderboard = draft.view.leaderboard.as_ref()?;
+    let is_managed = leaderboard.spec.network.policy == PolicySource::Managed;
+    if !is_managed || draft.view.is_policy_in_place {
+        return None;
+    }
+    let name = &draft.spec().leaderboard;
+    let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
+    let isolated = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
+    let why = isolated.filter(|c| c.status == "False" && c.observed_generation == leaderboard.metadata.generation);
+    Some(match why {
+        Some(c) => format!(
+            "The NetworkPolicy of Leaderboard {name} is not in place ({}): {} The submission goes on once it is.",
+            c.reason,
+            sentence(&c.message)
+        ),
+        None => format!(
+            "The NetworkPolicy of Leaderboard {name} is being applied; the submission goes on once it is in place. If this \
+             lasts, look at the condition Isolated of the Leaderboard."
+        ),
+    })
+}

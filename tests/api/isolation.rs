@@ -1,0 +1,381 @@
+//! The NetworkPolicy of a Leaderboard, as the whole controller keeps it: there before any Job, back when it is edited or
+//! deleted, shown when it is refused, and measured by the Pods. The test plays the kubelet.
+
+use std::time::{Duration, Instant};
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::api::networking::v1::NetworkPolicy;
+use k8s_openapi::api::rbac::v1::{Role, RoleBinding};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
+use kube::runtime::wait::await_condition;
+use kube::{Api, Client, ResourceExt};
+use leaderboard_operator::api::{Leaderboard, Submission, conditions, reasons};
+use serde_json::{Value, json};
+use tokio::net::TcpListener;
+use tokio::time::timeout;
+
+use super::bridge::{LIMIT, StandIn};
+use super::objects::{Kind, create};
+use super::operator::Operator;
+use crate::support::apiserver::server;
+
+const NAME: &str = "carla";
+const POLICY: &str = "leaderboard-carla";
+/// Rights are known to the API server a moment after they were given.
+const POLL: Duration = Duration::from_millis(50);
+
+/// A namespace and a place in S3, before there is a Leaderboard or a controller.
+struct World {
+    client: Client,
+    namespace: String,
+    aws: StandIn,
+}
+
+impl World {
+    async fn new() -> Self {
+        let server = server().await;
+        Self {
+            client: server.client(),
+            namespace: server.namespace("isolation").await,
+            aws: StandIn::start().await,
+        }
+    }
+
+    fn api<K>(&self) -> Api<K>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
+        K::DynamicType: Default,
+    {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    async fn operator(&self) -> Operator {
+        Operator::start(&self.namespace, self.aws.aws.clone()).await
+    }
+
+    async fn leaderboard(&self, network: &Value) {
+        self.leaderboard_at(&self.aws.endpoint, network).await;
+    }
+
+    /// A Leaderboard whose bucket is at this endpoint.
+    async fn leaderboard_at(&self, endpoint: &str, network: &Value) {
+        let storage = json!({"bucket": self.aws.name("bucket"), "endpoint": endpoint});
+        let patch = json!({"spec": {"storage": storage, "network": network}});
+        let api = Kind::Leaderboard.api(&self.client, &self.namespace);
+        create(&api, Kind::Leaderboard.object(NAME, &[&patch]), false)
+            .await
+            .unwrap();
+    }
+
+    async fn change(&self, network: &Value) {
+        let patch = Patch::Merge(json!({"spec": {"network": network}}));
+        let api = self.api::<Leaderboard>();
+        api.patch(NAME, &PatchParams::default(), &patch).await.unwrap();
+    }
+
+    async fn submit(&self, name: &str) {
+        let api = Kind::Submission.api(&self.client, &self.namespace);
+        let patch = json!({"spec": {"leaderboard": NAME}});
+        create(&api, Kind::Submission.object(name, &[&patch]), false)
+            .await
+            .unwrap();
+    }
+
+    /// Waits until an object is so.
+    async fn until<K>(&self, name: &str, what: &str, holds: impl Fn(&K) -> bool) -> K
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>
+            + Clone
+            + std::fmt::Debug
+            + serde::de::DeserializeOwned
+            + Send
+            + 'static,
+        K::DynamicType: Default,
+    {
+        let reached = await_condition(self.api::<K>(), name, |found: Option<&K>| found.is_some_and(&holds));
+        let Ok(found) = timeout(LIMIT, reached).await else {
+            panic!("{what}: {:?}", self.api::<K>().get_opt(name).await);
+        };
+        found.unwrap().unwrap()
+    }
+
+    async fn job(&self, submission: &str) -> Job {
+        let name = format!("{submission}-1");
+        self.until(&name, "its Job is made", |_: &Job| true).await
+    }
+
+    /// Waits until the Leaderboard's condition `Isolated` says so.
+    async fn says(&self, status: &str, reason: &str) -> Condition {
+        let holds = |board: &Leaderboard| isolated(board).is_some_and(|c| c.status == status && c.reason == reason);
+        let board = self.until(NAME, reason, holds).await;
+        isolated(&board).unwrap()
+    }
+
+    /// Waits until a submission is held back, and gives its message.
+    async fn held_back(&self, name: &str) -> String {
+        let holds = |submission: &Submission| {
+            let status = submission.status.as_ref();
+            status.and_then(|s| s.reason.as_deref()) == Some(reasons::NOT_ISOLATED)
+        };
+        let found = self.until(name, "it waits for the policy", holds).await;
+        found.status.unwrap().message.unwrap()
+    }
+
+    /// A Pod of this Job whose `workspace` has ended with this message.
+    async fn pod(&self, job: &Job, message: &Value) {
+        let template = job.spec.as_ref().unwrap().template.metadata.clone().unwrap();
+        let name = format!("{}-x", job.name_any());
+        let pod = json!({
+            "metadata": {"name": name, "labels": template.labels, "annotations": template.annotations},
+            "spec": {
+                "automountServiceAccountToken": false,
+                "initContainers": [{"name": "workspace", "image": "i"}],
+                "containers": [{"name": "agent-1", "image": "i"}],
+            },
+        });
+        let pods = self.api::<Pod>();
+        let pod = serde_json::from_value(pod).unwrap();
+        pods.create(&PostParams::default(), &pod).await.unwrap();
+        let ended = json!({"terminated": {"exitCode": 0, "reason": "Completed", "message": message.to_string(),
+            "startedAt": "2026-11-01T12:00:00Z", "finishedAt": "2026-11-01T12:00:03Z"}});
+        let workspace =
+            json!({"name": "workspace", "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": ended});
+        let status = Patch::Merge(json!({"status": {"initContainerStatuses": [workspace]}}));
+        let patched = pods.patch_status(&name, &PatchParams::default(), &status).await;
+        patched.unwrap();
+    }
+}
+
+fn isolated(board: &Leaderboard) -> Option<Condition> {
+    let status = board.status.as_ref()?;
+    conditions::get(&status.conditions, conditions::ISOLATED).cloned()
+}
+
+/// Versions of all kinds come from one count.
+fn version(object: &impl ResourceExt) -> u64 {
+    object.resource_version().unwrap().parse().unwrap()
+}
+
+fn egress(policy: &NetworkPolicy) -> Value {
+    serde_json::to_value(&policy.spec.as_ref().unwrap().egress).unwrap()
+}
+
+/// What a Pod is told of its isolation.
+fn told(job: &Job) -> Value {
+    let pod = job.spec.as_ref().unwrap().template.spec.as_ref().unwrap();
+    let workspace = pod
+        .init_containers
+        .iter()
+        .flatten()
+        .find(|c| c.name == "workspace")
+        .unwrap();
+    let run = workspace
+        .env
+        .iter()
+        .flatten()
+        .find(|v| v.name == "LEADERBOARD_RUN")
+        .unwrap();
+    let run: Value = serde_json::from_str(run.value.as_deref().unwrap()).unwrap();
+    run["isolation"].clone()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_job_is_made_before_the_policy_of_the_present_spec() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    let to = |cidr: &str| json!({"egress": [{"cidr": cidr, "ports": [443]}], "dns": false});
+    // The submission first: it starts in the moment in which its Leaderboard is seen.
+    world.submit("first").await;
+    world.leaderboard(&to("192.0.2.1/32")).await;
+    let job = world.job("first").await;
+    let policy = world.api::<NetworkPolicy>().get(POLICY).await.unwrap();
+    assert!(version(&policy) < version(&job), "{policy:?}\n{job:?}");
+
+    world.change(&to("192.0.2.2/32")).await;
+    world.submit("second").await;
+    let job = world.job("second").await;
+    let policy = world.api::<NetworkPolicy>().get(POLICY).await.unwrap();
+    assert_eq!(egress(&policy)[0]["to"][0]["ipBlock"]["cidr"], "192.0.2.2/32");
+    assert!(version(&policy) < version(&job), "{policy:?}\n{job:?}");
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_policy_that_is_edited_or_deleted_is_restored() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    world.leaderboard(&json!({})).await;
+    let first: NetworkPolicy = world.until(POLICY, "it is applied", |_| true).await;
+    let policies = world.api::<NetworkPolicy>();
+    for edit in [
+        json!({"spec": {"egress": [{}]}}),
+        json!({"spec": {"ingress": [{}]}}),
+        json!({"spec": {"policyTypes": ["Ingress"]}}),
+        json!({"metadata": {"labels": {"app.kubernetes.io/managed-by": "somebody"}}}),
+    ] {
+        let patch = Patch::Merge(&edit);
+        let edited = policies.patch(POLICY, &PatchParams::default(), &patch).await.unwrap();
+        let restored = |found: &NetworkPolicy| {
+            version(found) > version(&edited) && found.spec == first.spec && found.labels() == first.labels()
+        };
+        world.until(POLICY, &edit.to_string(), restored).await;
+    }
+    policies.delete(POLICY, &DeleteParams::default()).await.unwrap();
+    let uid = first.uid();
+    let back = |found: &NetworkPolicy| found.uid() != uid && found.spec == first.spec;
+    world.until(POLICY, "it comes back", back).await;
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_policy_is_restored_while_the_leaderboards_bucket_hangs() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    // Takes connections and says nothing: the reconcile of the Leaderboard waits ten seconds for it.
+    let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", silent.local_addr().unwrap());
+    world.leaderboard_at(&endpoint, &json!({})).await;
+    let first: NetworkPolicy = world.until(POLICY, "it is applied", |_| true).await;
+    silent.accept().await.unwrap();
+    let policies = world.api::<NetworkPolicy>();
+    policies.delete(POLICY, &DeleteParams::default()).await.unwrap();
+    let began = Instant::now();
+    let uid = first.uid();
+    world
+        .until(POLICY, "it comes back", |found: &NetworkPolicy| found.uid() != uid)
+        .await;
+    assert!(began.elapsed() < Duration::from_secs(6), "{:?}", began.elapsed());
+    operator.end().await;
+}
+
+/// Everything that the controller does in a namespace, but for what it may do to policies.
+fn role(policies: &[&str]) -> Value {
+    let groups = [
+        "leaderboard.carla.org",
+        "batch",
+        "",
+        "events.k8s.io",
+        "coordination.k8s.io",
+    ];
+    json!({
+        "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role", "metadata": {"name": "operator"},
+        "rules": [
+            {"apiGroups": groups, "resources": ["*"], "verbs": ["*"]},
+            {"apiGroups": ["networking.k8s.io"], "resources": ["networkpolicies"], "verbs": policies},
+        ],
+    })
+}
+
+async fn operator_with_few_rights(world: &World, policies: &[&str]) -> Operator {
+    let user = format!("operator-of-{}", world.namespace);
+    let role: Role = serde_json::from_value(role(policies)).unwrap();
+    world.api().create(&PostParams::default(), &role).await.unwrap();
+    let binding: RoleBinding = serde_json::from_value(json!({
+        "metadata": {"name": "operator"},
+        "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "Role", "name": "operator"},
+        "subjects": [{"kind": "User", "apiGroup": "rbac.authorization.k8s.io", "name": user}],
+    }))
+    .unwrap();
+    world.api().create(&PostParams::default(), &binding).await.unwrap();
+    let mut config = server().await.config();
+    config.auth_info.impersonate = Some(user);
+    config.auth_info.impersonate_groups = Some(vec!["system:authenticated".into()]);
+    let own: Api<Leaderboard> = Api::namespaced(Client::try_from(config.clone()).unwrap(), &world.namespace);
+    let has_rights = async {
+        while own.list(&kube::api::ListParams::default()).await.is_err() {
+            tokio::time::sleep(POLL).await;
+        }
+    };
+    timeout(LIMIT, has_rights).await.expect("it has its rights");
+    Operator::start_as(&world.namespace, world.aws.aws.clone(), config)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_a_right_to_policies_no_job_is_made_and_both_objects_say_what_to_do() {
+    let world = World::new().await;
+    let operator = operator_with_few_rights(&world, &["get", "list", "watch"]).await;
+    world.leaderboard(&json!({})).await;
+    world.submit("one").await;
+    let said = world.says("False", reasons::FORBIDDEN).await;
+    for part in [
+        POLICY,
+        "create and patch of networkpolicies",
+        "network.policy to External",
+    ] {
+        assert!(said.message.contains(part), "{part}: {}", said.message);
+    }
+    let message = world.held_back("one").await;
+    assert!(
+        message.starts_with("The NetworkPolicy of Leaderboard carla is"),
+        "{message}"
+    );
+    assert!(world.api::<Job>().get_opt("one-1").await.unwrap().is_none());
+    let mut kubectl = server().await.kubectl();
+    let shown = kubectl
+        .args(["describe", "leaderboard", NAME, "-n", &world.namespace])
+        .output()
+        .unwrap();
+    let shown = String::from_utf8(shown.stdout).unwrap();
+    assert!(shown.contains("Isolated") && shown.contains("Forbidden"), "{shown}");
+    let missing = operator.seen.readiness.missing().join("\n");
+    assert!(
+        missing.contains("may not patch networkpolicies of networking.k8s.io"),
+        "{missing}"
+    );
+
+    let all = role(&["get", "list", "watch", "create", "patch"]);
+    let rights = world.api::<Role>();
+    rights
+        .patch("operator", &PatchParams::default(), &Patch::Merge(&all))
+        .await
+        .unwrap();
+    world.job("one").await;
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_policies_of_the_clusters_own_none_is_applied_and_no_right_is_needed() {
+    let world = World::new().await;
+    let operator = operator_with_few_rights(&world, &["get"]).await;
+    world.leaderboard(&json!({"policy": "External"})).await;
+    world.submit("one").await;
+    let job = world.job("one").await;
+    assert_eq!(told(&job), Value::Null);
+    world.says("Unknown", reasons::EXTERNAL).await;
+    assert!(world.api::<NetworkPolicy>().get_opt(POLICY).await.unwrap().is_none());
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_pod_has_measured_is_the_leaderboards_condition_and_known_to_the_next_pod() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    world.leaderboard(&json!({"egress": [{"cidr": "192.0.2.1/32"}]})).await;
+    world.says("Unknown", reasons::NOT_MEASURED).await;
+    world.submit("first").await;
+    let job = world.job("first").await;
+    let first = json!({"enforcement": "Warn", "egress": ["192.0.2.1/32"], "isKnownOpen": false});
+    assert_eq!(told(&job), first);
+    let message = "The Pod could connect to 10.96.0.1:443.";
+    world
+        .pod(&job, &json!({"reason": "NotEnforced", "message": message}))
+        .await;
+    let said = world.says("False", reasons::NOT_ENFORCED).await;
+    assert_eq!(said.message, message);
+    world.submit("second").await;
+    assert_eq!(told(&world.job("second").await)["isKnownOpen"], true);
+
+    // Another spec has not been measured.
+    world.change(&json!({"egress": [{"cidr": "192.0.2.2/32"}]})).await;
+    world.says("Unknown", reasons::NOT_MEASURED).await;
+    world.submit("third").await;
+    let job = world.job("third").await;
+    assert_eq!(told(&job)["isKnownOpen"], false);
+    world
+        .pod(&job, &json!({"reason": "Enforced", "message": "It could not."}))
+        .await;
+    world.says("True", reasons::ENFORCED).await;
+    operator.end().await;
+}
