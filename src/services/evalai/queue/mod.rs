@@ -58,7 +58,7 @@ pub struct Timing {
     pub accept: Duration,
     /// A message that has not come for so long is lost.
     pub lost: Duration,
-    /// A live submission is read again, in case somebody has ended it in a way that no list tells. Above all its participant
+    /// A live submission is read again, in case somebody has ended it in a way that no list shows. Above all its participant
     /// may have deleted it: that leaves its status as it is, so the list of cancelled ones never holds it; and no list has
     /// those that are partially evaluated.
     pub refresh: Duration,

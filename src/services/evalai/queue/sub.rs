@@ -162,7 +162,7 @@ impl Sub {
         }
     }
 
-    /// The end that EvalAI is told: of a submission that was deleted before its end it is `cancelled`, whatever it was here.
+    /// The end to write: `cancelled` for a submission that was deleted before its end, whatever it was here.
     pub fn outcome(&self) -> Option<Outcome> {
         match self.end_verdict()? {
             End::Put if self.problem().is_none() => Some(self.end.as_ref()?.what.0),
