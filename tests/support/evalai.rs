@@ -167,9 +167,8 @@ impl Evalai {
             let mut lists = log.entries().filter(|entry| entry.path.contains("submission/?status="));
             lists.any(|entry| entry.time > lost && entry.answered.is_some())
         });
-        if timeout(limit, listed).await.is_err() {
-            panic!("no list of new submissions is asked for within {} s", limit.as_secs());
-        }
+        let listed = timeout(limit, listed).await;
+        listed.unwrap_or_else(|_| panic!("no list of new submissions is asked for within {} s", limit.as_secs()));
     }
 
     /// Resumes as the web page does.

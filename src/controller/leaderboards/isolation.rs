@@ -62,8 +62,8 @@ pub(super) async fn keep(context: &Context, leaderboard: &Leaderboard, now: Time
         }
     }
     let policy = apply(context, leaderboard).await;
-    if !matches!(policy, Policy::InPlace) {
-        tracing::warn!(leaderboard = %leaderboard.name_any(), ?policy, "the NetworkPolicy is not in place");
+    if let Policy::Refused(why) | Policy::NotApplied(why) = &policy {
+        tracing::warn!(leaderboard = %leaderboard.name_any(), why, "the NetworkPolicy is not in place");
     }
     let applied = Applied {
         at: now,

@@ -22,7 +22,7 @@ enum Change {
     Pod(Option<Box<PodView>>),
     Node(NodeSight),
     Report(ReportSight),
-    Evalai(EvalaiView),
+    Evalai(Box<EvalaiView>),
     Recorded(bool),
     Turn(Turn),
     Leaderboard {
@@ -249,7 +249,7 @@ fn change() -> impl Strategy<Value = Change> {
         6 => prop::option::weighted(0.9, pod_view().prop_map(Box::new)).prop_map(Change::Pod),
         3 => select(nodes).prop_map(Change::Node),
         5 => report_sight().prop_map(Change::Report),
-        3 => evalai_view().prop_map(Change::Evalai),
+        3 => evalai_view().prop_map(Box::new).prop_map(Change::Evalai),
         1 => any::<bool>().prop_map(Change::Recorded),
         2 => select(turns).prop_map(Change::Turn),
         1 => leaderboard.prop_map(|(present, infrastructure, schedule_seconds)| {
@@ -294,7 +294,7 @@ fn apply(world: &mut World, change: Change) {
         Change::Pod(pod) => world.view.pod = pod.map(|pod| *pod),
         Change::Node(node) => world.view.node = node,
         Change::Report(report) => world.view.report = report,
-        Change::Evalai(view) => world.view.evalai = is_evalais.then_some(view),
+        Change::Evalai(view) => world.view.evalai = is_evalais.then_some(*view),
         Change::Recorded(end) => world.view.record.get_or_insert_default().end_written = end,
         Change::Turn(turn) => world.view.turn = turn,
         Change::Leaderboard {
