@@ -6,7 +6,7 @@ use jiff::Timestamp;
 
 use super::answer::Answer;
 use super::row::{DatasetSplit, Phase, Row, Split};
-use super::status::{Outcome, Progress};
+use super::status::{Outcome, Progress, Status};
 use super::types::{ImageAnswer, Key, Payload};
 
 /// Whom a request is about.
@@ -30,6 +30,10 @@ pub enum Purpose {
     SweepSubmitted,
     /// `resuming`: whose message was lost.
     SweepResuming,
+    /// `queued`: many live submissions at once.
+    Queued,
+    /// `running`: many live submissions at once.
+    Running,
 }
 
 impl Purpose {
@@ -39,6 +43,17 @@ impl Purpose {
             Self::Cancel => "cancelled",
             Self::Accept | Self::SweepSubmitted => "submitted",
             Self::SweepResuming => "resuming",
+            Self::Queued => "queued",
+            Self::Running => "running",
+        }
+    }
+
+    /// The list that holds live submissions of a status. There is none of those that are partially evaluated.
+    pub fn of_live(status: Status) -> Option<Self> {
+        match status {
+            Status::Queued => Some(Self::Queued),
+            Status::Running => Some(Self::Running),
+            _ => None,
         }
     }
 }
@@ -101,6 +116,8 @@ impl Request {
                 Purpose::Accept => "list_submitted",
                 Purpose::SweepSubmitted => "sweep_submitted",
                 Purpose::SweepResuming => "sweep_resuming",
+                Purpose::Queued => "list_queued",
+                Purpose::Running => "list_running",
             },
             Self::Phases(_) => "get_phases",
             Self::Splits(_) => "get_splits",
@@ -122,6 +139,8 @@ impl Request {
                 Purpose::Accept => "list of submitted",
                 Purpose::SweepSubmitted => "sweep of submitted",
                 Purpose::SweepResuming => "sweep of resuming",
+                Purpose::Queued => "list of queued",
+                Purpose::Running => "list of running",
             },
             Self::Phases(_) => "phases",
             Self::Splits(_) => "splits",

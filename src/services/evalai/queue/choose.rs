@@ -16,6 +16,8 @@ use crate::services::evalai::types::Key;
 
 /// More submissions than these that wait for acceptance are asked for by one list.
 const ASKED_ONE_BY_ONE: usize = 5;
+/// More live submissions than these that one list holds are read again by that list.
+const READ_ONE_BY_ONE: usize = 5;
 /// How far back a list of new submissions reaches: the queue's messages live four days.
 const ACCEPT_REACH: SignedDuration = SignedDuration::from_hours(5 * 24);
 /// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
@@ -129,12 +131,15 @@ impl Queue {
     }
 
     fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer> {
-        let asked = self.asked_by_list();
+        let (asked, live) = (self.asked_by_list(), self.live_by_list());
         let in_flight = self.lanes.values().filter(|lane| lane.busy.is_some()).count();
         let mut offers = Vec::new();
         if in_flight < MAX_IN_FLIGHT {
             let subs = self.subs.iter().filter_map(|(key, sub)| {
-                let by_list = asked.contains_key(&sub.challenge);
+                let by_list = ByList {
+                    asked: asked.contains_key(&sub.challenge),
+                    live: list_of_live(sub).is_some_and(|list| live.contains_key(&(sub.challenge, list))),
+                };
                 self.offer_of(key, sub, now, may_write, by_list)
             });
             offers.extend(subs);
@@ -142,6 +147,11 @@ impl Queue {
         for (id, challenge) in &self.challenges {
             offers.extend(self.offers_of(*id, challenge, asked.contains_key(id)));
         }
+        let lists = live.keys().filter_map(|(id, purpose)| {
+            let challenge = self.challenges.get(id)?;
+            offer_of_list(Priority::Sweep, challenge, *id, *purpose)
+        });
+        offers.extend(lists);
         offers
     }
 
@@ -159,7 +169,19 @@ impl Queue {
         counts
     }
 
-    fn offer_of(&self, key: &Key, sub: &Sub, now: &Now, may_write: bool, by_list: bool) -> Option<Offer> {
+    /// Lists of live submissions that hold so many that one request is made for all.
+    fn live_by_list(&self) -> BTreeMap<(i64, Purpose), usize> {
+        let mut counts = BTreeMap::new();
+        for sub in self.subs.values() {
+            if let Some(list) = list_of_live(sub) {
+                *counts.entry((sub.challenge, list)).or_insert(0) += 1;
+            }
+        }
+        counts.retain(|_, count| *count > READ_ONE_BY_ONE);
+        counts
+    }
+
+    fn offer_of(&self, key: &Key, sub: &Sub, now: &Now, may_write: bool, by_list: ByList) -> Option<Offer> {
         let idle = Lane::default();
         let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
         if lane.busy.is_some() {
@@ -182,7 +204,7 @@ impl Queue {
         lane: &Lane,
         now: &Now,
         may_write: bool,
-        by_list: bool,
+        by_list: ByList,
     ) -> Option<(Priority, Duration, bool, Step)> {
         let write = if may_write {
             self.step_to_write(sub, lane, now)
@@ -193,7 +215,7 @@ impl Queue {
             return write;
         }
         if let Some(asked) = &sub.asked {
-            let alone = asked.listed || !by_list;
+            let alone = asked.listed || !by_list.asked;
             return alone.then_some((Priority::Acceptance, asked.since, false, Step::Get));
         }
         if sub.wants_image() {
@@ -202,7 +224,9 @@ impl Queue {
         if write.is_some() {
             return write;
         }
-        let due = sub.read.unwrap_or_default() + self.timing.refresh;
+        // One that its list has missed has another status by now.
+        let refresh = self.timing.refresh * if by_list.live { 2 } else { 1 };
+        let due = sub.read.unwrap_or_default() + refresh;
         let stale = sub.read.is_none() || sub.outdated || due <= now.at;
         (sub.live.is_some() && stale).then_some((Priority::Rest, due, false, Step::Get))
     }
@@ -228,24 +252,17 @@ impl Queue {
     }
 
     fn offers_of(&self, id: i64, challenge: &Challenge, by_list: bool) -> Vec<Offer> {
-        let list = |priority, poll: &super::poll::Poll, purpose| {
-            (!poll.busy).then_some(Offer {
-                priority,
-                since: poll.due,
-                ready: poll.due,
-                what: What::List(id, purpose),
-            })
-        };
+        let list = |priority, purpose| offer_of_list(priority, challenge, id, purpose);
         let mut offers = Vec::new();
         if self.subs.values().any(|sub| sub.challenge == id && sub.live.is_some()) {
-            offers.extend(list(Priority::CancelList, &challenge.cancel, Purpose::Cancel));
+            offers.extend(list(Priority::CancelList, Purpose::Cancel));
         }
         if by_list {
-            offers.extend(list(Priority::Acceptance, &challenge.accept, Purpose::Accept));
+            offers.extend(list(Priority::Acceptance, Purpose::Accept));
         }
         if challenge.sweep.is_some() {
-            offers.extend(list(Priority::Sweep, &challenge.submitted, Purpose::SweepSubmitted));
-            offers.extend(list(Priority::Sweep, &challenge.resuming, Purpose::SweepResuming));
+            offers.extend(list(Priority::Sweep, Purpose::SweepSubmitted));
+            offers.extend(list(Priority::Sweep, Purpose::SweepResuming));
             if !challenge.look.poll.busy {
                 offers.push(Offer {
                     priority: Priority::Sweep,
@@ -320,6 +337,11 @@ impl Queue {
                 let first = live.filter_map(Sub::submitted_at).min()?;
                 Some(back(first, SignedDuration::from_secs(1)))
             }
+            Purpose::Queued | Purpose::Running => {
+                let listed = |sub: &&Sub| sub.challenge == id && list_of_live(sub) == Some(purpose);
+                let first = self.subs.values().filter(listed).filter_map(Sub::submitted_at).min()?;
+                Some(back(first, SignedDuration::from_secs(1)))
+            }
             Purpose::Accept => Some(back(wall, ACCEPT_REACH)),
             Purpose::SweepSubmitted | Purpose::SweepResuming => {
                 let (_, since) = self.challenges.get(&id)?.sweep?;
@@ -327,6 +349,31 @@ impl Queue {
             }
         }
     }
+}
+
+/// What of a submission a list is asked for.
+#[derive(Clone, Copy)]
+struct ByList {
+    /// Whether it may run.
+    asked: bool,
+    /// Whether it was ended in a way that changes no status.
+    live: bool,
+}
+
+/// The list that holds a live submission, going by its last row.
+fn list_of_live(sub: &Sub) -> Option<Purpose> {
+    let row = sub.view.row.as_ref().filter(|_| sub.live.is_some())?;
+    Purpose::of_live(row.status)
+}
+
+fn offer_of_list(priority: Priority, challenge: &Challenge, id: i64, purpose: Purpose) -> Option<Offer> {
+    let poll = challenge.lists.get(&purpose).copied().unwrap_or_default();
+    (!poll.busy).then_some(Offer {
+        priority,
+        since: poll.due,
+        ready: poll.due,
+        what: What::List(id, purpose),
+    })
 }
 
 /// Earlier, or as it is at the beginning of time.

@@ -49,7 +49,7 @@ impl Queue {
     }
 
     fn took_list(&mut self, id: i64, purpose: Purpose, requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
-        let accept = self.timing.accept;
+        let (accept, refresh) = (self.timing.accept, self.timing.refresh);
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
         };
@@ -57,6 +57,8 @@ impl Queue {
             Purpose::Cancel => challenge.period,
             Purpose::Accept => accept,
             Purpose::SweepSubmitted | Purpose::SweepResuming => challenge.sweep.map_or(accept, |(every, _)| every),
+            // A deletion is to be observed within `refresh`, the time of the answer included.
+            Purpose::Queued | Purpose::Running => refresh * 3 / 4,
         };
         let rows = match answer {
             Answer::Done(rows) => rows,

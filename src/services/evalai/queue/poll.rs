@@ -17,7 +17,7 @@ const LONGEST_PAUSE: Duration = Duration::from_mins(1);
 const FIRST_PAUSE: Duration = Duration::from_secs(5);
 
 /// Something asked again and again, one request at a time.
-#[derive(Debug, Default)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Poll {
     pub busy: bool,
     pub due: Duration,
@@ -55,10 +55,8 @@ pub(super) struct Challenge {
     pub period: Duration,
     /// Time between two sweeps, and since when what they find counts; none while no Leaderboard serves it.
     pub sweep: Option<(Duration, Timestamp)>,
-    pub cancel: Poll,
-    pub accept: Poll,
-    pub submitted: Poll,
-    pub resuming: Poll,
+    /// When each of its lists is due. One that was never asked for is due at once.
+    pub lists: BTreeMap<Purpose, Poll>,
     pub look: Look,
     /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when we said so.
     pub swept: BTreeMap<i64, (Timestamp, Duration)>,
@@ -69,22 +67,14 @@ impl Challenge {
         Self {
             period,
             sweep: None,
-            cancel: Poll::default(),
-            accept: Poll::default(),
-            submitted: Poll::default(),
-            resuming: Poll::default(),
+            lists: BTreeMap::new(),
             look: Look::default(),
             swept: BTreeMap::new(),
         }
     }
 
     pub fn poll(&mut self, purpose: Purpose) -> &mut Poll {
-        match purpose {
-            Purpose::Cancel => &mut self.cancel,
-            Purpose::Accept => &mut self.accept,
-            Purpose::SweepSubmitted => &mut self.submitted,
-            Purpose::SweepResuming => &mut self.resuming,
-        }
+        self.lists.entry(purpose).or_default()
     }
 }
 
