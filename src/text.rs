@@ -1,6 +1,6 @@
-//! Words for people, as more than one room puts them. Pure, and knows nothing of what the words are about.
+//! Texts for people that several modules write. Pure.
 
-/// Somebody else's words as a sentence.
+/// Ends a text of another program with a full stop.
 pub fn sentence(words: &str) -> String {
     let words = words.trim();
     if words.is_empty() || words.ends_with(['.', '!', '?', '…']) {

@@ -28,17 +28,17 @@ pub enum NotAnImage {
     TooLong,
     #[error("it has white space or characters that are not ASCII")]
     Characters,
-    #[error("it is the id of an image, not its name")]
+    #[error("it is an image ID; use the name and tag that were pushed")]
     Id,
-    #[error("{0} is no host and port of a registry")]
+    #[error("{0} is not a registry host; write no https://")]
     Registry(String),
     #[error("the repository {0} has upper-case letters")]
     UpperCase(String),
-    #[error("{0:?} is no name of a repository")]
+    #[error("invalid repository name {0:?}")]
     Repository(String),
-    #[error("{0:?} is no tag")]
+    #[error("invalid tag {0:?}")]
     Tag(String),
-    #[error("{0:?} is no digest")]
+    #[error("invalid digest {0:?}")]
     Digest(String),
 }
 

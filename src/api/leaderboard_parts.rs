@@ -269,15 +269,15 @@ pub enum Enforcement {
 
 /// What the Pods of strangers may reach, by NetworkPolicy.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
-#[x_kube(validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed: what the cluster's own policies forbid is not known"))]
+#[x_kube(validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed, since the operator does not know what the cluster's own policies forbid; use Managed, or Warn"))]
 pub struct Network {
-    /// Whether the operator applies the policy or the cluster has its own.
+    /// `Managed`: the operator applies and restores one NetworkPolicy, and creates no Job without it. `External`: the operator applies none; the cluster's own policies are trusted.
     #[serde(default)]
     pub policy: PolicySource,
-    /// Whether a run may go on in a Pod whose policy is not enforced.
+    /// What follows when a Pod measures that its NetworkPolicy is not enforced. `Require`: the run fails as NotIsolated. `Warn`: it goes on, and the condition Isolated shows it. `"Off"` (in quotes): nothing is measured.
     #[serde(default)]
     pub enforcement: Enforcement,
-    /// What the Pod tries to reach to measure that, as `10.0.0.1:443`. Default: the API server's service address. Set it where `egress` allows the API server.
+    /// Address and port that the Pod connects to, to measure whether the policy is enforced, such as `10.0.0.1:443`. It must answer, and `egress` must not allow it: an address that never answers always looks enforced. Default: the API server's Service address. Set it where `egress` allows that one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(
         length(max = 64),

@@ -225,7 +225,12 @@ impl Poller {
             Ok(Outcome::Bumped(attempt)) => tracing::info!(submission, leaderboard, attempt, "resumed"),
             Ok(Outcome::Repeat | Outcome::Refused) => tracing::debug!(submission, leaderboard, "a repeat"),
             Ok(Outcome::Deleting) => tracing::info!(submission, leaderboard, "the old one is still being deleted"),
-            Ok(Outcome::IdTaken(owner)) => tracing::warn!(submission, leaderboard, owner, "the name is taken"),
+            Ok(Outcome::IdTaken(owner)) => tracing::warn!(
+                submission,
+                leaderboard,
+                owner,
+                "another object has the name of this submission; rename or delete it"
+            ),
             Err(error) => tracing::warn!(submission, leaderboard, %error, "not ingested"),
         }
         route::settle(envelope, &outcome, rules, now_ms())

@@ -227,7 +227,7 @@ impl Actor<'_> {
             from = old.and_then(|status| status.state).map_or("none", State::as_str),
             to = new.state.map_or("none", State::as_str),
             reason = new.reason,
-            "{}", new.message.as_deref().unwrap_or("the submission has moved on")
+            "{}", new.message.as_deref().unwrap_or("the submission's state has changed")
         );
     }
 
@@ -396,7 +396,7 @@ impl Actor<'_> {
             Ok(Ok(())) => {}
             Ok(Err(error)) => {
                 let error = text::kube(&error);
-                tracing::warn!(submission = %self.name(), reason = %event.reason, error, "an event was not taken");
+                tracing::warn!(submission = %self.name(), reason = %event.reason, error, "an event could not be written");
             }
             Err(_) => tracing::warn!(submission = %self.name(), reason = %event.reason, "an event was not answered"),
         }

@@ -138,7 +138,10 @@ mod tests {
             .await
             .unwrap();
         let (code, answer) = get(server.address(), "/readyz").await;
-        assert_eq!((code, body(&answer)), (503, "process: it is starting\n"));
+        assert_eq!(
+            (code, body(&answer)),
+            (503, "process: starting; not all checks are registered\n")
+        );
         seen.readiness
             .set("submissions synced", Err("the list has not come yet".into()));
         seen.readiness.registered();

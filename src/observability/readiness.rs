@@ -15,7 +15,10 @@ pub struct Readiness(Arc<Mutex<BTreeMap<String, Result<(), String>>>>);
 
 impl Default for Readiness {
     fn default() -> Self {
-        let starting = (START.to_owned(), Err("it is starting".to_owned()));
+        let starting = (
+            START.to_owned(),
+            Err("starting; not all checks are registered".to_owned()),
+        );
         Self(Arc::new(Mutex::new(BTreeMap::from([starting]))))
     }
 }
@@ -61,9 +64,16 @@ mod tests {
     #[test]
     fn a_process_without_its_checks_is_starting() {
         let readiness = Readiness::default();
-        assert_eq!(readiness.missing(), ["process: it is starting"]);
+        assert_eq!(
+            readiness.missing(),
+            ["process: starting; not all checks are registered"]
+        );
         readiness.set("permissions", Ok(()));
-        assert_eq!(readiness.missing(), ["process: it is starting"], "others may follow");
+        assert_eq!(
+            readiness.missing(),
+            ["process: starting; not all checks are registered"],
+            "others may follow"
+        );
         readiness.registered();
         assert!(readiness.missing().is_empty());
     }

@@ -16,7 +16,7 @@ use super::shutdown::Stop;
 
 /// A task that the process can't do without has ended.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the task {task} {why}; the process ends and starts anew")]
+#[error("task {task} {why} before a stop was asked for; the process exits, so that the kubelet restarts it")]
 pub struct TaskFailed {
     pub task: String,
     pub why: String,
@@ -198,7 +198,7 @@ mod tests {
         let failed = tasks.failed().await;
         assert_eq!(
             failed.to_string(),
-            "the task sweep has panicked: row 7 is odd; the process ends and starts anew"
+            "task sweep has panicked: row 7 is odd before a stop was asked for; the process exits, so that the kubelet restarts it"
         );
         assert_eq!(sweep.await.unwrap(), None::<()>);
     }

@@ -46,8 +46,8 @@ impl fmt::Display for Finding {
             Self::Open(address) => write!(
                 f,
                 "The Pod could connect to {address}, which its NetworkPolicy forbids: the policy is not enforced. Use a \
-                 network plugin that enforces policies; if network.egress holds the API server's own addresses, set \
-                 network.probe to an address outside."
+                 network plugin that enforces NetworkPolicies; if network.egress allows the API server's own addresses, set \
+                 network.probe to an address and port that answer and that network.egress does not allow."
             ),
             Self::Unmeasured(why) => f.write_str(why),
         }

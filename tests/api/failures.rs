@@ -358,7 +358,9 @@ async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() 
     let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
     assert_eq!(status.state, Some(State::Failed), "its result stays");
     let message = status.message.unwrap();
-    let told = format!("EvalAI has cancelled it: it was re-run as {rerun}.");
+    let told = format!(
+        "A host re-ran this submission in EvalAI as {rerun}; EvalAI cancelled this one's result. Its state, score and table row stay."
+    );
     assert!(
         message.starts_with("Agent 1 crashed") && message.ends_with(&told),
         "{message}"
@@ -379,7 +381,7 @@ async fn after_a_controller_that_did_not_confirm_its_requests_everybody_reads_un
     world.api().create(&PostParams::default(), &lease).await.unwrap();
     let _controller = world.controller();
 
-    let text = "The controller before may still have requests under way; EvalAI is written to again from ";
+    let text = "Nothing is written to EvalAI before ";
     let says = |board: Option<&Leaderboard>| {
         let status = board.and_then(|board| board.status.as_ref());
         let ready = status.and_then(|s| conditions::get(&s.conditions, conditions::READY));

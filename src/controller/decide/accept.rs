@@ -122,7 +122,7 @@ fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
     match ImageReference::parse(&image) {
         Ok(_) => Image::Named(image),
         Err(why) => {
-            let what = sentence(&format!("The submitted image can never be pulled: {why}"));
+            let what = sentence(&format!("The submitted image is not a valid image reference: {why}"));
             Image::Invalid { image, what }
         }
     }
@@ -133,8 +133,8 @@ fn image_unread(draft: &Draft<'_>) -> String {
     let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
     let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
     format!(
-        "The Submission names no image, and the file in EvalAI that names it could not be read yet; it is tried again.{why} If \
-         that lasts, look at EvalAI's files, or ask the participant to push again and cancel this submission."
+        "The image is not known: spec.image is empty, and the file in EvalAI that names it could not be read; it is tried \
+         again.{why} If this lasts, check that EvalAI serves the submission's input_file, or set spec.image."
     )
 }
 
@@ -152,7 +152,8 @@ fn foreign_phase(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Option<String>
 /// once; but the participant's submission does not wait for an end without limit.
 fn wait_for_phase(draft: &mut Draft<'_>, what: &str) -> bool {
     let message = format!(
-        "{what} It goes on when EvalAI says phase {} again, and fails after {} min.",
+        "{what} Set phase {} back in EvalAI, or delete this Submission and apply it with the right phase; after {} min it \
+         fails, uncharged.",
         draft.spec().evalai.map_or(0, |evalai| evalai.phase),
         PHASE_SECONDS / 60
     );

@@ -18,8 +18,9 @@ const AGAIN: Duration = Duration::from_secs(30);
 const FAREWELL_SECONDS: i64 = 120;
 /// What EvalAI calls a row that was cancelled.
 const CANCELLED: &str = "cancelled";
-const TOLD_AGAIN: &str = "EvalAI's own end may not stand there: a request was under way that may have undone it, or the \
-                           submission was deleted before its end. EvalAI is asked, and `cancelled` is written if need be.";
+const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
+                           the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
+                           needed.";
 
 /// Decides for a submission in a terminal state.
 pub(super) fn decide(draft: &mut Draft<'_>) {
@@ -47,8 +48,8 @@ fn show_refused_attempt(draft: &mut Draft<'_>) {
     };
     let reason = reasons::ATTEMPT_WITHOUT_MESSAGE;
     let message = format!(
-        "EvalAI's row has asked for attempt {} since {}, and no message has announced it, so it does not begin: participants \
-         can edit the row. Raise spec.attempt if it is to run; else set the row's status back in EvalAI.",
+        "Attempt {} does not begin: EvalAI's status asks for it since {}, but no queue message announced it, and participants \
+         can edit that status. Raise spec.attempt if it is to run; otherwise set the status back in EvalAI.",
         refused.attempt,
         seconds(refused.at)
     );
@@ -130,7 +131,10 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
         // What is known may be older than the re-run; it is asked for anew when the submission is looked at next.
         return false;
     }
-    let message = format!("EvalAI has cancelled it: it was re-run as {}.", rerun.submission_name);
+    let message = format!(
+        "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state, score and table row stay.",
+        rerun.submission_name
+    );
     let ended = draft.status.message.take().unwrap_or_default();
     draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
     if let Some(published) = conditions::get(&draft.status.conditions, conditions::PUBLISHED).cloned() {
@@ -208,7 +212,7 @@ fn published(draft: &mut Draft<'_>, team: Option<&str>) {
     let moved = ours.zip(team).filter(|(ours, theirs)| ours != theirs);
     let message = moved.map(|(ours, theirs)| {
         format!(
-            "EvalAI's row now belongs to team {theirs}, and EvalAI shows the result there; it was run and recorded for team \
+            "The submission was moved to team {theirs} in EvalAI, which shows the result there; it was run and recorded for team \
              {ours}. Set the team back in EvalAI, or correct the table."
         )
     });
@@ -230,7 +234,8 @@ fn is_of_another_phase(draft: &Draft<'_>) -> bool {
 /// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
 pub fn previous_controller(until: Timestamp) -> String {
     format!(
-        "The controller before may still have requests under way; EvalAI is written to again from {} UTC on.",
+        "Nothing is written to EvalAI before {} UTC: the previous controller did not confirm its last requests, and they may \
+         still be running. Nothing to do.",
         until.strftime("%H:%M:%S")
     )
 }
@@ -295,7 +300,7 @@ fn record(draft: &mut Draft<'_>) -> Sync {
         return Sync::Done;
     };
     if draft.status.plan.is_none() {
-        let message = "It was never accepted, so it has no row.";
+        let message = "The submission was never accepted, so the table has no row for it.";
         draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, message);
         return Sync::Done;
     }

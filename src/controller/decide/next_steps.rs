@@ -26,15 +26,16 @@ pub(super) fn in_the_log_of(agent: i32) -> Steps {
         hosts: format!(
             "Look at agent/agent{agent}/leaderboard.log of the results; the participant fixes the agent and submits again."
         ),
-        participant: "Run the agent on routes of your own, fix it and submit again; the challenge's hosts have its log.",
+        participant: "Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have its log.",
     }
 }
 
 /// An agent needs more memory than there is.
 pub(super) fn smaller() -> Steps {
     Steps {
-        hosts: "The participant makes it smaller; its limit is agent.resources of the Leaderboard.".to_owned(),
-        participant: "Make it smaller and submit again; the challenge's hosts know the limit.",
+        hosts: "The participant reduces the agent's memory use; its limit is agent.resources of the Leaderboard."
+            .to_owned(),
+        participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.",
     }
 }
 
@@ -42,7 +43,8 @@ pub(super) fn smaller() -> Steps {
 pub(super) fn of_infrastructure(reason: &str) -> &'static str {
     match reason {
         // The words of `workspace` hold it already.
-        reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => "",
+        reasons::PREFIX_IN_USE => "",
+        reasons::NOT_ISOLATED => "Then resume it.",
         reasons::JOB_DELETED => "Find out who deletes Jobs in this namespace, then resume it.",
         reasons::NODE_LOST => "Look at the node, then resume it.",
         reasons::RESULTS_NOT_STORED => "Look at the log of logcopy and at the bucket, then resume it.",
@@ -50,7 +52,9 @@ pub(super) fn of_infrastructure(reason: &str) -> &'static str {
             "Look at the simulator's log, then resume it, which repeats the route it was at."
         }
         reasons::JOB_FAILED => "Look at the Job's events, then resume it.",
-        reasons::PHASE_DIFFERS => "Set the phase back in EvalAI, then resume it.",
+        reasons::PHASE_DIFFERS => {
+            "Set the phase back in EvalAI, then resume it; if the Submission has the wrong phase, apply it anew."
+        }
         reasons::SCHEDULE_DEADLINE => "Add a node or make room, then resume it.",
         _ => "Fix that, then resume it.",
     }
@@ -66,7 +70,7 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::START_DEADLINE => "The run could not be started in time.",
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
         reasons::JOB_DELETED | reasons::JOB_FAILED => "The cluster ended the run.",
-        reasons::PHASE_DIFFERS => "The submission belongs to another phase than the one it was to be run for.",
+        reasons::PHASE_DIFFERS => "The submission's phase in EvalAI is not the one it was submitted to.",
         reasons::NOT_ISOLATED => "The run could not be isolated from the network.",
         reasons::PREFIX_IN_USE => "The place for the results is in use.",
         _ => "The run could not be set up.",

@@ -11,8 +11,8 @@ const PREFIX_IN_USE: &str = "The run's place in the bucket holds another object'
                              them up, or empty the prefix.";
 
 /// The same for a Pod that was not isolated.
-const NOT_ISOLATED: &str =
-    "The Pod could reach what its NetworkPolicy forbids. Use a network plugin that enforces policies.";
+const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the network, and network.enforcement is Require. Look at the log of its \
+     container workspace.";
 
 /// A container that does not start.
 pub(super) struct Trouble {
@@ -73,7 +73,7 @@ fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     match reason {
         // The host's images are the Leaderboard's to fix, and are waited for.
         "InvalidImageName" if is_agent(name) => {
-            let message = format!("The image of {name} is no reference to an image: {words}");
+            let message = format!("The image of {name} is not a valid image reference: {words}");
             Some(Trouble {
                 is_hopeless: true,
                 ..trouble(reasons::IMAGE_INVALID, &message, true)

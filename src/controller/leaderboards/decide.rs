@@ -395,13 +395,14 @@ mod tests {
             (
                 EvalaiStanding::Fits { note: None },
                 "True",
-                "The controller before may still have requests under way; EvalAI is written to again from 00:17:55 UTC on.",
+                "Nothing is written to EvalAI before 00:17:55 UTC: the previous controller did not confirm its last requests, and \
+                 they may still be running. Nothing to do.",
             ),
             (
                 EvalaiStanding::Fits { note: note() },
                 "True",
-                "EvalAI's token ends on 2026-12-01. The controller before may still have requests under way; EvalAI is written to \
-                 again from 00:17:55 UTC on.",
+                "EvalAI's token ends on 2026-12-01. Nothing is written to EvalAI before 00:17:55 UTC: the previous controller did \
+                 not confirm its last requests, and they may still be running. Nothing to do.",
             ),
             (EvalaiStanding::NoToken("x".into()), "False", "x"),
         ] {

@@ -41,7 +41,7 @@ pub(super) async fn look(context: &Context, leaderboard: &Leaderboard, mut reach
     });
     for (place, address, found) in join_all(asked).await {
         if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
-            tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "a place cannot be reached");
+            tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table or queue cannot be reached");
         }
         reach.take(place, &address, generation, found, now);
     }

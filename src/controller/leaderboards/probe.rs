@@ -259,7 +259,7 @@ mod tests {
         let said = note(&labels(vec![unsent]), ends()).unwrap();
         assert_eq!(
             said,
-            "The leaderboard of phase 2 also has Speed, Comfort, which stay empty; check spec.results. EvalAI's token ends \
+            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.results. EvalAI's token ends \
              on 2027-01-01."
         );
     }

@@ -41,7 +41,7 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
     let (server, leaderboard) = (&row.server, board.name_any());
     let submission = format!("{namespace}/{}", names::submission(row.submission));
     match ingest::apply(&api, &leaderboard, &incoming).await {
-        Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "it is known"),
+        Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "the submission is known already"),
         Ok(Outcome::Refused) => {
             tracing::warn!(
                 server,
@@ -51,7 +51,13 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
             );
         }
         Ok(Outcome::IdTaken(owner)) => {
-            tracing::warn!(server, submission, leaderboard, owner, "the name is taken");
+            tracing::warn!(
+                server,
+                submission,
+                leaderboard,
+                owner,
+                "another object has the name of this submission; rename or delete it"
+            );
         }
         Ok(outcome) => {
             tracing::info!(
@@ -62,7 +68,9 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
                 "EvalAI waits for a submission whose message was lost"
             );
         }
-        Err(error) => tracing::warn!(server, submission, leaderboard, %error, "not ingested"),
+        Err(error) => {
+            tracing::warn!(server, submission, leaderboard, %error, "EvalAI waits for a submission that could not be created or resumed")
+        }
     }
 }
 

@@ -62,7 +62,8 @@ impl fmt::Display for Need<'_> {
 /// Registers both checks, so that the process is not ready before they are answered.
 pub fn register(seen: &Observability) {
     for check in [KINDS_CHECK, ACCESS_CHECK] {
-        seen.readiness.set(check, Err("not asked yet".to_owned()));
+        seen.readiness
+            .set(check, Err("the API server has not been asked yet".to_owned()));
     }
 }
 

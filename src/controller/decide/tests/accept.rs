@@ -207,7 +207,7 @@ fn an_image_that_can_never_be_pulled_fails_at_once_without_a_job() {
             );
             let failure = plan.status.failure.clone().unwrap();
             assert_eq!((failure.class, failure.charged), (FailureClass::Participant, true));
-            let said = problem.map_or("can never be pulled", |_| "no submitted_image_uri");
+            let said = problem.map_or("is not a valid image reference", |_| "no submitted_image_uri");
             assert!(failure.message.contains(said), "{}", failure.message);
             assert!(failure.message.contains("Submit again"), "{}", failure.message);
             let wanted: &[Tell] = if is_evalais { &[Tell::Failed] } else { &[] };

@@ -279,7 +279,7 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
 
         says(&mut world, "cancelled");
         let plan = world.pass();
-        let text = "EvalAI has cancelled it: it was re-run as submission-99.";
+        let text = "A host re-ran this submission in EvalAI as submission-99; EvalAI cancelled this one's result. Its state, score and table row stay.";
         assert_eq!(plan.status.rerun_as, Some(rerun));
         assert_eq!(
             (plan.status.state, plan.status.score.clone(), plan.status.reason.clone()),

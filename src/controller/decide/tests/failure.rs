@@ -116,7 +116,7 @@ fn hosts_are_sent_to_the_log_and_the_participant_to_the_agent() {
     assert_eq!(
         crashed.participant_message.as_deref(),
         Some(
-            "Agent 2 crashed 5 times. Run the agent on routes of your own, fix it and submit again; the challenge's hosts have \
+            "Agent 2 crashed 5 times. Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have \
              its log."
         )
     );

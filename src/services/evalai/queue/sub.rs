@@ -326,7 +326,7 @@ impl Sub {
         (*outcome == Outcome::Finished && phase != payload.phase).then(|| {
             let (pk, ours) = (self.pk, payload.phase);
             format!(
-                "EvalAI says that submission {pk} belongs to phase {phase}, not {ours}; give it the right phase there"
+                "EvalAI says that submission {pk} belongs to phase {phase}, not to phase {ours}; set its phase back to {ours} in EvalAI"
             )
         })
     }
