@@ -28,6 +28,7 @@ mod scene;
 
 mod cluster {
     mod abrupt;
+    mod abuse;
     mod audit;
     mod bridge;
     mod bucket;

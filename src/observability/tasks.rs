@@ -16,7 +16,7 @@ use super::shutdown::Stop;
 
 /// A task that the process can't do without has ended.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("task {task} {why} before a stop was asked for; the process exits, so that the kubelet restarts it")]
+#[error("task {task} {why}; the process exits, so that the kubelet restarts it")]
 pub struct TaskFailed {
     pub task: String,
     pub why: String,
@@ -198,7 +198,7 @@ mod tests {
         let failed = tasks.failed().await;
         assert_eq!(
             failed.to_string(),
-            "task sweep has panicked: row 7 is odd before a stop was asked for; the process exits, so that the kubelet restarts it"
+            "task sweep has panicked: row 7 is odd; the process exits, so that the kubelet restarts it"
         );
         assert_eq!(sweep.await.unwrap(), None::<()>);
     }
@@ -221,7 +221,7 @@ mod tests {
         tasks.end("lease");
         assert_eq!(
             tasks.failed().await.to_string().split(';').next(),
-            Some("the task lease has ended")
+            Some("task lease has ended")
         );
     }
 

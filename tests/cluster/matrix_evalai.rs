@@ -1,5 +1,5 @@
 //! The matrix: what the real EvalAI server and its users do that a friendly server would not. Two servers with the same ids,
-//! cancels at the worst moment, connections that close, deletions, edits by participants, images that can never be one.
+//! cancels at the worst moment, connections that close, deletions, images that can never be one.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use leaderboard_operator::api::{State, Submission};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, together};
-use crate::evalai::{Evalai, FIRST_PHASE, PARTICIPANT};
+use crate::evalai::{Evalai, FIRST_PHASE};
 use crate::operator::{bridge, controller};
 use crate::scene::{Scene, lay_over, reason, scenario, state};
 
@@ -28,20 +28,19 @@ const OTHER_KEYS: u64 = 5000;
 #[tokio::test]
 async fn evalai_and_its_users_do_what_they_may() {
     scenario("matrix-evalai", async |scene: &Scene| {
-        let evalai = Evalai::start_wide(scene, 4).await;
+        let evalai = Evalai::start_wide(scene, 3).await;
         let _operator = (controller(scene), bridge(scene));
         let cases = vec![
             cancelled_after_a_list(scene, &evalai, FIRST_PHASE).boxed_local(),
             deleted_by_the_participant(scene, &evalai, FIRST_PHASE + 1).boxed_local(),
-            resumed_by_the_participant(scene, &evalai, FIRST_PHASE + 2).boxed_local(),
-            images_that_are_none(scene, &evalai, FIRST_PHASE + 3).boxed_local(),
+            images_that_are_none(scene, &evalai, FIRST_PHASE + 2).boxed_local(),
         ];
         together(WIDTH, cases).await;
     })
     .await;
 }
 
-async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) {
+pub async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) {
     let mut base = json!({
         "pairs": 1,
         "routes": 2,
@@ -120,39 +119,6 @@ async fn deleted_by_the_participant(scene: &Scene, evalai: &Evalai, phase: u64) 
     evalai.await_status(pk, Status::Cancelled, LIMIT).await;
     case.evalai(evalai.submission(pk).status);
     case.also(if noticed { "noticed within 60 s" } else { "noticed late" });
-    case.close();
-}
-
-/// EvalAI keeps resuming for hosts, but lets a participant write the fields of the own row that a resume writes.
-async fn resumed_by_the_participant(scene: &Scene, evalai: &Evalai, phase: u64) {
-    let mut case = Case::open(
-        "the participant resumes by editing the own row",
-        "Failed AgentCrashed (participant, charged); attempts without a message: at most 1",
-    );
-    let crashes = json!({
-        "retries": {"pair": 1},
-        "evalai": {"sweepSeconds": 10},
-        "agent": {"env": [{"name": "AGENT_KNOBS", "value": "crash@1"}]},
-    });
-    board(scene, evalai, phase, crashes).await;
-    let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
-    let name = format!("submission-{pk}");
-    case.ends(scene, &name, LIMIT).await;
-    let resume = || json!({"status": "submitted", "rerun_resumed_at": Timestamp::now().to_string()});
-    for _ in 0..2 {
-        evalai.edit_as(PARTICIPANT, pk, &resume()).await;
-        // The sweep comes after the two minutes in which a message may still arrive.
-        evalai.await_swept(LOST).await;
-    }
-    let attempts = scene.settled(&name, LIMIT).await.spec.attempt;
-    case.also(&format!(
-        "attempts without a message: {}",
-        if attempts <= 2 {
-            "at most 1".to_owned()
-        } else {
-            (attempts - 1).to_string()
-        }
-    ));
     case.close();
 }
 

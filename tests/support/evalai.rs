@@ -24,8 +24,6 @@ pub const PARTICIPANT: &str = "local-team-a-token";
 pub const FIRST_PHASE: u64 = 101;
 /// A connection without a request for so long is idle.
 const IDLE_MS: u64 = 100;
-/// After this time, and a sweep, nobody waits for a message any more.
-const LOST_AFTER: Duration = Duration::from_secs(140);
 /// Requests a minute that EvalAI lets a token make.
 pub const REQUESTS_PER_MINUTE: usize = 60;
 
@@ -158,17 +156,6 @@ impl Evalai {
     pub async fn edit_as(&self, token: &str, pk: u64, fields: &Value) {
         let path = format!("/api/jobs/challenges/1/submissions/{pk}/update_submission_meta/");
         self.call_as(token, reqwest::Method::PATCH, &path, fields).await;
-    }
-
-    /// Waits until the operator has listed new submissions, so long after now that one without a message counts as lost.
-    pub async fn await_swept(&self, limit: Duration) {
-        let lost = jiff::Timestamp::now() + LOST_AFTER;
-        let listed = self.handle.wait_until(|_, log| {
-            let mut lists = log.entries().filter(|entry| entry.path.contains("submission/?status="));
-            lists.any(|entry| entry.time > lost && entry.answered.is_some())
-        });
-        let listed = timeout(limit, listed).await;
-        listed.unwrap_or_else(|_| panic!("no list of new submissions is asked for within {} s", limit.as_secs()));
     }
 
     /// Resumes as the web page does.

@@ -69,7 +69,7 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
             );
         }
         Err(error) => {
-            tracing::warn!(server, submission, leaderboard, %error, "EvalAI waits for a submission that could not be created or resumed")
+            tracing::warn!(server, submission, leaderboard, %error, "EvalAI waits for a submission that could not be created or resumed");
         }
     }
 }

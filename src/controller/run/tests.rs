@@ -112,7 +112,7 @@ async fn the_end_of_any_task_ends_the_process_by_its_name() {
         assert_eq!(
             result.unwrap().unwrap_err().to_string(),
             format!(
-                "task {name} has ended before a stop was asked for; the process exits, so that the kubelet restarts it"
+                "task {name} has ended; the process exits, so that the kubelet restarts it"
             )
         );
     }

@@ -360,7 +360,7 @@ mod tests {
         let failed = tokio::time::timeout(std::time::Duration::from_mins(1), tasks.failed()).await;
         let failed = failed.unwrap().to_string();
         assert!(
-            failed.starts_with("the task EvalAI requests of token-") && failed.contains("has panicked: on purpose"),
+            failed.starts_with("task EvalAI requests of token-") && failed.contains("has panicked: on purpose"),
             "{failed}"
         );
         assert!(!hub.drain().await, "a write of it may have no answer");

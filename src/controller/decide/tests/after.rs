@@ -324,7 +324,7 @@ fn an_end_says_until_when_it_waits_for_the_controller_before() {
     assert_eq!(shown.reason, reasons::WAITING_FOR_PREVIOUS_CONTROLLER);
     let until = world.view.evalai_writes_from.unwrap().strftime("%H:%M:%S").to_string();
     assert!(
-        shown.message.contains(&format!("from {until} UTC on")),
+        shown.message.contains(&format!("before {until} UTC")),
         "{}",
         shown.message
     );

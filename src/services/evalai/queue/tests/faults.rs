@@ -106,7 +106,7 @@ fn refused_here() -> Bench {
     bench.running(7);
     bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
     bench.get(7, of_phase_2(Status::Running));
-    assert!(matches!(bench.view(7).end, Some(Ended::Refused(why)) if why.contains("phase 2, not 1")));
+    assert!(matches!(bench.view(7).end, Some(Ended::Refused(why)) if why.contains("phase 2, not to phase 1")));
     bench
 }
 

@@ -148,7 +148,7 @@ fn results_that_cannot_be_right_are_not_sent() {
     bench.wish(8, 1, Wish::Final(Outcome::Finished, foreign));
     bench.get(8, row(8, Status::Running));
     bench.expect_nothing();
-    assert!(matches!(bench.view(8).end, Some(Ended::Refused(why)) if why.contains("phase 1, not 2")));
+    assert!(matches!(bench.view(8).end, Some(Ended::Refused(why)) if why.contains("phase 1, not to phase 2")));
 }
 
 #[test]
