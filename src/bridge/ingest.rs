@@ -169,7 +169,9 @@ pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming:
             attempt,
             resource_version,
         },
-        Source::Sweep { is_resuming } if is_resuming && record.without_message.len() < MOST_WITHOUT_MESSAGE => {
+        Source::Sweep { is_resuming: true }
+            if is_resumable(existing) && record.without_message.len() < MOST_WITHOUT_MESSAGE =>
+        {
             Ingest::Bump {
                 attempt,
                 resource_version,
@@ -192,6 +194,13 @@ fn is_ended(existing: &Submission) -> bool {
             // A raised attempt that the controller has not looked at yet still shows the end of the one before.
             && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
     })
+}
+
+/// True if EvalAI can have resumed it: it resumes only what has failed. The row of one that a host cancelled was edited by its
+/// participant, who takes no cancel back.
+fn is_resumable(existing: &Submission) -> bool {
+    let state = existing.status.as_ref().and_then(|status| status.state);
+    state == Some(State::Failed) && !existing.spec.cancel
 }
 
 /// True if this was sent after what made or bumped the object.

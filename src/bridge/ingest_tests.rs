@@ -260,6 +260,27 @@ fn one_attempt_begins_without_a_message_until_the_next_message_comes() {
 }
 
 #[test]
+fn the_sweep_resumes_only_what_has_failed_and_nobody_cancelled() {
+    let in_state = |state| with_state(made_by(&message("a", 100_000)), state);
+    let lost = swept_resume(300_000);
+    check("failed", &in_state(State::Failed), &lost, &bump_to(2));
+    // EvalAI resumes only what has failed: the row of one that was cancelled was edited.
+    check("cancelled", &in_state(State::Cancelled), &lost, &refuse(2, "10"));
+    let mut by_host = in_state(State::Cancelled);
+    by_host.spec.cancel = true;
+    check("cancelled by a host", &by_host, &lost, &refuse(2, "10"));
+    let mut late = in_state(State::Failed);
+    late.spec.cancel = true;
+    check("failed, while a host cancelled it", &late, &lost, &refuse(2, "10"));
+    check(
+        "a message after the cancel",
+        &by_host,
+        &message("b", 300_000),
+        &bump_to(2),
+    );
+}
+
+#[test]
 fn a_resume_without_a_message_counts_also_where_its_object_is_gone() {
     let made = with_state(made_by(&swept_resume(100_000)), State::Failed);
     assert_eq!(Ingested::of(&made).unwrap().without_message, [1]);
@@ -436,6 +457,16 @@ async fn a_refusal_is_noted_and_changes_no_attempt() {
         (asked[2].0.as_str(), &asked[2].1),
         (format!("PATCH {ONE}").as_str(), &want)
     );
+}
+
+#[tokio::test]
+async fn the_sweep_leaves_a_hosts_cancel_as_it_is() {
+    let mut cancelled = with_state(made_by(&message("a", 100_000)), State::Cancelled);
+    cancelled.spec.cancel = true;
+    let script = vec![refusal(409, "AlreadyExists"), object(&cancelled), object(&cancelled)];
+    let (outcome, asked) = against(script, swept_resume(300_000)).await;
+    assert_eq!(outcome.unwrap(), Outcome::Refused);
+    assert_eq!(asked[2].1["spec"], json!({}));
 }
 
 #[tokio::test]
