@@ -302,6 +302,7 @@ fn map_view(seen: &evalai::View, submission: &Submission, rerun_of: Option<Rerun
                 image,
                 image_problem,
             }),
+        read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
         end: seen
