@@ -18,13 +18,13 @@ const RETRY: Duration = Duration::from_secs(30);
 /// participant, whose team has that submission in progress.
 const PHASE_SECONDS: i64 = 3600;
 
-/// Whether the submission may go on to its turn. Otherwise the draft says why not.
+/// Whether the submission may go on to its turn. Otherwise the draft says why not. EvalAI's own end goes before all that it may
+/// wait for.
 pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
         let message = no_leaderboard(draft);
         return refuse(draft, reasons::LEADERBOARD_NOT_FOUND, &message);
     };
-    // EvalAI's end goes before everything that a submission may wait for.
     let info = match ask_evalai(draft) {
         Answer::NotNeeded => None,
         Answer::Waiting => return false,

@@ -157,8 +157,8 @@ impl<'a> Draft<'a> {
         let record = Ingested::of(self.submission()).filter(|record| record.without_message.contains(&attempt));
         let Some(record) = record else { return };
         let message = format!(
-            "EvalAI's row says resuming since {}, and no message has announced attempt {attempt}. EvalAI lets only hosts \
-             resume, but participants can edit the row: check who asked for it.",
+            "EvalAI's row has asked for another run since {}, and no message has announced attempt {attempt}. EvalAI lets \
+             only hosts resume and re-run, but participants can edit the row: check who asked for it.",
             seconds(record.sent)
         );
         self.event(true, reasons::ATTEMPT_WITHOUT_MESSAGE, message);
