@@ -2,7 +2,7 @@
 //! for what its sweep of EvalAI finds.
 //!
 //! `decide_ingest` is pure and holds all policy; `apply` carries it out and is safe twice: names are deterministic,
-//! a bump carries the resourceVersion it was decided on. Knows no queue and no EvalAI.
+//! a bump carries the resourceVersion it was decided on. Knows no queue, and of EvalAI only what a swept row says.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -14,6 +14,7 @@ use thiserror::Error;
 
 use crate::api::ingested::SWEEP;
 use crate::api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
+use crate::services::evalai::Swept;
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 pub const SWEEP_AGE_MS: i64 = 120_000;
@@ -32,18 +33,15 @@ const MOST_WITHOUT_MESSAGE: usize = 1;
 pub enum Source {
     /// A message, by its id.
     Message(String),
-    /// The sweep of EvalAI's lists.
-    Sweep {
-        /// The row says `resuming`, which EvalAI sets for a resume; else `submitted`.
-        is_resuming: bool,
-    },
+    /// The sweep of EvalAI's lists, whose row says this.
+    Sweep(Swept),
 }
 
 impl Source {
     fn id(&self) -> &str {
         match self {
             Self::Message(id) => id,
-            Self::Sweep { .. } => SWEEP,
+            Self::Sweep(_) => SWEEP,
         }
     }
 }
@@ -87,6 +85,8 @@ pub enum Ingest {
     Refuse { attempt: i64, resource_version: String },
     /// It is known already.
     Repeat,
+    /// There is none, and EvalAI's row was run before: no message has announced that it is to be run again.
+    NotNew,
     /// The old one is being deleted: come back when it is gone.
     Deleting,
     /// The name belongs to another leaderboard, challenge or phase.
@@ -102,6 +102,8 @@ pub enum Outcome {
     Bumped(i64),
     /// No message has announced the attempt that EvalAI's row asks for, and none begins.
     Refused,
+    /// EvalAI's row was run before, and no message has announced that it is to be run again: none is made.
+    NotNew,
     /// It was known already.
     Repeat,
     /// The old one is being deleted: come back when it is gone.
@@ -116,6 +118,7 @@ impl std::fmt::Display for Outcome {
             Self::Created => f.write_str("created"),
             Self::Bumped(attempt) => write!(f, "resumed as attempt {attempt}"),
             Self::Refused => f.write_str("no message has announced the attempt, so none begins"),
+            Self::NotNew => f.write_str("it was run before and no message has announced another run, so none is made"),
             Self::Repeat => f.write_str("known already"),
             Self::Deleting => f.write_str("the old one is still being deleted"),
             Self::IdTaken(owner) => write!(f, "the name is taken by {owner}"),
@@ -147,6 +150,9 @@ pub enum IngestError {
 /// Decides what an incoming submission means for the object of its name, read uncached.
 pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &Incoming) -> Ingest {
     let Some(existing) = existing else {
+        if incoming.source == Source::Sweep(Swept::Edited) {
+            return Ingest::NotNew;
+        }
         return Ingest::Create(Box::new(new_submission(leaderboard, incoming)));
     };
     if existing.metadata.deletion_timestamp.is_some() {
@@ -169,15 +175,17 @@ pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming:
             attempt,
             resource_version,
         },
-        Source::Sweep { is_resuming } if is_resuming && record.without_message.len() < MOST_WITHOUT_MESSAGE => {
+        Source::Sweep(Swept::Resuming)
+            if is_resumable(existing) && record.without_message.len() < MOST_WITHOUT_MESSAGE =>
+        {
             Ingest::Bump {
                 attempt,
                 resource_version,
             }
         }
         // Noted once: a row that is edited again and again is not worth a write each time.
-        Source::Sweep { .. } if record.refused.is_some_and(|refused| refused.attempt == attempt) => Ingest::Repeat,
-        Source::Sweep { .. } => Ingest::Refuse {
+        Source::Sweep(_) if record.refused.is_some_and(|refused| refused.attempt == attempt) => Ingest::Repeat,
+        Source::Sweep(_) => Ingest::Refuse {
             attempt,
             resource_version,
         },
@@ -192,6 +200,13 @@ fn is_ended(existing: &Submission) -> bool {
             // A raised attempt that the controller has not looked at yet still shows the end of the one before.
             && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
     })
+}
+
+/// True if EvalAI can have resumed it: it resumes only what has failed. The row of one that a host cancelled was edited by its
+/// participant, who takes no cancel back.
+fn is_resumable(existing: &Submission) -> bool {
+    let state = existing.status.as_ref().and_then(|status| status.state);
+    state == Some(State::Failed) && !existing.spec.cancel
 }
 
 /// True if this was sent after what made or bumped the object.
@@ -250,9 +265,9 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
 fn record(existing: Option<&Submission>, incoming: &Incoming, attempt: i64) -> Ingested {
     let mut without_message = match incoming.source {
         Source::Message(_) => Vec::new(),
-        Source::Sweep { .. } => existing.and_then(Ingested::of).unwrap_or_default().without_message,
+        Source::Sweep(_) => existing.and_then(Ingested::of).unwrap_or_default().without_message,
     };
-    if incoming.source == (Source::Sweep { is_resuming: true }) {
+    if matches!(incoming.source, Source::Sweep(Swept::Resuming | Swept::Rerun)) {
         without_message.push(attempt);
     }
     Ingested {
@@ -271,7 +286,10 @@ fn annotation(record: &Ingested) -> (String, String) {
 pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming) -> Result<Outcome, IngestError> {
     let name = names::submission(incoming.submission);
     // Most are new, so the first try creates; the answer AlreadyExists makes the read necessary.
-    let mut existing = None;
+    let mut existing = match incoming.source {
+        Source::Sweep(Swept::Edited) => call(&name, "read", api.get_opt(&name)).await?,
+        _ => None,
+    };
     for _ in 0..ROUNDS {
         let done = match decide_ingest(leaderboard, existing.as_ref(), incoming) {
             Ingest::Create(fresh) => create(api, &name, &fresh).await?.then_some(Outcome::Created),
@@ -301,6 +319,7 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
                 .await?;
                 noted.then_some(Outcome::Refused)
             }
+            Ingest::NotNew => Some(Outcome::NotNew),
             Ingest::Repeat => Some(Outcome::Repeat),
             Ingest::Deleting => Some(Outcome::Deleting),
             Ingest::IdTaken(owner) => Some(Outcome::IdTaken(owner)),

@@ -24,12 +24,12 @@ fn message(id: &str, sent_ms: i64) -> Incoming {
 }
 
 fn sweep(sent_ms: i64) -> Incoming {
-    incoming(Source::Sweep { is_resuming: false }, sent_ms)
+    incoming(Source::Sweep(Swept::New), sent_ms)
 }
 
 /// What the sweep finds of a resume whose message was lost.
 fn swept_resume(sent_ms: i64) -> Incoming {
-    incoming(Source::Sweep { is_resuming: true }, sent_ms)
+    incoming(Source::Sweep(Swept::Resuming), sent_ms)
 }
 
 /// What the API server would hold after the first `incoming`.
@@ -260,12 +260,49 @@ fn one_attempt_begins_without_a_message_until_the_next_message_comes() {
 }
 
 #[test]
+fn the_sweep_resumes_only_what_has_failed_and_nobody_cancelled() {
+    let in_state = |state| with_state(made_by(&message("a", 100_000)), state);
+    let lost = swept_resume(300_000);
+    check("failed", &in_state(State::Failed), &lost, &bump_to(2));
+    // EvalAI resumes only what has failed: the row of one that was cancelled was edited.
+    check("cancelled", &in_state(State::Cancelled), &lost, &refuse(2, "10"));
+    let mut by_host = in_state(State::Cancelled);
+    by_host.spec.cancel = true;
+    check("cancelled by a host", &by_host, &lost, &refuse(2, "10"));
+    let mut late = in_state(State::Failed);
+    late.spec.cancel = true;
+    check("failed, while a host cancelled it", &late, &lost, &refuse(2, "10"));
+    check(
+        "a message after the cancel",
+        &by_host,
+        &message("b", 300_000),
+        &bump_to(2),
+    );
+}
+
+#[test]
 fn a_resume_without_a_message_counts_also_where_its_object_is_gone() {
     let made = with_state(made_by(&swept_resume(100_000)), State::Failed);
     assert_eq!(Ingested::of(&made).unwrap().without_message, [1]);
     check("the next one", &made, &swept_resume(600_000), &refuse(2, "10"));
     let first = with_state(made_by(&sweep(100_000)), State::Failed);
     check("of a first run", &first, &swept_resume(600_000), &bump_to(2));
+}
+
+#[test]
+fn a_row_that_was_run_before_makes_no_object_without_a_message() {
+    let swept = |says| incoming(Source::Sweep(says), 300_000);
+    assert_eq!(decide_ingest(BOARD, None, &swept(Swept::Edited)), Ingest::NotNew);
+    assert!(matches!(
+        decide_ingest(BOARD, None, &message("a", 300_000)),
+        Ingest::Create(_)
+    ));
+    // Its participant can have edited the row of a re-run: that is shown, and counts.
+    let rerun = with_state(made_by(&swept(Swept::Rerun)), State::Failed);
+    assert_eq!(Ingested::of(&rerun).unwrap().without_message, [1]);
+    check("its resume", &rerun, &swept_resume(600_000), &refuse(2, "10"));
+    let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    check("of one that is there", &failed, &swept(Swept::Edited), &refuse(2, "10"));
 }
 
 #[test]
@@ -438,56 +475,5 @@ async fn a_refusal_is_noted_and_changes_no_attempt() {
     );
 }
 
-#[tokio::test]
-async fn of_two_bumps_at_once_the_second_finds_a_repeat() {
-    let failed = with_state(made_by(&message("a", 100)), State::Failed);
-    let resume = message("b", 200);
-    let script = vec![
-        refusal(409, "AlreadyExists"),
-        object(&failed),
-        refusal(409, "Conflict"),
-        object(&bumped(failed.clone(), &resume)),
-    ];
-    let (outcome, asked) = against(script, resume).await;
-    assert_eq!(outcome.unwrap(), Outcome::Repeat);
-    assert_eq!(asked.len(), 4);
-}
-
-#[tokio::test]
-async fn one_that_vanishes_in_between_is_created() {
-    let failed = with_state(made_by(&message("a", 100)), State::Failed);
-    let script = vec![
-        refusal(409, "AlreadyExists"),
-        object(&failed),
-        refusal(404, "NotFound"),
-        refusal(404, "NotFound"),
-        object(&failed),
-    ];
-    let (outcome, asked) = against(script, message("b", 200)).await;
-    assert_eq!(outcome.unwrap(), Outcome::Created);
-    assert_eq!(asked[4].0, format!("POST {ALL}"));
-}
-
-#[tokio::test]
-async fn a_refusal_for_good_is_told_from_a_passing_failure() {
-    let (refused, _) = against(vec![refusal(422, "Invalid")], message("a", 100)).await;
-    assert!(matches!(refused, Err(IngestError::Refused { .. })), "{refused:?}");
-    let (failed, _) = against(vec![refusal(403, "Forbidden")], message("a", 100)).await;
-    let text = failed.unwrap_err().to_string();
-    assert_eq!(
-        text,
-        "Submission submission-3 could not be created: Forbidden indeed; it is tried again"
-    );
-}
-
-#[tokio::test(start_paused = true)]
-async fn a_silent_api_server_is_not_waited_for() {
-    let (service, _handle) =
-        tower_test::mock::pair::<http::Request<kube::client::Body>, http::Response<kube::client::Body>>();
-    let api = Api::namespaced(kube::Client::new(service, "ns"), "ns");
-    let outcome = apply(&api, BOARD, &message("a", 100)).await;
-    assert!(
-        matches!(outcome, Err(IngestError::Timeout { verb: "created", .. })),
-        "{outcome:?}"
-    );
-}
+#[path = "ingest_races_tests.rs"]
+mod races;

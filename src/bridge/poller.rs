@@ -223,7 +223,9 @@ impl Poller {
         match &outcome {
             Ok(Outcome::Created) => tracing::info!(submission, leaderboard, "created"),
             Ok(Outcome::Bumped(attempt)) => tracing::info!(submission, leaderboard, attempt, "resumed"),
-            Ok(Outcome::Repeat | Outcome::Refused) => tracing::debug!(submission, leaderboard, "a repeat"),
+            Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => {
+                tracing::debug!(submission, leaderboard, "a repeat");
+            }
             Ok(Outcome::Deleting) => tracing::info!(submission, leaderboard, "the old one is still being deleted"),
             Ok(Outcome::IdTaken(owner)) => tracing::warn!(
                 submission,

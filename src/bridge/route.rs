@@ -199,7 +199,7 @@ pub fn settle(envelope: &Envelope, outcome: &Result<Outcome, IngestError>, rules
         Ok(Outcome::Created) => Fate::Delete(Done::Created),
         Ok(Outcome::Bumped(_)) => Fate::Delete(Done::Bumped),
         // Only the sweep is refused an attempt.
-        Ok(Outcome::Repeat | Outcome::Refused) => Fate::Delete(Done::Repeat),
+        Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => Fate::Delete(Done::Repeat),
         Ok(Outcome::Deleting) => later(envelope.receives, SHORT_WAIT, Later::Deleting),
         Ok(Outcome::IdTaken(owner)) => Fate::Dead(DeadReason::IdTaken(owner.clone())),
         // Definitions that are newer or older than this program may refuse what others accept.

@@ -132,6 +132,10 @@ impl Actor<'_> {
                 self.context.sync.ask(self.view);
                 Ok(())
             }
+            Action::FollowEvalai => {
+                self.context.sync.follow(self.view, status);
+                Ok(())
+            }
             Action::Tell(tell) => {
                 self.context.sync.tell(self.context, self.view, status, *tell).await;
                 Ok(())

@@ -103,6 +103,14 @@ impl Sync {
         log_refused(&view.submission, asked);
     }
 
+    /// Looks for a submission's end in EvalAI from now on, also while it waits before anything of it runs.
+    pub fn follow(&self, view: &View, status: &SubmissionStatus) {
+        let Some(way) = self.way(view) else { return };
+        let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
+        let followed = self.hub.live(&way.target, &way.key, way.pk, &way.run, since);
+        log_refused(&view.submission, followed);
+    }
+
     /// Tells EvalAI. Texts that cannot be read now are told by a later pass.
     pub async fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: Tell) {
         let Some(way) = self.way(view) else { return };
@@ -115,11 +123,7 @@ impl Sync {
             Tell::Cancelled => final_wish(context, view, status, Outcome::Cancelled).await,
         };
         if matches!(tell, Tell::Queued | Tell::Running) {
-            let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
-            log_refused(
-                &view.submission,
-                self.hub.live(&way.target, &way.key, way.pk, &way.run, since),
-            );
+            self.follow(view, status);
         }
         if let Some(wish) = wish {
             log_refused(
@@ -298,6 +302,7 @@ fn map_view(seen: &evalai::View, submission: &Submission, rerun_of: Option<Rerun
                 image,
                 image_problem,
             }),
+        read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
         end: seen

@@ -181,6 +181,8 @@ pub enum Turn {
 pub struct EvalaiView {
     /// What EvalAI last said of it; None until it was asked.
     pub info: Option<EvalaiInfo>,
+    /// When its row was read.
+    pub read_at: Option<Timestamp>,
     /// It was cancelled there, after this attempt was announced.
     pub cancelled: bool,
     /// A write of ours may have undone that cancel in EvalAI.

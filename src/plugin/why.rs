@@ -377,11 +377,9 @@ fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: S
     reasons.extend(troubles.iter().filter_map(|trouble| trouble.reason.as_deref()));
     let pair = status.failure.as_ref().and_then(|failure| failure.pair);
     let mut steps: Vec<String> = Vec::new();
-    for next in reasons
-        .into_iter()
-        .filter_map(steps::of)
-        .map(|step| of_pair(&step.next, pair))
-    {
+    let of_failure = |reason: &str| after_failure(submission, status, reason);
+    let next = |reason| of_failure(reason).or_else(|| steps::of(reason).map(|step| step.next));
+    for next in reasons.into_iter().filter_map(next).map(|next| of_pair(&next, pair)) {
         if !steps.contains(&next) {
             steps.push(next);
         }
@@ -390,6 +388,17 @@ fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: S
         steps.push("Nothing; if it lasts for a minute, look whether the operator runs.".to_owned());
     }
     steps
+}
+
+/// The next step of a failure whose reason is also one of a wait, of which the documentation's row speaks.
+fn after_failure(submission: &Submission, status: &SubmissionStatus, reason: &str) -> Option<String> {
+    const BOTH: [&str; 2] = [reasons::NOT_ISOLATED, reasons::PHASE_DIFFERS];
+    status
+        .failure
+        .as_ref()
+        .filter(|failure| failure.reason == reason && BOTH.contains(&reason))?;
+    let then = if has_ended(submission) { ", then resume it" } else { "" };
+    Some(format!("Do what the message says{then}."))
 }
 
 /// The command of this plugin that carries the next step out.

@@ -17,6 +17,7 @@ use leaderboard_operator::bridge::{self, Health, Observer, Settings};
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::{TaskFailed, Tasks};
 use leaderboard_operator::services::aws::Aws;
+use leaderboard_operator::services::evalai::Swept;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
@@ -339,15 +340,15 @@ async fn the_sweep_begins_one_attempt_and_a_message_any() {
         ingest::apply(&api, "lb", &incoming).await.unwrap()
     };
     let message = |id: &str| Source::Message(id.to_owned());
-    let sweep = |is_resuming| Source::Sweep { is_resuming };
+    let sweep = Source::Sweep;
     let failed = async || world.end("submission-7", "Failed").await;
     assert_eq!(take(message("a"), 0).await, Outcome::Created);
     failed().await;
-    assert_eq!(take(sweep(false), 10).await, Outcome::Refused);
-    assert_eq!(take(sweep(true), 20).await, Outcome::Bumped(2));
+    assert_eq!(take(sweep(Swept::Edited), 10).await, Outcome::Refused);
+    assert_eq!(take(sweep(Swept::Resuming), 20).await, Outcome::Bumped(2));
     failed().await;
-    assert_eq!(take(sweep(true), 30).await, Outcome::Refused);
-    assert_eq!(take(sweep(true), 40).await, Outcome::Repeat, "noted once");
+    assert_eq!(take(sweep(Swept::Resuming), 30).await, Outcome::Refused);
+    assert_eq!(take(sweep(Swept::Resuming), 40).await, Outcome::Repeat, "noted once");
     let found = api.get("submission-7").await.unwrap();
     let record = Ingested::of(&found).unwrap();
     assert_eq!((found.spec.attempt, record.without_message), (2, vec![2]));

@@ -18,30 +18,28 @@ const RETRY: Duration = Duration::from_secs(30);
 /// participant, whose team has that submission in progress.
 const PHASE_SECONDS: i64 = 3600;
 
-/// Whether the submission may go on to its turn. Otherwise the draft says why not.
+/// Whether the submission may go on to its turn. Otherwise the draft says why not. EvalAI's own end goes before all that it may
+/// wait for.
 pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
         let message = no_leaderboard(draft);
         return refuse(draft, reasons::LEADERBOARD_NOT_FOUND, &message);
     };
-    let Some(track) = find_track(draft, leaderboard) else {
-        let message = missing_track(draft, leaderboard);
-        return refuse(draft, reasons::TRACK_NOT_FOUND, &message);
-    };
-    draft.status.track = Some(track.name.clone());
     let info = match ask_evalai(draft) {
         Answer::NotNeeded => None,
         Answer::Waiting => return false,
         Answer::Ended(status) => {
-            let message = format!(
-                "EvalAI says {status}: nothing is run and nothing is reported. Resume it there if it is to run."
-            );
-            end::cancelled(draft, reasons::ENDED_IN_EVALAI, &message);
+            end::cancelled(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(&status));
             return false;
         }
         Answer::Wanted(info) => Some(info),
     };
     take_team(draft, info.as_ref());
+    let Some(track) = find_track(draft, leaderboard) else {
+        let message = missing_track(draft, leaderboard);
+        return refuse(draft, reasons::TRACK_NOT_FOUND, &message);
+    };
+    draft.status.track = Some(track.name.clone());
     if let Some(what) = foreign_phase(draft, info.as_ref()) {
         return wait_for_phase(draft, &what);
     }
@@ -49,7 +47,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
         Image::Named(image) => image,
         Image::Unknown => {
             let message = image_unread(draft);
-            let message = draft.stall(reasons::IMAGE_MISSING, &message);
+            draft.stall_with(reasons::IMAGE_MISSING, &message);
             return refuse(draft, reasons::IMAGE_MISSING, &message);
         }
         Image::Invalid { image, what } => {
@@ -70,6 +68,27 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
     pin(draft, leaderboard, track, image, info.as_ref());
     draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
     true
+}
+
+/// What is said of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
+/// and counts what was deleted before its end as being processed until it is ended.
+fn ended_in_evalai(status: &str) -> String {
+    let (done, next) = match status {
+        "failed" => ("nothing is reported", "Resume it there if it is to run."),
+        "deleted" => (
+            "`cancelled` is written there",
+            "EvalAI takes up nothing that was deleted; the participant can submit again.",
+        ),
+        "ignored" | "missing" => (
+            "nothing is reported",
+            "EvalAI takes up nothing that was deleted; the participant can submit again.",
+        ),
+        _ => (
+            "nothing is reported",
+            "EvalAI resumes only what has failed; re-run it there if it is to run.",
+        ),
+    };
+    format!("EvalAI says {status}: nothing is run and {done}. {next}")
 }
 
 /// What is said while the Leaderboard does not exist.

@@ -16,6 +16,8 @@ use crate::text::sentence;
 const AGAIN: Duration = Duration::from_secs(30);
 /// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
 const FAREWELL_SECONDS: i64 = 120;
+/// How long after the time of a re-run a row may have been read that does not show it: the clocks differ.
+const RERUN_SECONDS: i64 = 60;
 /// What EvalAI calls a row that was cancelled.
 const CANCELLED: &str = "cancelled";
 const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
@@ -128,8 +130,13 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
         return true;
     };
     if info.status != CANCELLED {
-        // What is known may be older than the re-run; it is asked for anew when the submission is looked at next.
-        return false;
+        let read_at = evalai.and_then(|evalai| evalai.read_at);
+        let is_old = may_be_older(read_at, rerun.time.as_ref(), draft.now());
+        if is_old {
+            // What is known is forgotten, so that the next pass asks anew.
+            draft.act(Action::ForgetEvalai);
+        }
+        return is_old;
     }
     let message = format!(
         "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state, score and table row stay.",
@@ -146,11 +153,21 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
     false
 }
 
+/// Whether what was read may be from before a re-run that EvalAI dates so. A time that is still to come was not written by EvalAI.
+fn may_be_older(read_at: Option<Timestamp>, rerun: Option<&Time>, now: Timestamp) -> bool {
+    let Some((read_at, rerun)) = read_at.zip(rerun) else {
+        return false;
+    };
+    let latest = after(now, RERUN_SECONDS);
+    rerun.0 <= latest && read_at <= after(rerun.0, RERUN_SECONDS)
+}
+
 fn publish(draft: &mut Draft<'_>) -> Sync {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
-    let is_ours = draft.spec().evalai.is_some() && !is_of_another_phase(draft);
+    // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
+    let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
     if !is_ours || (is_evalais && !is_overtaken) {
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
         return Sync::Done;

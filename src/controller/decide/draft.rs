@@ -5,7 +5,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::{Action, Event, Plan};
+use super::{Action, Event, Plan, Tell};
 use crate::api::conditions::{self, Truth};
 use crate::api::{
     Deadlines, Failure, Ingested, LeaderboardSpec, Retries, State, Submission, SubmissionSpec, SubmissionStatus, names,
@@ -157,8 +157,8 @@ impl<'a> Draft<'a> {
         let record = Ingested::of(self.submission()).filter(|record| record.without_message.contains(&attempt));
         let Some(record) = record else { return };
         let message = format!(
-            "Attempt {attempt} begins without a queue message: EvalAI's status is resuming since {}. Only hosts can resume, but \
-             participants can edit the status. Check who asked for it; cancel the submission if nobody did.",
+            "Attempt {attempt} begins without a queue message: EvalAI's row has asked for it since {}. Only hosts can resume or \
+             re-run, but participants can edit the row. Check who asked for it; cancel the submission if nobody did.",
             seconds(record.sent)
         );
         self.event(true, reasons::ATTEMPT_WITHOUT_MESSAGE, message);
@@ -166,6 +166,12 @@ impl<'a> Draft<'a> {
 
     pub(super) fn act(&mut self, action: Action) {
         self.actions.push(action);
+    }
+
+    /// Whether EvalAI is told how far it is.
+    pub(super) fn tells_progress(&self) -> bool {
+        let is_progress = |action: &Action| matches!(action, Action::Tell(Tell::Queued | Tell::Running));
+        self.actions.iter().any(is_progress)
     }
 
     pub(super) fn event(&mut self, warning: bool, reason: &str, message: impl Into<String>) {
@@ -235,6 +241,12 @@ impl<'a> Draft<'a> {
         let message = known.unwrap_or_else(|| message.to_owned());
         self.condition(conditions::STALLED, Truth::True, reason, &message);
         message
+    }
+
+    /// The same with the words of this moment: for a cause that changes while the reason stays.
+    pub(super) fn stall_with(&mut self, reason: &str, message: &str) {
+        self.stall(reason, message);
+        self.condition(conditions::STALLED, Truth::True, reason, message);
     }
 
     pub(super) fn moves(&mut self) {

@@ -8,7 +8,7 @@ use super::draft::{Draft, after};
 use super::{Action, Tell, accept, end, failure, isolation, job_name, start, stop};
 use crate::api::conditions::{self, Truth};
 use crate::api::{PairStatus, Progress, State, Waiting, reasons};
-use crate::controller::view::{JobSight, JobView, PodView, Turn};
+use crate::controller::view::{JobSight, JobView, PodView, Standing, Turn};
 use crate::pod::report::Report;
 use crate::text::sentence;
 
@@ -31,6 +31,18 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
         JobSight::Foreign if !draft.is_to_stop() => name_taken(draft),
         JobSight::Absent | JobSight::Foreign if has_job => without_its_job(draft),
         JobSight::Absent | JobSight::Foreign => in_line(draft),
+    }
+    follow(draft);
+}
+
+/// Looks for its end in EvalAI also while it waits and EvalAI is told nothing, whatever it waits for.
+fn follow(draft: &mut Draft<'_>) {
+    let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
+    // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
+    let is_known = draft.status.times.submitted.is_some();
+    let may_run = is_known && info.is_some_and(|info| info.standing != Standing::Ended);
+    if may_run && !draft.is_finished() && !draft.is_to_stop() && !draft.tells_progress() {
+        draft.act(Action::FollowEvalai);
     }
 }
 
@@ -89,7 +101,6 @@ fn in_line(draft: &mut Draft<'_>) {
     draft.status.waiting = Some(Waiting { position, eta });
     draft.moves();
     draft.say(State::Pending, reason, message);
-    // Who waits in EvalAI's eyes too: only what it was told to be queued is looked for among the cancelled.
     tell(draft);
     draft.requeue_in(BACKSTOP);
 }
@@ -179,7 +190,7 @@ fn without_its_job(draft: &mut Draft<'_>) {
         return draft.requeue_in(BACKSTOP);
     }
     if let Some(message) = isolation::missing(draft) {
-        let message = draft.stall(reasons::NOT_ISOLATED, &message);
+        draft.stall_with(reasons::NOT_ISOLATED, &message);
         draft.say(draft.live_state(), reasons::NOT_ISOLATED, message);
         return draft.requeue_in(BACKSTOP);
     }

@@ -65,6 +65,8 @@ pub enum Action {
     KeepLog { places: Vec<LogPlace> },
     /// Ask EvalAI for the submission.
     AskEvalai,
+    /// Look for its end in EvalAI from now on, although EvalAI is told nothing of it yet.
+    FollowEvalai,
     /// Tell EvalAI.
     Tell(Tell),
     /// Nothing more is wanted from EvalAI for this object.

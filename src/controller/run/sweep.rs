@@ -33,9 +33,7 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
         phase: row.phase,
         submission: row.submission,
         image: None,
-        source: Source::Sweep {
-            is_resuming: row.is_resuming,
-        },
+        source: Source::Sweep(row.says),
         sent_ms: row.time.as_millisecond(),
     };
     let (server, leaderboard) = (&row.server, board.name_any());
@@ -48,6 +46,14 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
                 submission,
                 leaderboard,
                 "EvalAI's row asks for another attempt, and no message has announced it: none begins"
+            );
+        }
+        Ok(Outcome::NotNew) => {
+            tracing::warn!(
+                server,
+                submission,
+                leaderboard,
+                "EvalAI's row was run before and asks for another run, and no message has announced it: none is made"
             );
         }
         Ok(Outcome::IdTaken(owner)) => {
@@ -94,6 +100,7 @@ mod tests {
     use serde_json::{Value, json};
 
     use super::*;
+    use crate::services::evalai::Swept;
 
     /// A Leaderboard of challenge 1 with phase 2, created at this second, in a namespace of its own name.
     fn board(name: &str, second: i64, server: &str) -> Leaderboard {
@@ -114,7 +121,7 @@ mod tests {
             challenge: 1,
             phase,
             submission: 7,
-            is_resuming: false,
+            says: Swept::New,
             time: Timestamp::from_second(100).unwrap(),
         }
     }

@@ -6,7 +6,7 @@ use super::{
     assert_width, cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission,
     waiting, with,
 };
-use crate::api::{Leaderboard, Submission};
+use crate::api::{Leaderboard, Submission, reasons};
 use crate::plugin::board::Sight;
 use crate::plugin::why::explain;
 
@@ -99,6 +99,34 @@ fn an_infrastructures_failure_is_not_charged_and_is_resumed() {
         "Next:        Look at the node, then resume.\n             kubectl leaderboard resume submission-42 -n carla",
     ] {
         assert!(words.contains(expected), "{expected}\n\n{words}");
+    }
+}
+
+#[test]
+fn the_next_step_of_a_failure_is_not_that_of_a_wait_for_the_same_reason() {
+    let wait = |reason: &str| told(&json!({"state": "Pending", "reason": reason, "attempt": 1}));
+    for (reason, waits) in [
+        (
+            reasons::NOT_ISOLATED,
+            "Nothing for a moment after the Leaderboard was applied",
+        ),
+        (
+            reasons::PHASE_DIFFERS,
+            "Set the phase back in EvalAI, and it goes on by itself.",
+        ),
+    ] {
+        assert!(wait(reason).contains(waits), "{}", wait(reason));
+        let message = "It could not be. Correct that, then resume it.";
+        let failure = json!({"class": "infrastructure", "charged": false, "reason": reason, "message": message});
+        let text = told(&with(
+            node_lost(),
+            &json!({"reason": reason, "message": message, "failure": failure}),
+        ));
+        assert!(!text.contains(waits), "{text}");
+        assert!(
+            text.contains("Next:        Do what the message says, then resume it."),
+            "{text}"
+        );
     }
 }
 

@@ -24,4 +24,4 @@ pub use labels::{Labels, Misfit};
 pub use queue::Timing;
 pub use row::Row;
 pub use status::{Outcome, Progress, Status};
-pub use types::{Changed, Ended, ImageAnswer, Key, Payload, Run, SweepRow, Target, View, Wish};
+pub use types::{Changed, Ended, ImageAnswer, Key, Payload, Run, SweepRow, Swept, Target, View, Wish};

@@ -27,6 +27,8 @@ pub struct Row {
     pub submitted_at: Option<Timestamp>,
     /// When it was last re-run or resumed.
     pub resumed_at: Option<Timestamp>,
+    /// When it last came to an end; a re-run keeps that of the old row.
+    pub completed_at: Option<Timestamp>,
     /// Where the uploaded file is.
     pub input_file: Option<String>,
     /// Every `job_name` ever sent, in lower case.
@@ -44,6 +46,7 @@ impl Row {
             team_name: None,
             submitted_at: None,
             resumed_at: None,
+            completed_at: None,
             input_file: None,
             jobs: Vec::new(),
         }
@@ -80,6 +83,8 @@ impl<'de> Deserialize<'de> for Row {
             #[serde(default)]
             rerun_resumed_at: Value,
             #[serde(default)]
+            completed_at: Value,
+            #[serde(default)]
             input_file: Value,
             #[serde(default)]
             job_name: Value,
@@ -101,6 +106,7 @@ impl<'de> Deserialize<'de> for Row {
             team_name: text(&raw.participant_team_name),
             submitted_at: time(&raw.submitted_at),
             resumed_at: time(&raw.rerun_resumed_at),
+            completed_at: time(&raw.completed_at),
             input_file: text(&raw.input_file),
             jobs: jobs.filter_map(Value::as_str).map(str::to_lowercase).collect(),
         })

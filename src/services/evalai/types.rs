@@ -141,6 +141,19 @@ pub enum Changed {
     Leaderboard(Key),
 }
 
+/// What a swept row says of the run that it asks for. Its participant can edit all of it but when it was submitted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Swept {
+    /// `submitted`, and nothing of it was ever run.
+    New,
+    /// `submitted`, as a host's re-run of another submission makes it.
+    Rerun,
+    /// `submitted`, although it was run before, or is older than the Leaderboard.
+    Edited,
+    /// `resuming`.
+    Resuming,
+}
+
 /// A submission that asks to be run and that nobody here knows: its message may be lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SweepRow {
@@ -149,8 +162,7 @@ pub struct SweepRow {
     pub challenge: i64,
     pub phase: i64,
     pub submission: i64,
-    /// EvalAI says `resuming`, not `submitted`.
-    pub is_resuming: bool,
+    pub says: Swept,
     /// When it asked to be run: its re-run or resume, else its submission.
     pub time: Timestamp,
 }

@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::builders::*;
 use crate::api::State::{Cancelled, Failed, Pending};
 use crate::api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
-use crate::api::{FailureClass, LeaderboardStatus, conditions, reasons};
+use crate::api::{FailureClass, conditions, reasons};
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{Standing, Turn};
 
@@ -139,24 +139,26 @@ fn an_unknown_leaderboard_or_track_is_waited_for() {
     assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
 }
 
+/// Its Leaderboard is not ready, for this reason.
+fn not_ready(world: &mut World, reason: &str) {
+    let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
+    let conditions = &mut leaderboard.status.get_or_insert_default().conditions;
+    let now = Time(at(0));
+    conditions::set(
+        conditions,
+        READY,
+        conditions::Truth::False,
+        reason,
+        "spec.pod: no",
+        None,
+        &now,
+    );
+}
+
 #[test]
 fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
     let mut world = World::local();
-    let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
-    let status = leaderboard.status.get_or_insert_with(LeaderboardStatus::default);
-    let mut not_ready = |reason: &str| {
-        let now = Time(at(0));
-        conditions::set(
-            &mut status.conditions,
-            READY,
-            conditions::Truth::False,
-            reason,
-            "spec.pod: no",
-            None,
-            &now,
-        );
-    };
-    not_ready(reasons::INVALID_POD);
+    not_ready(&mut world, reasons::INVALID_POD);
     let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_READY);
     assert!(
         plan.status
@@ -166,18 +168,7 @@ fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
     );
 
     let mut world = World::local();
-    let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
-    let status = leaderboard.status.get_or_insert_with(LeaderboardStatus::default);
-    let now = Time(at(0));
-    conditions::set(
-        &mut status.conditions,
-        READY,
-        conditions::Truth::False,
-        reasons::QUEUE_BLOCKED,
-        "",
-        None,
-        &now,
-    );
+    not_ready(&mut world, reasons::QUEUE_BLOCKED);
     assert!(creates(&world.pass()), "a blocked queue is the bridge's affair");
 }
 
@@ -293,4 +284,144 @@ fn a_submission_with_a_wrong_phase_is_taken_back_without_ending_the_row() {
     world.pass_to(Pending, reasons::PHASE_DIFFERS);
     world.submission().spec.cancel = true;
     assert_eq!(tells(&world.pass_to(Cancelled, reasons::CANCELLED)), [Tell::Cancelled]);
+}
+
+#[test]
+fn what_waits_before_its_acceptance_hears_of_its_end_in_evalai() {
+    type Wait = fn(&mut World);
+    let waits: [(&str, Wait); 5] = [
+        (reasons::TRACK_NOT_FOUND, |w| w.leaderboard().tracks[0].phase = Some(8)),
+        (reasons::IMAGE_MISSING, |w| {
+            w.submission().spec.image = None;
+            w.in_evalai().info.as_mut().unwrap().image = None;
+        }),
+        (reasons::LEADERBOARD_NOT_READY, |w| not_ready(w, reasons::INVALID_POD)),
+        (reasons::NOT_ISOLATED, |w| w.view.is_policy_in_place = false),
+        (reasons::PHASE_DIFFERS, |w| moved_to(w, 9)),
+    ];
+    for (reason, wait) in waits {
+        let mut world = World::evalai();
+        wait(&mut world);
+        let plan = world.pass_to(Pending, reason);
+        assert!(
+            has(&plan, |a| *a == Action::FollowEvalai),
+            "{reason}: {:?}",
+            plan.actions
+        );
+        assert_eq!(
+            plan.status.times.submitted,
+            Some(Time(at(-60))),
+            "{reason}: EvalAI's lists are asked from then on"
+        );
+        world.in_evalai().cancelled = true;
+        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        assert_eq!(tells(&plan), [], "{reason}");
+        assert!(
+            has(&plan, |a| *a == Action::ForgetEvalai),
+            "{reason}: {:?}",
+            plan.actions
+        );
+    }
+}
+
+#[test]
+fn evalai_is_asked_also_where_the_track_is_missing() {
+    let mut world = World::evalai();
+    world.leaderboard().tracks[0].phase = Some(8);
+    world.in_evalai().info = None;
+    assert!(has(&world.pass(), |a| *a == Action::AskEvalai));
+    world.in_evalai().info = Some(crate::controller::view::EvalaiInfo {
+        standing: Standing::Ended,
+        status: "cancelled".into(),
+        ..info()
+    });
+    world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+}
+
+#[test]
+fn what_waits_between_two_tries_is_followed_after_a_restart() {
+    let mut world = World::evalai().running();
+    world.job().end = Some(crate::controller::view::JobEnd::Failed {
+        at: None,
+        reason: "BackoffLimitExceeded".into(),
+        message: "no".into(),
+    });
+    world.view.report = crate::controller::view::ReportSight::Absent;
+    world.pass_to(Pending, reasons::REPLACING);
+    world.job_gone();
+    let plan = world.pass_to(Pending, reasons::REPLACING);
+    assert!(has(&plan, |a| *a == Action::FollowEvalai), "{:?}", plan.actions);
+}
+
+#[test]
+fn a_row_of_another_phase_that_its_participant_deleted_is_ended_there() {
+    let mut world = World::evalai();
+    moved_to(&mut world, 9);
+    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    let mut cancelled = world.clone();
+    (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert_eq!(tells(&plan), [Tell::Cancelled], "EvalAI counts it as being processed");
+    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::OVERTAKEN.into()));
+    world.published();
+    assert_eq!(condition(&world.pass(), PUBLISHED).0, "True");
+
+    cancelled.in_evalai().cancelled = true;
+    let plan = cancelled.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert_eq!(tells(&plan), []);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_WANTED);
+}
+
+#[test]
+fn the_next_step_after_evalais_own_end_is_one_that_evalai_takes() {
+    for (status, is_written, step) in [
+        ("failed", false, "Resume it there if it is to run."),
+        ("cancelled", false, "re-run it there if it is to run."),
+        ("archived", false, "re-run it there if it is to run."),
+        ("finished", false, "re-run it there if it is to run."),
+        ("deleted", true, "the participant can submit again."),
+        ("ignored", false, "the participant can submit again."),
+        ("missing", false, "the participant can submit again."),
+    ] {
+        let mut world = World::evalai();
+        world.in_evalai().info = Some(crate::controller::view::EvalaiInfo {
+            standing: Standing::Ended,
+            status: status.into(),
+            ..info()
+        });
+        let message = world
+            .pass_to(Cancelled, reasons::ENDED_IN_EVALAI)
+            .status
+            .message
+            .unwrap();
+        assert!(message.starts_with(&format!("EvalAI says {status}: ")), "{message}");
+        assert!(message.ends_with(step), "{message}");
+        assert_eq!(
+            message.contains("`cancelled` is written there"),
+            is_written,
+            "{message}"
+        );
+        assert_eq!(message.contains("nothing is reported"), !is_written, "{message}");
+    }
+}
+
+#[test]
+fn why_an_image_is_unknown_follows_its_cause() {
+    let mut world = World::evalai();
+    world.submission().spec.image = None;
+    world.in_evalai().info.as_mut().unwrap().image = None;
+    world.in_evalai().error = Some("EvalAI answered 404".into());
+    world.pass_to(Pending, reasons::IMAGE_MISSING);
+    let since = conditions::get(&world.status().conditions, STALLED).cloned().unwrap();
+    world.wait(60);
+    world.in_evalai().error = Some("EvalAI answered 503".into());
+    let status = world.pass_to(Pending, reasons::IMAGE_MISSING).status;
+    let stalled = conditions::get(&status.conditions, STALLED).unwrap();
+    for message in [&stalled.message, status.message.as_ref().unwrap()] {
+        assert!(
+            message.contains("answered 503") && !message.contains("404"),
+            "{message}"
+        );
+    }
+    assert_eq!(stalled.last_transition_time, since.last_transition_time);
 }

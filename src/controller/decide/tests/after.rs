@@ -302,6 +302,41 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
 }
 
 #[test]
+fn a_row_that_was_read_before_the_rerun_is_asked_for_anew() {
+    let mut world = finished();
+    world.job().has_ttl = true;
+    world.published();
+    world.recorded();
+    world.pass();
+    world.view.rerun_as = Some(Rerun {
+        submission_name: "submission-99".into(),
+        time: Some(Time(at(500))),
+    });
+    says(&mut world, "finished");
+    world.in_evalai().read_at = Some(at(490));
+    world.go_to(501);
+    let plan = world.pass();
+    assert_eq!(plan.actions, [Action::ForgetEvalai]);
+    assert!(plan.requeue.is_some(), "nobody else looks again");
+
+    let mut unproven = world.clone();
+    world.view.evalai = None;
+    assert_eq!(world.pass().actions, [Action::AskEvalai]);
+    says(&mut world, "cancelled");
+    world.in_evalai().read_at = Some(at(532));
+    assert!(world.pass().status.rerun_as.is_some());
+
+    // The row of the re-run was edited: EvalAI still says finished after it.
+    unproven.go_to(600);
+    unproven.in_evalai().read_at = Some(at(590));
+    let plan = unproven.pass();
+    assert_eq!((plan.actions, plan.requeue), (vec![Action::ForgetEvalai], None));
+    // A time to come would be asked about until then.
+    unproven.view.rerun_as.as_mut().unwrap().time = Some(Time(at(90_000)));
+    assert_eq!(unproven.pass().requeue, None);
+}
+
+#[test]
 fn a_submission_remembers_which_one_it_reruns() {
     let mut world = World::evalai();
     let of = Rerun {

@@ -73,6 +73,12 @@ fn a_job_that_was_deleted_is_made_again_only_under_the_policy() {
     let plan = world.pass_to(Running, reasons::NOT_ISOLATED);
     assert!(!creates(&plan));
     assert_eq!(condition(&plan, STALLED), ("True".into(), reasons::NOT_ISOLATED.into()));
+    say_of_the_leaderboard(&mut world, reasons::FORBIDDEN, "The API server refuses it");
+    let status = world.pass_to(Running, reasons::NOT_ISOLATED).status;
+    let stalled = conditions::get(&status.conditions, STALLED).unwrap();
+    for message in [&stalled.message, status.message.as_ref().unwrap()] {
+        assert!(message.contains("(Forbidden): The API server refuses it."), "{message}");
+    }
     world.view.is_policy_in_place = true;
     assert!(creates(&world.pass_to(Running, reasons::REPLACING)));
     assert_eq!(world.status().recreated, 1);

@@ -222,6 +222,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
     (select(infos), cancels, select(ends), error).prop_map(|(info, (cancelled, overtaken), end, error)| EvalaiView {
         team_id: None,
         info,
+        read_at: None,
         cancelled,
         overtaken,
         end,

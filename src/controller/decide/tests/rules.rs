@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use crate::api::conditions::{self, FINISHED, PUBLISHED};
 use crate::api::{FailureClass, PolicySource, State, SubmissionStatus};
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
-use crate::controller::view::{JobSight, NodeSight, View};
+use crate::controller::view::{JobSight, NodeSight, Standing, View};
 
 /// Passes after which nothing may change any more in a world that stands still.
 const SETTLED_AFTER: usize = 5;
@@ -20,6 +20,7 @@ pub fn check(view: &View, plan: &Plan) {
     status_is_whole(plan);
     conditions_are_conventional(plan);
     live_ones_are_looked_at_again(plan);
+    a_wait_hears_evalai(view, plan);
     comes_to_rest(view, plan);
 }
 
@@ -183,6 +184,33 @@ fn conditions_are_conventional(plan: &Plan) {
 fn live_ones_are_looked_at_again(plan: &Plan) {
     if !is_finished(&plan.status) {
         assert!(plan.requeue.is_some(), "forgotten while {:?}", plan.status.reason);
+    }
+}
+
+/// What EvalAI lets run is ended when EvalAI ends it, whatever it waits for: its end is looked for.
+fn a_wait_hears_evalai(view: &View, plan: &Plan) {
+    let Some(evalai) = view.evalai.as_ref().filter(|evalai| !evalai.cancelled) else {
+        return;
+    };
+    let may_run = evalai
+        .info
+        .as_ref()
+        .is_some_and(|info| info.standing != Standing::Ended);
+    let (spec, status) = (&view.submission.spec, &plan.status);
+    let is_to_stop = spec.cancel
+        || view.submission.metadata.deletion_timestamp.is_some()
+        || status.failure.is_some()
+        || status.times.stopping.is_some();
+    // The next pass looks at an attempt that has just begun.
+    let is_seen = plan.requeue != Some(std::time::Duration::ZERO);
+    let is_asked = status.times.submitted.is_some();
+    if may_run && is_asked && is_seen && !is_to_stop && !is_finished(status) {
+        let follows = |a: &Action| matches!(a, Action::FollowEvalai | Action::Tell(Tell::Queued | Tell::Running));
+        assert!(
+            plan.actions.iter().any(follows),
+            "EvalAI's end is not looked for: {:?}",
+            plan.actions
+        );
     }
 }
 

@@ -5,19 +5,35 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::SignedDuration;
+use jiff::{SignedDuration, Timestamp};
 
 use super::{Now, Queue};
+use crate::api::names;
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
 use crate::services::evalai::row::{Row, Split};
 use crate::services::evalai::status::Status;
-use crate::services::evalai::types::{Changed, SweepRow};
+use crate::services::evalai::types::{Changed, SweepRow, Swept};
 
 /// What the sweep has found is not handed out again for so long.
 const SWEPT_FOR: Duration = Duration::from_mins(10);
 /// Before a failed check is tried again.
 const RETRY_LOOK: Duration = Duration::from_mins(1);
+
+/// What a row says that asks to be run. EvalAI makes a re-run's row by copying the old one: it keeps the Jobs of the old one's id,
+/// when that was submitted and when it ended.
+fn says(row: &Row, since: Timestamp) -> Swept {
+    let own = format!("{}-", names::submission(row.id));
+    let has_run = row.jobs.iter().any(|job| job.starts_with(&own));
+    let is_ours = !has_run && row.submitted_at.is_some_and(|at| at >= since);
+    let has_ended = row.completed_at.is_some();
+    match (row.status, row.resumed_at) {
+        (Status::Resuming, _) => Swept::Resuming,
+        (_, None) if is_ours && !has_ended => Swept::New,
+        (_, Some(_)) if is_ours && !(has_ended && row.jobs.is_empty()) => Swept::Rerun,
+        _ => Swept::Edited,
+    }
+}
 
 impl Queue {
     /// Takes in what is not about one submission.
@@ -125,7 +141,7 @@ impl Queue {
             challenge: id,
             phase,
             submission: row.id,
-            is_resuming: row.status == Status::Resuming,
+            says: says(row, since),
             time,
         });
     }

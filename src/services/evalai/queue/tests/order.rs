@@ -1,6 +1,7 @@
 //! What comes first, how much at once, and what is asked for a whole challenge.
 
 use super::*;
+use crate::services::evalai::types::Swept;
 
 #[test]
 fn priorities() {
@@ -118,12 +119,15 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         .queue
         .take_sweep()
         .into_iter()
-        .map(|row| (row.server, row.submission, row.is_resuming, row.time))
+        .map(|row| (row.server, row.submission, row.says, row.time))
         .collect();
     let server = target().api_server;
     assert_eq!(
         swept,
-        [(server.clone(), 1, false, wall(-1000)), (server, 5, true, wall(-200))]
+        [
+            (server.clone(), 1, Swept::New, wall(-1000)),
+            (server, 5, Swept::Resuming, wall(-200))
+        ]
     );
     let mut again = 0;
     for _ in 0..11 {
@@ -143,6 +147,59 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         again += bench.queue.take_sweep().len();
     }
     assert_eq!(again, 1, "once more after ten minutes");
+}
+
+#[test]
+fn a_swept_row_that_was_run_before_is_told_from_a_lost_rerun() {
+    let edited = |pk| Row {
+        submitted_at: Some(wall(-1000)),
+        resumed_at: Some(wall(-200)),
+        completed_at: Some(wall(-500)),
+        ..row(pk, Status::Submitted)
+    };
+    let with = |row: Row, jobs: &[&str]| Row {
+        jobs: jobs.iter().map(|&job| job.to_owned()).collect(),
+        ..row
+    };
+    let rows = vec![
+        with(edited(1), &["submission-1-1"]),
+        with(edited(2), &["submission-1-1"]),
+        with(edited(3), &["submission-1-1", "submission-3-1"]),
+        edited(4),
+        Row {
+            completed_at: None,
+            ..edited(5)
+        },
+        Row {
+            resumed_at: None,
+            ..edited(6)
+        },
+        // From before the Leaderboard.
+        Row {
+            submitted_at: Some(wall(-7200)),
+            ..with(edited(7), &["submission-1-1"])
+        },
+        with(edited(11), &["submission-1-1"]),
+    ];
+    let mut bench = Bench::new();
+    bench.serve();
+    bench.list("sweep of submitted", rows);
+    let swept = bench.queue.take_sweep();
+    let said: Vec<_> = swept.into_iter().map(|row| (row.submission, row.says)).collect();
+    let (edited, rerun) = (Swept::Edited, Swept::Rerun);
+    assert_eq!(
+        said,
+        [
+            (1, edited),
+            (2, rerun),
+            (3, edited),
+            (4, edited),
+            (5, rerun),
+            (6, edited),
+            (7, edited),
+            (11, rerun)
+        ]
+    );
 }
 
 #[test]

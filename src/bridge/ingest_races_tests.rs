@@ -1,0 +1,79 @@
+//! More races on a mock API server, and requests that fail.
+
+use super::*;
+
+#[tokio::test]
+async fn the_sweep_leaves_a_hosts_cancel_as_it_is() {
+    let mut cancelled = with_state(made_by(&message("a", 100_000)), State::Cancelled);
+    cancelled.spec.cancel = true;
+    let script = vec![refusal(409, "AlreadyExists"), object(&cancelled), object(&cancelled)];
+    let (outcome, asked) = against(script, swept_resume(300_000)).await;
+    assert_eq!(outcome.unwrap(), Outcome::Refused);
+    assert_eq!(asked[2].1["spec"], json!({}));
+}
+
+#[tokio::test]
+async fn whether_a_row_that_was_run_before_has_an_object_is_read_first() {
+    let edited = || incoming(Source::Sweep(Swept::Edited), 300_000);
+    let (outcome, asked) = against(vec![refusal(404, "NotFound")], edited()).await;
+    assert_eq!(outcome.unwrap(), Outcome::NotNew);
+    assert_eq!(asked[0].0, format!("GET {ONE}"));
+    let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    let (outcome, asked) = against(vec![object(&failed), object(&failed)], edited()).await;
+    assert_eq!(outcome.unwrap(), Outcome::Refused);
+    assert_eq!(asked[1].0, format!("PATCH {ONE}"));
+}
+
+#[tokio::test]
+async fn of_two_bumps_at_once_the_second_finds_a_repeat() {
+    let failed = with_state(made_by(&message("a", 100)), State::Failed);
+    let resume = message("b", 200);
+    let script = vec![
+        refusal(409, "AlreadyExists"),
+        object(&failed),
+        refusal(409, "Conflict"),
+        object(&bumped(failed.clone(), &resume)),
+    ];
+    let (outcome, asked) = against(script, resume).await;
+    assert_eq!(outcome.unwrap(), Outcome::Repeat);
+    assert_eq!(asked.len(), 4);
+}
+
+#[tokio::test]
+async fn one_that_vanishes_in_between_is_created() {
+    let failed = with_state(made_by(&message("a", 100)), State::Failed);
+    let script = vec![
+        refusal(409, "AlreadyExists"),
+        object(&failed),
+        refusal(404, "NotFound"),
+        refusal(404, "NotFound"),
+        object(&failed),
+    ];
+    let (outcome, asked) = against(script, message("b", 200)).await;
+    assert_eq!(outcome.unwrap(), Outcome::Created);
+    assert_eq!(asked[4].0, format!("POST {ALL}"));
+}
+
+#[tokio::test]
+async fn a_refusal_for_good_is_told_from_a_passing_failure() {
+    let (refused, _) = against(vec![refusal(422, "Invalid")], message("a", 100)).await;
+    assert!(matches!(refused, Err(IngestError::Refused { .. })), "{refused:?}");
+    let (failed, _) = against(vec![refusal(403, "Forbidden")], message("a", 100)).await;
+    let text = failed.unwrap_err().to_string();
+    assert_eq!(
+        text,
+        "Submission submission-3 could not be created: Forbidden indeed; it is tried again"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_silent_api_server_is_not_waited_for() {
+    let (service, _handle) =
+        tower_test::mock::pair::<http::Request<kube::client::Body>, http::Response<kube::client::Body>>();
+    let api = Api::namespaced(kube::Client::new(service, "ns"), "ns");
+    let outcome = apply(&api, BOARD, &message("a", 100)).await;
+    assert!(
+        matches!(outcome, Err(IngestError::Timeout { verb: "created", .. })),
+        "{outcome:?}"
+    );
+}
