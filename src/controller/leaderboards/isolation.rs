@@ -284,6 +284,7 @@ pub fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
             | WorkspaceReason::NotEnforced
             | WorkspaceReason::NotMeasured
             | WorkspaceReason::NotIsolated
+            | WorkspaceReason::NotKnownIsolated
     );
     is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
 }
@@ -311,13 +312,13 @@ pub(super) fn condition(
                 "The NetworkPolicy is in place. Whether it is enforced is not measured: network.enforcement is Off.";
             (Truth::Unknown, reasons::NOT_MEASURED, message.into())
         }
-        Policy::InPlace => match measured {
-            Some(verdict) => (truth(verdict.reason), reason(verdict.reason), verdict.message.clone()),
-            None => {
+        Policy::InPlace => measured.map_or_else(
+            || {
                 let message = "The NetworkPolicy is in place. The next run measures whether it is enforced.";
                 (Truth::Unknown, reasons::NOT_MEASURED, message.into())
-            }
-        },
+            },
+            |found| (truth(found.reason), reason(found.reason), found.message.clone()),
+        ),
     }
 }
 
@@ -338,7 +339,7 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
 fn truth(found: WorkspaceReason) -> Truth {
     match found {
         WorkspaceReason::Enforced => Truth::True,
-        WorkspaceReason::NotMeasured => Truth::Unknown,
+        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => Truth::Unknown,
         _ => Truth::False,
     }
 }
@@ -346,7 +347,7 @@ fn truth(found: WorkspaceReason) -> Truth {
 fn reason(found: WorkspaceReason) -> &'static str {
     match found {
         WorkspaceReason::Enforced => reasons::ENFORCED,
-        WorkspaceReason::NotMeasured => reasons::NOT_MEASURED,
+        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => reasons::NOT_MEASURED,
         _ => reasons::NOT_ENFORCED,
     }
 }

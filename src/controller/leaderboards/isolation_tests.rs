@@ -43,7 +43,7 @@ fn shown(reason: &str, of: i64) -> Leaderboard {
 
 #[test]
 fn only_what_was_measured_is_called_enforced() {
-    use WorkspaceReason::{Enforced, NotEnforced, NotIsolated, NotMeasured};
+    use WorkspaceReason::{Enforced, NotEnforced, NotIsolated, NotKnownIsolated, NotMeasured};
     let (on, off) = (
         leaderboard(&json!({}), 2),
         leaderboard(&json!({"enforcement": "Off"}), 2),
@@ -76,6 +76,13 @@ fn only_what_was_measured_is_called_enforced() {
         (&on, in_place(), Some(Enforced), Truth::True, reasons::ENFORCED),
         (&on, in_place(), Some(NotEnforced), Truth::False, reasons::NOT_ENFORCED),
         (&on, in_place(), Some(NotIsolated), Truth::False, reasons::NOT_ENFORCED),
+        (
+            &on,
+            in_place(),
+            Some(NotKnownIsolated),
+            Truth::Unknown,
+            reasons::NOT_MEASURED,
+        ),
         (&off, in_place(), Some(Enforced), Truth::Unknown, reasons::NOT_MEASURED),
     ];
     for (leaderboard, policy, found, truth, reason) in cases {
