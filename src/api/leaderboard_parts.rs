@@ -269,7 +269,10 @@ pub enum Enforcement {
 
 /// What the Pods of strangers may reach, by NetworkPolicy.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
-#[x_kube(validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed, since the operator does not know what the cluster's own policies forbid; use Managed, or Warn"))]
+#[x_kube(
+    validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed, since the operator does not know what the cluster's own policies forbid; use Managed, or Warn"),
+    validation = Rule::new("!has(self.probe) || (isIP(self.probe.substring(0, self.probe.lastIndexOf(':')).replace('[', '').replace(']', '')) && int(self.probe.substring(self.probe.lastIndexOf(':') + 1)) > 0 && int(self.probe.substring(self.probe.lastIndexOf(':') + 1)) < 65536)").message("network.probe is not an address and port such as 192.0.2.1:443 or [2001:db8::1]:443")
+)]
 pub struct Network {
     /// `Managed`: the operator applies and restores one NetworkPolicy, and creates no Job without it. `External`: the operator applies none; the cluster's own policies are trusted.
     #[serde(default)]

@@ -249,6 +249,7 @@ impl Actor<'_> {
             operator_image: &settings.image,
             image_pull_policy: settings.image_pull_policy.as_deref(),
             region: settings.region.as_deref(),
+            now: self.view.now,
         });
         let name = names::job(&self.name(), attempt, retry);
         let resource = ApiResource::erase::<Job>(&());

@@ -18,6 +18,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         leaderboards: vec![board],
         submissions: vec![submission.clone()],
         jobs: vec![job],
+        ..Cluster::default()
     };
     let around = surroundings(cluster, "http://127.0.0.1:9").await;
     let view = observe(&around.context, Arc::new(submission)).await;

@@ -18,11 +18,12 @@ use super::leaderboards::Desk;
 use super::memory::Memory;
 use super::network_policy;
 use super::observe::board::Board;
-use super::observe::is_pod_of;
 use super::observe::node::Nodes;
 use super::observe::report::Reports;
+use super::observe::{is_pod_of, uid_of};
 use super::reruns::Reruns;
 use super::sync::Sync;
+use super::watches::Synced;
 use crate::api::{Leaderboard, Storage, Submission};
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
@@ -37,6 +38,8 @@ pub struct Stores {
     pub jobs: Store<Job>,
     pub pods: Store<Pod>,
     pub policies: Store<NetworkPolicy>,
+    /// Whether what `policies` shows can be relied on.
+    pub policies_synced: Synced,
 }
 
 impl Stores {
@@ -46,8 +49,11 @@ impl Stores {
         pods.max_by_key(|pod| (pod.metadata.creation_timestamp.clone().map(|t| t.0), pod.name_any()))
     }
 
-    /// Whether the policy that a Leaderboard's present spec asks for is in place.
-    pub fn is_policy_in_place(&self, leaderboard: &Leaderboard) -> bool {
+    /// Whether the policy that a Leaderboard's present spec asks for is seen to be there.
+    pub fn shows_policy(&self, leaderboard: &Leaderboard) -> bool {
+        if !self.policies_synced.is_true() {
+            return false;
+        }
         let namespace = leaderboard.namespace().unwrap_or_default();
         let name = network_policy::name(leaderboard);
         let found = self.policies.get(&ObjectRef::new(&name).within(&namespace));
@@ -82,6 +88,9 @@ pub struct Settings {
     pub concurrency: u16,
 }
 
+/// Tells the queue of a Leaderboard.
+pub type Wake = Box<dyn Fn(ObjectRef<Leaderboard>) + Send + std::marker::Sync>;
+
 /// Shared by all passes.
 pub struct Context {
     pub client: Client,
@@ -98,11 +107,21 @@ pub struct Context {
     pub buckets: Buckets,
     pub nodes: Nodes,
     pub recorder: Recorder,
+    /// Looks at a Leaderboard again, and at those that wait for it.
+    pub wake: Wake,
     archives: Mutex<HashMap<String, Archive>>,
 }
 
 impl Context {
-    pub fn new(client: Client, settings: Settings, stores: Stores, sync: Sync, aws: Aws, recorder: Recorder) -> Self {
+    pub fn new(
+        client: Client,
+        settings: Settings,
+        stores: Stores,
+        sync: Sync,
+        aws: Aws,
+        recorder: Recorder,
+        wake: Wake,
+    ) -> Self {
         Self {
             client,
             settings,
@@ -118,8 +137,14 @@ impl Context {
             buckets: Buckets::default(),
             nodes: Nodes::default(),
             recorder,
+            wake,
             archives: Mutex::default(),
         }
+    }
+
+    /// Whether Jobs may be made: the policy of the present spec is seen to be there, and the last apply did not fail.
+    pub fn is_policy_in_place(&self, leaderboard: &Leaderboard) -> bool {
+        self.stores.shows_policy(leaderboard) && !self.desk.policy_failed(&uid_of(leaderboard))
     }
 
     /// The prefix of a run; clients are kept by region and endpoint. A pass calls it through `buckets`.

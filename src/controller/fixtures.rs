@@ -8,11 +8,12 @@ use aws_credential_types::Credentials;
 use http::{Method, Request, Response};
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
 use kube::client::Body;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::store::Writer;
-use kube::runtime::reflector::{Lookup, Store};
+use kube::runtime::reflector::{Lookup, ObjectRef, Store};
 use kube::runtime::watcher::Event;
 use kube::{Client, ResourceExt};
 use serde_json::{Value, json};
@@ -22,6 +23,7 @@ use tower_test::mock::{Handle, pair};
 
 use super::context::{Context, Settings, Stores};
 use super::sync::Sync;
+use super::watches::Synced;
 use crate::api::{Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
@@ -39,6 +41,7 @@ pub struct Cluster {
     pub leaderboards: Vec<Leaderboard>,
     pub submissions: Vec<Submission>,
     pub jobs: Vec<Job>,
+    pub policies: Vec<NetworkPolicy>,
 }
 
 /// A request that the API server got.
@@ -54,6 +57,8 @@ pub struct Surroundings {
     pub context: Context,
     /// What the API server gets.
     pub requests: mpsc::UnboundedReceiver<Arrived>,
+    /// The Leaderboards that were woken.
+    pub woken: mpsc::UnboundedReceiver<String>,
     _stop: watch::Sender<bool>,
 }
 
@@ -95,12 +100,15 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         tasks: tasks.clone(),
     });
     let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, tasks));
+    let policies_synced = Synced::default();
+    policies_synced.set(true);
     let stores = Stores {
         leaderboards: store(cluster.leaderboards),
         submissions: store(cluster.submissions),
         jobs: store(cluster.jobs),
         pods: store(Vec::new()),
-        policies: store(Vec::new()),
+        policies: store(cluster.policies),
+        policies_synced,
     };
     let settings = Settings {
         image: "operator:1".into(),
@@ -114,9 +122,14 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         instance: None,
     };
     let events = EventRecorder::new(client.clone(), reporter);
+    let (woken_by, woken) = mpsc::unbounded_channel();
+    let wake = Box::new(move |board: ObjectRef<Leaderboard>| {
+        let _ = woken_by.send(board.name);
+    });
     Surroundings {
-        context: Context::new(client, settings, stores, sync, aws, events),
+        context: Context::new(client, settings, stores, sync, aws, events, wake),
         requests,
+        woken,
         _stop: stop,
     }
 }

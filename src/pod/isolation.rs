@@ -22,26 +22,43 @@ use crate::api::ranges;
 const TRY: Duration = Duration::from_secs(1);
 /// Between a connection that was made and the next try.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Tries in a row that must fail: one may be lost without any policy.
+/// Tries in a row that must fail: one may be lost without any policy, and an API server that is being restarted refuses some.
 const FAILURES: u32 = 3;
+/// Where a Pod before has waited in vain: a plugin that is some seconds late must not be called absent again each time.
+const KNOWN_OPEN: Duration = Duration::from_secs(10);
 
 /// What was found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Finding {
-    /// What the policy forbids cannot be reached.
-    Enforced(SocketAddr),
+    /// What the policy forbids cannot be reached, and how that showed.
+    Enforced(SocketAddr, Blocked),
     /// It can.
     Open(SocketAddr),
     /// Nothing could be tried, and why.
     Unmeasured(String),
 }
 
+/// How connections have failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Blocked {
+    /// Without an answer: most network plugins drop what a policy forbids.
+    Silent,
+    /// By a refusal at the last: some plugins reject it, and so does a closed port.
+    Refused,
+}
+
 impl fmt::Display for Finding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Enforced(address) => write!(
+            Self::Enforced(address, Blocked::Silent) => write!(
                 f,
                 "The Pod could not connect to {address}, which its NetworkPolicy forbids: the policy is enforced."
+            ),
+            Self::Enforced(address, Blocked::Refused) => write!(
+                f,
+                "The Pod could not connect to {address}, which its NetworkPolicy forbids: the policy is enforced. The \
+                 connections were refused, as some network plugins do and as an address does at which nothing listens: if \
+                 network.probe is set, check that {address} accepts connections from elsewhere."
             ),
             Self::Open(address) => write!(
                 f,
@@ -55,63 +72,114 @@ impl fmt::Display for Finding {
 }
 
 /// Looks for what the policy forbids. A network plugin may let a new Pod through until it has heard of it, so connections
-/// count as proof only after `enforced_within`; where a Pod before has waited for that in vain, the first one does.
+/// count as proof only after `enforced_within`, or `KNOWN_OPEN` where a Pod before has waited for that in vain.
 pub async fn find(asked: &Isolation, api_server: Option<SocketAddr>, enforced_within: Duration) -> Finding {
-    let named = asked.probe.as_ref().map(|probe| probe.parse().ok());
-    let Some(address) = named.unwrap_or(api_server) else {
-        let why = "There is no address to try, so whether the NetworkPolicy is enforced is not known. Set network.probe to \
-                   an address and port that answer and that network.egress does not allow.";
-        return Finding::Unmeasured(why.to_owned());
+    let address = match address(asked, api_server) {
+        Ok(address) => address,
+        Err(why) => return Finding::Unmeasured(why),
+    };
+    let patience = if asked.is_known_open {
+        KNOWN_OPEN.min(enforced_within)
+    } else {
+        enforced_within
+    };
+    match measure(|| reach(address), patience).await {
+        Measured::Blocked(how) => Finding::Enforced(address, how),
+        Measured::Open => Finding::Open(address),
+        Measured::NoRoute => Finding::Unmeasured(format!(
+            "The Pod has no route to {address}, so whether the NetworkPolicy is enforced is not known. Set network.probe to an \
+             address and port that Pods have a route to, that answer and that network.egress does not allow."
+        )),
+    }
+}
+
+/// The address to try, or why there is none.
+fn address(asked: &Isolation, api_server: Option<SocketAddr>) -> Result<SocketAddr, String> {
+    let address = match &asked.probe {
+        Some(probe) => probe.parse().map_err(|_| {
+            format!(
+                "network.probe {probe} is not an address and port, so whether the NetworkPolicy is enforced is not known. \
+                 Set it to one such as 192.0.2.1:443 or [2001:db8::1]:443 that answers, or leave it out."
+            )
+        })?,
+        None => api_server.ok_or_else(|| {
+            "There is no address to try, so whether the NetworkPolicy is enforced is not known. Set network.probe to an \
+             address and port that answer and that network.egress does not allow."
+                .to_owned()
+        })?,
     };
     if ranges::allows(asked.egress.iter().map(String::as_str), address.ip()) {
-        return Finding::Unmeasured(format!(
+        return Err(format!(
             "network.egress allows {address}, so trying it shows nothing. Allow less, or set network.probe to an address \
              and port that answer and that network.egress does not allow."
         ));
     }
-    let patience = if asked.is_known_open {
-        Duration::ZERO
-    } else {
-        enforced_within
-    };
-    if is_kept_from(|| reaches(address), patience).await {
-        Finding::Enforced(address)
-    } else {
-        Finding::Open(address)
-    }
+    Ok(address)
 }
 
-/// Whether connections fail in a row before they have succeeded for too long.
-async fn is_kept_from(mut reaches: impl AsyncFnMut() -> bool, patience: Duration) -> bool {
+/// What one try has shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Try {
+    /// A connection was made, the only proof that packets come through.
+    Connected,
+    Blocked(Blocked),
+    /// It could not even be sent: that proves nothing, unless it could be before.
+    NoRoute,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Measured {
+    Blocked(Blocked),
+    Open,
+    NoRoute,
+}
+
+/// Tries until enough fail in a row, or until they have done anything else for too long.
+async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Measured {
     let began = Instant::now();
-    let mut failures = 0;
-    while failures < FAILURES {
+    let (mut failures, mut was_reached) = (0, false);
+    loop {
         let tried = Instant::now();
-        if reaches().await {
+        let found = reach().await;
+        let how = match found {
+            Try::Blocked(how) => Some(how),
+            Try::NoRoute if was_reached => Some(Blocked::Silent),
+            Try::Connected | Try::NoRoute => None,
+        };
+        let Some(how) = how else {
+            was_reached |= found == Try::Connected;
             if began.elapsed() >= patience {
-                return false;
+                return if was_reached { Measured::Open } else { Measured::NoRoute };
             }
             failures = 0;
             sleep(PAUSE).await;
-        } else {
-            failures += 1;
-            // An error that comes at once, such as of a route that is not set up yet, counts for no more than a silence.
-            sleep_until(tried + TRY).await;
+            continue;
+        };
+        failures += 1;
+        // An error that comes at once counts for no more than a silence.
+        sleep_until(tried + TRY).await;
+        if failures == FAILURES {
+            return Measured::Blocked(how);
         }
     }
-    true
 }
 
-/// Whether packets come through. A refusal does count: the address has answered. Network plugins drop what a policy
-/// forbids, and an API server that is being restarted refuses.
-async fn reaches(address: SocketAddr) -> bool {
+/// Tries to connect. Of the errors that come at once, only these are an answer of the network.
+async fn reach(address: SocketAddr) -> Try {
     match timeout(TRY, TcpStream::connect(address)).await {
-        Ok(Ok(_)) => true,
-        Ok(Err(error)) => matches!(
-            error.kind(),
-            io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionReset
-        ),
-        Err(_) => false,
+        Ok(Ok(_)) => Try::Connected,
+        Ok(Err(error)) => of_error(error.kind()),
+        Err(_) => Try::Blocked(Blocked::Silent),
+    }
+}
+
+fn of_error(kind: io::ErrorKind) -> Try {
+    match kind {
+        io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionReset | io::ErrorKind::PermissionDenied => {
+            Try::Blocked(Blocked::Refused)
+        }
+        io::ErrorKind::TimedOut => Try::Blocked(Blocked::Silent),
+        _ => Try::NoRoute,
     }
 }
 
@@ -133,18 +201,100 @@ mod tests {
         }
     }
 
-    /// What is found, and after how many milliseconds, where connections are made until `until`, and once at each of `also`.
+    /// Whether it is found to be enforced, and after how many milliseconds, where connections are made until `until`, and
+    /// once at each of `also`.
     async fn found(until: Duration, also: &[u64], patience: Duration) -> (bool, u128) {
         let began = Instant::now();
-        let reaches = async || {
+        let reach = async || {
             let now = began.elapsed();
-            let is_open = now < until || also.iter().any(|at| Duration::from_millis(*at) == now);
-            if !is_open {
-                sleep(TRY).await;
+            if now < until || also.iter().any(|at| Duration::from_millis(*at) == now) {
+                return Try::Connected;
             }
-            is_open
+            sleep(TRY).await;
+            Try::Blocked(Blocked::Silent)
         };
-        (is_kept_from(reaches, patience).await, began.elapsed().as_millis())
+        let found = measure(reach, patience).await;
+        (found == Measured::Blocked(Blocked::Silent), began.elapsed().as_millis())
+    }
+
+    /// What is found where the tries show this, one after the other, and the last again and again; and after how many seconds.
+    async fn of(tries: &[Try], patience: Duration) -> (Measured, u64) {
+        let (began, mut next) = (Instant::now(), 0);
+        let reach = async || {
+            next += 1;
+            tries[(next - 1).min(tries.len() - 1)]
+        };
+        let found = measure(reach, patience).await;
+        (found, began.elapsed().as_secs())
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_plugin_that_rejects_enforces_and_a_missing_route_proves_nothing() {
+        use Try::{Connected, NoRoute};
+        let refused = Try::Blocked(Blocked::Refused);
+        let silent = Try::Blocked(Blocked::Silent);
+        let (by_refusal, by_silence) = (Measured::Blocked(Blocked::Refused), Measured::Blocked(Blocked::Silent));
+        let cases: [(&str, &[Try], (Measured, u64)); 8] = [
+            ("it rejects", &[refused], (by_refusal, 3)),
+            ("it drops", &[silent], (by_silence, 3)),
+            ("both", &[silent, refused, silent], (by_silence, 3)),
+            (
+                "an API server that is being restarted",
+                &[refused, refused, Connected],
+                (Measured::Open, 60),
+            ),
+            (
+                "no route yet",
+                &[NoRoute, NoRoute, NoRoute, NoRoute, silent],
+                (by_silence, 5),
+            ),
+            ("no route ever", &[NoRoute], (Measured::NoRoute, 60)),
+            (
+                "no route yet, then open",
+                &[NoRoute, NoRoute, Connected],
+                (Measured::Open, 60),
+            ),
+            ("a route that is taken away", &[Connected, NoRoute], (by_silence, 3)),
+        ];
+        for (name, tries, expected) in cases {
+            assert_eq!(of(tries, WITHIN).await, expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn only_an_answer_of_the_network_is_a_failure() {
+        use io::ErrorKind::{
+            AddrNotAvailable, ConnectionRefused, ConnectionReset, HostUnreachable, NetworkUnreachable, OutOfMemory,
+            PermissionDenied,
+        };
+        for kind in [ConnectionRefused, ConnectionReset, PermissionDenied] {
+            assert_eq!(of_error(kind), Try::Blocked(Blocked::Refused), "{kind}");
+        }
+        for kind in [NetworkUnreachable, HostUnreachable, AddrNotAvailable, OutOfMemory] {
+            assert_eq!(of_error(kind), Try::NoRoute, "{kind}");
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn where_a_pod_has_waited_in_vain_a_plugin_that_is_late_is_still_noticed() {
+        assert_eq!(found(Duration::from_secs(8), &[], KNOWN_OPEN).await, (true, 11_000));
+        assert_eq!(found(Duration::MAX, &[], KNOWN_OPEN).await, (false, 10_000));
+    }
+
+    #[tokio::test]
+    async fn a_probe_that_is_no_address_is_named() {
+        for probe in ["999.1.1.1:99999", "10.0.0.1:0x1", "10.0.0.1"] {
+            let asked = Isolation {
+                probe: Some(probe.to_owned()),
+                ..asked()
+            };
+            let found = find(&asked, "10.96.0.1:443".parse().ok(), WITHIN).await;
+            let said = found.to_string();
+            assert!(
+                matches!(found, Finding::Unmeasured(_)) && said.starts_with(&format!("network.probe {probe} is not")),
+                "{said}"
+            );
+        }
     }
 
     #[tokio::test(start_paused = true)]
@@ -165,7 +315,6 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn where_nothing_enforces_a_minute_is_lost_once() {
         assert_eq!(found(Duration::MAX, &[], WITHIN).await, (false, 60_000));
-        assert_eq!(found(Duration::MAX, &[], Duration::ZERO).await, (false, 0));
         assert_eq!(
             found(Duration::ZERO, &[], Duration::ZERO).await,
             (true, 3_000),
@@ -174,12 +323,12 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_answers_is_reached_and_what_is_silent_is_not() {
+    async fn only_a_connection_that_is_made_reaches_an_address() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        assert!(reaches(address).await);
+        assert_eq!(reach(address).await, Try::Connected);
         drop(listener);
-        assert!(reaches(address).await, "a refusal is an answer");
+        assert_eq!(reach(address).await, Try::Blocked(Blocked::Refused));
 
         // A listener whose queue is full drops what else comes, as a policy does.
         let socket = TcpSocket::new_v4().unwrap();
@@ -187,7 +336,7 @@ mod tests {
         let full = socket.listen(0).unwrap();
         let address = full.local_addr().unwrap();
         let _queued = TcpStream::connect(address).await.unwrap();
-        assert!(!reaches(address).await);
+        assert_eq!(reach(address).await, Try::Blocked(Blocked::Silent));
     }
 
     #[tokio::test]
@@ -209,7 +358,7 @@ mod tests {
             is_known_open: true,
             ..wide
         };
-        let found = find(&named, api_server, WITHIN).await;
+        let found = find(&named, api_server, Duration::ZERO).await;
         assert_eq!(found, Finding::Open(listener.local_addr().unwrap()));
     }
 }

@@ -84,7 +84,7 @@ pub struct Isolation {
     /// Ranges that the policy allows: an address in one of them shows nothing.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub egress: Vec<String>,
-    /// A Pod before this one has waited in vain for the policy to be enforced, so one look is enough.
+    /// A Pod before this one has lately waited in vain for the policy to be enforced, so a shorter wait is enough.
     #[serde(default)]
     pub is_known_open: bool,
 }

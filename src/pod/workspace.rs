@@ -46,8 +46,10 @@ pub enum WorkspaceReason {
     StorageFailed,
     /// A volume of the Pod can't be used.
     VolumeFailed,
-    /// The Pod's NetworkPolicy has to be enforced, and is not as far as is known.
+    /// The Pod's NetworkPolicy has to be enforced, and is not. Of older runners: or it is not known.
     NotIsolated,
+    /// The Pod's NetworkPolicy has to be enforced, and whether it is could not be measured.
+    NotKnownIsolated,
     /// No failure: the policy is enforced.
     Enforced,
     /// No failure: it is not.
@@ -83,7 +85,7 @@ impl WorkspaceVerdict {
     fn of(finding: &Finding) -> Self {
         Self {
             reason: match finding {
-                Finding::Enforced(_) => WorkspaceReason::Enforced,
+                Finding::Enforced(..) => WorkspaceReason::Enforced,
                 Finding::Open(_) => WorkspaceReason::NotEnforced,
                 Finding::Unmeasured(_) => WorkspaceReason::NotMeasured,
             },
@@ -138,6 +140,7 @@ impl WorkspaceError {
     pub fn verdict(&self) -> WorkspaceVerdict {
         let reason = match self {
             Self::PrefixInUse(_) => WorkspaceReason::PrefixInUse,
+            Self::NotIsolated(Finding::Unmeasured(_)) => WorkspaceReason::NotKnownIsolated,
             Self::NotIsolated(_) => WorkspaceReason::NotIsolated,
             Self::Plan(_) => WorkspaceReason::PlanInvalid,
             Self::Storage(_) => WorkspaceReason::StorageFailed,
@@ -181,7 +184,7 @@ async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
     };
     let finding = isolation::find(asked, setting.api_server, setting.pace.enforced_within).await;
     tracing::info!("{finding}");
-    if asked.enforcement == Enforcement::Require && !matches!(finding, Finding::Enforced(_)) {
+    if asked.enforcement == Enforcement::Require && !matches!(finding, Finding::Enforced(..)) {
         return Err(WorkspaceError::NotIsolated(finding));
     }
     Ok(Some(finding))
@@ -337,6 +340,7 @@ fn folders(logs: &Path) -> Result<Arc<Tree>, WorkspaceError> {
 mod tests {
     use super::*;
     use crate::pod::fixtures;
+    use crate::pod::isolation::Blocked;
 
     #[test]
     fn the_first_report_is_one_the_controller_takes() {
@@ -350,19 +354,28 @@ mod tests {
     #[test]
     fn what_a_pod_found_of_its_isolation_is_no_failure_unless_it_has_to_be_isolated() {
         let address = "10.96.0.1:443".parse().unwrap();
-        for (finding, reason) in [
-            (Finding::Enforced(address), WorkspaceReason::Enforced),
-            (Finding::Open(address), WorkspaceReason::NotEnforced),
+        for (finding, reason, required) in [
+            (
+                Finding::Enforced(address, Blocked::Silent),
+                WorkspaceReason::Enforced,
+                WorkspaceReason::NotIsolated,
+            ),
+            (
+                Finding::Open(address),
+                WorkspaceReason::NotEnforced,
+                WorkspaceReason::NotIsolated,
+            ),
             (
                 Finding::Unmeasured("No address.".to_owned()),
                 WorkspaceReason::NotMeasured,
+                WorkspaceReason::NotKnownIsolated,
             ),
         ] {
             let verdict = WorkspaceVerdict::of(&finding);
             assert_eq!(verdict.reason, reason);
             assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
             let verdict = WorkspaceError::NotIsolated(finding).verdict();
-            assert_eq!(verdict.reason, WorkspaceReason::NotIsolated);
+            assert_eq!(verdict.reason, required);
             assert!(
                 verdict.message.contains("network.enforcement is Require"),
                 "{}",

@@ -69,6 +69,13 @@ impl World {
             .unwrap();
     }
 
+    /// What the operator with few rights may do to policies from now on.
+    async fn set_rights(&self, policies: &[&str]) {
+        let patch = Patch::Merge(role(policies));
+        let roles = self.api::<Role>();
+        roles.patch("operator", &PatchParams::default(), &patch).await.unwrap();
+    }
+
     async fn change(&self, network: &Value) {
         let patch = Patch::Merge(json!({"spec": {"network": network}}));
         let api = self.api::<Leaderboard>();
@@ -250,6 +257,28 @@ async fn a_policy_is_restored_while_the_leaderboards_bucket_hangs() {
     operator.end().await;
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn an_edited_egress_is_applied_while_the_leaderboards_bucket_hangs() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", silent.local_addr().unwrap());
+    world.leaderboard_at(&endpoint, &json!({})).await;
+    world.until(POLICY, "it is applied", |_: &NetworkPolicy| true).await;
+    silent.accept().await.unwrap();
+    let began = Instant::now();
+    world
+        .change(&json!({"egress": [{"cidr": "192.0.2.7/32"}], "dns": false}))
+        .await;
+    let follows = |found: &NetworkPolicy| {
+        let rules = egress(found);
+        rules[0]["to"][0]["ipBlock"]["cidr"] == "192.0.2.7/32"
+    };
+    world.until(POLICY, "it follows the edit", follows).await;
+    assert!(began.elapsed() < Duration::from_secs(6), "{:?}", began.elapsed());
+    operator.end().await;
+}
+
 /// Everything that the controller does in a namespace, but for what it may do to policies.
 fn role(policies: &[&str]) -> Value {
     let groups = [
@@ -325,13 +354,59 @@ async fn without_a_right_to_policies_no_job_is_made_and_both_objects_say_what_to
         "{missing}"
     );
 
-    let all = role(&["get", "list", "watch", "create", "patch"]);
-    let rights = world.api::<Role>();
-    rights
-        .patch("operator", &PatchParams::default(), &Patch::Merge(&all))
-        .await
-        .unwrap();
+    world.set_rights(&["get", "list", "watch", "create", "patch"]).await;
     world.job("one").await;
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_a_right_to_observe_policies_no_job_is_made_and_it_is_said() {
+    let world = World::new().await;
+    let operator = operator_with_few_rights(&world, &["get", "create", "patch"]).await;
+    world.leaderboard(&json!({})).await;
+    world.submit("one").await;
+    let said = world.says("False", reasons::NOT_APPLIED).await;
+    assert!(
+        said.message.contains("list and watch of networkpolicies"),
+        "{}",
+        said.message
+    );
+    world.held_back("one").await;
+    assert!(world.api::<Job>().get_opt("one-1").await.unwrap().is_none());
+    world.set_rights(&["get", "list", "watch", "create", "patch"]).await;
+    world.job("one").await;
+    world.says("Unknown", reasons::NOT_MEASURED).await;
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_was_deleted_with_the_policy_comes_back_with_it() {
+    let world = World::new().await;
+    let all = ["get", "list", "watch", "create", "patch"];
+    let operator = operator_with_few_rights(&world, &all).await;
+    world.leaderboard(&json!({})).await;
+    world.submit("one").await;
+    let first = world.job("one").await.uid();
+    world.set_rights(&all[..3]).await;
+    // The API server takes a moment to know; until then the policy comes back.
+    let policies = world.api::<NetworkPolicy>();
+    let is_refused = async {
+        loop {
+            let _ = policies.delete(POLICY, &DeleteParams::default()).await;
+            let board = world.api::<Leaderboard>().get(NAME).await.unwrap();
+            if isolated(&board).is_some_and(|c| c.reason == reasons::FORBIDDEN) {
+                return;
+            }
+            tokio::time::sleep(POLL * 10).await;
+        }
+    };
+    timeout(LIMIT, is_refused).await.expect("the apply is refused");
+    let jobs = world.api::<Job>();
+    jobs.delete("one-1", &DeleteParams::background()).await.unwrap();
+    world.held_back("one").await;
+    world.set_rights(&all).await;
+    let back = |job: &Job| job.uid() != first;
+    world.until("one-1", "its Job comes back", back).await;
     operator.end().await;
 }
 

@@ -300,9 +300,13 @@ fn pods_and_tables() -> Vec<Case> {
     let table = |sort_key: &Value| json!({"table": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}});
     let both = table(&json!("submission_id"));
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    let probe = |probe: &str| json!({"network": {"probe": probe}});
+    let not_a_probe = "network.probe is not an address and port";
     let one_way = "exactly one of roleArn and secretRef";
     vec![
         case("is not a range of addresses", &to("2001:db8::/32"), &to("10.0.0.1")),
+        case(not_a_probe, &probe("192.0.2.1:443"), &probe("999.1.1.1:443")),
+        case(not_a_probe, &probe("[2001:db8::1]:443"), &probe("192.0.2.1:65536")),
         case(
             "Require needs network.policy Managed",
             &policy("Managed", "Require"),

@@ -298,12 +298,12 @@ fn the_hosts_variables_win_but_not_over_the_plan() {
 
 #[test]
 fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
-    let asked = |network: Value, found: Option<(&str, i64)>| {
+    let asked = |network: Value, found: Option<(&str, i64, &str)>| {
         let mut case = Case::new("V2", json!({ "network": network }));
         case.leaderboard.metadata.generation = Some(3);
-        if let Some((reason, generation)) = found {
+        if let Some((reason, generation, since)) = found {
             let condition = json!({"type": "Isolated", "status": "False", "reason": reason, "message": "",
-                                   "observedGeneration": generation, "lastTransitionTime": "2026-11-01T12:00:00Z"});
+                                   "observedGeneration": generation, "lastTransitionTime": since});
             case.leaderboard.status = serde_json::from_value(json!({"conditions": [condition]})).unwrap();
         }
         let annotation = &case.json()["spec"]["template"]["metadata"]["annotations"][names::ANNOTATION_GENERATION];
@@ -324,13 +324,16 @@ fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
     for unmeasured in [json!({"enforcement": "Off"}), json!({"policy": "External"})] {
         assert_eq!(asked(unmeasured, None), Value::Null);
     }
-    for (enforcement, reason, generation, expected) in [
-        ("Warn", "NotEnforced", 3, true),
-        ("Warn", "NotEnforced", 2, false),
-        ("Warn", "Forbidden", 3, false),
-        ("Require", "NotEnforced", 3, false),
+    // It is 12:00.
+    let lately = "2026-11-01T11:30:00Z";
+    for (enforcement, reason, generation, since, expected) in [
+        ("Warn", "NotEnforced", 3, lately, true),
+        ("Warn", "NotEnforced", 3, "2026-11-01T10:59:00Z", false),
+        ("Warn", "NotEnforced", 2, lately, false),
+        ("Warn", "Forbidden", 3, lately, false),
+        ("Require", "NotEnforced", 3, lately, false),
     ] {
-        let told = asked(json!({"enforcement": enforcement}), Some((reason, generation)));
+        let told = asked(json!({"enforcement": enforcement}), Some((reason, generation, since)));
         assert_eq!(told["isKnownOpen"], expected, "{enforcement} {reason} of {generation}");
     }
 }

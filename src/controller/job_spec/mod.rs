@@ -16,7 +16,9 @@ mod container_tests;
 mod tests;
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
+use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::{Job, JobSpec};
 use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
@@ -45,6 +47,8 @@ const LOST_NODE_SECONDS: i64 = 60;
 const NET_SECONDS: i64 = 1800;
 /// Restarts beyond those of the pairs that do not end the Job: `contents`, `workspace` and `logcopy` count too.
 const SPARE_RESTARTS: i32 = 20;
+/// A policy that a Pod has found not to be enforced is taken for such so long; after that each Pod waits its full time again.
+const KNOWN_OPEN_FOR: Duration = Duration::from_hours(1);
 
 /// What a Job is built from.
 #[derive(Clone, Copy, Debug)]
@@ -65,6 +69,8 @@ pub struct JobInput<'a> {
     pub image_pull_policy: Option<&'a str>,
     /// The operator's own AWS region, for what the Leaderboard gives no region.
     pub region: Option<&'a str>,
+    /// When it is made.
+    pub now: Timestamp,
 }
 
 impl JobInput<'_> {
@@ -143,12 +149,12 @@ pub fn run_document(input: &JobInput<'_>) -> Run {
         flush_seconds: unsigned(spec.deadlines.flush_seconds),
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
         log_group: spec.log_group.clone(),
-        isolation: isolation(input.leaderboard),
+        isolation: isolation(input.leaderboard, input.now),
     }
 }
 
 /// How the Pod measures whether its policy is enforced. What policies of the cluster's own forbid is not known.
-fn isolation(leaderboard: &Leaderboard) -> Option<Isolation> {
+fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
         return None;
@@ -156,7 +162,10 @@ fn isolation(leaderboard: &Leaderboard) -> Option<Isolation> {
     let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
     let found = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
     let is_open = found.is_some_and(|found| {
-        found.reason == reasons::NOT_ENFORCED && found.observed_generation == leaderboard.metadata.generation
+        let age = now.duration_since(found.last_transition_time.0).unsigned_abs();
+        found.reason == reasons::NOT_ENFORCED
+            && found.observed_generation == leaderboard.metadata.generation
+            && age < KNOWN_OPEN_FOR
     });
     Some(Isolation {
         enforcement: network.enforcement,

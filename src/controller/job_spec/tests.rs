@@ -72,6 +72,7 @@ impl Case {
             operator_image: OPERATOR_IMAGE,
             image_pull_policy: None,
             region: None,
+            now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }
     }
 

@@ -2,16 +2,19 @@
 //!
 //! `keep` writes it, `restore` as soon as somebody else has changed it; `measured` reads what the Pods found; `condition` is pure and says what follows for `Isolated`.
 
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
 
 use futures::StreamExt;
+use futures::stream::select;
 use jiff::Timestamp;
 use k8s_openapi::api::core::v1::{ContainerStateTerminated, ContainerStatus, Pod};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{Patch, PatchParams};
+use kube::runtime::reflector::ObjectRef;
 use kube::{Api, ResourceExt};
 
-use super::{RESYNC, SOONEST};
+use super::{Desk, POLICY_AGAIN, RESYNC, SOONEST};
 use crate::api::conditions::{self, Truth};
 use crate::api::{Enforcement, Leaderboard, PolicySource, names, reasons};
 use crate::controller::context::{CALL_TIMEOUT, Context, Stores};
@@ -41,7 +44,33 @@ pub enum Policy {
 #[derive(Clone, Debug)]
 pub(super) struct Applied {
     at: Timestamp,
+    /// Of which spec.
+    generation: Option<i64>,
     policy: Policy,
+    /// Since when applies are answered well and the cache does not show it.
+    unseen: Option<Timestamp>,
+}
+
+impl Applied {
+    pub(super) fn has_failed(&self) -> bool {
+        matches!(self.policy, Policy::Refused(_) | Policy::NotApplied(_))
+    }
+}
+
+/// What was measured last, of which generation.
+pub(super) type Measured = (Option<i64>, WorkspaceVerdict);
+
+/// How long after an apply another one is due. `is_shown`: the cache shows the policy as it should be.
+pub(super) fn again(policy: &Policy, is_shown: bool) -> Duration {
+    match policy {
+        Policy::External => RESYNC,
+        Policy::InPlace if is_shown => RESYNC,
+        // A person has to change something.
+        Policy::Refused(_) => POLICY_AGAIN,
+        Policy::NotApplied(_) if !is_shown => POLICY_AGAIN,
+        // The cache lags behind an apply, and a program that undoes each one must not cost a request each moment.
+        Policy::InPlace | Policy::NotApplied(_) => SOONEST,
+    }
 }
 
 /// Puts the policy in place if it is not, and once in a while all the same. Never fails: what is wrong is shown.
@@ -50,50 +79,134 @@ pub(super) async fn keep(context: &Context, leaderboard: &Leaderboard, now: Time
         return Policy::External;
     }
     let uid = uid_of(leaderboard);
-    let is_in_place = context.stores.is_policy_in_place(leaderboard);
-    if let Some(last) = context.desk.applied(&uid) {
-        let age = now.duration_since(last.at).unsigned_abs();
-        if is_in_place && age < RESYNC {
-            return Policy::InPlace;
-        }
-        // The cache lags behind an apply, and a program that undoes each one must not cost a request each moment.
-        if age < SOONEST {
-            return last.policy;
-        }
+    let generation = leaderboard.metadata.generation;
+    let is_shown = context.stores.shows_policy(leaderboard);
+    if is_shown {
+        context.desk.note_seen(&uid);
     }
-    let policy = apply(context, leaderboard).await;
-    if let Policy::Refused(why) | Policy::NotApplied(why) = &policy {
-        tracing::warn!(leaderboard = %leaderboard.name_any(), why, "the NetworkPolicy is not in place");
+    let last = context.desk.applied(&uid);
+    if let Some(last) = last.as_ref().filter(|last| last.generation == generation)
+        && now.duration_since(last.at).unsigned_abs() < again(&last.policy, is_shown)
+    {
+        return last.policy.clone();
     }
+    let answer = apply(context, leaderboard).await;
+    let is_shown = context.stores.shows_policy(leaderboard);
+    let is_unseen = answer == Policy::InPlace && !is_shown;
+    let unseen = is_unseen.then(|| last.as_ref().and_then(|last| last.unseen).unwrap_or(now));
+    let is_blind = !context.stores.policies_synced.is_true()
+        || unseen.is_some_and(|since| now.duration_since(since).unsigned_abs() >= POLICY_AGAIN);
+    let policy = settled(answer, is_shown, is_blind);
     let applied = Applied {
         at: now,
+        generation,
         policy: policy.clone(),
+        unseen,
     };
+    tell(leaderboard, last.as_ref(), &applied);
     context.desk.note_applied(&uid, applied);
+    if policy == Policy::InPlace && last.is_some_and(|last| last.has_failed()) {
+        // An apply that changes nothing is no event.
+        (context.wake)(ObjectRef::from_obj(leaderboard));
+    }
     policy
 }
 
-/// Restores what somebody has edited or deleted, until the process stops: a task of its own, because the reconcile of a
-/// Leaderboard may wait for a bucket or a token meanwhile.
-pub async fn restore(touches: Touches<NetworkPolicy>, context: Arc<Context>) {
-    let restored = touches.for_each_concurrent(RESTORED_AT_ONCE, |touch| {
+/// What an answer means, given what the cache shows.
+fn settled(answer: Policy, is_shown: bool, is_blind: bool) -> Policy {
+    match answer {
+        // It stands as it should; only the look at it failed, which is made again.
+        Policy::NotApplied(_) if is_shown => Policy::InPlace,
+        Policy::InPlace if !is_shown && is_blind => Policy::NotApplied(
+            "The operator does not observe NetworkPolicies, so it would not notice if this one was edited or deleted. Give its \
+             role list and watch of networkpolicies in this namespace; if it has both, look for a program that undoes each \
+             apply. It is tried again."
+                .to_owned(),
+        ),
+        other => other,
+    }
+}
+
+/// Logs what has changed.
+fn tell(leaderboard: &Leaderboard, last: Option<&Applied>, new: &Applied) {
+    if last.is_some_and(|last| last.policy == new.policy) {
+        return;
+    }
+    let leaderboard = super::key_of(leaderboard).to_string();
+    match &new.policy {
+        Policy::Refused(why) | Policy::NotApplied(why) => {
+            tracing::warn!(leaderboard, why, "the NetworkPolicy is not in place");
+        }
+        Policy::InPlace if last.is_some() => tracing::info!(leaderboard, "the NetworkPolicy is in place"),
+        Policy::InPlace | Policy::External => {}
+    }
+}
+
+impl Desk {
+    fn applied(&self, uid: &str) -> Option<Applied> {
+        let policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
+        policies.get(uid).cloned()
+    }
+
+    /// Whether the last apply of its policy was refused or failed.
+    pub fn policy_failed(&self, uid: &str) -> bool {
+        self.applied(uid).is_some_and(|last| last.has_failed())
+    }
+
+    fn note_applied(&self, uid: &str, applied: Applied) {
+        let mut policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
+        policies.insert(uid.to_owned(), applied);
+    }
+
+    /// The cache shows the policy as it should be.
+    fn note_seen(&self, uid: &str) {
+        let mut policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(applied) = policies.get_mut(uid) {
+            applied.unseen = None;
+        }
+    }
+
+    fn measured(&self, uid: &str) -> Option<Measured> {
+        let measured = self.measured.lock().unwrap_or_else(PoisonError::into_inner);
+        measured.get(uid).cloned()
+    }
+
+    fn note_measured(&self, uid: &str, found: Measured) {
+        let mut measured = self.measured.lock().unwrap_or_else(PoisonError::into_inner);
+        measured.insert(uid.to_owned(), found);
+    }
+}
+
+/// Restores what somebody has edited or deleted, and applies what a new spec asks for, until the process stops: a task of its
+/// own, because the reconcile of a Leaderboard may wait for a bucket or a token meanwhile.
+pub async fn restore(policies: Touches<NetworkPolicy>, leaderboards: Touches<Leaderboard>, context: Arc<Context>) {
+    // The reconcile of a Leaderboard has a moment to do it itself.
+    let of_spec = leaderboards.map(|touch| (Some(ObjectRef::from_obj(touch.object.as_ref())), false));
+    let of_policy = policies.map(|touch| (Stores::leaderboard_of(touch.object.as_ref()), true));
+    let restored = select(of_spec, of_policy).for_each_concurrent(RESTORED_AT_ONCE, |(reference, at_once)| {
         let context = Arc::clone(&context);
         async move {
-            let reference = Stores::leaderboard_of(touch.object.as_ref());
-            let leaderboard = reference.and_then(|reference| context.stores.leaderboards.get(&reference));
-            let Some(leaderboard) = leaderboard else { return };
-            if context.stores.is_policy_in_place(&leaderboard) {
-                return;
+            let Some(reference) = reference else { return };
+            if at_once {
+                keep_missing(&context, &reference).await;
             }
-            keep(&context, &leaderboard, Timestamp::now()).await;
             // The edit may have come a moment after an apply, which is then left to this second one.
             tokio::time::sleep(SOONEST).await;
-            if !context.stores.is_policy_in_place(&leaderboard) {
-                keep(&context, &leaderboard, Timestamp::now()).await;
-            }
+            keep_missing(&context, &reference).await;
         }
     });
     restored.await;
+}
+
+async fn keep_missing(context: &Context, reference: &ObjectRef<Leaderboard>) {
+    let Some(leaderboard) = context.stores.leaderboards.get(reference) else {
+        return;
+    };
+    if context.stores.shows_policy(&leaderboard) {
+        context.desk.note_seen(&uid_of(leaderboard.as_ref()));
+    } else {
+        keep(context, &leaderboard, Timestamp::now()).await;
+    }
 }
 
 async fn apply(context: &Context, leaderboard: &Leaderboard) -> Policy {
@@ -130,8 +243,23 @@ fn is_refusal(code: u16) -> bool {
     (400..500).contains(&code) && ![408, 409, 429].contains(&code)
 }
 
+/// What was measured last of this generation: by a Pod that is there, else by one that is gone, as the condition says; while the
+/// condition says something else, as this process remembers it.
+pub(super) fn measured(context: &Context, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
+    let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation);
+    let remembered = || {
+        let (of, verdict) = context.desk.measured(&uid)?;
+        (of == generation).then_some(verdict)
+    };
+    let found = by_pods(&context.stores, leaderboard)
+        .or_else(|| known(leaderboard))
+        .or_else(remembered)?;
+    context.desk.note_measured(&uid, (generation, found.clone()));
+    Some(found)
+}
+
 /// What the Pod that ended its `workspace` last has found, of those that this generation's Jobs made.
-pub(super) fn measured(stores: &Stores, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
+fn by_pods(stores: &Stores, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let (name, namespace) = (leaderboard.name_any(), leaderboard.namespace());
     let generation = leaderboard.metadata.generation.unwrap_or_default().to_string();
     let is_ours = |pod: &Arc<Pod>| {
@@ -156,6 +284,7 @@ pub fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
             | WorkspaceReason::NotEnforced
             | WorkspaceReason::NotMeasured
             | WorkspaceReason::NotIsolated
+            | WorkspaceReason::NotKnownIsolated
     );
     is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
 }
@@ -183,33 +312,34 @@ pub(super) fn condition(
                 "The NetworkPolicy is in place. Whether it is enforced is not measured: network.enforcement is Off.";
             (Truth::Unknown, reasons::NOT_MEASURED, message.into())
         }
-        Policy::InPlace => match measured {
-            Some(verdict) => (truth(verdict.reason), reason(verdict.reason), verdict.message.clone()),
-            None => known(leaderboard).unwrap_or_else(|| {
+        Policy::InPlace => measured.map_or_else(
+            || {
                 let message = "The NetworkPolicy is in place. The next run measures whether it is enforced.";
                 (Truth::Unknown, reasons::NOT_MEASURED, message.into())
-            }),
-        },
+            },
+            |found| (truth(found.reason), reason(found.reason), found.message.clone()),
+        ),
     }
 }
 
-/// What a Pod that is gone had found, for this generation.
-fn known(leaderboard: &Leaderboard) -> Option<(Truth, &'static str, String)> {
+/// What the condition says that a Pod which is gone had found, for this generation.
+fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let status = leaderboard.status.as_ref()?;
     let known = conditions::get(&status.conditions, conditions::ISOLATED)
         .filter(|known| known.observed_generation == leaderboard.metadata.generation)?;
-    let (truth, reason) = match known.reason.as_str() {
-        reasons::ENFORCED => (Truth::True, reasons::ENFORCED),
-        reasons::NOT_ENFORCED => (Truth::False, reasons::NOT_ENFORCED),
+    let reason = match known.reason.as_str() {
+        reasons::ENFORCED => WorkspaceReason::Enforced,
+        reasons::NOT_ENFORCED => WorkspaceReason::NotEnforced,
         _ => return None,
     };
-    Some((truth, reason, known.message.clone()))
+    let message = known.message.clone();
+    Some(WorkspaceVerdict { reason, message })
 }
 
 fn truth(found: WorkspaceReason) -> Truth {
     match found {
         WorkspaceReason::Enforced => Truth::True,
-        WorkspaceReason::NotMeasured => Truth::Unknown,
+        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => Truth::Unknown,
         _ => Truth::False,
     }
 }
@@ -217,151 +347,11 @@ fn truth(found: WorkspaceReason) -> Truth {
 fn reason(found: WorkspaceReason) -> &'static str {
     match found {
         WorkspaceReason::Enforced => reasons::ENFORCED,
-        WorkspaceReason::NotMeasured => reasons::NOT_MEASURED,
+        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => reasons::NOT_MEASURED,
         _ => reasons::NOT_ENFORCED,
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-    use serde_json::{Value, json};
-
-    use super::*;
-
-    fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
-        let spec = json!({
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2", "contents": {"image": "c"},
-            "simulator": {"image": "s"}, "storage": {"bucket": "bucket"}, "network": network,
-        });
-        let mut object = Leaderboard::new("carla", serde_json::from_value(spec).unwrap());
-        object.metadata.generation = Some(generation);
-        object
-    }
-
-    fn verdict(reason: WorkspaceReason) -> WorkspaceVerdict {
-        WorkspaceVerdict {
-            reason,
-            message: "It was tried.".into(),
-        }
-    }
-
-    /// A Leaderboard whose condition says this of this generation.
-    fn shown(reason: &str, of: i64) -> Leaderboard {
-        let mut object = leaderboard(&json!({}), 2);
-        let mut conditions = Vec::new();
-        let now = Time(Timestamp::UNIX_EPOCH);
-        conditions::set(
-            &mut conditions,
-            conditions::ISOLATED,
-            Truth::False,
-            reason,
-            "As before.",
-            Some(of),
-            &now,
-        );
-        object.status.get_or_insert_default().conditions = conditions;
-        object
-    }
-
-    #[test]
-    fn only_what_was_measured_is_called_enforced() {
-        use WorkspaceReason::{Enforced, NotEnforced, NotIsolated, NotMeasured};
-        let (on, off) = (
-            leaderboard(&json!({}), 2),
-            leaderboard(&json!({"enforcement": "Off"}), 2),
-        );
-        let in_place = || Policy::InPlace;
-        let cases = [
-            (&on, Policy::External, Some(Enforced), Truth::Unknown, reasons::EXTERNAL),
-            (
-                &on,
-                Policy::Refused("no".into()),
-                Some(Enforced),
-                Truth::False,
-                reasons::FORBIDDEN,
-            ),
-            (
-                &on,
-                Policy::NotApplied("no".into()),
-                None,
-                Truth::False,
-                reasons::NOT_APPLIED,
-            ),
-            (&on, in_place(), None, Truth::Unknown, reasons::NOT_MEASURED),
-            (
-                &on,
-                in_place(),
-                Some(NotMeasured),
-                Truth::Unknown,
-                reasons::NOT_MEASURED,
-            ),
-            (&on, in_place(), Some(Enforced), Truth::True, reasons::ENFORCED),
-            (&on, in_place(), Some(NotEnforced), Truth::False, reasons::NOT_ENFORCED),
-            (&on, in_place(), Some(NotIsolated), Truth::False, reasons::NOT_ENFORCED),
-            (&off, in_place(), Some(Enforced), Truth::Unknown, reasons::NOT_MEASURED),
-        ];
-        for (leaderboard, policy, found, truth, reason) in cases {
-            let (is, why, message) = condition(leaderboard, &policy, found.map(verdict).as_ref());
-            assert_eq!((is, why), (truth, reason), "{policy:?} {found:?}");
-            assert!(!message.is_empty());
-        }
-    }
-
-    #[test]
-    fn what_a_pod_found_outlives_it_until_the_spec_changes() {
-        let said = |leaderboard: &Leaderboard| condition(leaderboard, &Policy::InPlace, None);
-        let (truth, reason, message) = said(&shown(reasons::NOT_ENFORCED, 2));
-        assert_eq!(
-            (truth, reason, message.as_str()),
-            (Truth::False, reasons::NOT_ENFORCED, "As before.")
-        );
-        assert_eq!(said(&shown(reasons::ENFORCED, 2)).0, Truth::True);
-        for (reason, of) in [
-            (reasons::NOT_ENFORCED, 1),
-            (reasons::ENFORCED, 1),
-            (reasons::FORBIDDEN, 2),
-        ] {
-            assert_eq!(said(&shown(reason, of)).1, reasons::NOT_MEASURED, "{reason} of {of}");
-        }
-        let (truth, ..) = condition(
-            &shown(reasons::NOT_ENFORCED, 2),
-            &Policy::InPlace,
-            Some(&verdict(WorkspaceReason::Enforced)),
-        );
-        assert_eq!(truth, Truth::True, "what was found last counts");
-    }
-
-    #[test]
-    fn a_finding_is_read_from_workspace_alone() {
-        let pod = |container: &str, message: &str| -> Pod {
-            let ended =
-                json!({"terminated": {"exitCode": 0, "message": message, "finishedAt": "2026-11-01T12:00:00Z"}});
-            let status = json!({"name": container, "image": "i", "imageID": "", "ready": false, "restartCount": 0, "state": ended});
-            serde_json::from_value(json!({"metadata": {}, "status": {"initContainerStatuses": [status]}})).unwrap()
-        };
-        let said = verdict(WorkspaceReason::NotEnforced);
-        let found = finding(&pod("workspace", &said.to_json()));
-        assert_eq!(
-            found.map(|(at, verdict)| (at.is_some(), verdict)),
-            Some((true, said.clone()))
-        );
-        assert!(finding(&pod("contents", &said.to_json())).is_none());
-        assert!(finding(&pod("workspace", &verdict(WorkspaceReason::StorageFailed).to_json())).is_none());
-        assert!(finding(&pod("workspace", "Error")).is_none());
-    }
-
-    #[test]
-    fn what_a_person_has_to_change_is_a_refusal() {
-        for (code, expected) in [
-            (400, true),
-            (403, true),
-            (422, true),
-            (409, false),
-            (429, false),
-            (500, false),
-        ] {
-            assert_eq!(is_refusal(code), expected, "{code}");
-        }
-    }
-}
+#[path = "isolation_tests.rs"]
+mod tests;

@@ -26,7 +26,7 @@ use crate::api::{Leaderboard, State, Submission, conditions, names};
 use crate::observability::text;
 use crate::services::ObjectKey;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
-use isolation::{Applied, Policy};
+use isolation::{Applied, Measured, Policy};
 use probe::Probe;
 
 /// A status whose counts alone have changed is written at most this often.
@@ -57,6 +57,7 @@ pub struct Desk {
     probes: Mutex<HashMap<String, Probe>>,
     written: Mutex<HashMap<String, Timestamp>>,
     policies: Mutex<HashMap<String, Applied>>,
+    measured: Mutex<HashMap<String, Measured>>,
 }
 
 impl Desk {
@@ -65,16 +66,7 @@ impl Desk {
         self.probes.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
         self.written.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
         self.policies.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
-    }
-
-    fn applied(&self, uid: &str) -> Option<Applied> {
-        let policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
-        policies.get(uid).cloned()
-    }
-
-    fn note_applied(&self, uid: &str, applied: Applied) {
-        let mut policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
-        policies.insert(uid.to_owned(), applied);
+        self.measured.lock().unwrap_or_else(PoisonError::into_inner).remove(uid);
     }
 
     fn probe(&self, uid: &str) -> Probe {
@@ -128,20 +120,10 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, context: Arc<Context>) -> 
         return Ok(RESYNC);
     }
     let again = write_status(&context, &leaderboard, &plan, now).await?;
-    let next = probe.next(now).map(|at| at.duration_since(now).unsigned_abs());
-    let policy = policy_again(&context, &view);
-    let next = next.into_iter().chain(policy).min();
-    Ok(next.map_or(again, |next| next.max(SOONEST).min(again)))
-}
-
-/// When a policy that is not in place, or is not seen to be, is applied again.
-fn policy_again(context: &Context, view: &LeaderboardView) -> Option<Duration> {
-    match view.policy {
-        Policy::External => None,
-        Policy::InPlace if context.stores.is_policy_in_place(&view.leaderboard) => None,
-        Policy::InPlace => Some(SOONEST),
-        Policy::Refused(_) | Policy::NotApplied(_) => Some(POLICY_AGAIN),
-    }
+    let probed = probe.next(now).map(|at| at.duration_since(now).unsigned_abs());
+    let policy = isolation::again(&view.policy, context.stores.shows_policy(&view.leaderboard));
+    let next = probed.map_or(policy, |probed| probed.min(policy));
+    Ok(next.max(SOONEST).min(again))
 }
 
 fn observe(
@@ -160,7 +142,7 @@ fn observe(
         counts,
         in_use,
         policy,
-        measured: isolation::measured(&context.stores, leaderboard),
+        measured: isolation::measured(context, leaderboard),
         invalid_pod: probe.invalid_pod(),
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(context, leaderboard, &key, now),

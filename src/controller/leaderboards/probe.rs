@@ -235,6 +235,7 @@ fn sample_job(context: &Context, leaderboard: &Leaderboard) -> Option<DynamicObj
         operator_image: &context.settings.image,
         image_pull_policy: context.settings.image_pull_policy.as_deref(),
         region: context.settings.region.as_deref(),
+        now: Timestamp::now(),
     }))
 }
 

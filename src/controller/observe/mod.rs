@@ -25,9 +25,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
     let leaderboard = leaderboard(context, &submission, &namespace);
-    let is_policy_in_place = leaderboard
-        .as_ref()
-        .is_some_and(|l| context.stores.is_policy_in_place(l));
+    let is_policy_in_place = leaderboard.as_ref().is_some_and(|l| context.is_policy_in_place(l));
     let status = submission.status.clone().unwrap_or_default();
     let name = job_name(&submission.name_any(), &status);
     let (job, pod) = children(context, &submission, &namespace, &name);

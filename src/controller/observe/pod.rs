@@ -6,9 +6,10 @@ use k8s_openapi::api::core::v1::{
 use kube::ResourceExt;
 use leaderboard_runner::verdict::{Verdict, What};
 
-use crate::api::names;
+use crate::api::{names, reasons};
 use crate::controller::view::{ContainerView, EndView, PodView};
 use crate::pod::run::Stop;
+use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
 
 /// Longest text of Kubernetes that is passed on to people.
 const MAX_WORDS: usize = 600;
@@ -187,6 +188,11 @@ fn word(verdict: &Verdict) -> &'static str {
 /// `workspace` leaves `{"reason": …, "message": …}`.
 fn foreign_word(message: &str) -> Option<String> {
     let value: serde_json::Value = serde_json::from_str(message).ok()?;
+    let verdict = WorkspaceVerdict::parse(message);
+    if verdict.is_some_and(|verdict| verdict.reason == WorkspaceReason::NotKnownIsolated) {
+        // For the run it is the same; the Leaderboard's condition tells them apart.
+        return Some(reasons::NOT_ISOLATED.to_owned());
+    }
     value.get("reason")?.as_str().map(short)
 }
 
@@ -286,5 +292,13 @@ mod tests {
         let seen = view(&pod.unwrap());
         assert_eq!(seen.deleted.unwrap().to_string(), "2026-01-01T00:00:00Z");
         assert_eq!(seen.delete_by.unwrap().to_string(), "2026-01-01T00:10:00Z");
+    }
+
+    #[test]
+    fn a_pod_that_is_not_known_to_be_isolated_is_not_isolated_for_its_run() {
+        for reason in ["NotIsolated", "NotKnownIsolated"] {
+            let said = json!({"reason": reason, "message": "There is no address to try."}).to_string();
+            assert_eq!(foreign_word(&said).as_deref(), Some(reasons::NOT_ISOLATED), "{reason}");
+        }
     }
 }

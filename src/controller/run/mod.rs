@@ -155,6 +155,7 @@ impl Watches {
             jobs: self.jobs.store.clone(),
             pods: self.pods.store.clone(),
             policies: self.policies.store.clone(),
+            policies_synced: self.policies.synced.clone(),
         }
     }
 
@@ -230,7 +231,8 @@ impl Watches {
             }
             concerned
         });
-        tasks.stay("policies", isolation::restore(self.policies.subscribe(), policies_of));
+        let restored = isolation::restore(self.policies.subscribe(), self.leaderboards.subscribe(), policies_of);
+        tasks.stay("policies", restored);
         forward(
             tasks,
             self.policies.subscribe(),
@@ -329,7 +331,12 @@ impl Parts {
         let gauges = counts::keep(hub.clone(), self.watches.submissions.store.clone(), self.seen.clone());
         self.seen.tasks.stay("gauges", gauges);
         let stores = self.watches.stores();
-        let context = Arc::new(Context::new(self.client, self.settings, stores, sync, self.aws, events));
+        let to_queue = touched.clone();
+        let wake = Box::new(move |board| {
+            let _ = to_queue.send(Touched::Leaderboard(board));
+        });
+        let context = Context::new(self.client, self.settings, stores, sync, self.aws, events, wake);
+        let context = Arc::new(context);
         self.watches.feed(&touched, &context, &self.seen.tasks);
         let mut leadership = leader.leadership();
         let passes = passes::run(context, inbox, self.seen.clone());

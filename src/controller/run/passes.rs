@@ -16,6 +16,7 @@ use crate::controller::backoff::BackoffMap;
 use crate::controller::context::Context;
 use crate::controller::decide::decide;
 use crate::controller::leaderboards::{self, LeaderboardError};
+use crate::controller::memory::waits_for_leaderboard;
 use crate::controller::observe::{observe, uid_of};
 use crate::observability::Observability;
 
@@ -129,13 +130,13 @@ async fn sort(
     }
 }
 
-/// A Leaderboard, or the line before it, has changed: whoever has no Job yet may now start.
+/// A Leaderboard, or the line before it, has changed: those that have no Job may now start.
 fn wake_waiting(
     context: &Context,
     board: &ObjectRef<Leaderboard>,
     submissions: &mpsc::UnboundedSender<ObjectRef<Submission>>,
 ) {
-    let waits = |s: &Submission| s.status.as_ref().is_none_or(|status| status.job.is_none());
+    let waits = |s: &Submission| s.status.as_ref().is_none_or(waits_for_leaderboard);
     for submission in context.stores.submissions.state() {
         let mine = submission.spec.leaderboard == board.name && submission.namespace() == board.namespace;
         if mine && waits(&submission) && context.memory.is_waiting(&submission) {

@@ -11,10 +11,12 @@ mod tests;
 
 use std::collections::HashMap;
 use std::fmt;
+use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use futures::StreamExt;
+use futures::{Stream, StreamExt};
 use kube::core::{DeserializeGuard, NamespaceResourceScope};
 use kube::runtime::reflector::{ObjectRef, Store, store::Writer};
 use kube::runtime::watcher::{Config, Error, Event};
@@ -32,6 +34,8 @@ use crate::observability::{Observability, text};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.
 const READ_TIMEOUT: Duration = Duration::from_mins(5);
+/// A watch that the API server has refused begins again with a list after this long.
+const REFUSED_AGAIN: Duration = Duration::from_secs(10);
 
 /// What can be watched.
 pub trait Watchable:
@@ -68,13 +72,32 @@ where
 pub struct Watch<K: Watchable> {
     /// The objects as they were last seen.
     pub store: Store<K>,
+    /// Whether the store follows the API server.
+    pub synced: Synced,
     feed: feed::Feed<K>,
+}
+
+/// Whether a watch has listed its kind and was not refused since: without it a store may show what is long gone. Clones are
+/// the same one.
+#[derive(Clone, Debug, Default)]
+pub struct Synced(Arc<AtomicBool>);
+
+impl Synced {
+    /// It does.
+    pub fn is_true(&self) -> bool {
+        self.0.load(Ordering::Acquire)
+    }
+
+    pub(super) fn set(&self, is_synced: bool) {
+        self.0.store(is_synced, Ordering::Release);
+    }
 }
 
 impl<K: Watchable> Clone for Watch<K> {
     fn clone(&self) -> Self {
         Self {
             store: self.store.clone(),
+            synced: self.synced.clone(),
             feed: self.feed.clone(),
         }
     }
@@ -99,6 +122,7 @@ pub fn spawn_watch<K: Watchable>(
     let writer = Writer::<K>::new(());
     let watch = Watch {
         store: writer.as_reader(),
+        synced: Synced::default(),
         feed: feed::Feed::new(),
     };
     let kind = K::kind(&()).into_owned();
@@ -112,7 +136,7 @@ pub fn spawn_watch<K: Watchable>(
         store: watch.store.clone(),
         writer,
         feed: watch.feed.clone(),
-        is_synced: false,
+        synced: watch.synced.clone(),
     };
     task.missing("the first list has not come yet");
     let name = format!("watch of {}", K::plural(&()));
@@ -131,12 +155,29 @@ struct Task<K: Watchable> {
     store: Store<K>,
     writer: Writer<K>,
     feed: feed::Feed<K>,
-    is_synced: bool,
+    synced: Synced,
+}
+
+type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<DeserializeGuard<K>>, Error>> + Send>>;
+
+/// A list, then what changes.
+fn begin<K: Watchable>(api: &Api<DeserializeGuard<K>>, config: &Config) -> Events<K> {
+    Box::pin(watcher(api.clone(), config.clone()).default_backoff())
+}
+
+/// The right to list or to watch is missing.
+fn is_refusal(error: &Error) -> bool {
+    match error {
+        Error::InitialListFailed(kube::Error::Api(status)) | Error::WatchStartFailed(kube::Error::Api(status)) => {
+            status.code == 403
+        }
+        _ => false,
+    }
 }
 
 impl<K: Watchable> Task<K> {
     async fn run(mut self, api: Api<DeserializeGuard<K>>, config: Config, stop: Stop) {
-        let mut events = std::pin::pin!(watcher(api, config).default_backoff());
+        let mut events = begin(&api, &config);
         loop {
             let event = tokio::select! {
                 () = stop.wait() => break,
@@ -144,7 +185,14 @@ impl<K: Watchable> Task<K> {
             };
             match event {
                 Some(Ok(event)) => self.event(event),
-                Some(Err(error)) => self.error(&error),
+                Some(Err(error)) => {
+                    self.error(&error);
+                    // Where it was is of no use: a watch without news would not tell that it has its right again.
+                    if matches!(error, Error::WatchStartFailed(_)) && is_refusal(&error) {
+                        tokio::select! { () = stop.wait() => break, () = tokio::time::sleep(REFUSED_AGAIN) => {} }
+                        events = begin(&api, &config);
+                    }
+                }
                 // The stream has no end; should it find one, this task ends, and with it the process.
                 None => break,
             }
@@ -225,6 +273,11 @@ impl<K: Watchable> Task<K> {
             .collect();
         self.writer.apply_watcher_event(&Event::InitDone);
         self.probe.listed();
+        // Before anybody is woken by what was listed.
+        if !self.synced.is_true() {
+            self.synced.set(true);
+            self.readiness.set(&self.check, Ok(()));
+        }
         let mut changed = 0_usize;
         for object in self.store.state() {
             let known = before.remove(&object.uid());
@@ -235,10 +288,6 @@ impl<K: Watchable> Task<K> {
         }
         for gone in before.values() {
             self.feed.push(gone, true);
-        }
-        if !self.is_synced {
-            self.is_synced = true;
-            self.readiness.set(&self.check, Ok(()));
         }
         tracing::info!(
             kind = self.kind,
@@ -281,10 +330,9 @@ impl<K: Watchable> Task<K> {
         match error {
             // Both come from a watch that had been let in.
             Error::WatchError(_) | Error::WatchFailed(_) => self.probe.running(),
-            Error::InitialListFailed(kube::Error::Api(status)) | Error::WatchStartFailed(kube::Error::Api(status))
-                if status.code == 403 =>
-            {
+            _ if is_refusal(error) => {
                 self.probe.refused();
+                self.synced.set(false);
             }
             _ => self.probe.failed(),
         }
@@ -297,7 +345,7 @@ impl<K: Watchable> Task<K> {
         } else {
             tracing::warn!(kind = self.kind, error = told, "a watch has failed and is tried again");
         }
-        if !self.is_synced {
+        if !self.synced.is_true() {
             self.missing(&told);
         }
     }

@@ -224,6 +224,27 @@ async fn a_refused_list_is_told_by_readiness_and_tried_again() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_watch_that_is_refused_after_its_list_is_not_ready_until_it_is_listed_again() {
+    let refused = || {
+        let status = json!({"kind": "Status", "status": "Failure", "reason": "Forbidden", "code": 403,
+            "message": "leaderboards is forbidden"});
+        Answer::Json(403, status)
+    };
+    let mut rig = rig(vec![list(&[board("a", "1", "5")]), Answer::Watch(vec![])]);
+    assert_eq!(rig.next().await, told("a", "5", false));
+    assert!(rig.watch.synced.is_true() && rig.seen.readiness.missing().is_empty());
+    rig.send(vec![refused(), refused()]);
+    tokio::time::sleep(Duration::from_secs(15)).await;
+    let missing = rig.seen.readiness.missing().join("");
+    assert!(missing.contains("403: leaderboards is forbidden"), "{missing}");
+    assert!(!rig.watch.synced.is_true(), "what it shows may be long gone");
+    // Nothing has changed meanwhile, so that no event would tell that the right is back.
+    rig.send(vec![list(&[board("a", "1", "5")])]);
+    tokio::time::sleep(Duration::from_secs(30)).await;
+    assert!(rig.watch.synced.is_true() && rig.seen.readiness.missing().is_empty());
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_list_that_is_never_answered_fails_liveness_while_others_are() {
     let rig = rig(vec![]);
     tokio::time::sleep(Duration::from_mins(11)).await;

@@ -1,0 +1,272 @@
+//! What follows from answers, caches and findings.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use serde_json::{Value, json};
+
+use super::*;
+use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
+
+fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
+    let spec = json!({
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2", "contents": {"image": "c"},
+        "simulator": {"image": "s"}, "storage": {"bucket": "bucket"}, "network": network,
+    });
+    let mut object = Leaderboard::new("carla", serde_json::from_value(spec).unwrap());
+    object.metadata.generation = Some(generation);
+    object
+}
+
+fn verdict(reason: WorkspaceReason) -> WorkspaceVerdict {
+    WorkspaceVerdict {
+        reason,
+        message: "It was tried.".into(),
+    }
+}
+
+/// A Leaderboard whose condition says this of this generation.
+fn shown(reason: &str, of: i64) -> Leaderboard {
+    let mut object = leaderboard(&json!({}), 2);
+    let mut conditions = Vec::new();
+    let now = Time(Timestamp::UNIX_EPOCH);
+    conditions::set(
+        &mut conditions,
+        conditions::ISOLATED,
+        Truth::False,
+        reason,
+        "As before.",
+        Some(of),
+        &now,
+    );
+    object.status.get_or_insert_default().conditions = conditions;
+    object
+}
+
+#[test]
+fn only_what_was_measured_is_called_enforced() {
+    use WorkspaceReason::{Enforced, NotEnforced, NotIsolated, NotKnownIsolated, NotMeasured};
+    let (on, off) = (
+        leaderboard(&json!({}), 2),
+        leaderboard(&json!({"enforcement": "Off"}), 2),
+    );
+    let in_place = || Policy::InPlace;
+    let cases = [
+        (&on, Policy::External, Some(Enforced), Truth::Unknown, reasons::EXTERNAL),
+        (
+            &on,
+            Policy::Refused("no".into()),
+            Some(Enforced),
+            Truth::False,
+            reasons::FORBIDDEN,
+        ),
+        (
+            &on,
+            Policy::NotApplied("no".into()),
+            None,
+            Truth::False,
+            reasons::NOT_APPLIED,
+        ),
+        (&on, in_place(), None, Truth::Unknown, reasons::NOT_MEASURED),
+        (
+            &on,
+            in_place(),
+            Some(NotMeasured),
+            Truth::Unknown,
+            reasons::NOT_MEASURED,
+        ),
+        (&on, in_place(), Some(Enforced), Truth::True, reasons::ENFORCED),
+        (&on, in_place(), Some(NotEnforced), Truth::False, reasons::NOT_ENFORCED),
+        (&on, in_place(), Some(NotIsolated), Truth::False, reasons::NOT_ENFORCED),
+        (
+            &on,
+            in_place(),
+            Some(NotKnownIsolated),
+            Truth::Unknown,
+            reasons::NOT_MEASURED,
+        ),
+        (&off, in_place(), Some(Enforced), Truth::Unknown, reasons::NOT_MEASURED),
+    ];
+    for (leaderboard, policy, found, truth, reason) in cases {
+        let (is, why, message) = condition(leaderboard, &policy, found.map(verdict).as_ref());
+        assert_eq!((is, why), (truth, reason), "{policy:?} {found:?}");
+        assert!(!message.is_empty());
+    }
+}
+
+#[tokio::test]
+async fn what_a_pod_found_outlives_it_until_the_spec_changes() {
+    let around = surroundings(Cluster::default(), "http://127.0.0.1:1").await;
+    let said = |leaderboard: &Leaderboard| {
+        let found = measured(&around.context, leaderboard);
+        condition(leaderboard, &Policy::InPlace, found.as_ref())
+    };
+    for (reason, of) in [
+        (reasons::NOT_ENFORCED, 1),
+        (reasons::ENFORCED, 1),
+        (reasons::FORBIDDEN, 2),
+    ] {
+        assert_eq!(said(&shown(reason, of)).1, reasons::NOT_MEASURED, "{reason} of {of}");
+    }
+    assert_eq!(said(&shown(reasons::ENFORCED, 2)).0, Truth::True);
+    let (truth, reason, message) = said(&shown(reasons::NOT_ENFORCED, 2));
+    assert_eq!(
+        (truth, reason, message.as_str()),
+        (Truth::False, reasons::NOT_ENFORCED, "As before.")
+    );
+    let (truth, ..) = condition(
+        &shown(reasons::NOT_ENFORCED, 2),
+        &Policy::InPlace,
+        Some(&verdict(WorkspaceReason::Enforced)),
+    );
+    assert_eq!(truth, Truth::True, "what was found last counts");
+
+    // It was refused for a moment.
+    let (_, reason, message) = said(&shown(reasons::FORBIDDEN, 2));
+    assert_eq!((reason, message.as_str()), (reasons::NOT_ENFORCED, "As before."));
+    let mut edited = shown(reasons::FORBIDDEN, 2);
+    edited.metadata.generation = Some(3);
+    assert_eq!(said(&edited).1, reasons::NOT_MEASURED, "of another spec");
+}
+
+#[test]
+fn a_finding_is_read_from_workspace_alone() {
+    let pod = |container: &str, message: &str| -> Pod {
+        let ended = json!({"terminated": {"exitCode": 0, "message": message, "finishedAt": "2026-11-01T12:00:00Z"}});
+        let status =
+            json!({"name": container, "image": "i", "imageID": "", "ready": false, "restartCount": 0, "state": ended});
+        serde_json::from_value(json!({"metadata": {}, "status": {"initContainerStatuses": [status]}})).unwrap()
+    };
+    let said = verdict(WorkspaceReason::NotEnforced);
+    let found = finding(&pod("workspace", &said.to_json()));
+    assert_eq!(
+        found.map(|(at, verdict)| (at.is_some(), verdict)),
+        Some((true, said.clone()))
+    );
+    assert!(finding(&pod("contents", &said.to_json())).is_none());
+    assert!(finding(&pod("workspace", &verdict(WorkspaceReason::StorageFailed).to_json())).is_none());
+    assert!(finding(&pod("workspace", "Error")).is_none());
+}
+
+#[test]
+fn what_a_person_has_to_change_is_a_refusal() {
+    for (code, expected) in [
+        (400, true),
+        (403, true),
+        (422, true),
+        (409, false),
+        (429, false),
+        (500, false),
+    ] {
+        assert_eq!(is_refusal(code), expected, "{code}");
+    }
+}
+
+#[test]
+fn what_the_cache_shows_decides_with_the_answer() {
+    let (refused, failed) = (Policy::Refused("no".into()), Policy::NotApplied("no".into()));
+    let cases = [
+        ("seen", Policy::InPlace, true, false, Policy::InPlace),
+        ("not seen yet", Policy::InPlace, false, false, Policy::InPlace),
+        (
+            "a timeout of a look at it",
+            failed.clone(),
+            true,
+            false,
+            Policy::InPlace,
+        ),
+        ("not there", failed.clone(), false, false, failed.clone()),
+        ("a right that is missing", refused.clone(), true, false, refused.clone()),
+        ("refused and unseen", refused.clone(), false, true, refused.clone()),
+    ];
+    for (name, answer, is_shown, is_blind, expected) in cases {
+        assert_eq!(settled(answer, is_shown, is_blind), expected, "{name}");
+    }
+    let Policy::NotApplied(why) = settled(Policy::InPlace, false, true) else {
+        panic!("nobody would notice that it was deleted");
+    };
+    assert!(why.contains("list and watch of networkpolicies"), "{why}");
+    assert_eq!(again(&Policy::InPlace, true), RESYNC);
+    assert_eq!(again(&Policy::InPlace, false), SOONEST);
+    assert_eq!(again(&refused, true), POLICY_AGAIN, "it does not come and go");
+    assert_eq!(again(&failed, false), POLICY_AGAIN);
+    assert_eq!(again(&failed, true), SOONEST, "seen after all");
+}
+
+/// A Leaderboard whose policy the cache shows.
+async fn in_place() -> (Leaderboard, Surroundings) {
+    let mut board = fixtures::leaderboard("carla", "http://127.0.0.1:1");
+    board.metadata.generation = Some(1);
+    let cluster = Cluster {
+        policies: vec![network_policy(&board)],
+        ..Cluster::default()
+    };
+    let around = surroundings(cluster, "http://127.0.0.1:1").await;
+    (board, around)
+}
+
+fn note(context: &Context, board: &Leaderboard, policy: Policy, at: Timestamp) {
+    let applied = Applied {
+        at,
+        generation: board.metadata.generation,
+        policy,
+        unseen: None,
+    };
+    context.desk.note_applied(&uid_of(board), applied);
+}
+
+#[tokio::test]
+async fn no_job_is_made_while_the_last_apply_is_refused_whatever_the_cache_shows() {
+    let (board, around) = in_place().await;
+    let context = &around.context;
+    assert!(context.is_policy_in_place(&board));
+    for failed in [Policy::Refused("no".into()), Policy::NotApplied("no".into())] {
+        note(context, &board, failed, Timestamp::now());
+        assert!(!context.is_policy_in_place(&board));
+    }
+    note(context, &board, Policy::InPlace, Timestamp::now());
+    assert!(context.is_policy_in_place(&board));
+    context.stores.policies_synced.set(false);
+    assert!(
+        !context.is_policy_in_place(&board),
+        "what the cache shows may be long gone"
+    );
+}
+
+#[tokio::test]
+async fn what_was_refused_stays_so_until_it_is_tried_again_and_then_wakes_who_waits() {
+    let (board, mut around) = in_place().await;
+    let began = Timestamp::now();
+    let after = |seconds: i64| began + jiff::SignedDuration::from_secs(seconds);
+    let refused = Policy::Refused("no".into());
+    note(&around.context, &board, refused.clone(), began);
+    assert_eq!(keep(&around.context, &board, after(5)).await, refused);
+    assert!(around.requests.try_recv().is_err() && around.woken.try_recv().is_err());
+    assert_eq!(keep(&around.context, &board, after(11)).await, Policy::InPlace);
+    assert_eq!(around.requests.try_recv().unwrap().method, http::Method::PATCH);
+    assert_eq!(around.woken.try_recv().unwrap(), "carla");
+    assert_eq!(keep(&around.context, &board, after(20)).await, Policy::InPlace);
+    assert!(around.requests.try_recv().is_err() && around.woken.try_recv().is_err());
+}
+
+#[tokio::test]
+async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missing() {
+    let mut board = fixtures::leaderboard("carla", "http://127.0.0.1:1");
+    board.metadata.generation = Some(1);
+    let mut around = surroundings(Cluster::default(), "http://127.0.0.1:1").await;
+    let began = Timestamp::now();
+    let mut said = Vec::new();
+    for second in 0..60 {
+        let now = began + jiff::SignedDuration::from_secs(second);
+        said.push(keep(&around.context, &board, now).await == Policy::InPlace);
+    }
+    assert!(said[..10].iter().all(|is_fine| *is_fine), "the cache may lag");
+    assert!(said[10..].iter().all(|is_fine| !is_fine));
+    let mut requests = 0;
+    while around.requests.try_recv().is_ok() {
+        requests += 1;
+    }
+    assert_eq!(requests, 10 + 5);
+    around.context.stores.policies_synced.set(false);
+    board.metadata.generation = Some(2);
+    let policy = keep(&around.context, &board, began).await;
+    assert!(matches!(policy, Policy::NotApplied(_)), "never listed: said at once");
+}
