@@ -6,6 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
 use super::failure::{self, infrastructure};
+use super::isolation::Missing;
 use super::{Action, end, isolation};
 use crate::api::conditions::{self, Truth};
 use crate::api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
@@ -17,6 +18,8 @@ const RETRY: Duration = Duration::from_secs(30);
 /// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
 /// participant, whose team has that submission in progress.
 const PHASE_SECONDS: i64 = 3600;
+/// How long after its creation a submission does not say that the policy is not in place yet.
+const POLICY_SECONDS: i64 = 5;
 
 /// Whether the submission may go on to its turn. Otherwise the draft says why not. EvalAI's own end goes before all that it may
 /// wait for.
@@ -62,12 +65,23 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
     if let Some(message) = not_ready(draft) {
         return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
     }
-    if let Some(message) = isolation::missing(draft) {
-        return refuse(draft, reasons::NOT_ISOLATED, &message);
+    if let Some(missing) = isolation::missing(draft) {
+        return wait_for_policy(draft, &missing);
     }
     pin(draft, leaderboard, track, image, info.as_ref());
     draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
     true
+}
+
+/// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
+fn wait_for_policy(draft: &mut Draft<'_>, missing: &Missing) -> bool {
+    let created = draft.submission().metadata.creation_timestamp.as_ref();
+    let until = after(created.map_or(draft.now(), |time| time.0), POLICY_SECONDS);
+    if draft.now() < until && !missing.is_refused {
+        draft.requeue_at(until);
+        return refuse(draft, reasons::PREPARING, &missing.message);
+    }
+    refuse(draft, reasons::NOT_ISOLATED, &missing.message)
 }
 
 /// What is said of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,

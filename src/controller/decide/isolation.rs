@@ -5,9 +5,17 @@ use crate::api::PolicySource;
 use crate::api::conditions;
 use crate::text::sentence;
 
+/// A policy that is not in place.
+pub(super) struct Missing {
+    /// Why no Job may be made.
+    pub(super) message: String,
+    /// It could not be applied, so waiting alone does not help.
+    pub(super) is_refused: bool,
+}
+
 /// Why no Job may be made, if the policy is not in place. It is restored by the Leaderboard's reconcile, which wakes the
 /// submission.
-pub(super) fn missing(draft: &Draft<'_>) -> Option<String> {
+pub(super) fn missing(draft: &Draft<'_>) -> Option<Missing> {
     let leaderboard = draft.view.leaderboard.as_ref()?;
     let is_managed = leaderboard.spec.network.policy == PolicySource::Managed;
     if !is_managed || draft.view.is_policy_in_place {
@@ -17,15 +25,17 @@ pub(super) fn missing(draft: &Draft<'_>) -> Option<String> {
     let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
     let isolated = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
     let why = isolated.filter(|c| c.status == "False" && c.observed_generation == leaderboard.metadata.generation);
-    Some(match why {
+    let is_refused = why.is_some();
+    let message = match why {
         Some(c) => format!(
             "The NetworkPolicy of Leaderboard {name} is not in place ({}): {} The submission goes on once it is.",
             c.reason,
             sentence(&c.message)
         ),
         None => format!(
-            "The NetworkPolicy of Leaderboard {name} is being applied; the submission goes on once it is in place. If this \
-             lasts, look at the condition Isolated of the Leaderboard."
+            "The NetworkPolicy of Leaderboard {name} is not in place yet; the submission goes on once it is. If this lasts, look \
+             at the Leaderboard's condition Isolated, and at /readyz of the controller for a missing right."
         ),
-    })
+    };
+    Some(Missing { message, is_refused })
 }

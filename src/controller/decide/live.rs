@@ -189,9 +189,9 @@ fn without_its_job(draft: &mut Draft<'_>) {
         draft.say(draft.live_state(), reasons::LEADERBOARD_NOT_FOUND, message);
         return draft.requeue_in(BACKSTOP);
     }
-    if let Some(message) = isolation::missing(draft) {
-        draft.stall_with(reasons::NOT_ISOLATED, &message);
-        draft.say(draft.live_state(), reasons::NOT_ISOLATED, message);
+    if let Some(missing) = isolation::missing(draft) {
+        draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
+        draft.say(draft.live_state(), reasons::NOT_ISOLATED, missing.message);
         return draft.requeue_in(BACKSTOP);
     }
     if was_seen(draft) {

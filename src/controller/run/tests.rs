@@ -111,9 +111,7 @@ async fn the_end_of_any_task_ends_the_process_by_its_name() {
         let result = ended.unwrap_or_else(|_| panic!("the process goes on without {name}"));
         assert_eq!(
             result.unwrap().unwrap_err().to_string(),
-            format!(
-                "task {name} has ended; the process exits, so that the kubelet restarts it"
-            )
+            format!("task {name} has ended; the process exits, so that the kubelet restarts it")
         );
     }
 }

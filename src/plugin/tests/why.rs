@@ -110,10 +110,7 @@ fn the_next_step_of_a_failure_is_not_that_of_a_wait_for_the_same_reason() {
             reasons::NOT_ISOLATED,
             "Nothing for a moment after the Leaderboard was applied",
         ),
-        (
-            reasons::PHASE_DIFFERS,
-            "Set the phase back in EvalAI, and it goes on by itself.",
-        ),
+        (reasons::PHASE_DIFFERS, "Set the phase back in EvalAI: within the hour"),
     ] {
         assert!(wait(reason).contains(waits), "{}", wait(reason));
         let message = "It could not be. Correct that, then resume it.";

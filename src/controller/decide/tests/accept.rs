@@ -296,7 +296,10 @@ fn what_waits_before_its_acceptance_hears_of_its_end_in_evalai() {
             w.in_evalai().info.as_mut().unwrap().image = None;
         }),
         (reasons::LEADERBOARD_NOT_READY, |w| not_ready(w, reasons::INVALID_POD)),
-        (reasons::NOT_ISOLATED, |w| w.view.is_policy_in_place = false),
+        (reasons::NOT_ISOLATED, |w| {
+            w.view.is_policy_in_place = false;
+            w.go_to(5);
+        }),
         (reasons::PHASE_DIFFERS, |w| moved_to(w, 9)),
     ];
     for (reason, wait) in waits {

@@ -29,6 +29,10 @@ fn say_of_the_leaderboard(world: &mut World, reason: &str, message: &str) {
 fn a_job_waits_for_the_policy_and_follows_it_by_itself() {
     let mut world = World::local();
     world.view.is_policy_in_place = false;
+    // A Leaderboard and its first submission may come together.
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert!(!creates(&plan));
+    world.go_to(5);
     let plan = world.pass_to(Pending, reasons::NOT_ISOLATED);
     assert!(!creates(&plan));
     assert_eq!(
@@ -37,7 +41,7 @@ fn a_job_waits_for_the_policy_and_follows_it_by_itself() {
     );
     let message = world.status().message.unwrap();
     assert!(
-        message.contains("being applied; the submission goes on once it is in place."),
+        message.contains("is not in place yet; the submission goes on once it is."),
         "{message}"
     );
 
