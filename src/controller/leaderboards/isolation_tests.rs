@@ -5,6 +5,7 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
+use crate::observability::logging::tests::Lines;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
     let spec = json!({
@@ -252,6 +253,8 @@ async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missi
     let mut board = fixtures::leaderboard("carla", "http://127.0.0.1:1");
     board.metadata.generation = Some(1);
     let mut around = surroundings(Cluster::default(), "http://127.0.0.1:1").await;
+    let lines = Lines::default();
+    let _guard = lines.collect();
     let began = Timestamp::now();
     let mut said = Vec::new();
     for second in 0..60 {
@@ -265,6 +268,9 @@ async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missi
         requests += 1;
     }
     assert_eq!(requests, 10 + 5);
+    let told = lines.take();
+    assert_eq!(told.matches("the NetworkPolicy is not in place").count(), 1, "{told}");
+    assert!(told.contains("one/carla"), "{told}");
     around.context.stores.policies_synced.set(false);
     board.metadata.generation = Some(2);
     let policy = keep(&around.context, &board, began).await;
