@@ -17,6 +17,9 @@ pub struct Ingested {
     pub message: String,
     /// When it was sent, in milliseconds since 1970; of the sweep, when EvalAI's row asked to be run.
     pub sent: i64,
+    /// The attempt that it began; none of an older operator's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub attempt: Option<i64>,
     /// The attempts that began without a message since the last one that came.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub without_message: Vec<i64>,
@@ -39,5 +42,10 @@ impl Ingested {
     pub fn of(submission: &Submission) -> Option<Self> {
         let annotations = submission.metadata.annotations.as_ref()?;
         serde_json::from_str(annotations.get(names::ANNOTATION_INGESTED)?).ok()
+    }
+
+    /// Whether EvalAI has asked for an attempt, by a message or by its row. Every other was begun by a person.
+    pub fn has_begun(&self, attempt: i64) -> bool {
+        self.attempt == Some(attempt) || self.without_message.contains(&attempt)
     }
 }

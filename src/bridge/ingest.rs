@@ -273,6 +273,7 @@ fn record(existing: Option<&Submission>, incoming: &Incoming, attempt: i64) -> I
     Ingested {
         message: incoming.source.id().to_owned(),
         sent: incoming.sent_ms,
+        attempt: Some(attempt),
         without_message,
         refused: None,
     }

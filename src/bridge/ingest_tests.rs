@@ -89,7 +89,7 @@ fn the_first_message_makes_the_object_with_everything_it_needs() {
     assert_eq!(labels[names::LABEL_LEADERBOARD], BOARD);
     assert_eq!(labels[names::LABEL_PHASE], "2");
     let record: Value = serde_json::from_str(&made.metadata.annotations.unwrap()[names::ANNOTATION_INGESTED]).unwrap();
-    assert_eq!(record, json!({"message": "a", "sent": 100}));
+    assert_eq!(record, json!({"message": "a", "sent": 100, "attempt": 1}));
     let spec = made.spec;
     assert_eq!(
         (spec.leaderboard.as_str(), spec.attempt, spec.cancel),
@@ -450,7 +450,7 @@ async fn a_bump_is_one_patch_bound_to_what_was_read() {
     let (outcome, asked) = against(script, message("b", 200)).await;
     assert_eq!(outcome.unwrap(), Outcome::Bumped(2));
     assert_eq!(asked[2].0, format!("PATCH {ONE}"));
-    let record = json!({"message": "b", "sent": 200}).to_string();
+    let record = json!({"message": "b", "sent": 200, "attempt": 2}).to_string();
     let want = json!({
         "metadata": {"resourceVersion": "10", "annotations": {names::ANNOTATION_INGESTED: record}},
         "spec": {"attempt": 2, "cancel": false},
@@ -464,7 +464,8 @@ async fn a_refusal_is_noted_and_changes_no_attempt() {
     let script = vec![refusal(409, "AlreadyExists"), object(&failed), object(&failed)];
     let (outcome, asked) = against(script, sweep(300_000)).await;
     assert_eq!(outcome.unwrap(), Outcome::Refused);
-    let record = json!({"message": "a", "sent": 100_000, "refused": {"attempt": 2, "at": 300_000}}).to_string();
+    let record =
+        json!({"message": "a", "sent": 100_000, "attempt": 1, "refused": {"attempt": 2, "at": 300_000}}).to_string();
     let want = json!({
         "metadata": {"resourceVersion": "10", "annotations": {names::ANNOTATION_INGESTED: record}},
         "spec": {},

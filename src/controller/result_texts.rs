@@ -63,17 +63,25 @@ pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> 
     })
 }
 
-/// The payload of a partial result: with the metrics over the routes so far, where `results` has zeros until the end.
-pub(super) async fn partial_payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
+/// The payload of a partial result. `is_shown` says that its phase's leaderboard shows it.
+pub(super) async fn partial_payload(
+    context: &Context,
+    view: &View,
+    report: &Report,
+    is_shown: bool,
+) -> Result<Payload, TextError> {
     let payload = payload(context, view, report).await?;
     Ok(Payload {
-        result: partial_results(report).to_owned(),
+        result: partial_results(report, is_shown).to_owned(),
         ..payload
     })
 }
 
-fn partial_results(report: &Report) -> &str {
-    report.partial_results.as_ref().unwrap_or(&report.results)
+/// The metrics over the routes so far where people see them, else the original's zeros: EvalAI keeps them, and would show them as
+/// final of a row that its participant calls finished.
+fn partial_results(report: &Report, is_shown: bool) -> &str {
+    let so_far = report.partial_results.as_ref().filter(|_| is_shown);
+    so_far.unwrap_or(&report.results)
 }
 
 /// The numbers alone.
@@ -289,9 +297,14 @@ mod tests {
     #[test]
     fn a_partial_result_has_the_metrics_so_far_where_a_report_has_them() {
         let mut report = report("zeros");
-        assert_eq!(partial_results(&report), "so far");
+        assert_eq!(partial_results(&report, true), "so far");
+        assert_eq!(
+            partial_results(&report, false),
+            "zeros",
+            "nobody is to see them before the end"
+        );
         report.partial_results = None;
-        assert_eq!(partial_results(&report), "zeros", "of an older operator's Pod");
+        assert_eq!(partial_results(&report, true), "zeros", "of an older operator's Pod");
     }
 
     #[test]

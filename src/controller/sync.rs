@@ -14,7 +14,7 @@ use super::observe::{report, uid_of};
 use super::reruns;
 use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
-use crate::api::{Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
+use crate::api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
 use crate::services::ObjectKey;
 use crate::services::evalai::{self, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
@@ -154,7 +154,8 @@ impl Sync {
             context.memory.note_read(&view.submission);
         }
         if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
-            self.recorder.record(table, &object_key(&view.submission), row, end);
+            self.recorder
+                .record(table, &object_key(view.submission.as_ref()), row, end);
         }
     }
 
@@ -167,14 +168,24 @@ impl Sync {
     fn way(&self, view: &View) -> Option<Way> {
         let evalai = view.submission.spec.evalai?;
         let target = self.target(view.leaderboard.as_deref()?)?;
-        let attempt = view.submission.spec.attempt;
-        let job = names::job(&view.submission.name_any(), attempt, 0);
         Some(Way {
             target,
-            key: object_key(&view.submission),
+            key: object_key(view.submission.as_ref()),
             pk: evalai.submission,
-            run: Run { attempt, job },
+            run: run_of(&view.submission),
         })
+    }
+}
+
+/// The present attempt, as EvalAI's side has to know it.
+fn run_of(submission: &Submission) -> Run {
+    let attempt = submission.spec.attempt;
+    let status = submission.status.as_ref().filter(|s| s.attempt == Some(attempt));
+    Run {
+        attempt,
+        job: names::job(&submission.name_any(), attempt, 0),
+        by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
+        has_job: status.is_some_and(|s| s.job.is_some() || s.retry > 0),
     }
 }
 
@@ -187,7 +198,9 @@ struct Way {
 
 async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
-    let read = result_texts::partial_payload(context, view, report).await;
+    let leaderboard = object_key(view.leaderboard.as_deref()?);
+    let is_shown = context.sync.hub.shows_partial(&leaderboard, result_texts::phase(view));
+    let read = result_texts::partial_payload(context, view, report, is_shown).await;
     let attempt = view.submission.spec.attempt;
     // What takes too long or is not there is left out: the next route has a result of its own.
     if !matches!(read, Err(TextError::Unread(BucketError::Refused(_)))) {
@@ -336,11 +349,11 @@ fn log_refused(submission: &Submission, result: Result<(), evalai::client::Clien
     }
 }
 
-fn object_key(submission: &Submission) -> ObjectKey {
+fn object_key(object: &impl ResourceExt) -> ObjectKey {
     ObjectKey {
-        namespace: submission.namespace().unwrap_or_default(),
-        name: submission.name_any(),
-        uid: uid_of(submission),
+        namespace: object.namespace().unwrap_or_default(),
+        name: object.name_any(),
+        uid: uid_of(object),
     }
 }
 

@@ -142,7 +142,7 @@ impl Bench {
 
     fn is_handed_in(&self) -> bool {
         let recorder = &self.around.context.sync.recorder;
-        recorder.view(&object_key(&self.view.submission)).is_some()
+        recorder.view(&object_key(self.view.submission.as_ref())).is_some()
     }
 }
 
@@ -212,4 +212,39 @@ async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ev
         .unwrap();
     bench.records_the_end().await;
     assert_eq!(bench.row().await["submission_status"], "FINISHED");
+}
+
+#[test]
+fn an_attempt_that_evalai_has_asked_for_is_told_from_one_that_a_person_has_begun() {
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    let mut of = |attempt, record: Option<Value>| {
+        submission.spec.attempt = attempt;
+        let annotations = record.map(|record| (names::ANNOTATION_INGESTED.to_owned(), record.to_string()));
+        submission.metadata.annotations = annotations.map(|annotation| [annotation].into());
+        run_of(&submission).by_hand
+    };
+    let by_message = || Some(json!({"message": "m", "sent": 1, "attempt": 2}));
+    assert!(!of(2, by_message()));
+    assert!(of(3, by_message()), "raised after the one that the message began");
+    let by_sweep = || Some(json!({"message": "sweep", "sent": 1, "attempt": 3, "withoutMessage": [2, 3]}));
+    assert!(!of(2, by_sweep()) && !of(3, by_sweep()) && of(4, by_sweep()));
+    assert!(of(2, None), "nobody but people made it");
+    assert!(
+        of(2, Some(json!({"message": "m", "sent": 1}))),
+        "an older operator noted no attempt"
+    );
+}
+
+#[test]
+fn a_run_has_a_job_once_that_of_this_attempt_was_asked_for() {
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    assert!(run_of(&submission).has_job);
+    let status = submission.status.as_mut().unwrap();
+    (status.job, status.retry) = (None, 1);
+    assert!(run_of(&submission).has_job, "between two tries");
+    submission.status.as_mut().unwrap().retry = 0;
+    assert!(!run_of(&submission).has_job);
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    submission.spec.attempt += 1;
+    assert!(!run_of(&submission).has_job, "it was the attempt before");
 }

@@ -234,6 +234,8 @@ fn run(pk: i64, attempt: i64) -> Run {
     Run {
         attempt,
         job: format!("submission-{pk}-{attempt}"),
+        by_hand: true,
+        has_job: false,
     }
 }
 

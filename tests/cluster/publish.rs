@@ -19,6 +19,7 @@ const BUDGET: usize = 54;
 async fn a_message_becomes_the_same_score_in_all_four_places() {
     scenario("message", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
+        evalai.handle.state().seed.challenges[0].phases[0].is_partial_submission_evaluation_enabled = true;
         // A run that is over at once would be finished before its turn comes to say that it runs.
         let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "2000"}]}});
         scene.evalai_leaderboard("lb", &evalai, change).await;
@@ -95,7 +96,7 @@ async fn assert_published(scene: &Scene, evalai: &Evalai, pk: u64) {
     assert_eq!(evalai.file(row.stderr_file.as_ref()).trim(), "", "nothing went wrong");
 }
 
-/// Before the end EvalAI gets the metrics over the routes so far, not the zeros of the stored file.
+/// Before the end EvalAI gets the metrics over the routes so far where its phase shows them, not the zeros of the stored file.
 fn assert_partials(requests: &[Entry]) {
     let is_partial = |entry: &&Entry| entry.method == "PUT" && entry.path.contains("partially_evaluated");
     for partial in requests.iter().filter(is_partial) {

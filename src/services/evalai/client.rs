@@ -270,9 +270,19 @@ fn silence(error: reqwest::Error) -> Silence {
         () => "EvalAI's answer broke off",
     };
     Silence {
-        sent: !error.is_connect() && !error.is_builder(),
+        sent: !error.is_connect() && !error.is_builder() && !is_canceled(&error),
         why: format!("{what} ({})", chain(&error)),
     }
+}
+
+/// Whether the connection was closed before a byte of the request was sent on it.
+fn is_canceled(error: &(dyn std::error::Error + 'static)) -> bool {
+    let mut causes = std::iter::successors(Some(error), |error| error.source());
+    causes.any(|cause| {
+        cause
+            .downcast_ref::<hyper::Error>()
+            .is_some_and(hyper::Error::is_canceled)
+    })
 }
 
 /// An error with its causes, which reqwest leaves to the reader.

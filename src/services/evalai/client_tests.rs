@@ -1,7 +1,10 @@
 //! The client against a server of the test's own, that treats connections as servers do.
 
+use std::io;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::task::{Context, Poll};
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -103,4 +106,50 @@ async fn a_write_to_a_server_that_is_not_there_was_not_sent() {
         matches!(&answer, Answer::Unanswered(silence) if !silence.sent),
         "{answer:?}"
     );
+}
+
+/// A connection that the other side has closed.
+struct Closed;
+
+impl hyper::rt::Read for Closed {
+    fn poll_read(self: Pin<&mut Self>, _: &mut Context<'_>, _: hyper::rt::ReadBufCursor<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl hyper::rt::Write for Closed {
+    fn poll_write(self: Pin<&mut Self>, _: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        Poll::Ready(Ok(bytes.len()))
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+}
+
+#[tokio::test]
+async fn a_request_whose_connection_was_closed_before_its_first_byte_was_not_sent() {
+    #[derive(thiserror::Error, Debug)]
+    #[error("it did not work")]
+    struct Wrapped(#[source] hyper::Error);
+
+    let handshake = || hyper::client::conn::http1::handshake::<_, String>(Closed);
+    let (mut sender, connection) = handshake().await.unwrap();
+    drop(connection);
+    let unsent = sender
+        .send_request(hyper::Request::new(String::new()))
+        .await
+        .unwrap_err();
+    assert!(is_canceled(&Wrapped(unsent)));
+
+    // This one is sent, and then the answer breaks off.
+    let (mut sender, connection) = handshake().await.unwrap();
+    let sent = sender.send_request(hyper::Request::new(String::new()));
+    let (sent, _) = tokio::join!(sent, connection);
+    println!("{sent:?}");
+    assert!(!is_canceled(&io::Error::other("reset")));
 }

@@ -2,11 +2,25 @@
 //!
 //! Called by `queue` with each read. Pure: words in, words out.
 //!
-//! `begun` says that the end of an earlier attempt no longer stands: this attempt's Job is in the row's `job_name`, or the
-//! read was requested after EvalAI had answered this attempt's `queued`, or after another read had shown the submission as
-//! live. Only then does `cancelled` or `failed` speak of this attempt.
+//! An [`Attempt`] has `begun` when the end of an earlier one no longer stands: its Job is in the row's `job_name`, or the read
+//! was requested after EvalAI had answered its `queued`, or after another read had shown the submission as live. Only then does
+//! `failed` speak of this attempt. So does `cancelled`, but EvalAI resumes only what has failed: before an attempt that it has
+//! asked for has begun, `cancelled` is a new cancel. Only an attempt that a person has begun here follows a cancelled one.
 
 use super::status::{Outcome, Progress, Status};
+
+/// The attempt that a status may speak of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Attempt {
+    /// From 1.
+    pub number: i64,
+    /// A person has begun it here: EvalAI has not asked for it.
+    pub by_hand: bool,
+    /// See the module's text.
+    pub begun: bool,
+    /// It was on its way here before the status was read.
+    pub under_way: bool,
+}
 
 /// Whether an attempt may run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,38 +62,40 @@ pub enum End {
 }
 
 /// Whether this attempt may run.
-pub fn start(status: Status, attempt: i64, begun: bool) -> Start {
-    match standing(status, attempt, begun) {
+pub fn start(status: Status, attempt: Attempt) -> Start {
+    match standing(status, attempt) {
         Status::Unknown => Start::Unclear,
         standing if standing.is_live() => Start::Run,
+        // EvalAI lets participants write it. The end is ours alone, and is written over it.
+        Status::Finished if attempt.under_way => Start::Run,
         _ => Start::Drop(status),
     }
 }
 
 /// Whether `queued` or `running` is written. `told` says that EvalAI has been told of this attempt: before, a later attempt
 /// writes even over `running`, which is an earlier one's word.
-pub fn progress(status: Status, attempt: i64, begun: bool, told: bool, wanted: Progress) -> Verdict {
-    match start(status, attempt, begun) {
+pub fn progress(status: Status, attempt: Attempt, told: bool, wanted: Progress) -> Verdict {
+    match start(status, attempt) {
         Start::Drop(status) => Verdict::Ended(status),
         Start::Unclear => Verdict::Wait,
-        Start::Run if (attempt == 1 || told) && reached(status, wanted) => Verdict::There,
+        Start::Run if (attempt.number == 1 || told) && reached(status, wanted) => Verdict::There,
         Start::Run => Verdict::Send,
     }
 }
 
 /// Whether partial results are written. An earlier attempt's end is first overwritten by `queued` or `running`.
-pub fn partial(status: Status, attempt: i64, begun: bool) -> Verdict {
-    match start(status, attempt, begun) {
+pub fn partial(status: Status, attempt: Attempt) -> Verdict {
+    match start(status, attempt) {
         Start::Drop(status) => Verdict::Ended(status),
         Start::Unclear => Verdict::Wait,
-        Start::Run if standing(status, attempt, begun) != status => Verdict::Wait,
+        Start::Run if standing(status, attempt) != status => Verdict::Wait,
         Start::Run => Verdict::Send,
     }
 }
 
 /// Whether the end is written.
-pub fn end(status: Status, attempt: i64, begun: bool, wanted: Outcome) -> End {
-    match (standing(status, attempt, begun), wanted) {
+pub fn end(status: Status, attempt: Attempt, wanted: Outcome) -> End {
+    match (standing(status, attempt), wanted) {
         (Status::Unknown, _) => End::Wait,
         (Status::Deleted, Outcome::Finished | Outcome::Failed) => End::Cancel,
         (Status::Failed, Outcome::Failed | Outcome::Cancelled)
@@ -92,9 +108,10 @@ pub fn end(status: Status, attempt: i64, begun: bool, wanted: Outcome) -> End {
 }
 
 /// The status as it speaks of this attempt: the end of an earlier attempt is a beginning.
-fn standing(status: Status, attempt: i64, begun: bool) -> Status {
+fn standing(status: Status, attempt: Attempt) -> Status {
     match status {
-        Status::Failed | Status::Cancelled if attempt > 1 && !begun => Status::Resuming,
+        Status::Failed if attempt.number > 1 && !attempt.begun => Status::Resuming,
+        Status::Cancelled if attempt.number > 1 && !attempt.begun && attempt.by_hand => Status::Resuming,
         other => other,
     }
 }
@@ -122,33 +139,100 @@ mod tests {
     const GONE: [S; 3] = [S::Archived, S::Ignored, S::Missing];
     const DELETED: [S; 1] = [S::Deleted];
 
+    /// One that a person has begun, as all were once.
+    fn of(number: i64, begun: bool) -> Attempt {
+        Attempt {
+            number,
+            by_hand: true,
+            begun,
+            under_way: false,
+        }
+    }
+
+    #[test]
+    fn a_cancel_before_the_first_read_of_an_attempt_that_evalai_has_asked_for_stays() {
+        let asked_for = |number, begun| Attempt {
+            by_hand: false,
+            ..of(number, begun)
+        };
+        for begun in [false, true] {
+            let attempt = asked_for(2, begun);
+            assert_eq!(start(S::Cancelled, attempt), Start::Drop(S::Cancelled));
+            for wanted in [Progress::Queued, Progress::Running] {
+                let ended = Verdict::Ended(S::Cancelled);
+                assert_eq!(progress(S::Cancelled, attempt, false, wanted), ended);
+            }
+            assert_eq!(partial(S::Cancelled, attempt), Verdict::Ended(S::Cancelled));
+            assert_eq!(end(S::Cancelled, attempt, Outcome::Finished), End::Amend(S::Cancelled));
+        }
+        assert_eq!(
+            start(S::Failed, asked_for(2, false)),
+            Start::Run,
+            "that is what was resumed"
+        );
+        assert_eq!(start(S::Failed, asked_for(2, true)), Start::Drop(S::Failed));
+    }
+
+    #[test]
+    fn nobody_but_us_finishes_a_run_that_is_under_way() {
+        for (number, begun) in [(1, false), (1, true), (2, false), (2, true)] {
+            let under_way = Attempt {
+                under_way: true,
+                ..of(number, begun)
+            };
+            assert_eq!(start(S::Finished, under_way), Start::Run);
+            for told in [false, true] {
+                let sent = progress(S::Finished, under_way, told, Progress::Running);
+                assert_eq!(sent, Verdict::Send, "{number} {begun} {told}");
+            }
+            assert_eq!(partial(S::Finished, under_way), Verdict::Send);
+            for wanted in [Outcome::Finished, Outcome::Failed, Outcome::Cancelled] {
+                assert_eq!(end(S::Finished, under_way, wanted), End::Put);
+            }
+            for status in [S::Archived, S::Deleted, S::Ignored, S::Missing] {
+                assert_eq!(start(status, under_way), Start::Drop(status));
+            }
+        }
+        let under_way = Attempt {
+            under_way: true,
+            ..of(1, true)
+        };
+        for status in [S::Failed, S::Cancelled] {
+            assert_eq!(start(status, under_way), Start::Drop(status));
+        }
+    }
+
     #[test]
     fn what_starts_and_what_drops() {
         for begun in [false, true] {
             for attempt in [1, 2, 7] {
                 for status in LIVE {
-                    assert_eq!(start(status, attempt, begun), Start::Run, "{status} {attempt} {begun}");
+                    assert_eq!(
+                        start(status, of(attempt, begun)),
+                        Start::Run,
+                        "{status} {attempt} {begun}"
+                    );
                 }
                 for status in GONE.into_iter().chain(DELETED).chain([S::Finished]) {
                     assert_eq!(
-                        start(status, attempt, begun),
+                        start(status, of(attempt, begun)),
                         Start::Drop(status),
                         "{status} {attempt} {begun}"
                     );
                 }
-                assert_eq!(start(S::Unknown, attempt, begun), Start::Unclear);
+                assert_eq!(start(S::Unknown, of(attempt, begun)), Start::Unclear);
             }
         }
         for status in [S::Failed, S::Cancelled] {
-            assert_eq!(start(status, 1, false), Start::Drop(status), "attempt 1");
-            assert_eq!(start(status, 1, true), Start::Drop(status), "attempt 1");
+            assert_eq!(start(status, of(1, false)), Start::Drop(status), "attempt 1");
+            assert_eq!(start(status, of(1, true)), Start::Drop(status), "attempt 1");
             assert_eq!(
-                start(status, 2, false),
+                start(status, of(2, false)),
                 Start::Run,
                 "the end of attempt 1 does not end attempt 2"
             );
             assert_eq!(
-                start(status, 2, true),
+                start(status, of(2, true)),
                 Start::Drop(status),
                 "attempt 2 itself was ended"
             );
@@ -161,39 +245,42 @@ mod tests {
         for status in LIVE.into_iter().chain([S::Finished]) {
             for wanted in [Finished, Failed, Cancelled] {
                 for (attempt, begun) in [(1, false), (1, true), (2, false), (2, true)] {
-                    assert_eq!(end(status, attempt, begun, wanted), End::Put, "{status} {wanted:?}");
+                    assert_eq!(end(status, of(attempt, begun), wanted), End::Put, "{status} {wanted:?}");
                 }
             }
         }
-        assert_eq!(end(S::Failed, 1, true, Finished), End::Put);
-        assert_eq!(end(S::Failed, 1, true, Failed), End::Done(S::Failed));
-        assert_eq!(end(S::Failed, 1, true, Cancelled), End::Done(S::Failed));
+        assert_eq!(end(S::Failed, of(1, true), Finished), End::Put);
+        assert_eq!(end(S::Failed, of(1, true), Failed), End::Done(S::Failed));
+        assert_eq!(end(S::Failed, of(1, true), Cancelled), End::Done(S::Failed));
         for status in GONE.into_iter().chain([S::Cancelled]) {
-            assert_eq!(end(status, 1, true, Finished), End::Amend(status));
-            assert_eq!(end(status, 1, true, Failed), End::Amend(status));
-            assert_eq!(end(status, 1, true, Cancelled), End::Done(status));
-            assert_eq!(end(status, 2, true, Finished), End::Amend(status));
+            assert_eq!(end(status, of(1, true), Finished), End::Amend(status));
+            assert_eq!(end(status, of(1, true), Failed), End::Amend(status));
+            assert_eq!(end(status, of(1, true), Cancelled), End::Done(status));
+            assert_eq!(end(status, of(2, true), Finished), End::Amend(status));
         }
-        assert_eq!(end(S::Unknown, 1, true, Finished), End::Wait);
+        assert_eq!(end(S::Unknown, of(1, true), Finished), End::Wait);
     }
 
     #[test]
     fn a_submission_deleted_before_its_end_is_cancelled_whatever_its_outcome() {
         for (attempt, begun) in [(1, false), (1, true), (2, false), (2, true)] {
             for wanted in [Outcome::Finished, Outcome::Failed] {
-                assert_eq!(end(S::Deleted, attempt, begun, wanted), End::Cancel);
+                assert_eq!(end(S::Deleted, of(attempt, begun), wanted), End::Cancel);
             }
-            assert_eq!(end(S::Deleted, attempt, begun, Outcome::Cancelled), End::Put);
+            assert_eq!(end(S::Deleted, of(attempt, begun), Outcome::Cancelled), End::Put);
         }
     }
 
     #[test]
     fn a_short_later_attempt_is_published_over_the_end_of_the_earlier_one() {
         for wanted in [Outcome::Finished, Outcome::Failed, Outcome::Cancelled] {
-            assert_eq!(end(S::Cancelled, 2, false, wanted), End::Put);
-            assert_eq!(end(S::Failed, 2, false, wanted), End::Put);
+            assert_eq!(end(S::Cancelled, of(2, false), wanted), End::Put);
+            assert_eq!(end(S::Failed, of(2, false), wanted), End::Put);
         }
-        assert_eq!(end(S::Archived, 2, false, Outcome::Finished), End::Amend(S::Archived));
+        assert_eq!(
+            end(S::Archived, of(2, false), Outcome::Finished),
+            End::Amend(S::Archived)
+        );
     }
 
     #[test]
@@ -218,17 +305,17 @@ mod tests {
             (S::Unknown, Queued, Verdict::Wait, Verdict::Wait),
         ] {
             assert_eq!(
-                progress(status, 1, false, false, wanted),
+                progress(status, of(1, false), false, wanted),
                 first,
                 "{status} {wanted:?}, attempt 1"
             );
             assert_eq!(
-                progress(status, 2, false, false, wanted),
+                progress(status, of(2, false), false, wanted),
                 later,
                 "{status} {wanted:?}, attempt 2 before it has begun"
             );
             assert_eq!(
-                progress(status, 2, true, true, wanted),
+                progress(status, of(2, true), true, wanted),
                 first,
                 "{status} {wanted:?}, attempt 2 after it has begun"
             );
@@ -237,9 +324,12 @@ mod tests {
 
     #[test]
     fn a_later_attempt_is_told_once_even_where_the_earlier_one_left_its_words() {
-        assert_eq!(progress(S::Running, 2, true, false, Progress::Queued), Verdict::Send);
         assert_eq!(
-            progress(S::Cancelled, 2, true, false, Progress::Queued),
+            progress(S::Running, of(2, true), false, Progress::Queued),
+            Verdict::Send
+        );
+        assert_eq!(
+            progress(S::Cancelled, of(2, true), false, Progress::Queued),
             Verdict::Ended(S::Cancelled)
         );
     }
@@ -247,17 +337,17 @@ mod tests {
     #[test]
     fn partials_follow_only_a_run_that_evalai_knows() {
         for status in LIVE {
-            assert_eq!(partial(status, 1, false), Verdict::Send);
+            assert_eq!(partial(status, of(1, false)), Verdict::Send);
         }
         for status in GONE
             .into_iter()
             .chain(DELETED)
             .chain([S::Cancelled, S::Failed, S::Finished])
         {
-            assert_eq!(partial(status, 1, true), Verdict::Ended(status));
+            assert_eq!(partial(status, of(1, true)), Verdict::Ended(status));
         }
-        assert_eq!(partial(S::Cancelled, 2, false), Verdict::Wait);
-        assert_eq!(partial(S::Cancelled, 2, true), Verdict::Ended(S::Cancelled));
-        assert_eq!(partial(S::Unknown, 1, true), Verdict::Wait);
+        assert_eq!(partial(S::Cancelled, of(2, false)), Verdict::Wait);
+        assert_eq!(partial(S::Cancelled, of(2, true)), Verdict::Ended(S::Cancelled));
+        assert_eq!(partial(S::Unknown, of(1, true)), Verdict::Wait);
     }
 }

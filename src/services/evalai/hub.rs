@@ -167,6 +167,12 @@ impl Hub {
             .map_or((None, None), |shared| shared.queue().labels(leaderboard))
     }
 
+    /// Whether partial results are on the leaderboards of a phase; no as long as that is not known.
+    pub fn shows_partial(&self, leaderboard: &Key, phase: i64) -> bool {
+        let (labels, _) = self.labels(leaderboard);
+        labels.is_some_and(|labels| labels.partial.contains(&phase))
+    }
+
     /// Requests that a Leaderboard's token has made in the last minute, and its limit.
     pub fn budget_used(&self, leaderboard: &Key) -> Option<(u32, u32)> {
         let shared = self.place(leaderboard)?;

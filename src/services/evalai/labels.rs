@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use jiff::Timestamp;
 
-use super::row::Split;
+use super::row::{Phase, Split};
 use super::types::Target;
 
 /// What EvalAI said of a challenge.
@@ -14,8 +14,8 @@ use super::types::Target;
 pub struct Catalog {
     /// When it was read.
     pub at: Timestamp,
-    /// Ids of its phases.
-    pub phases: Vec<i64>,
+    /// Its phases.
+    pub phases: Vec<Phase>,
     /// Its leaderboards.
     pub splits: Vec<Split>,
     /// Codenames of dataset splits; none where EvalAI does not tell.
@@ -29,6 +29,8 @@ pub struct Labels {
     pub at: Timestamp,
     /// What does not fit.
     pub problems: Vec<Misfit>,
+    /// The phases whose leaderboards show partial results.
+    pub partial: Vec<i64>,
 }
 
 impl Labels {
@@ -71,11 +73,17 @@ pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
             .iter()
             .flat_map(|phase| compare_phase(target, catalog, *phase))
             .collect(),
+        partial: catalog
+            .phases
+            .iter()
+            .filter(|phase| phase.shows_partial)
+            .map(|phase| phase.id)
+            .collect(),
     }
 }
 
 fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> {
-    if !catalog.phases.contains(&phase) {
+    if !catalog.phases.iter().any(|known| known.id == phase) {
         let challenge = target.challenge;
         return vec![Misfit::Phase { challenge, phase }];
     }
@@ -145,7 +153,9 @@ mod tests {
         };
         Catalog {
             at: Timestamp::UNIX_EPOCH,
-            phases: vec![1, 2],
+            phases: [(1, false), (2, true)]
+                .map(|(id, shows_partial)| Phase { id, shows_partial })
+                .into(),
             splits: vec![split(1, 10, &["A", "B"]), split(2, 11, &["A", "B", "C"])],
             codenames: [(10, codename.map(str::to_owned)), (11, None)].into(),
         }
@@ -166,6 +176,7 @@ mod tests {
         };
         let found = of(&[1, 2], &["A", "B"], Some("leaderboard"));
         assert!(found.ok() && found.problems == [unsent], "{found:?}");
+        assert_eq!(found.partial, [2]);
         for (phases, labels, codename, text) in [
             (
                 &[3][..],

@@ -118,6 +118,17 @@ impl<'de> Deserialize<'de> for Row {
 pub struct Phase {
     /// Its id.
     pub id: i64,
+    /// Its leaderboards show partial results.
+    #[serde(
+        default,
+        rename = "is_partial_submission_evaluation_enabled",
+        deserialize_with = "is_true"
+    )]
+    pub shows_partial: bool,
+}
+
+fn is_true<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error> {
+    Ok(Value::deserialize(deserializer)?.as_bool() == Some(true))
 }
 
 /// A leaderboard of a phase. The codename of its dataset split stands elsewhere.
@@ -192,6 +203,17 @@ mod tests {
             (Status::Cancelled, None, None, 0)
         );
         assert!(serde_json::from_value::<Row>(json!({"id": 7})).is_err());
+    }
+
+    #[test]
+    fn a_phase_shows_partial_results_only_where_it_says_so() {
+        let of = |phase: Value| serde_json::from_value::<Phase>(phase).unwrap().shows_partial;
+        let name = "is_partial_submission_evaluation_enabled";
+        assert!(of(json!({"id": 1, name: true, "slug": "x"})));
+        for odd in [json!(false), json!(null), json!("true"), json!(1)] {
+            assert!(!of(json!({"id": 1, name: odd})));
+        }
+        assert!(!of(json!({"id": 1})));
     }
 
     #[test]

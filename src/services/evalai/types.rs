@@ -45,6 +45,10 @@ pub struct Run {
     /// Name of the attempt's first Job, told to EvalAI with `queued`: found there again, it says that EvalAI knows of the
     /// attempt.
     pub job: String,
+    /// A person has begun it here: EvalAI has not asked for it by a message, nor by its row.
+    pub by_hand: bool,
+    /// Its Job was made.
+    pub has_job: bool,
 }
 
 /// What EvalAI is to say.

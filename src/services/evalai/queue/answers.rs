@@ -120,7 +120,7 @@ impl Queue {
                 }
                 other => {
                     let why = other.error().unwrap_or_default();
-                    sub.read_failed(why.clone(), now);
+                    sub.image_failed(why.clone(), now);
                     ImageAnswer::Unread(why)
                 }
             });

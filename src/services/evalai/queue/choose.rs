@@ -11,7 +11,7 @@ use super::poll::Challenge;
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
 use crate::services::evalai::request::{Purpose, Request, Subject};
-use crate::services::evalai::status::{Outcome, Progress};
+use crate::services::evalai::status::{Outcome, Progress, Status};
 use crate::services::evalai::types::Key;
 
 /// More submissions than these that wait for acceptance are asked for by one list.
@@ -138,7 +138,8 @@ impl Queue {
             let subs = self.subs.iter().filter_map(|(key, sub)| {
                 let by_list = ByList {
                     asked: asked.contains_key(&sub.challenge),
-                    live: list_of_live(sub).is_some_and(|list| live.contains_key(&(sub.challenge, list))),
+                    live: list_of_live(sub).is_some_and(|list| live.contains_key(&(sub.challenge, list)))
+                        || self.is_swept(sub),
                 };
                 self.offer_of(key, sub, now, may_write, by_list)
             });
@@ -153,6 +154,13 @@ impl Queue {
         });
         offers.extend(lists);
         offers
+    }
+
+    /// Whether the sweep's lists hold it, going by its last row.
+    fn is_swept(&self, sub: &Sub) -> bool {
+        let row = sub.view.row.as_ref();
+        row.is_some_and(|row| matches!(row.status, Status::Submitted | Status::Resuming))
+            && self.challenges.get(&sub.challenge).is_some_and(|c| c.sweep.is_some())
     }
 
     /// Challenges with so many waiting submissions that one list is asked for all.
@@ -188,7 +196,12 @@ impl Queue {
             return None;
         }
         let (priority, since, write, step) = self.step_of(sub, lane, now, may_write, by_list)?;
-        let pause = sub.retry_at.max(lane.hold_until);
+        let again = if step == Step::Image {
+            sub.image_at
+        } else {
+            sub.retry_at
+        };
+        let pause = again.max(lane.hold_until);
         Some(Offer {
             priority,
             since,
@@ -218,12 +231,16 @@ impl Queue {
             let alone = asked.listed || !by_list.asked;
             return alone.then_some((Priority::Acceptance, asked.since, false, Step::Get));
         }
-        if sub.wants_image() {
+        let refresh = self.refresh_of(sub, now, by_list);
+        // A file that is not there must not keep its submission from being read.
+        if sub.wants_image() && (sub.image_at <= now.at || refresh.is_none()) {
             return Some((Priority::Free, now.at, false, Step::Image));
         }
-        if write.is_some() {
-            return write;
-        }
+        write.or(refresh)
+    }
+
+    /// A live submission is read again now and then.
+    fn refresh_of(&self, sub: &Sub, now: &Now, by_list: ByList) -> Option<(Priority, Duration, bool, Step)> {
         // One that its list has missed has another status by now.
         let refresh = self.timing.refresh * if by_list.live { 2 } else { 1 };
         let due = sub.read.unwrap_or_default() + refresh;
@@ -383,10 +400,10 @@ fn back(at: Timestamp, by: SignedDuration) -> Timestamp {
 
 impl Progress {
     /// The status it leads to.
-    pub(super) fn status(self) -> crate::services::evalai::status::Status {
+    pub(super) fn status(self) -> Status {
         match self {
-            Self::Queued => crate::services::evalai::status::Status::Queued,
-            Self::Running => crate::services::evalai::status::Status::Running,
+            Self::Queued => Status::Queued,
+            Self::Running => Status::Running,
         }
     }
 }

@@ -44,7 +44,7 @@ impl Queue {
             }
             (Request::Phases(id), Reply::Phases(answer)) => {
                 self.looked(*id, answer, now, |look, phases| {
-                    look.phases = Some(phases.iter().map(|phase| phase.id).collect());
+                    look.phases = Some(phases);
                 });
             }
             (Request::Splits(id), Reply::Splits(answer)) => {
@@ -84,8 +84,12 @@ impl Queue {
                 return;
             }
             other => {
+                let is_news = !challenge.poll(purpose).is_failing();
                 challenge.poll(purpose).failed(now.at, every);
-                if matches!(other, Answer::Refused(_)) {
+                if let Answer::Refused(refusal) = other {
+                    if is_news && refusal.about == About::Challenge {
+                        challenge.look.hurry(now.at);
+                    }
                     self.listed(id, purpose, now.at);
                 }
                 return;

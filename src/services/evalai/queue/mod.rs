@@ -342,6 +342,9 @@ impl Queue {
         if run.attempt > sub.run.attempt {
             sub.begin(run.clone());
         }
+        if run.attempt == sub.run.attempt {
+            sub.run.has_job |= run.has_job;
+        }
         // An object's submission is immutable.
         (run.attempt == sub.run.attempt && pk == sub.pk).then_some(sub)
     }

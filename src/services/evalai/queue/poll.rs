@@ -9,7 +9,7 @@ use jiff::Timestamp;
 
 use crate::services::evalai::labels::Catalog;
 use crate::services::evalai::request::{Purpose, Request};
-use crate::services::evalai::row::Split;
+use crate::services::evalai::row::{Phase, Split};
 
 /// Longest wait after failures.
 const LONGEST_PAUSE: Duration = Duration::from_mins(1);
@@ -33,6 +33,11 @@ impl Poll {
             due: (requested + every).max(now + every / 4),
             failures: 0,
         };
+    }
+
+    /// Whether it went wrong last.
+    pub fn is_failing(&self) -> bool {
+        self.failures > 0
     }
 
     /// It went wrong: again later, and later each time.
@@ -84,7 +89,7 @@ pub(super) struct Look {
     pub poll: Poll,
     /// Phases whose splits are of interest.
     pub wanted: Vec<i64>,
-    pub phases: Option<Vec<i64>>,
+    pub phases: Option<Vec<Phase>>,
     pub splits: Option<Vec<Split>>,
     pub codenames: BTreeMap<i64, Option<String>>,
     /// The last whole reading.
@@ -100,6 +105,14 @@ impl Look {
     pub fn restart(&mut self) {
         (self.phases, self.splits) = (None, None);
         self.codenames.clear();
+    }
+
+    /// Starts anew at once: a list was refused as if the token's user were no host of the challenge.
+    pub fn hurry(&mut self, now: Duration) {
+        if !self.is_forbidden {
+            self.restart();
+            self.poll.due = now;
+        }
     }
 
     /// The next request of a reading; none when it is whole.

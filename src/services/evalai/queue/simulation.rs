@@ -18,6 +18,8 @@ use crate::services::token::Token;
 const SUBMISSIONS: i64 = 12;
 /// Those that their participant deletes at some time.
 const DELETED: [i64; 2] = [11, 12];
+/// Those that their participant calls finished at some times.
+const FINISHED: [i64; 3] = [8, 9, 10];
 const MINUTE_LIMIT: usize = 54;
 /// Faults, cancellations and new attempts end here; what is left must come to its end after it.
 const PEACE: Duration = Duration::from_mins(40);
@@ -65,6 +67,8 @@ enum Event {
     Pass,
     Cancel(i64),
     Delete(i64),
+    /// Its participant writes that it has finished.
+    Finish(i64),
     Lease(bool),
     Wake,
 }
@@ -97,6 +101,7 @@ struct World {
     lost: (usize, usize),
     cancels: usize,
     deleted: usize,
+    edited: usize,
     published: u32,
 }
 
@@ -179,6 +184,7 @@ impl World {
             lost: (0, 0),
             cancels: 0,
             deleted: 0,
+            edited: 0,
             published: 0,
         };
         for pk in 1..=SUBMISSIONS {
@@ -192,6 +198,12 @@ impl World {
         for pk in DELETED {
             let at = world.random(0.0, PEACE.as_secs_f64());
             world.push(at, Event::Delete(pk));
+        }
+        for pk in FINISHED {
+            for _ in 0..3 {
+                let at = world.random(0.0, PEACE.as_secs_f64());
+                world.push(at, Event::Finish(pk));
+            }
         }
         for _ in 0..5 {
             let at = world.random(0.0, PEACE.as_secs_f64());
@@ -305,6 +317,13 @@ impl World {
                 let record = self.table.get_mut(&pk).unwrap();
                 record.deleted = true;
                 self.deleted += usize::from(record.status.is_live());
+            }
+            Event::Finish(pk) => {
+                let record = self.table.get_mut(&pk).unwrap();
+                if record.status.is_live() {
+                    record.status = Status::Finished;
+                    self.edited += 1;
+                }
             }
             Event::Lease(lease) => self.lease = lease,
             Event::Wake => {}
@@ -454,6 +473,8 @@ impl World {
         let run = Run {
             attempt: actor.attempt,
             job: format!("submission-{pk}-{}", actor.attempt),
+            by_hand: true,
+            has_job: actor.began.is_some(),
         };
         let key = key(pk);
         self.queue.ask(&target, &key, pk, &run, false, now);
@@ -478,6 +499,7 @@ impl World {
             self.actors.get_mut(&pk).unwrap().began = Some(self.at);
             return;
         };
+        assert_ne!(view.ended, Some(Status::Finished), "no run is finished by others");
         let age = self.at.saturating_sub(began);
         let wish = match (view.ended, age >= actor.length) {
             (Some(_), _) => Wish::Final(Outcome::Cancelled, results(0)),
@@ -522,7 +544,8 @@ impl World {
 
 #[test]
 fn a_bad_network_breaks_no_promise() {
-    let (mut meanwhile, mut between, mut cancels, mut published, mut attempts, mut deleted) = (0, 0, 0, 0, 0, 0);
+    let (mut meanwhile, mut between, mut cancels, mut published, mut attempts) = (0, 0, 0, 0, 0);
+    let (mut deleted, mut edited) = (0, 0);
     for seed in 0..20 {
         let world = World::new(seed).run();
         let open: Vec<_> = world.actors.iter().filter(|(_, actor)| !actor.settled).collect();
@@ -531,14 +554,16 @@ fn a_bad_network_breaks_no_promise() {
         between += world.lost.1;
         cancels += world.cancels;
         deleted += world.deleted;
+        edited += world.edited;
         published += world.published;
         attempts += world.actors.values().map(|actor| actor.attempt).sum::<i64>();
     }
     println!(
-        "{attempts} attempts, {published} published; of {cancels} cancels {meanwhile} and {between} overwritten; {deleted} deleted"
+        "{attempts} attempts, {published} published; of {cancels} cancels {meanwhile} and {between} overwritten; {deleted} deleted; \
+         {edited} called finished"
     );
     // The world must be as bad as it is meant to be.
-    assert!(published > 500 && attempts > 800 && cancels > 200 && deleted > 15);
+    assert!(published > 500 && attempts > 800 && cancels > 200 && deleted > 15 && edited > 40);
     // What falls into a request, which takes up to a minute here, can't be saved; what falls between a read and its write
     // is rare.
     assert!(between * 100 < cancels && meanwhile * 5 < cancels);

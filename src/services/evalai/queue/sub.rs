@@ -9,7 +9,7 @@ use jiff::Timestamp;
 
 use super::Now;
 use super::poll::pause;
-use crate::services::evalai::guard::{self, End, Start, Verdict};
+use crate::services::evalai::guard::{self, Attempt, End, Start, Verdict};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
 use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, View};
@@ -71,6 +71,9 @@ pub(super) struct Sub {
     pub retry_at: Duration,
     /// Failed reads in a row.
     pub failures: u32,
+    /// From when on the uploaded file may be fetched again, and how often it could not be.
+    pub image_at: Duration,
+    pub image_failures: u32,
     /// Failed writes in a row: a read that goes well between two of them repairs nothing.
     pub write_failures: u32,
     pub view: View,
@@ -101,6 +104,8 @@ impl Sub {
             wrote_at: Duration::ZERO,
             retry_at: Duration::ZERO,
             failures: 0,
+            image_at: Duration::ZERO,
+            image_failures: 0,
             write_failures: 0,
             view,
         }
@@ -193,12 +198,22 @@ impl Sub {
         self.told(row, requested) || self.live_at.is_some_and(|live| requested > live)
     }
 
+    /// This attempt, as far as it had come when a read was made.
+    fn attempt(&self, row: &Row, requested: Duration) -> Attempt {
+        let since = |at: Option<Duration>| at.is_some_and(|at| requested > at);
+        Attempt {
+            number: self.run.attempt,
+            by_hand: self.run.by_hand,
+            begun: self.begun(row, requested),
+            under_way: self.run.has_job || since(self.known_at) || since(self.live_at),
+        }
+    }
+
     /// Takes a row in; `calm` if no write of ours can still change it. Returns whether anything changed that the object
     /// should know.
     pub fn take_row(&mut self, row: &Arc<Row>, requested: Duration, calm: bool, now: &Now) -> bool {
         let before = self.view.clone();
-        let begun = self.begun(row, requested);
-        let start = guard::start(row.status, self.run.attempt, begun);
+        let start = guard::start(row.status, self.attempt(row, requested));
         let outdated = requested < self.wrote_at || self.read.is_some_and(|read| requested < read);
         if outdated {
             // A cancel may since have been overwritten by one of our writes: it still was one.
@@ -295,23 +310,22 @@ impl Sub {
     pub fn progress_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         let wanted = self.progress.as_ref()?.what;
-        let (begun, told) = (self.begun(row, read), self.told(row, read));
-        Some(guard::progress(row.status, self.run.attempt, begun, told, wanted))
+        let (attempt, told) = (self.attempt(row, read), self.told(row, read));
+        Some(guard::progress(row.status, attempt, told, wanted))
     }
 
     /// What becomes of partial results; none without some, or without a row.
     pub fn partial_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         self.partial.as_ref()?;
-        Some(guard::partial(row.status, self.run.attempt, self.begun(row, read)))
+        Some(guard::partial(row.status, self.attempt(row, read)))
     }
 
     /// What becomes of the wish for an end; none without one, or without a read since.
     pub fn end_verdict(&self) -> Option<End> {
         let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
         let since = !self.outdated && read >= want.since && read >= self.wrote_at;
-        let begun = self.begun(row, read);
-        since.then(|| guard::end(row.status, self.run.attempt, begun, want.what.0))
+        since.then(|| guard::end(row.status, self.attempt(row, read), want.what.0))
     }
 
     /// Why the end is not sent although EvalAI waits for it.
@@ -358,8 +372,18 @@ impl Sub {
     pub fn read_done(&mut self) {
         self.failures = 0;
         if self.write_failures == 0 {
-            self.view.last_error = None;
+            self.view.last_error = match &self.view.image {
+                Some(ImageAnswer::Unread(why)) if self.wants_image() => Some(why.clone()),
+                _ => None,
+            };
         }
+    }
+
+    /// The uploaded file could not be fetched: the next try is later each time, whatever is read of the row meanwhile.
+    pub fn image_failed(&mut self, why: String, now: &Now) {
+        self.image_at = now.at + pause(self.image_failures);
+        self.image_failures = self.image_failures.saturating_add(1);
+        self.view.last_error = Some(why);
     }
 
     /// A write went wrong: the next try is that much later.

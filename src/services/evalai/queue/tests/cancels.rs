@@ -125,6 +125,29 @@ fn an_old_cancellation_does_not_end_a_resumed_attempt() {
 }
 
 #[test]
+fn a_cancel_before_the_first_read_of_an_attempt_that_evalai_has_asked_for_stays() {
+    for (by_hand, ended) in [(true, None), (false, Some(Status::Cancelled))] {
+        let mut bench = Bench::new();
+        let run = Run { by_hand, ..run(7, 2) };
+        let cancelled = Row {
+            jobs: vec!["submission-7-1".into()],
+            ..row(7, Status::Cancelled)
+        };
+        let now = bench.now();
+        bench.queue.ask(&target(), &key(7), 7, &run, false, now);
+        bench.get(7, cancelled.clone());
+        assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, ended));
+        bench.queue.wish(&target(), &key(7), 7, &run, Wish::Queued, now);
+        if ended.is_some() {
+            bench.expect_nothing();
+        } else {
+            bench.get(7, cancelled);
+            bench.write("queued 7");
+        }
+    }
+}
+
+#[test]
 fn a_cancellation_while_a_later_attempt_waits_ends_it() {
     let mut bench = Bench::new();
     bench.ask(7, 2);

@@ -111,6 +111,58 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
 }
 
 #[test]
+fn a_participant_who_calls_a_run_finished_neither_ends_it_nor_keeps_its_results() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.read_and_write(7, "partial");
+    bench.wait(70.0);
+    bench.list("list of cancelled", vec![]);
+    bench.get(7, row(7, Status::Finished));
+    assert_eq!(bench.view(7).ended, None);
+    bench.wish(7, 1, Wish::Partial(results(42.0)));
+    bench.get(7, row(7, Status::Finished));
+    bench.write("partial 7");
+    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(0.0)));
+    bench.get(7, row(7, Status::Finished));
+    bench.write("failed 7");
+    let failed = Outcome::Failed;
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { outcome, .. }) if outcome == failed));
+}
+
+#[test]
+fn after_a_restart_a_run_with_a_job_is_still_not_finished_by_others() {
+    let mut bench = Bench::new();
+    let run = Run {
+        has_job: true,
+        ..run(7, 1)
+    };
+    let finished = Row {
+        jobs: vec![run.job.clone()],
+        ..row(7, Status::Finished)
+    };
+    let now = bench.now();
+    bench.queue.ask(&target(), &key(7), 7, &run, false, now);
+    bench.get(7, finished.clone());
+    assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, None));
+    bench.queue.wish(&target(), &key(7), 7, &run, Wish::Running, now);
+    bench.get(7, finished);
+    bench.write("running 7");
+}
+
+#[test]
+fn an_object_that_was_made_anew_does_not_run_again_what_is_finished() {
+    let mut bench = Bench::new();
+    bench.ask(7, 1);
+    let finished = Row {
+        jobs: vec!["submission-7-1".into()],
+        ..row(7, Status::Finished)
+    };
+    bench.get(7, finished);
+    assert_eq!(bench.view(7).ended, Some(Status::Finished));
+}
+
+#[test]
 fn an_unknown_status_starts_nothing_and_ends_nothing() {
     let mut bench = Bench::new();
     bench.ask(7, 1);
@@ -260,4 +312,68 @@ fn the_file_of_a_submission_that_is_over_is_not_fetched() {
         bench.wait(60.0);
         bench.expect_nothing();
     }
+}
+
+#[test]
+fn a_submission_whose_file_is_missing_is_still_heard_of() {
+    for (status, overtaken) in [(Status::Cancelled, false), (Status::Deleted, true)] {
+        let mut bench = Bench::new();
+        let ticket = image_wanted(&mut bench, 1);
+        let gone = || Reply::Image(Answer::Refused(refusal(About::Request, 404)));
+        bench.answer(&ticket, gone());
+        bench.live(7, 1);
+        let begun = bench.at;
+        while bench.view(7).ended.is_none() {
+            bench.wait(1.0);
+            while let Some((name, ticket)) = bench.next() {
+                let reply = match ticket.request {
+                    Request::Image(..) => gone(),
+                    // Deleted, it is in no list.
+                    Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
+                    _ => Reply::Row(Answer::Done(row(7, status))),
+                };
+                bench.answer(&ticket, reply);
+                assert!(!name.starts_with("image") || bench.view(7).last_error.is_some());
+            }
+            assert!(bench.at.checked_sub(begun).unwrap() <= Duration::from_secs(66));
+        }
+        assert_eq!(
+            (bench.view(7).ended, bench.view(7).overtaken),
+            (Some(status), overtaken)
+        );
+        bench.wait(60.0);
+        bench.expect_nothing();
+    }
+}
+
+#[test]
+fn a_read_that_goes_well_does_not_hide_that_the_file_is_missing() {
+    let mut bench = Bench::new();
+    let ticket = image_wanted(&mut bench, 1);
+    bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
+    let why = bench.view(7).last_error;
+    assert!(why.is_some());
+    bench.live(7, 1);
+    let (mut files, mut reads) = (0, 0);
+    for _ in 0..300 {
+        bench.wait(1.0);
+        while let Some((_, ticket)) = bench.next() {
+            let reply = match ticket.request {
+                Request::Image(..) => {
+                    files += 1;
+                    Reply::Image(Answer::Refused(refusal(About::Request, 404)))
+                }
+                Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
+                _ => {
+                    reads += 1;
+                    let found = bench.view(7).row.unwrap();
+                    Reply::Row(Answer::Done(Row::clone(&found)))
+                }
+            };
+            bench.answer(&ticket, reply);
+            assert_eq!(bench.view(7).last_error, why);
+        }
+    }
+    assert!((3..10).contains(&files), "{files}: its pauses grow, whatever is read");
+    assert!(reads >= 4, "{reads}");
 }

@@ -217,7 +217,7 @@ fn a_leaderboard_is_checked_at_its_start_and_hourly() {
     };
     for round in 0..2 {
         let ticket = bench.expect("phases");
-        bench.answer(&ticket, Reply::Phases(Answer::Done(vec![Phase { id: 1 }])));
+        bench.answer(&ticket, Reply::Phases(Answer::Done(vec![phase(1)])));
         let ticket = bench.expect("splits");
         bench.answer(&ticket, Reply::Splits(Answer::Done(vec![split.clone()])));
         let ticket = bench.expect("dataset split");
@@ -243,6 +243,38 @@ fn a_leaderboard_is_checked_at_its_start_and_hourly() {
     let now = bench.now();
     bench.queue.retire(&key(100), now);
     bench.wait(3600.0);
+    bench.expect_nothing();
+}
+
+fn phase(id: i64) -> Phase {
+    Phase {
+        id,
+        shows_partial: false,
+    }
+}
+
+#[test]
+fn a_list_that_is_refused_for_the_challenge_has_the_challenge_checked_at_once() {
+    let mut bench = Bench::new();
+    bench.serve();
+    bench.list("sweep of submitted", vec![]);
+    bench.list("sweep of resuming", vec![]);
+    let ticket = bench.expect("phases");
+    bench.answer(&ticket, Reply::Phases(Answer::Done(vec![phase(1)])));
+    let ticket = bench.expect("splits");
+    bench.answer(&ticket, Reply::Splits(Answer::Done(vec![])));
+    bench.wait(60.0);
+    let forbidden = || refusal(About::Challenge, 401);
+    let ticket = bench.expect("sweep of submitted");
+    bench.answer(&ticket, Reply::Rows(Answer::Refused(forbidden())));
+    let ticket = bench.expect("sweep of resuming");
+    bench.answer(&ticket, Reply::Rows(Answer::Refused(forbidden())));
+    bench.queue.take_changes();
+    let ticket = bench.expect("phases");
+    bench.answer(&ticket, Reply::Phases(Answer::Refused(forbidden())));
+    assert!(bench.queue.challenge_refused(&key(100)).is_some());
+    assert_eq!(bench.queue.take_changes(), [Changed::Leaderboard(key(100))].into());
+    // From now on it is checked each minute anyway.
     bench.expect_nothing();
 }
 
