@@ -118,7 +118,7 @@ fn not_ready(draft: &Draft<'_>) -> Option<String> {
     let blocks = [reasons::INVALID_POD, reasons::PREFIX_CONFLICT].contains(&ready.reason.as_str());
     blocks.then(|| {
         format!(
-            "Leaderboard {} is not ready ({}): {} Mend it, and the submission goes on.",
+            "Leaderboard {} is not ready ({}): {} Fix it, and the submission goes on.",
             draft.spec().leaderboard,
             ready.reason,
             sentence(&ready.message)
@@ -149,7 +149,7 @@ fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
         let problem = info.and_then(|i| i.image_problem.as_deref());
         return problem.map_or(Image::Unknown, |why| Image::Invalid {
             image: String::new(),
-            what: sentence(&format!("The submission names no image: {why}")),
+            what: sentence(&format!("The submission names no usable image: {why}")),
         });
     };
     match ImageReference::parse(&image) {

@@ -167,7 +167,9 @@ pub fn image(file: &[u8]) -> Result<String, String> {
         .trim();
     match ImageReference::parse(image) {
         Ok(_) => Ok(image.to_owned()),
-        Err(why) => Err(format!("submitted_image_uri in the uploaded file is no image: {why}")),
+        Err(why) => Err(format!(
+            "submitted_image_uri in the uploaded file is not a valid image reference: {why}"
+        )),
     }
 }
 
@@ -241,9 +243,18 @@ mod tests {
         for (value, part) in [
             (json!({}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": 1}), "no submitted_image_uri"),
-            (json!({"submitted_image_uri": "two words"}), "no image"),
-            (json!({"submitted_image_uri": ""}), "no image: it is empty"),
-            (json!({"submitted_image_uri": "  "}), "no image: it is empty"),
+            (
+                json!({"submitted_image_uri": "two words"}),
+                "not a valid image reference",
+            ),
+            (
+                json!({"submitted_image_uri": ""}),
+                "not a valid image reference: it is empty",
+            ),
+            (
+                json!({"submitted_image_uri": "  "}),
+                "not a valid image reference: it is empty",
+            ),
             (json!({"submitted_image_uri": null}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": {"a": 1}}), "no submitted_image_uri"),
             (json!({"submitted_image_uri": "x".repeat(513)}), "512 characters"),

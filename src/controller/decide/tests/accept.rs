@@ -164,7 +164,7 @@ fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
         plan.status
             .message
             .unwrap()
-            .contains("(InvalidPod): spec.pod: no. Mend it")
+            .contains("(InvalidPod): spec.pod: no. Fix it")
     );
 
     let mut world = World::local();

@@ -73,7 +73,8 @@ impl Default for Timing {
             fresh: Duration::from_secs(1),
             accept: Duration::from_secs(5),
             lost: Duration::from_mins(2),
-            refresh: Duration::from_mins(1),
+            // What is deleted is to be ended there within a minute, and its Pod takes some seconds to stop.
+            refresh: Duration::from_secs(40),
             check: Duration::from_hours(1),
         }
     }

@@ -283,6 +283,8 @@ fn lists_keep_their_period_however_slow_they_are() {
     let mut bench = Bench::new();
     bench.running(7);
     bench.wait(10.0);
+    // Its own reads are another test's.
+    bench.queue.timing.refresh = Duration::from_hours(1);
     for _ in 0..5 {
         let ticket = bench.expect("list of cancelled");
         bench.wait(3.0);
@@ -293,7 +295,6 @@ fn lists_keep_their_period_however_slow_they_are() {
     }
     // A server that needs longer than that is never asked twice at the same time, and is given a rest.
     let ticket = bench.expect("list of cancelled");
-    bench.get(7, row(7, Status::Running));
     bench.wait(25.0);
     bench.expect_nothing();
     bench.answer(&ticket, Reply::Rows(Answer::Done(vec![])));
@@ -379,7 +380,7 @@ fn longest_gaps(live: i64) -> (Duration, Duration) {
 fn each_live_submission_is_read_each_minute_however_many_there_are() {
     for live in [1, 10, 40, 300] {
         let (unread, unlisted) = longest_gaps(live);
-        assert!(unread <= Duration::from_secs(65), "{live}: {unread:?} without a read");
+        assert!(unread <= Duration::from_secs(45), "{live}: {unread:?} without a read");
         assert!(
             unlisted < Duration::from_secs(16),
             "{live}: {unlisted:?} without a list"
@@ -411,5 +412,5 @@ fn what_a_list_of_live_submissions_has_missed_is_read_alone() {
             bench.answer(&ticket, reply);
         }
     }
-    assert!((5..=6).contains(&seven), "{seven} reads of its own in ten minutes");
+    assert!((7..=8).contains(&seven), "{seven} reads of its own in ten minutes");
 }
