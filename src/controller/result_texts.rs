@@ -170,6 +170,11 @@ pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<
         end_time: text(status.times.finished.as_ref()),
         results: status.results.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
+        rerun_as: status
+            .rerun_as
+            .as_ref()
+            .map(|r| r.submission_name.clone())
+            .unwrap_or_default(),
         metrics: columns(report.filter(|_| is_finished(status)), plan.results),
     })
 }

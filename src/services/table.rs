@@ -34,6 +34,10 @@ const ENDS: [&str; 3] = ["FINISHED", "FAILED", "CANCELLED"];
 /// A row is written only over an older attempt, or over the same one before its end.
 const CONDITION: &str = "attribute_not_exists(#attempt) OR #attempt < :attempt \
      OR (#attempt = :attempt AND NOT (#status IN (:end0, :end1, :end2)))";
+/// Column with the Submission of a re-run, which comes after the end.
+const RERUN: &str = "rerun_as";
+/// A row that names a re-run is also written over the end that it had before.
+const OR_RERUN: &str = " OR (#attempt = :attempt AND #status = :status AND attribute_not_exists(#rerun))";
 
 /// One row, all columns as text. An empty text is unknown: its column stays as it is.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -64,6 +68,8 @@ pub struct Row {
     pub results: String,
     /// `12/20`.
     pub progress: String,
+    /// Name of the Submission that a host made of it by a re-run in EvalAI.
+    pub rerun_as: String,
     /// Metric columns and their values; none removes the column: only a finished submission has metrics.
     pub metrics: Vec<(String, Option<String>)>,
 }
@@ -82,6 +88,7 @@ impl Row {
             ("end_time", &self.end_time),
             ("results", &self.results),
             ("progress", &self.progress),
+            (RERUN, &self.rerun_as),
         ];
         let metrics = self
             .metrics
@@ -93,6 +100,12 @@ impl Row {
             .filter(|(column, value)| *value != Some("") && *column != ATTEMPT)
             .collect()
     }
+}
+
+/// What must hold of the row that is there.
+fn condition(row: &Row) -> String {
+    let or_rerun = if row.rerun_as.is_empty() { "" } else { OR_RERUN };
+    format!("{CONDITION}{or_rerun}")
 }
 
 /// Columns and their values; those without one are removed.
@@ -225,7 +238,7 @@ impl Table {
                 self.key_value(&self.partition, &row.team_id, "team")?,
             )
             .key(&self.sort.name, self.key_value(&self.sort, &row.run_id, "submission")?)
-            .condition_expression(CONDITION)
+            .condition_expression(condition(row))
             .expression_attribute_names("#attempt", ATTEMPT)
             .expression_attribute_names("#status", STATUS)
             .expression_attribute_values(":attempt", AttributeValue::N(row.attempt.to_string()))
@@ -237,10 +250,10 @@ impl Table {
         let (mut set, mut remove) = (vec!["#attempt = :attempt".to_owned()], Vec::new());
         for (index, (column, value)) in columns.iter().enumerate() {
             // A name may have one placeholder only, and the status has one already.
-            let name = if *column == STATUS {
-                "#status".to_owned()
-            } else {
-                format!("#c{index}")
+            let name = match *column {
+                STATUS => "#status".to_owned(),
+                RERUN => "#rerun".to_owned(),
+                _ => format!("#c{index}"),
             };
             request = request.expression_attribute_names(&name, *column);
             if let Some(value) = value {
@@ -249,6 +262,10 @@ impl Table {
             } else {
                 remove.push(name);
             }
+        }
+        if !row.rerun_as.is_empty() {
+            let status = AttributeValue::S(row.submission_status.clone());
+            request = request.expression_attribute_values(":status", status);
         }
         let mut update = format!("SET {}", set.join(", "));
         if !remove.is_empty() {

@@ -359,7 +359,7 @@ async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() 
     assert_eq!(status.state, Some(State::Failed), "its result stays");
     let message = status.message.unwrap();
     let told = format!(
-        "A host re-ran this submission in EvalAI as {rerun}; EvalAI cancelled this one's result. Its state, score and table row stay."
+        "A host re-ran this submission in EvalAI as {rerun}; EvalAI cancelled this one's result. Its state and score stay, in the table too."
     );
     assert!(
         message.starts_with("Agent 1 crashed") && message.ends_with(&told),

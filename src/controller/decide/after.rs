@@ -139,7 +139,7 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
         return is_old;
     }
     let message = format!(
-        "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state, score and table row stay.",
+        "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state and score stay, in the table too.",
         rerun.submission_name
     );
     let ended = draft.status.message.take().unwrap_or_default();
@@ -150,7 +150,17 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
     }
     draft.event(false, reasons::RERUN_IN_EVALAI, message);
     draft.status.rerun_as = Some(rerun);
-    false
+    record_again(draft)
+}
+
+/// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
+fn record_again(draft: &mut Draft<'_>) -> bool {
+    let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
+    if is_recorded {
+        draft.act(Action::Record { end: true });
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    }
+    is_recorded
 }
 
 /// Whether what was read may be from before a re-run that EvalAI dates so. A time that is still to come was not written by EvalAI.

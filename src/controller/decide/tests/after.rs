@@ -279,7 +279,7 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
 
         says(&mut world, "cancelled");
         let plan = world.pass();
-        let text = "A host re-ran this submission in EvalAI as submission-99; EvalAI cancelled this one's result. Its state, score and table row stay.";
+        let text = "A host re-ran this submission in EvalAI as submission-99; EvalAI cancelled this one's result. Its state and score stay, in the table too.";
         assert_eq!(plan.status.rerun_as, Some(rerun));
         assert_eq!(
             (plan.status.state, plan.status.score.clone(), plan.status.reason.clone()),
@@ -289,15 +289,21 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
         let published = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
         assert_eq!((published.status.as_str(), published.message.as_str()), ("True", text));
         assert_eq!(events(&plan), [reasons::RERUN_IN_EVALAI]);
-        assert_eq!(plan.actions, [Action::ForgetEvalai]);
+        assert_eq!(plan.actions, [Action::Record { end: true }], "the row names it too");
+        assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
 
+        world.view.record.as_mut().unwrap().end_written = false;
+        let waits = world.pass();
+        assert_eq!(waits.actions, [Action::Record { end: true }], "until it is written");
+        world.recorded();
         world.view.evalai = None;
         let again = world.pass();
         assert_eq!(
             (again.actions.as_slice(), again.events.len()),
             ([Action::ForgetEvalai].as_slice(), 0)
         );
-        assert_eq!(again.status, plan.status, "it is said once");
+        assert_eq!(condition(&again, RECORDED).0, "True");
+        assert_eq!(again.status.message, plan.status.message, "it is said once");
     }
 }
 
