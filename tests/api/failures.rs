@@ -365,7 +365,7 @@ async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() 
         message.starts_with("Agent 1 crashed") && message.ends_with(&told),
         "{message}"
     );
-    assert!(world.shown(&name).await.contains("re-run as"));
+    assert!(world.shown(&name).await.contains("re-ran this submission in EvalAI as"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

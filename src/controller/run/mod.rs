@@ -4,12 +4,12 @@
 //! that has lost one of its tasks: the kubelet starts it again with empty hands.
 
 mod counts;
+mod events;
 mod marks;
 mod needs;
 mod passes;
 mod sweep;
 
-use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -28,7 +28,6 @@ use tokio::time::Instant;
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
 use super::leaderboards::isolation;
-use super::observe::board::Places;
 use super::observe::children_selector;
 use super::sync::Sync;
 use super::watches::preflight::{self, await_kinds, watch_access};
@@ -40,7 +39,6 @@ use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::table::Recorder;
-use marks::{Fingerprints, standing};
 
 /// Passes in hand may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -170,68 +168,18 @@ impl Watches {
 
     /// Tells everything that is there now, then everything that is touched.
     fn feed(&self, touched: &mpsc::UnboundedSender<Touched>, context: &Arc<Context>, tasks: &Tasks) {
-        let mut boards = Fingerprints::default();
-        forward(
-            tasks,
-            self.leaderboards.subscribe(),
-            touched,
-            move |touch: Touch<Leaderboard>| {
-                let object = touch.object.as_ref();
-                if touch.is_gone {
-                    return vec![Touched::Gone(boards.drop(object))];
-                }
-                let moved = boards.moved(object, "");
-                moved
-                    .by_others
-                    .then(|| Touched::Leaderboard(ObjectRef::from_obj(object)))
-                    .into_iter()
-                    .collect()
-            },
-        );
-        let (mut submissions, mut places) = (Fingerprints::default(), Places::default());
-        let (policies_of, context) = (Arc::clone(context), Arc::clone(context));
-        forward(
-            tasks,
-            self.submissions.subscribe(),
-            touched,
-            move |touch: Touch<Submission>| {
-                let object = touch.object.as_ref();
-                let namespace = object.namespace().unwrap_or_default();
-                let board = ObjectRef::new(&object.spec.leaderboard).within(&namespace);
-                // Before anybody is woken by it.
-                if places.moved(object, touch.is_gone) {
-                    context.board.moved(&namespace, &object.spec.leaderboard);
-                }
-                let original = context.reruns.moved(object, touch.is_gone);
-                if touch.is_gone {
-                    return vec![Touched::Gone(submissions.drop(object)), Touched::Leaderboard(board)];
-                }
-                let moved = submissions.moved(object, &standing(object));
-                let own = moved
-                    .by_others
-                    .then(|| Touched::Submission(ObjectRef::from_obj(object)));
-                own.into_iter()
-                    .chain(moved.in_line.then_some(Touched::Leaderboard(board)))
-                    .chain(original.map(Touched::Submission))
-                    .collect()
-            },
-        );
+        forward(tasks, self.leaderboards.subscribe(), touched, events::of_leaderboards());
+        let of_submissions = events::of_submissions(Arc::clone(context));
+        forward(tasks, self.submissions.subscribe(), touched, of_submissions);
         forward(tasks, self.jobs.subscribe(), touched, |touch: Touch<Job>| {
             owner(touch.object.as_ref())
         });
-        let mut measured = HashSet::new();
-        forward(tasks, self.pods.subscribe(), touched, move |touch: Touch<Pod>| {
-            let pod = touch.object.as_ref();
-            let uid = pod.uid().unwrap_or_default();
-            let mut concerned = owner(pod);
-            if touch.is_gone {
-                measured.remove(&uid);
-            } else if isolation::finding(pod).is_some() && measured.insert(uid) {
-                concerned.extend(board(pod));
-            }
-            concerned
-        });
-        let restored = isolation::restore(self.policies.subscribe(), self.leaderboards.subscribe(), policies_of);
+        forward(tasks, self.pods.subscribe(), touched, events::of_pods());
+        let restored = isolation::restore(
+            self.policies.subscribe(),
+            self.leaderboards.subscribe(),
+            Arc::clone(context),
+        );
         tasks.stay("policies", restored);
         forward(
             tasks,
