@@ -19,7 +19,10 @@ const BUDGET: usize = 54;
 async fn a_message_becomes_the_same_score_in_all_four_places() {
     scenario("message", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        evalai.handle.state().seed.challenges[0].phases[0].is_partial_submission_evaluation_enabled = true;
+        let first_phase_shows_partials = |state: &mut evalai_stand_in::State| {
+            state.seed.challenges[0].phases[0].is_partial_submission_evaluation_enabled = true;
+        };
+        evalai.handle.with_state(first_phase_shows_partials);
         // A run that is over at once would be finished before its turn comes to say that it runs.
         let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "2000"}]}});
         scene.evalai_leaderboard("lb", &evalai, change).await;
