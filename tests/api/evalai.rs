@@ -212,6 +212,16 @@ impl World {
             .filter(|entry| entry.method == method)
             .collect()
     }
+
+    /// Waits until EvalAI refuses the Leaderboard's token, and hands back what it says.
+    async fn token_refused(&mut self) -> String {
+        loop {
+            if let Some(why) = self.hub.token_refused(&leaderboard()) {
+                return why;
+            }
+            self.changed.recv().await.unwrap();
+        }
+    }
 }
 
 fn key(pk: i64) -> Key {
@@ -479,12 +489,7 @@ async fn a_token_whose_user_is_no_host_is_named_and_one_submission_condemns_none
     let good = world.target.clone();
     world.target = target(&world.server.url(), "local-team-a-token");
     world.hub.serve(&leaderboard(), &world.target).unwrap();
-    let why = loop {
-        if let Some(why) = world.hub.token_refused(&leaderboard()) {
-            break why;
-        }
-        world.changed.recv().await.unwrap();
-    };
+    let why = world.token_refused().await;
     assert!(
         why.contains("no host of this challenge") && why.contains("evalai.token"),
         "{why}"
@@ -509,12 +514,7 @@ async fn a_refused_token_is_told_and_a_new_one_taken() {
     let good = world.target.clone();
     world.target = target(&world.server.url(), "local-host-access-token");
     world.hub.serve(&leaderboard(), &world.target).unwrap();
-    let why = loop {
-        if let Some(why) = world.hub.token_refused(&leaderboard()) {
-            break why;
-        }
-        world.changed.recv().await.unwrap();
-    };
+    let why = world.token_refused().await;
     assert!(
         why.contains("Token has wrong type") && why.contains("refresh token of a host"),
         "{why}"

@@ -87,20 +87,17 @@ fn wait_for_policy(draft: &mut Draft<'_>, missing: &Missing) -> bool {
 /// What is said of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
 /// and counts what was deleted before its end as being processed until it is ended.
 fn ended_in_evalai(status: &str) -> String {
-    let (done, next) = match status {
-        "failed" => ("nothing is reported", "Resume it there if it is to run."),
-        "deleted" => (
-            "`cancelled` is written there",
-            "EvalAI takes up nothing that was deleted; the participant can submit again.",
-        ),
-        "ignored" | "missing" => (
-            "nothing is reported",
-            "EvalAI takes up nothing that was deleted; the participant can submit again.",
-        ),
-        _ => (
-            "nothing is reported",
-            "EvalAI resumes only what has failed; re-run it there if it is to run.",
-        ),
+    let done = if status == "deleted" {
+        "`cancelled` is written there"
+    } else {
+        "nothing is reported"
+    };
+    let next = match status {
+        "failed" => "Resume it there if it is to run.",
+        "deleted" | "ignored" | "missing" => {
+            "EvalAI takes up nothing that was deleted; the participant can submit again."
+        }
+        _ => "EvalAI resumes only what has failed; re-run it there if it is to run.",
     };
     format!("EvalAI says {status}: nothing is run and {done}. {next}")
 }
