@@ -246,6 +246,11 @@ fn is_refusal(code: u16) -> bool {
 /// What was measured last of this generation: by a Pod that is there, else by one that is gone, as the condition says; while the
 /// condition says something else, as this process remembers it.
 pub(super) fn measured(context: &Context, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
+    let network = &leaderboard.spec.network;
+    if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
+        // The condition does not show it, and each reconcile would look at all Pods.
+        return None;
+    }
     let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation);
     let remembered = || {
         let (of, verdict) = context.desk.measured(&uid)?;
