@@ -7,14 +7,14 @@ use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomRe
 use kube::CustomResourceExt;
 use serde_json::Value;
 
-use crate::api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission};
 
-const HEADER: &str = "# Generated from src/api by `make crds`.\n";
+const HEADER: &str = "# Generated from crates/api by `make crds`.\n";
 
 /// Why the definitions could not be printed or written.
 #[derive(thiserror::Error, Debug)]
 pub enum CrdError {
-    /// A definition that is not JSON, or not a definition any more; a mistake in `src/api`.
+    /// A definition that is not JSON, or not a definition any more; a mistake in `crates/api`.
     #[error("the definition of {kind} cannot be built: {source}")]
     Build {
         /// Kind of the definition.
@@ -22,7 +22,7 @@ pub enum CrdError {
         /// What serde says.
         source: serde_json::Error,
     },
-    /// A definition that is not YAML; a mistake in `src/api`.
+    /// A definition that is not YAML; a mistake in `crates/api`.
     #[error("the definition of {kind} cannot be printed: {source}")]
     Print {
         /// Kind of the definition.
@@ -147,7 +147,7 @@ mod tests {
             let differs = committed.lines().zip(generated.lines()).position(|(a, b)| a != b);
             assert!(
                 committed == generated,
-                "crds/{} differs from src/api at line {}; run `make crds` and commit the result",
+                "crds/{} differs from crates/api at line {}; run `make crds` and commit the result",
                 definition.file,
                 differs.map_or(committed.lines().count().min(generated.lines().count()), |at| at) + 1
             );

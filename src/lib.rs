@@ -2,13 +2,10 @@
 //!
 //! The rooms and who may know what are drawn in docs/architecture.md.
 
-pub mod api;
 pub mod bridge;
 pub mod cli;
 pub mod controller;
 pub mod crds;
 pub mod observability;
-pub mod plugin;
 pub mod pod;
 pub mod services;
-mod text;

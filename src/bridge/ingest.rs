@@ -12,9 +12,9 @@ use kube::api::{ObjectMeta, Patch, PatchParams, PostParams};
 use serde_json::{Value, json};
 use thiserror::Error;
 
-use crate::api::ingested::SWEEP;
-use crate::api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
 use crate::services::evalai::Swept;
+use leaderboard_api::ingested::SWEEP;
+use leaderboard_api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 pub const SWEEP_AGE_MS: i64 = 120_000;

@@ -4,7 +4,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use serde_json::Value;
 
 use super::*;
-use crate::api::SubmissionStatus;
+use leaderboard_api::SubmissionStatus;
 
 const BOARD: &str = "leaderboard-20";
 

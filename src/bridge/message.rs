@@ -5,7 +5,7 @@
 use serde_json::{Map, Value};
 use thiserror::Error;
 
-use crate::api::image;
+use leaderboard_api::image;
 
 /// A message that names a submission of EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]

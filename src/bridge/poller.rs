@@ -19,7 +19,7 @@ use super::queue::{QueueError, Reader, Received, batch_size};
 use super::route::{self, DeadReason, Envelope, Fate, Rules};
 use super::world::{self, World};
 use super::{PULSE_LIMIT, Shared};
-use crate::api::{Leaderboard, names, reasons};
+use leaderboard_api::{Leaderboard, names, reasons};
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);

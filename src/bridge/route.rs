@@ -8,7 +8,7 @@ use kube::ResourceExt;
 
 use super::ingest::{IngestError, Outcome};
 use super::message::{Malformed, Message};
-use crate::api::{Foreign, Leaderboard, Queue};
+use leaderboard_api::{Foreign, Leaderboard, Queue};
 
 /// First wait of a message that can't be used yet, in seconds; it doubles with each receive.
 const FIRST_WAIT: i32 = 30;

@@ -14,7 +14,7 @@ use kube::{Api, Client};
 use tokio::sync::watch;
 
 use super::{Health, Observer};
-use crate::api::Leaderboard;
+use leaderboard_api::Leaderboard;
 
 /// Namespace and name.
 type Key = (String, String);

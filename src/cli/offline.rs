@@ -8,8 +8,8 @@ use std::process::ExitCode;
 use clap::{Args, ValueEnum};
 use leaderboard_results::{Files, Format, Plan, Refusal, Verify, offline};
 
-use crate::api::effective;
 use crate::crds;
+use leaderboard_api::effective;
 
 /// Exit code of a refusal: nothing that had been good is overwritten.
 const REFUSED: u8 = 2;

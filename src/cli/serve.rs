@@ -12,13 +12,14 @@ use crate::controller::context::Settings;
 use crate::controller::leader::{self, Identity};
 use crate::controller::run::{self, Clients};
 use crate::controller::watches::watch_client;
+use crate::observability::Observability;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
 use crate::observability::shutdown::on_signals;
-use crate::observability::{Observability, text};
 use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
+use leaderboard_api::client_errors as text;
 
 /// The commit that was built, where the build was given one.
 const REVISION: Option<&str> = option_env!("LEADERBOARD_REVISION");

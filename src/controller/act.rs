@@ -21,9 +21,9 @@ use super::job_spec::{self, JobInput};
 use super::observe::{is_pod_of, uid_of};
 use super::significance::{Change, change, patience};
 use super::view::View;
-use crate::api::{State, Submission, SubmissionStatus, names};
-use crate::observability::text;
 use crate::pod::report::OWNER_KEY;
+use leaderboard_api::client_errors;
+use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
 /// What a pass could not carry out.
 #[derive(thiserror::Error, Debug)]

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use super::*;
-use crate::api::Progress;
 use crate::controller::decide::Plan;
 use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
 use crate::controller::observe::observe;
 use crate::observability::logging::tests::Lines;
+use leaderboard_api::Progress;
 
 #[tokio::test(start_paused = true)]
 async fn each_transition_is_one_line_with_all_that_identifies_it() {

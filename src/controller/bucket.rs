@@ -13,9 +13,9 @@ use std::time::Duration;
 use futures::FutureExt;
 use tokio::time::Instant;
 
-use crate::api::Storage;
 use crate::services::archive::ArchiveError;
 use breaker::{Breaker, Change, Permit};
+use leaderboard_api::Storage;
 
 /// A failure without an answer that took so long is a silence, too: the client gives up by itself once its connections have not
 /// come about.

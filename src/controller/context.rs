@@ -24,9 +24,9 @@ use super::observe::{is_pod_of, uid_of};
 use super::reruns::Reruns;
 use super::sync::Sync;
 use super::watches::Synced;
-use crate::api::{Leaderboard, Storage, Submission};
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
+use leaderboard_api::{Leaderboard, Storage, Submission};
 
 /// Time any one call to the API server may take.
 pub const CALL_TIMEOUT: Duration = Duration::from_secs(20);
@@ -62,13 +62,13 @@ impl Stores {
 
     /// The Submission that a child belongs to.
     pub fn owner_of(child: &impl ResourceExt) -> Option<ObjectRef<Submission>> {
-        let name = child.labels().get(crate::api::names::LABEL_SUBMISSION)?;
+        let name = child.labels().get(leaderboard_api::names::LABEL_SUBMISSION)?;
         Some(ObjectRef::new(name).within(&child.namespace()?))
     }
 
     /// The Leaderboard that a Pod or a policy belongs to.
     pub fn leaderboard_of(child: &impl ResourceExt) -> Option<ObjectRef<Leaderboard>> {
-        let name = child.labels().get(crate::api::names::LABEL_LEADERBOARD)?;
+        let name = child.labels().get(leaderboard_api::names::LABEL_LEADERBOARD)?;
         Some(ObjectRef::new(name).within(&child.namespace()?))
     }
 }
@@ -153,7 +153,7 @@ impl Context {
         let shared = archives
             .entry(bucket::id(storage))
             .or_insert_with(|| Archive::of_run(&self.aws, storage, run_id));
-        shared.at_prefix(crate::api::effective::key_prefix(storage, run_id))
+        shared.at_prefix(leaderboard_api::effective::key_prefix(storage, run_id))
     }
 
     /// Half the period of a submission's Leaderboard, in seconds.

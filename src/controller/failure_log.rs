@@ -18,9 +18,9 @@ use super::context::Context;
 use super::decide::{LogAt, LogPlace};
 use super::observe::uid_of;
 use super::view::View;
-use crate::api::SubmissionStatus;
-use crate::observability::text;
-use crate::pod::report::FAILURE_LOG_KEY;
+use leaderboard_api::SubmissionStatus;
+use leaderboard_api::client_errors;
+use leaderboard_api::names::FAILURE_LOG_KEY;
 
 /// Characters that are kept, as EvalAI's own worker does.
 const TAIL_CHARS: usize = 10_000;

@@ -24,13 +24,13 @@ use tower_test::mock::{Handle, pair};
 use super::context::{Context, Settings, Stores};
 use super::sync::Sync;
 use super::watches::Synced;
-use crate::api::{Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options, Timeouts, Timing};
 use crate::services::meter::Meter;
 use crate::services::table::Recorder;
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";

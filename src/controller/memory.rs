@@ -10,7 +10,7 @@ use kube::ResourceExt;
 use tokio::time::Instant;
 
 use super::observe::uid_of;
-use crate::api::{Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Submission, SubmissionStatus, reasons};
 
 /// Places in line that are written without waiting for their turn.
 const FIRST_PLACES: i32 = 20;

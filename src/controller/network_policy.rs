@@ -13,8 +13,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{LabelSelector, ObjectMeta, 
 use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
 use kube::Resource;
 
-use crate::api::ranges::{self, Range};
-use crate::api::{Egress, Leaderboard, names};
+use leaderboard_api::ranges::{self, Range};
+use leaderboard_api::{Egress, Leaderboard, names};
 
 /// Where NodeLocal DNSCache answers.
 const NODE_LOCAL_DNS: &str = "169.254.20.10/32";

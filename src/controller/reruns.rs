@@ -11,8 +11,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
-use crate::api::{Rerun, Submission};
 use crate::services::evalai::row::Row;
+use leaderboard_api::{Rerun, Submission};
 
 /// The newest Submission that a row is a re-run of; `known` looks a Submission of the same namespace up by its name. A
 /// participant can edit the row, so only a Submission of the same Leaderboard, phase and team is taken.

@@ -13,11 +13,11 @@ use super::context::Context;
 use super::failure_log::Tail;
 use super::sync::END_WAITS;
 use super::view::View;
-use crate::api::{FailureClass, LogTail, ResultsFormat, State, SubmissionStatus};
 use crate::pod::report::Report;
 use crate::pod::upload::hex;
 use crate::services::evalai::Payload;
 use crate::services::table::Row;
+use leaderboard_api::{FailureClass, LogTail, ResultsFormat, State, SubmissionStatus};
 
 /// Largest text that is passed on to EvalAI, in bytes.
 const MAX_TEXT: u64 = 16 << 20;

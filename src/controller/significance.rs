@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use crate::api::{LeaderboardSpec, SubmissionStatus};
+use leaderboard_api::{LeaderboardSpec, SubmissionStatus};
 
 /// Longest wait of progress.
 const LONGEST: Duration = Duration::from_secs(30);
@@ -75,7 +75,7 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::api::{PairStatus, Progress, State};
+    use leaderboard_api::{PairStatus, Progress, State};
 
     fn running(done: i32) -> SubmissionStatus {
         SubmissionStatus {
@@ -100,7 +100,7 @@ mod tests {
     #[test]
     fn a_step_forward_is_a_place_and_the_first_place_is_not() {
         let waiting = |position| SubmissionStatus {
-            waiting: Some(crate::api::Waiting { position, eta: None }),
+            waiting: Some(leaderboard_api::Waiting { position, eta: None }),
             ..SubmissionStatus::default()
         };
         assert_eq!(change(&waiting(3), &waiting(2)), Change::Place);

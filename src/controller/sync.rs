@@ -14,10 +14,10 @@ use super::observe::{report, uid_of};
 use super::reruns;
 use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
-use crate::api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
 use crate::services::ObjectKey;
 use crate::services::evalai::{self, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Target, Wish};
 use crate::services::table::Recorder;
+use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
 
 /// How long an end waits to be told for a result that cannot be read: as long as the end itself.
 pub(super) const END_WAITS: SignedDuration = SignedDuration::from_hours(24);

@@ -11,9 +11,9 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use super::*;
-use crate::api::State;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::view::{JobSight, NodeSight, Turn};
+use leaderboard_api::State;
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use jiff::Timestamp;
 
-use crate::api::{Leaderboard, Rerun, Submission};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
+use leaderboard_api::{Leaderboard, Rerun, Submission};
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]

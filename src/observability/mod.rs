@@ -10,7 +10,6 @@ pub mod metrics;
 pub mod readiness;
 pub mod shutdown;
 pub mod tasks;
-pub mod text;
 
 use std::sync::Arc;
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
 
 use super::run::{Run, STATUS_FOLDER};
-use crate::api::{ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_api::{ResultsFormat, RunPlan, Storage, Verify};
 
 /// Two pairs of two routes each, once.
 pub(crate) fn run() -> Run {

@@ -16,7 +16,7 @@ use super::report::{ReportPair, StoredFile};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Stamp, Tree, TreeError};
 use super::upload::hex;
-use crate::api::{ResultsFormat, Verify, effective};
+use leaderboard_api::{ResultsFormat, Verify, effective};
 
 /// Largest checkpoint that is read, in bytes.
 const CHECKPOINT_LIMIT: u64 = 64 << 20;

@@ -11,8 +11,8 @@ use aws_credential_types::provider::{ProvideCredentials, SharedCredentialsProvid
 
 use super::places::Setting;
 use super::run::Run;
-use crate::api::effective::key_prefix;
 use crate::services::aws::Aws;
+use leaderboard_api::effective::key_prefix;
 
 /// The way to AWS for this Pod.
 pub async fn aws(setting: &Setting) -> Aws {
@@ -143,7 +143,7 @@ mod tests {
     #[test]
     fn a_log_group_adds_this_runs_streams() {
         let mut run = fixtures::run();
-        run.log_group = Some(crate::api::LogGroup {
+        run.log_group = Some(leaderboard_api::LogGroup {
             name: "leaderboard-20".to_owned(),
             region: None,
             endpoint: None,

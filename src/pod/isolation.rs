@@ -16,7 +16,7 @@ use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use super::run::Isolation;
-use crate::api::ranges;
+use leaderboard_api::ranges;
 
 /// Time that one connection may take.
 const TRY: Duration = Duration::from_secs(1);
@@ -188,7 +188,7 @@ mod tests {
     use tokio::net::{TcpListener, TcpSocket};
 
     use super::*;
-    use crate::api::Enforcement;
+    use leaderboard_api::Enforcement;
 
     const WITHIN: Duration = Duration::from_mins(1);
 

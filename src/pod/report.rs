@@ -10,8 +10,6 @@ use serde::{Deserialize, Serialize};
 pub const REPORT_KEY: &str = "logcopy/report.json";
 /// Key of the file that names the Pod whose writes count.
 pub const OWNER_KEY: &str = "logcopy/owner";
-/// Key of the log that explains a failure. Of this prefix it is the one text that the controller writes.
-pub const FAILURE_LOG_KEY: &str = "evalai/environment_log.txt";
 /// Largest report that is read or written, in bytes.
 pub const MAX_BYTES: usize = 1 << 20;
 /// Version of the document.

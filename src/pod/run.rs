@@ -5,7 +5,7 @@
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 
-use crate::api::{Enforcement, LogGroup, RunPlan, Verify};
+use leaderboard_api::{Enforcement, LogGroup, RunPlan, Verify};
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";

@@ -20,11 +20,12 @@ use super::gather::results_plan;
 use super::identity;
 use super::isolation::{self, Finding};
 use super::places::{Places, Setting};
-use super::report::{FAILURE_LOG_KEY, MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
+use super::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Tree, TreeError};
-use crate::api::Enforcement;
 use crate::services::archive::{Archive, ArchiveError};
+use leaderboard_api::Enforcement;
+use leaderboard_api::names::FAILURE_LOG_KEY;
 
 /// Folders that no mount makes. The others are the kubelet's.
 const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "evalai", "logcopy"];
@@ -273,7 +274,7 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
         return Ok(Claim::Fresh);
     }
     let plan = &run.plan;
-    let prefix = crate::api::effective::key_prefix(&plan.storage, &plan.run_id);
+    let prefix = leaderboard_api::effective::key_prefix(&plan.storage, &plan.run_id);
     Err(WorkspaceError::PrefixInUse(format!("{}/{prefix}", plan.storage.bucket)))
 }
 

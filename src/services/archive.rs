@@ -17,9 +17,9 @@ use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPa
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use tokio::io::AsyncWriteExt;
 
-use crate::api::{Storage, effective};
 use crate::services::aws::Aws;
 use crate::services::meter::Meter;
+use leaderboard_api::{Storage, effective};
 
 pub use error::{ArchiveError, Cause};
 pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};

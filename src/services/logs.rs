@@ -7,8 +7,8 @@ use std::time::Duration;
 use aws_sdk_cloudwatchlogs::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_cloudwatchlogs::types::InputLogEvent;
 
-use crate::api::LogGroup;
 use crate::services::aws::Aws;
+use leaderboard_api::LogGroup;
 
 /// Events of one request.
 pub const MAX_EVENTS: usize = 10_000;

@@ -4,7 +4,7 @@ use aws_sdk_sqs::types::QueueAttributeName;
 
 use super::aws::Aws;
 use super::fault::{self, Fault};
-use crate::api;
+use leaderboard_api as api;
 
 /// Why a queue could not be looked at.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

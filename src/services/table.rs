@@ -20,10 +20,10 @@ use thiserror::Error;
 pub use ledger::View;
 pub use recorder::Recorder;
 
-use crate::api;
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
+use leaderboard_api as api;
 
 /// Column with the attempt, a number.
 const ATTEMPT: &str = "attempt";

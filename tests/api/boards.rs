@@ -12,7 +12,7 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{Api, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_operator::api::{Leaderboard, conditions, reasons};
+use leaderboard_api::{Leaderboard, conditions, reasons};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;

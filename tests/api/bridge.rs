@@ -11,7 +11,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{Api, ApiResource, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Client, ResourceExt};
-use leaderboard_operator::api::{Ingested, Leaderboard, Submission, names};
+use leaderboard_api::{Ingested, Leaderboard, Submission, names};
 use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
 use leaderboard_operator::bridge::{self, Health, Observer, Settings};
 use leaderboard_operator::observability::shutdown::Stop;

@@ -3,7 +3,7 @@
 use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
 use kube::Client;
 use kube::api::{Api, ListParams, Patch, PatchParams};
-use leaderboard_operator::api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission};
 use leaderboard_operator::crds;
 use serde_json::{Value, json};
 

@@ -13,7 +13,7 @@ use evalai_stand_in::Config;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{Api, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_operator::api::{Leaderboard, Submission, conditions};
+use leaderboard_api::{Leaderboard, Submission, conditions};
 use serde_json::json;
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};

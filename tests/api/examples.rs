@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use leaderboard_operator::api::{Leaderboard, Submission, effective};
+use leaderboard_api::{Leaderboard, Submission, effective};
 
 use crate::support::apiserver::{ApiServer, server};
 

@@ -16,7 +16,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, State, Storage, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{Leaderboard, State, Storage, Submission, SubmissionStatus, conditions, names};
 use leaderboard_operator::controller::context::Settings;
 use leaderboard_operator::controller::leader::{self, Identity};
 use leaderboard_operator::controller::run::{self, Clients};

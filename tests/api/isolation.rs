@@ -11,7 +11,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, Submission, conditions, reasons};
+use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;

@@ -3,7 +3,7 @@
 use kube::api::{Api, PostParams};
 use kube::core::{ApiResource, DynamicObject};
 use kube::{Client, Resource};
-use leaderboard_operator::api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission};
 use serde_json::{Value, json};
 
 /// A kind of ours.

@@ -20,10 +20,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use leaderboard_operator::api::{LogGroup, ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_api::{LogGroup, ResultsFormat, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::logcopy::{self, LogcopyError};
 use leaderboard_operator::pod::places::{Pace, Places, Setting};
-use leaderboard_operator::pod::report::{FAILURE_LOG_KEY, MAX_BYTES, OWNER_KEY, REPORT_KEY, Report};
+use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report};
 use leaderboard_operator::pod::run::{Run, STATUS_FOLDER, Stop};
 use leaderboard_operator::pod::tree::Tree;
 use leaderboard_operator::pod::upload::Haste;

@@ -17,7 +17,7 @@ use jiff::{SignedDuration, Timestamp};
 use kube::api::Api;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, State, Submission, conditions, reasons};
+use leaderboard_api::{Leaderboard, State, Submission, conditions, reasons};
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::time::{Instant, timeout_at};

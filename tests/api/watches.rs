@@ -6,7 +6,7 @@ use futures::StreamExt;
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::watcher::Config;
 use kube::{Api, ResourceExt};
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use leaderboard_operator::controller::watches::preflight::{Need, access_missing, await_kinds};
 use leaderboard_operator::controller::watches::{Touches, guarded, spawn_watch};
 use leaderboard_operator::observability::Observability;

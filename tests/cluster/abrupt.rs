@@ -5,7 +5,7 @@ use std::time::Duration;
 use evalai_stand_in::model::Status;
 use fastrand::Rng;
 use k8s_openapi::api::coordination::v1::Lease;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::{Value, json};
 use tokio::time::sleep;
 

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use leaderboard_operator::api::{Submission, conditions};
+use leaderboard_api::{Submission, conditions};
 use serde_json::json;
 
 use super::matrix::Case;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use evalai_stand_in::model::Status;
-use leaderboard_operator::api::{FailureClass, State, Submission};
+use leaderboard_api::{FailureClass, State, Submission};
 use serde_json::json;
 
 use super::expected::SIX_ROUTES;

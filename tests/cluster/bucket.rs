@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_operator::api::{Submission, conditions};
+use leaderboard_api::{Submission, conditions};
 use serde_json::json;
 use tokio::time::sleep;
 

@@ -8,7 +8,7 @@ use fastrand::Rng;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::json;
 
 use super::expected::{assert_finished, assert_results};

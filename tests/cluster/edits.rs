@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::json;
 
 use super::expected::{assert_finished, assert_results};

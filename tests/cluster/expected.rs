@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use leaderboard_operator::api::{State, Submission};
+use leaderboard_api::{State, Submission};
 use serde_json::{Map, Value};
 
 use crate::scene::{score, state};

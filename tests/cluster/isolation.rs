@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::DeleteParams;
-use leaderboard_operator::api::{Leaderboard, State, conditions, reasons};
+use leaderboard_api::{Leaderboard, State, conditions, reasons};
 use serde_json::json;
 
 use crate::operator::controller;

@@ -7,7 +7,7 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
-use leaderboard_operator::api::{State, Submission};
+use leaderboard_api::{State, Submission};
 use serde_json::{Value, json};
 
 use super::expected::SIX_ROUTES;

@@ -14,7 +14,7 @@ use evalai_stand_in::model::Status;
 use futures::future::LocalBoxFuture;
 use futures::{FutureExt, StreamExt, stream};
 use jiff::Timestamp;
-use leaderboard_operator::api::{FailureClass, State, Submission};
+use leaderboard_api::{FailureClass, State, Submission};
 
 use crate::scene::{Scene, reason, say, state};
 

@@ -7,7 +7,7 @@ use evalai_stand_in::model::Status;
 use futures::FutureExt;
 use futures::future::join_all;
 use jiff::Timestamp;
-use leaderboard_operator::api::{State, Submission};
+use leaderboard_api::{State, Submission};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, together};

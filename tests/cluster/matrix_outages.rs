@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use kube::Config;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::json;
 
 use super::matrix::Case;

@@ -6,7 +6,7 @@ use evalai_stand_in::model::Status;
 use futures::FutureExt;
 use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::ResourceExt;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::{Value, json};
 
 use super::matrix::{Case, together};

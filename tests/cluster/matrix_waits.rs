@@ -11,7 +11,7 @@ use futures::FutureExt;
 use k8s_openapi::api::core::v1::{Node, Pod, ResourceQuota};
 use kube::ResourceExt;
 use kube::api::{Api, DeleteParams, ListParams, Patch, PatchParams, PostParams};
-use leaderboard_operator::api::{State, Submission, conditions};
+use leaderboard_api::{State, Submission, conditions};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, SHOWN, together};

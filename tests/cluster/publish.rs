@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use evalai_stand_in::log::Entry;
 use evalai_stand_in::model::Status;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::{Value, json};
 
 use super::expected::{assert_finished, assert_results, assert_row, metrics};

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::json;
 use tokio::process::Command;
 use tokio::select;

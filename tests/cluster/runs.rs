@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use leaderboard_operator::api::{Submission, conditions};
+use leaderboard_api::{Submission, conditions};
 use serde_json::{Value, json};
 
 use super::expected::{assert_finished, assert_results};

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
-use leaderboard_operator::api::Submission;
+use leaderboard_api::Submission;
 use serde_json::{Value, json};
 
 use super::matrix::{Case, measured};

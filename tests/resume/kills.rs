@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use fastrand::Rng;
 use futures::FutureExt;
 use futures::future::{self, BoxFuture};
-use leaderboard_operator::api::ResultsFormat;
+use leaderboard_api::ResultsFormat;
 use leaderboard_operator::pod::watch::Watch;
 use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};

@@ -11,7 +11,7 @@ use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use fastrand::Rng;
 use futures::StreamExt;
-use leaderboard_operator::api::ResultsFormat;
+use leaderboard_api::ResultsFormat;
 
 use super::kubelet::Kubelet;
 use super::submission::{Submission, make_volumes};

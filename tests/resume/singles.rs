@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use fastrand::Rng;
-use leaderboard_operator::api::ResultsFormat;
+use leaderboard_api::ResultsFormat;
 use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 use nix::sys::signal::Signal;
 

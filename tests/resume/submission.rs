@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use leaderboard_operator::api::{ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_api::{ResultsFormat, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::places::Places;
 use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run};
 use leaderboard_operator::services::archive::Archive;

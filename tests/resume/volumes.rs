@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use fastrand::Rng;
-use leaderboard_operator::api::ResultsFormat;
+use leaderboard_api::ResultsFormat;
 use leaderboard_operator::pod::run::Stop;
 use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 

@@ -20,7 +20,7 @@ use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomRe
 use kube::api::{Api, DeleteParams, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::{await_condition, conditions::is_crd_established};
 use kube::{Client, Config, Resource, ResourceExt};
-use leaderboard_operator::api::{Leaderboard, State, Submission, conditions};
+use leaderboard_api::{Leaderboard, State, Submission, conditions};
 use leaderboard_operator::crds;
 use serde_json::{Value, json};
 use tokio::sync::Semaphore;

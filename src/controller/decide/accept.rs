@@ -8,10 +8,10 @@ use super::draft::{Draft, after};
 use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::{Action, end, isolation};
-use crate::api::conditions::{self, Truth};
-use crate::api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
 use crate::controller::view::{EvalaiInfo, Standing};
-use crate::text::sentence;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
 
 /// How long EvalAI may take before its silence is shown.
 const RETRY: Duration = Duration::from_secs(30);
@@ -282,7 +282,7 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
     let plan = match draft.status.plan.take() {
         // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
         // made; all else belongs to the submission.
-        Some(pinned) if draft.status.retry == 0 && draft.status.job.is_none() => crate::api::RunPlan {
+        Some(pinned) if draft.status.retry == 0 && draft.status.job.is_none() => leaderboard_api::RunPlan {
             // The same, unless an earlier attempt had none.
             image,
             contents_image: leaderboard.contents.image.clone(),

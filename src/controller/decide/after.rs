@@ -7,10 +7,10 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after, seconds};
 use super::{Action, Tell, accept, log, stop};
-use crate::api::conditions::{self, Truth};
-use crate::api::{Ingested, State, reasons};
 use crate::controller::view::{EvalaiEnd, JobSight, JobView};
-use crate::text::sentence;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Ingested, State, reasons};
 
 /// How often an unpublished end is looked at again.
 const AGAIN: Duration = Duration::from_secs(30);

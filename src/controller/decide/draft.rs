@@ -6,12 +6,12 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::{Action, Event, Plan, Tell};
-use crate::api::conditions::{self, Truth};
-use crate::api::{
+use crate::controller::view::View;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::{
     Deadlines, Failure, Ingested, LeaderboardSpec, Retries, State, Submission, SubmissionSpec, SubmissionStatus, names,
     reasons,
 };
-use crate::controller::view::View;
 
 /// A plan in the making.
 pub(super) struct Draft<'a> {
@@ -137,12 +137,12 @@ impl<'a> Draft<'a> {
             attempt: Some(wanted),
             team: old.team,
             track: old.track,
-            plan: old.plan.map(|plan| crate::api::RunPlan { resume: true, ..plan }),
+            plan: old.plan.map(|plan| leaderboard_api::RunPlan { resume: true, ..plan }),
             progress: old.progress,
             score: old.score.map(|s| if s.starts_with('~') { s } else { format!("~{s}") }),
             results: old.results,
             rerun_of: old.rerun_of,
-            times: crate::api::Times {
+            times: leaderboard_api::Times {
                 submitted: old.times.submitted,
                 ..Default::default()
             },

@@ -7,11 +7,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
 use super::failure;
-use crate::api::conditions::{self, Truth};
-use crate::api::{Failure, FailureClass, State, reasons};
 use crate::controller::view::{JobEnd, ReportSight, View};
 use crate::pod::report::Report;
-use crate::text::sentence;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, FailureClass, State, reasons};
 
 /// First delay before a new Job after an infrastructure failure; doubles with each.
 const RETRY_SECONDS: i64 = 10;

@@ -7,11 +7,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::Draft;
 use super::next_steps::{Steps, for_both, in_the_log_of, infrastructure_for_participants, of_infrastructure, smaller};
-use crate::api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
 use crate::controller::view::{ContainerView, EndView, JobEnd, NodeSight, PodView};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
-use crate::text::sentence;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
 pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
@@ -405,7 +405,7 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
 fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
     let slice = status.plan.as_ref().and_then(|plan| {
         let slice = plan.slices.get(usize::try_from(id).ok()?.checked_sub(1)?)?;
-        let (first, last) = crate::api::effective::slice_bounds(slice)?;
+        let (first, last) = leaderboard_api::effective::slice_bounds(slice)?;
         i32::try_from(last - first + 1).ok()?.checked_mul(plan.repetitions)
     });
     slice.unwrap_or(0)

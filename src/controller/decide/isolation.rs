@@ -1,9 +1,9 @@
 //! No Job without the NetworkPolicy of its Leaderboard, as the Leaderboard's present spec asks for it.
 
 use super::draft::Draft;
-use crate::api::PolicySource;
-use crate::api::conditions;
-use crate::text::sentence;
+use leaderboard_api::PolicySource;
+use leaderboard_api::conditions;
+use leaderboard_api::text::sentence;
 
 /// A policy that is not in place.
 pub(super) struct Missing {

@@ -6,11 +6,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 
 use super::draft::{Draft, after};
 use super::{Action, Tell, accept, end, failure, isolation, job_name, start, stop};
-use crate::api::conditions::{self, Truth};
-use crate::api::{PairStatus, Progress, State, Waiting, reasons};
 use crate::controller::view::{JobSight, JobView, PodView, Standing, Turn};
 use crate::pod::report::Report;
-use crate::text::sentence;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{PairStatus, Progress, State, Waiting, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;

@@ -5,9 +5,9 @@
 
 use super::draft::Draft;
 use super::{Action, trouble};
-use crate::api::{FailureClass, SubmissionStatus, conditions, names, reasons};
 use crate::controller::view::PodView;
 use crate::pod::run::console;
+use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
 
 /// A place where a log may be.
 #[derive(Clone, Debug, PartialEq, Eq)]

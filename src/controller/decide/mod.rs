@@ -22,10 +22,10 @@ mod trouble;
 use std::time::Duration;
 
 use super::view::View;
-use crate::api::{SubmissionStatus, names};
 use crate::pod::run::Stop;
 pub use after::previous_controller;
 use draft::Draft;
+use leaderboard_api::{SubmissionStatus, names};
 pub use log::{LogAt, LogPlace};
 
 /// What a pass wants: the status to show, then the actions in order, then the events.

@@ -3,7 +3,7 @@
 //!
 //! Called by `failure`, `start` and `end`. Pure. No text for a participant names a file, an object or a machine of the hosts.
 
-use crate::api::reasons;
+use leaderboard_api::reasons;
 
 /// The next step after a participant failure, for each of its two readers.
 #[derive(Clone, Debug, PartialEq, Eq)]

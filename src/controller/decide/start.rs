@@ -10,10 +10,10 @@ use super::draft::{Draft, after};
 use super::failure::{self, infrastructure, participant};
 use super::next_steps::for_both;
 use super::trouble::{self, Trouble};
-use crate::api::conditions::{self, Truth};
-use crate::api::{Failure, State, names, reasons};
 use crate::controller::view::{JobView, NodeSight, PodView};
-use crate::text::sentence;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, State, names, reasons};
 
 /// What is said of a Pod that does as it should.
 pub(super) const PREPARED: &str = "Its Pod is being prepared.";

@@ -7,9 +7,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
 use super::{Action, failure, log, start};
-use crate::api::reasons;
 use crate::controller::view::{JobView, NodeSight, PodView};
 use crate::pod::run::Stop;
+use leaderboard_api::reasons;
 
 /// Added to `cancelSeconds` before a Pod that was told to stop is deleted.
 const STOP_MARGIN_SECONDS: i64 = 15;
@@ -138,7 +138,7 @@ pub(super) fn remove_overdue_pod(draft: &mut Draft<'_>) {
 
 /// A Pod that goes away although nobody told it to stop, on a node that is gone: the Job would wait for the node.
 pub(super) fn lost_pod<'a>(draft: &mut Draft<'a>) -> Option<&'a PodView> {
-    let is_given_up = |f: &crate::api::Failure| f.reason == reasons::NODE_LOST;
+    let is_given_up = |f: &leaderboard_api::Failure| f.reason == reasons::NODE_LOST;
     let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));
     let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
     let at = given_up_at(draft.view.node, pod)?;

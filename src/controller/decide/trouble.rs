@@ -2,9 +2,9 @@
 //!
 //! Called by `start`. Agents and simulators that started and crashed are judged by `failure`, not here.
 
-use crate::api::{names, reasons};
 use crate::controller::view::{ContainerView, EndView, PodView};
-use crate::text::sentence;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{names, reasons};
 
 /// What is said should `workspace` not say it itself.
 const PREFIX_IN_USE: &str = "The run's place in the bucket holds another object's results. Apply it with attempt: 2 to take \

@@ -4,7 +4,7 @@
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
 use super::pairs;
-use crate::api::ResultsFormat;
+use leaderboard_api::ResultsFormat;
 
 /// A command with its arguments.
 pub(super) fn words(command: &[String], arguments: Option<&[String]>) -> Vec<String> {

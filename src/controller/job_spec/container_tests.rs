@@ -4,9 +4,9 @@ use serde_json::{Value, json};
 
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
 use super::{JobInput, build_json, run_document};
-use crate::api::names;
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
+use leaderboard_api::names;
 
 fn env<'a>(container: &'a Value, name: &str) -> Option<&'a Value> {
     container["env"]
@@ -203,7 +203,7 @@ fn the_run_document_is_the_plan_and_its_times() {
         (2, 5, 1800, 120)
     );
     assert_eq!(run.plan, case.plan);
-    assert_eq!(run.verify, crate::api::Verify::Refuse);
+    assert_eq!(run.verify, leaderboard_api::Verify::Refuse);
     assert_eq!(run.log_group.unwrap().name, "g");
 }
 

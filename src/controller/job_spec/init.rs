@@ -11,8 +11,8 @@ use k8s_openapi::api::core::v1::{
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
 use super::{JobInput, commands, run_document, variable, volumes};
-use crate::api::names;
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
+use leaderboard_api::names;
 
 /// `workspace` and `logcopy` run as nobody in particular: with every capability dropped root could read no more than any
 /// other uid, and all that they write to is a volume (0777) or a folder that the kubelet or they themselves made there.

@@ -27,11 +27,11 @@ use kube::api::{DynamicObject, TypeMeta};
 use serde_json::{Value, json};
 
 use super::pod_overlay;
-use crate::api::{
+use crate::pod::run::{Isolation, Run};
+use leaderboard_api::{
     Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions, names,
     reasons,
 };
-use crate::pod::run::{Isolation, Run};
 
 pub(super) use pairs::FIXED_ENV;
 pub(super) use volumes::{CONTENTS_VOLUMES, OWN_VOLUMES, protected_mounts};

@@ -5,8 +5,8 @@
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 
 use super::{JobInput, commands, init, variable, volumes};
-use crate::api::{ResultsFormat, names};
 use crate::pod::run::{RUNNER, TOOLS, console_name};
+use leaderboard_api::{ResultsFormat, names};
 
 pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
 pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";

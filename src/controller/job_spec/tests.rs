@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::api::effective;
+use leaderboard_api::effective;
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
 

@@ -8,8 +8,8 @@ use k8s_openapi::api::core::v1::{
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
 use super::JobInput;
-use crate::api::names;
 use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
+use leaderboard_api::names;
 
 /// Volumes with the private contents, each with where `contents` writes it and where agents read it.
 pub(in crate::controller) const CONTENTS_VOLUMES: [(&str, &str, &str); 3] = [

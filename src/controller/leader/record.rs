@@ -9,7 +9,7 @@ use k8s_openapi::api::coordination::v1::{Lease, LeaseSpec};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, ObjectMeta};
 
 use super::{ANNOTATION_DRAINED, ANNOTATION_RELEASED, Settings};
-use crate::api::names::{LABEL_MANAGED_BY, OPERATOR};
+use leaderboard_api::names::{LABEL_MANAGED_BY, OPERATOR};
 
 /// Term of the first leader there ever was.
 pub const FIRST_TERM: i32 = 1;

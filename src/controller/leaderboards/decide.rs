@@ -9,11 +9,11 @@ use kube::ResourceExt;
 
 use super::isolation::{self, Policy};
 use super::reach::Unreachable;
-use crate::api::conditions::{self, Truth};
-use crate::api::leaderboard::Counts;
-use crate::api::{Evalai, Leaderboard, LeaderboardStatus, effective, names, reasons};
 use crate::controller::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::leaderboard::Counts;
+use leaderboard_api::{Evalai, Leaderboard, LeaderboardStatus, effective, names, reasons};
 
 /// What one pass saw of a Leaderboard.
 #[derive(Clone, Debug)]

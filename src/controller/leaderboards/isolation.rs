@@ -15,15 +15,15 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Api, ResourceExt};
 
 use super::{Desk, POLICY_AGAIN, RESYNC, SOONEST};
-use crate::api::conditions::{self, Truth};
-use crate::api::{Enforcement, Leaderboard, PolicySource, names, reasons};
 use crate::controller::context::{CALL_TIMEOUT, Context, Stores};
 use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::observe::uid_of;
 use crate::controller::watches::Touches;
-use crate::observability::text;
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
-use crate::text::sentence;
+use leaderboard_api::client_errors;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Enforcement, Leaderboard, PolicySource, names, reasons};
 
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;

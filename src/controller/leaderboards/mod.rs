@@ -21,12 +21,12 @@ use serde_json::json;
 
 use super::context::{CALL_TIMEOUT, Context};
 use super::observe::uid_of;
-use crate::api::leaderboard::Counts;
-use crate::api::{Leaderboard, State, Submission, conditions, names};
-use crate::observability::text;
 use crate::services::ObjectKey;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::{Applied, Measured, Policy};
+use leaderboard_api::client_errors;
+use leaderboard_api::leaderboard::Counts;
+use leaderboard_api::{Leaderboard, State, Submission, conditions, names};
 use probe::Probe;
 
 /// A status whose counts alone have changed is written at most this often.
@@ -180,7 +180,7 @@ fn needs_leaderboard(submission: &Submission) -> bool {
         .unwrap_or_default();
     let waits = |type_: &str| {
         conditions::get(conditions, type_)
-            .is_some_and(|c| c.status != "True" && c.reason != crate::api::reasons::NOT_WANTED)
+            .is_some_and(|c| c.status != "True" && c.reason != leaderboard_api::reasons::NOT_WANTED)
     };
     !conditions::is_true(conditions, conditions::FINISHED)
         || waits(conditions::PUBLISHED)
@@ -225,7 +225,7 @@ async fn write_status(
     if old == plan.status {
         return Ok(RESYNC);
     }
-    let only_numbers = crate::api::LeaderboardStatus {
+    let only_numbers = leaderboard_api::LeaderboardStatus {
         counts: old.counts,
         budget: old.budget.clone(),
         ..plan.status.clone()

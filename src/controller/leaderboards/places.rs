@@ -9,12 +9,12 @@ use jiff::Timestamp;
 
 use super::key_of;
 use super::reach::{Finding, Place, Reach};
-use crate::api::Leaderboard;
 use crate::controller::context::Context;
 use crate::services::archive::ArchiveError;
 use crate::services::fault::Fault;
 use crate::services::queue::{self, QueueError};
 use crate::services::table::{Table, TableError};
+use leaderboard_api::Leaderboard;
 
 /// Time one answer may take.
 const LIMIT: Duration = Duration::from_secs(10);

@@ -12,14 +12,14 @@ use leaderboard_results::metrics;
 use super::decide::EvalaiStanding;
 use super::places;
 use super::reach::{Reach, Unreachable};
-use crate::api::{Evalai, Leaderboard, ResultsFormat, Submission, Token as TokenPlace, effective};
 use crate::controller::context::{CALL_TIMEOUT, Context};
 use crate::controller::job_spec::{self, JobInput};
 use crate::controller::pod_overlay;
 use crate::services::ObjectKey;
 use crate::services::evalai::{Labels, Target};
 use crate::services::token::{Token, TokenSource};
-use crate::text::sentence;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Evalai, Leaderboard, ResultsFormat, Submission, Token as TokenPlace, effective};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);

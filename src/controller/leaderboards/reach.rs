@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::api::conditions::Truth;
-use crate::api::reasons;
+use leaderboard_api::conditions::Truth;
+use leaderboard_api::reasons;
 
 /// What was good is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);

@@ -13,9 +13,9 @@ use kube::ResourceExt;
 use tokio::time::Instant;
 
 use super::uid_of;
-use crate::api::{Leaderboard, Submission, SubmissionStatus, conditions};
 use crate::controller::turns::{InLine, Limits, Past, turns};
 use crate::controller::view::Turn;
+use leaderboard_api::{Leaderboard, Submission, SubmissionStatus, conditions};
 
 #[cfg(test)]
 #[path = "board_histories.rs"]
@@ -442,7 +442,7 @@ mod tests {
         let paused = leaderboard(&ONE());
         let paused = Leaderboard::new(
             "lb",
-            crate::api::LeaderboardSpec {
+            leaderboard_api::LeaderboardSpec {
                 paused: true,
                 ..paused.spec
             },

@@ -17,7 +17,7 @@ use kube::{Resource, ResourceExt};
 use super::context::Context;
 use super::decide::job_name;
 use super::view::{JobSight, NodeSight, PodView, ReportSight, View};
-use crate::api::{Leaderboard, Submission, conditions, names};
+use leaderboard_api::{Leaderboard, Submission, conditions, names};
 
 /// Sees everything a pass may depend on.
 pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {

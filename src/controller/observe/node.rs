@@ -12,7 +12,7 @@ use tokio::time::Instant;
 
 use crate::controller::context::{CALL_TIMEOUT, Context};
 use crate::controller::view::{NodeSight, PodView};
-use crate::observability::text;
+use leaderboard_api::client_errors;
 
 /// How long what a node has said is passed on to the Pods that run on it.
 const FRESH: Duration = Duration::from_secs(15);

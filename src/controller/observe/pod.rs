@@ -6,10 +6,10 @@ use k8s_openapi::api::core::v1::{
 use kube::ResourceExt;
 use leaderboard_runner::verdict::{Verdict, What};
 
-use crate::api::{names, reasons};
 use crate::controller::view::{ContainerView, EndView, PodView};
 use crate::pod::run::Stop;
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
+use leaderboard_api::{names, reasons};
 
 /// Longest text of Kubernetes that is passed on to people.
 const MAX_WORDS: usize = 600;

@@ -8,11 +8,11 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 
 use super::{report_matters, uid_of};
-use crate::api::{Submission, SubmissionStatus};
 use crate::controller::context::Context;
 use crate::controller::view::{JobSight, PodView, ReportSight};
 use crate::pod::report::{MAX_BYTES, REPORT_KEY, Report};
 use crate::services::archive::Fetched;
+use leaderboard_api::{Submission, SubmissionStatus};
 
 /// Time one read may take; the pass goes on without it.
 pub const READ_TIMEOUT: Duration = Duration::from_secs(10);

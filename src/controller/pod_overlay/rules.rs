@@ -6,11 +6,11 @@ use k8s_openapi::api::core::v1::{EnvVar, PodTemplateSpec};
 use serde_json::{Map, Value};
 
 use super::without_nulls;
-use crate::api::{LeaderboardSpec, names};
 use crate::controller::job_spec::{
     ANNOTATION_SKIP_CONTAINERS, CONTENTS_VOLUMES, FIXED_ENV, OWN_VOLUMES, protected_mounts,
 };
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
+use leaderboard_api::{LeaderboardSpec, names};
 
 /// Why a Leaderboard's `pod` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]
@@ -142,7 +142,7 @@ fn metadata(metadata: &Map<String, Value>) -> Checked {
         let path = format!("{path}.{field}");
         for key in object(value, &path)?.keys() {
             let prefix = key.split_once('/').map_or("", |(prefix, _)| prefix);
-            let ours = prefix == crate::api::GROUP
+            let ours = prefix == leaderboard_api::GROUP
                 || [names::LABEL_MANAGED_BY, ANNOTATION_SKIP_CONTAINERS].contains(&key.as_str());
             let kubernetes = prefix == "batch.kubernetes.io" || ["job-name", "controller-uid"].contains(&key.as_str());
             if ours || kubernetes {

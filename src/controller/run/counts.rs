@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use kube::runtime::reflector::Store;
 
-use crate::api::{State, Submission};
 use crate::observability::Observability;
 use crate::services::evalai::Hub;
 use crate::services::meter::Meter;
+use leaderboard_api::{State, Submission};
 
 /// How often what is not an event is counted: more often than anybody scrapes.
 const EVERY: Duration = Duration::from_secs(5);
@@ -61,7 +61,7 @@ fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::api::{SubmissionSpec, SubmissionStatus};
+    use leaderboard_api::{SubmissionSpec, SubmissionStatus};
 
     #[test]
     fn every_state_is_counted_also_with_nobody_in_it() {

@@ -9,11 +9,11 @@ use kube::runtime::reflector::ObjectRef;
 
 use super::marks::{Fingerprints, standing};
 use super::{Touched, board, owner};
-use crate::api::{Leaderboard, Submission};
 use crate::controller::context::Context;
 use crate::controller::leaderboards::isolation;
 use crate::controller::observe::board::Places;
 use crate::controller::watches::Touch;
+use leaderboard_api::{Leaderboard, Submission};
 
 pub(super) fn of_leaderboards() -> impl FnMut(Touch<Leaderboard>) -> Vec<Touched> + Send {
     let mut leaderboards = Fingerprints::default();

@@ -5,13 +5,13 @@ use std::collections::HashMap;
 use kube::ResourceExt;
 
 use super::key;
-use crate::api::Submission;
 use crate::services::ObjectKey;
+use leaderboard_api::Submission;
 
 /// What of a Submission's status matters to the others in line and to its Leaderboard's counts.
 pub(super) fn standing(submission: &Submission) -> String {
     let status = submission.status.as_ref();
-    let state = status.and_then(|s| s.state).map(crate::api::State::as_str);
+    let state = status.and_then(|s| s.state).map(leaderboard_api::State::as_str);
     format!("{state:?} {}", status.is_some_and(|s| s.job.is_some()))
 }
 

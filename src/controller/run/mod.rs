@@ -32,13 +32,13 @@ use super::observe::children_selector;
 use super::sync::Sync;
 use super::watches::preflight::{self, await_kinds, watch_access};
 use super::watches::{Touch, Touches, Watch, Watchable, guarded, spawn_watch};
-use crate::api::{Leaderboard, Submission};
 use crate::observability::Observability;
 use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::table::Recorder;
+use leaderboard_api::{Leaderboard, Submission};
 
 /// Passes in hand may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);

@@ -3,9 +3,9 @@
 //! The same rights as the chart's `controller-rbac.yaml` grants, which the test below holds against it. Two are not asked
 //! for: the question itself, and each Leaderboard's Secret, whose absence its condition `Ready` shows (`TokenMissing`).
 
-use crate::api::GROUP;
 use crate::controller::leader;
 use crate::controller::watches::preflight::Need;
+use leaderboard_api::GROUP;
 
 /// Group, resource, verbs.
 type Right = (&'static str, &'static str, &'static [&'static str]);

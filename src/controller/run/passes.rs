@@ -10,7 +10,6 @@ use kube::{Resource, ResourceExt};
 use tokio::sync::mpsc;
 
 use super::{Touched, key};
-use crate::api::{Leaderboard, Submission};
 use crate::controller::act::{ActError, act};
 use crate::controller::backoff::BackoffMap;
 use crate::controller::context::Context;
@@ -19,6 +18,7 @@ use crate::controller::leaderboards::{self, LeaderboardError};
 use crate::controller::memory::waits_for_leaderboard;
 use crate::controller::observe::{observe, uid_of};
 use crate::observability::Observability;
+use leaderboard_api::{Leaderboard, Submission};
 
 /// A pass takes at most this long.
 const PASS_LIMIT: Duration = Duration::from_secs(90);

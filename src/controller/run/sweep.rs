@@ -8,9 +8,9 @@ use kube::runtime::reflector::Store;
 use kube::{Api, Client, ResourceExt};
 use tokio::sync::mpsc;
 
-use crate::api::{Evalai, Leaderboard, Submission, names};
 use crate::bridge::ingest::{self, Incoming, Outcome, Source};
 use crate::services::evalai::SweepRow;
+use leaderboard_api::{Evalai, Leaderboard, Submission, names};
 
 /// Takes rows in until their sender is gone.
 pub(super) async fn into_cluster(

@@ -13,8 +13,8 @@ use kube::core::GroupVersion;
 use kube::{Api, Client, discovery};
 use tokio::time::{sleep, timeout};
 
-use crate::api::{GROUP, VERSION};
 use crate::observability::{Observability, text};
+use leaderboard_api::{GROUP, VERSION};
 
 /// Name of the check for our kinds.
 const KINDS_CHECK: &str = "custom resources";

@@ -12,7 +12,7 @@ use tower_test::mock::{Handle, pair};
 
 use super::preflight::{Need, access_missing, await_kinds};
 use super::*;
-use crate::api::Leaderboard;
+use leaderboard_api::Leaderboard;
 
 /// Longer than anything here may take.
 const LIMIT: Duration = Duration::from_mins(20);

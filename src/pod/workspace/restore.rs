@@ -9,11 +9,12 @@ use std::sync::Arc;
 use futures::{StreamExt, TryStreamExt};
 
 use super::WorkspaceError;
-use crate::pod::report::{FAILURE_LOG_KEY, OWNER_KEY, REPORT_KEY};
+use crate::pod::report::{OWNER_KEY, REPORT_KEY};
 use crate::pod::run::{Run, STATUS_FOLDER};
 use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
 use crate::pod::upload::{Memory, Stored, fingerprint};
 use crate::services::archive::{Archive, Listed};
+use leaderboard_api::names::FAILURE_LOG_KEY;
 
 /// Most objects of a run.
 const MAX_OBJECTS: usize = 100_000;

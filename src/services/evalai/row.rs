@@ -8,7 +8,7 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use super::status::Status;
-use crate::api::ImageReference;
+use leaderboard_api::ImageReference;
 
 /// A submission as EvalAI shows it to a host.
 #[derive(Clone, Debug, PartialEq)]

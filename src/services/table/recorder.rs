@@ -14,10 +14,10 @@ use tokio::time::Instant;
 
 use super::ledger::{Ledger, TableId, View, Wish};
 use super::{Row, Table, TableError, Written};
-use crate::api;
 use crate::observability::tasks::Tasks;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
+use leaderboard_api as api;
 
 /// Time between the starts of two writes to one table: the stock table has one write unit.
 const SPACING: Duration = Duration::from_secs(2);

@@ -14,8 +14,18 @@ use crate::api::bridge::LIMIT;
 use crate::api::objects::{Kind, create, merge};
 use crate::support::apiserver::{ApiServer, server};
 
-pub const PLUGIN: &str = env!("CARGO_BIN_EXE_kubectl-leaderboard");
 const TIME: &str = "2026-11-01T10:00:00Z";
+
+/// The plugin's program, next to the operator's: cargo builds it for the tests of its own package.
+pub fn plugin() -> PathBuf {
+    let program = Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard");
+    assert!(
+        program.exists(),
+        "{} is missing: run cargo build --workspace --bins",
+        program.display()
+    );
+    program
+}
 
 /// A namespace, and a person at a terminal.
 pub struct Desk {
@@ -74,7 +84,7 @@ impl Desk {
     }
 
     pub fn command(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(PLUGIN);
+        let mut command = Command::new(plugin());
         command
             .env("KUBECONFIG", &self.kubeconfig)
             .args(arguments)

@@ -11,7 +11,7 @@ use tempfile::TempDir;
 use tokio::process::Command;
 use tokio::time::timeout;
 
-use super::desk::{Desk, PLUGIN, Said, Waits, assert_has, end, ended, running, waiting};
+use super::desk::{Desk, Said, Waits, assert_has, end, ended, plugin, running, waiting};
 use crate::api::bridge::LIMIT;
 use crate::api::objects::{Kind, merge};
 
@@ -23,7 +23,8 @@ const POLL: Duration = Duration::from_millis(50);
 async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
     let desk = Desk::new().await;
     desk.submission("a", &json!({}), &waiting()).await;
-    let bin = Path::new(PLUGIN).parent().unwrap();
+    let program = plugin();
+    let bin = program.parent().unwrap();
     let mut path = OsString::from(bin);
     path.push(":");
     path.push(std::env::var_os("PATH").unwrap_or_default());
@@ -35,7 +36,7 @@ async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
     assert!(words.starts_with("a is Pending since "), "{words}");
 
     let (folder, file) = person(&desk, &json!({}));
-    let mut command = Command::new(PLUGIN);
+    let mut command = Command::new(plugin());
     command
         .env("KUBECONFIG", &file)
         .args(["why", "a", "--context", "person"]);
@@ -44,7 +45,7 @@ async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
             .well()
             .starts_with("a is Pending since ")
     );
-    let mut command = Command::new(PLUGIN);
+    let mut command = Command::new(plugin());
     command
         .env("KUBECONFIG", &file)
         .args(["why", "a", "--context", "nobody"]);
@@ -57,7 +58,7 @@ async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
 async fn a_cluster_that_is_not_there_is_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let missing = folder.path().join("missing");
-    let mut command = Command::new(PLUGIN);
+    let mut command = Command::new(plugin());
     command.arg("why").arg("--kubeconfig").arg(&missing);
     let words = Said::of(&ended(&mut command).await).refused();
     assert_has(&words, &["no cluster is configured: ", "Set KUBECONFIG"]);
@@ -65,7 +66,7 @@ async fn a_cluster_that_is_not_there_is_one_line() {
     let broken = folder.path().join("broken");
     std::fs::write(&broken, "users: [secret-token\nclusters: {").unwrap();
     for set in [&["--kubeconfig"][..], &[]] {
-        let mut command = Command::new(PLUGIN);
+        let mut command = Command::new(plugin());
         command.arg("why").args(set).env("KUBECONFIG", &broken);
         if !set.is_empty() {
             command.arg(&broken);

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use leaderboard_operator::api::Enforcement;
+use leaderboard_api::Enforcement;
 use leaderboard_operator::pod::run::Isolation;
 use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};

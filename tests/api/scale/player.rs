@@ -13,7 +13,7 @@ use k8s_openapi::api::core::v1::{Node, Pod};
 use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
-use leaderboard_operator::api::names;
+use leaderboard_api::names;
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
 use leaderboard_operator::pod::run::Stop;
 use leaderboard_operator::services::archive::Archive;

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Failed, Pending};
-use crate::api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
-use crate::api::{FailureClass, conditions, reasons};
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{Standing, Turn};
+use leaderboard_api::State::{Cancelled, Failed, Pending};
+use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
+use leaderboard_api::{FailureClass, conditions, reasons};
 
 #[test]
 fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {

@@ -4,11 +4,11 @@ use jiff::SignedDuration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Failed, Finished};
-use crate::api::conditions::{self, PUBLISHED, RECORDED};
-use crate::api::{Rerun, reasons};
 use crate::controller::decide::{Action, Plan, Tell};
 use crate::controller::view::{EvalaiEnd, EvalaiInfo, ReportSight, Standing};
+use leaderboard_api::State::{Cancelled, Failed, Finished};
+use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
+use leaderboard_api::{Rerun, reasons};
 
 fn finished() -> World {
     let mut world = World::evalai().running();
@@ -191,7 +191,7 @@ fn an_outage_is_shown_and_waited_for() {
     world.in_evalai().error = Some("502 Bad Gateway".into());
     let plan = world.pass();
     assert_eq!(tells(&plan), [Tell::Finished]);
-    let shown = crate::api::conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    let shown = leaderboard_api::conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
     assert_eq!(shown.message, "The last request failed: 502 Bad Gateway.");
 
     world.published();
@@ -220,7 +220,7 @@ fn what_is_not_wanted_is_not_waited_for() {
     world.complete();
     world.report(final_report());
     let plan = world.pass_to(Finished, reasons::FINISHED);
-    let shown = crate::api::conditions::get(&plan.status.conditions, RECORDED).unwrap();
+    let shown = leaderboard_api::conditions::get(&plan.status.conditions, RECORDED).unwrap();
     assert!(shown.message.contains("spec.team.id"));
 }
 

@@ -7,8 +7,6 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::json;
 
 use super::rules;
-use crate::api::conditions;
-use crate::api::{Leaderboard, LeaderboardSpec, State, Submission, SubmissionStatus, names};
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobSight, JobView, NodeSight, PodView,
@@ -16,6 +14,8 @@ use crate::controller::view::{
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
+use leaderboard_api::conditions;
+use leaderboard_api::{Leaderboard, LeaderboardSpec, State, Submission, SubmissionStatus, names};
 
 /// UID of every submission here.
 pub const UID: &str = "uid-1";

@@ -1,11 +1,11 @@
 //! Crashes of a pair: whose they are, how many are forgiven.
 
 use super::builders::*;
-use crate::api::FailureClass::{Infrastructure, Participant};
-use crate::api::State::{Failed, Finished, Running};
-use crate::api::reasons;
 use crate::controller::view::{JobEnd, ReportSight};
 use crate::pod::run::Stop;
+use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::State::{Failed, Finished, Running};
+use leaderboard_api::reasons;
 
 /// How often each side of pair 1 ends how, and what comes of it.
 #[test]

@@ -1,6 +1,6 @@
 //! docs/states.md names every reason there is.
 
-const REASONS: &str = include_str!("../../../api/reasons.rs");
+const REASONS: &str = include_str!("../../../../crates/api/src/reasons.rs");
 const STATES: &str = include_str!("../../../../docs/states.md");
 
 /// The values of the constants in `api::reasons`.

@@ -3,13 +3,13 @@
 use std::time::Duration;
 
 use super::builders::*;
-use crate::api::FailureClass::{Infrastructure, Participant};
-use crate::api::State::{Cancelled, Failed, Finished, Pending, Running};
-use crate::api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
-use crate::api::reasons;
 use crate::controller::decide::{Action, Plan};
 use crate::controller::view::{JobEnd, ReportSight};
 use crate::pod::report::Report;
+use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
+use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
+use leaderboard_api::reasons;
 
 #[test]
 fn complete_results_that_count_finish() {

@@ -1,10 +1,10 @@
 //! Sentences: each failure has its own, with a next step that a retry leaves out.
 
 use super::builders::*;
-use crate::api::{Failure, FailureClass, reasons};
 use crate::controller::decide::failure::{infrastructure, invalid_results, participant, what_happened};
 use crate::controller::decide::next_steps::for_both;
-use crate::text::sentence;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, FailureClass, reasons};
 
 #[test]
 fn a_next_step_is_added_and_taken_off_again() {

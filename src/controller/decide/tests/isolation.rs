@@ -5,9 +5,9 @@ use std::sync::Arc;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::api::State::{Pending, Running};
-use crate::api::conditions::{self, ACCEPTED, ISOLATED, STALLED, Truth};
-use crate::api::{PolicySource, reasons};
+use leaderboard_api::State::{Pending, Running};
+use leaderboard_api::conditions::{self, ACCEPTED, ISOLATED, STALLED, Truth};
+use leaderboard_api::{PolicySource, reasons};
 
 /// The Leaderboard says so of its present spec.
 fn say_of_the_leaderboard(world: &mut World, reason: &str, message: &str) {

@@ -1,10 +1,10 @@
 //! In line: slots, pauses, and the Leaderboard's changes before the first Job.
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Pending};
-use crate::api::{Waiting, reasons};
 use crate::controller::decide::Tell;
 use crate::controller::view::{JobSight, Turn};
+use leaderboard_api::State::{Cancelled, Pending};
+use leaderboard_api::{Waiting, reasons};
 
 #[test]
 fn who_waits_sees_place_and_time() {

@@ -1,11 +1,11 @@
 //! Which log is kept of which failure, from where, and when.
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Failed, Pending, Running};
-use crate::api::reasons;
 use crate::controller::decide::{Action, LogAt, LogPlace, Plan, Tell};
 use crate::controller::view::{JobEnd, ReportSight};
 use crate::pod::report::Report;
+use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
+use leaderboard_api::reasons;
 
 /// The places of a wish, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
 fn places(plan: &Plan) -> Vec<String> {

@@ -1,10 +1,10 @@
 //! Nodes that are lost, silent or late under a run.
 
 use super::builders::*;
-use crate::api::State::{Pending, Running};
-use crate::api::reasons;
 use crate::controller::decide::Action;
 use crate::controller::view::{NodeSight, PodView};
+use leaderboard_api::State::{Pending, Running};
+use leaderboard_api::reasons;
 
 #[test]
 fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {

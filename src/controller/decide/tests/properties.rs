@@ -355,7 +355,7 @@ proptest! {
                 world.job_gone();
             }
             world.wait(300);
-            if plan.status.state.is_some_and(crate::api::State::is_terminal) {
+            if plan.status.state.is_some_and(leaderboard_api::State::is_terminal) {
                 return Ok(());
             }
         }

@@ -3,11 +3,11 @@
 use serde_json::json;
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Failed, Finished, Pending, Resumed};
-use crate::api::conditions::{FINISHED, PUBLISHED, STALLED};
-use crate::api::{names, reasons};
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{EvalaiView, ReportSight};
+use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Resumed};
+use leaderboard_api::conditions::{FINISHED, PUBLISHED, STALLED};
+use leaderboard_api::{names, reasons};
 
 fn failed() -> World {
     let mut world = World::evalai().running();

@@ -2,10 +2,10 @@
 
 use std::collections::HashSet;
 
-use crate::api::conditions::{self, FINISHED, PUBLISHED};
-use crate::api::{FailureClass, PolicySource, State, SubmissionStatus};
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{JobSight, NodeSight, Standing, View};
+use leaderboard_api::conditions::{self, FINISHED, PUBLISHED};
+use leaderboard_api::{FailureClass, PolicySource, State, SubmissionStatus};
 
 /// Passes after which nothing may change any more in a world that stands still.
 const SETTLED_AFTER: usize = 5;
@@ -112,7 +112,7 @@ fn a_reporting_node_has_its_grace(view: &View, plan: &Plan) {
         .status
         .failure
         .as_ref()
-        .is_some_and(|f| f.reason == crate::api::reasons::NODE_LOST);
+        .is_some_and(|f| f.reason == leaderboard_api::reasons::NODE_LOST);
     if let (true, true, Some(pod)) = (is_live, is_lost, &view.pod) {
         let by = pod.delete_by.expect("only a Pod that is being deleted is given up");
         assert!(

@@ -1,14 +1,14 @@
 //! A run under way: progress, time and disk, Pods and Jobs that are lost.
 
 use super::builders::*;
-use crate::api::FailureClass::{Infrastructure, Participant};
-use crate::api::State::{Failed, Finished, Pending, Resumed, Running};
-use crate::api::conditions::{self, PLAUSIBLE, RUNNING, STALLED};
-use crate::api::reasons;
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{JobSight, PodView, ReportSight};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
+use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::State::{Failed, Finished, Pending, Resumed, Running};
+use leaderboard_api::conditions::{self, PLAUSIBLE, RUNNING, STALLED};
+use leaderboard_api::reasons;
 
 #[test]
 fn progress_is_no_transition_and_is_told_once() {

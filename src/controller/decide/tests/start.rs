@@ -3,13 +3,13 @@
 use std::time::Duration;
 
 use super::builders::*;
-use crate::api::FailureClass::{self, Infrastructure, Participant};
-use crate::api::State::{Failed, Pending, Running};
-use crate::api::conditions::{RUNNING, STALLED};
-use crate::api::reasons;
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::ContainerView;
 use crate::pod::run::Stop;
+use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
+use leaderboard_api::State::{Failed, Pending, Running};
+use leaderboard_api::conditions::{RUNNING, STALLED};
+use leaderboard_api::reasons;
 
 const NOT_FOUND: &str = "rpc error: code = NotFound desc = failed to pull and unpack image \"r/x:1\": not found";
 

@@ -1,12 +1,12 @@
 //! Cancels and deletions at every stage, and stops that nobody obeys.
 
 use super::builders::*;
-use crate::api::State::{Cancelled, Failed, Finished, Pending, Running};
-use crate::api::{names, reasons};
 use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{EvalaiEnd, JobEnd, ReportSight};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
+use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
+use leaderboard_api::{names, reasons};
 
 type Wish = fn(&mut World);
 

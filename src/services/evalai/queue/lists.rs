@@ -8,12 +8,12 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use super::{Now, Queue};
-use crate::api::names;
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
 use crate::services::evalai::row::{Row, Split};
 use crate::services::evalai::status::Status;
 use crate::services::evalai::types::{Changed, SweepRow, Swept};
+use leaderboard_api::names;
 
 /// What the sweep has found is not handed out again for so long.
 const SWEPT_FOR: Duration = Duration::from_mins(10);

@@ -5,8 +5,8 @@ use serde_json::{Value, json};
 use super::{
     assert_width, cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, waiting, with,
 };
-use crate::api::{Leaderboard, Submission};
-use crate::plugin::overview::lines;
+use crate::overview::lines;
+use leaderboard_api::{Leaderboard, Submission};
 
 fn said(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> String {
     let lines = lines("carla", submissions, leaderboards, now());

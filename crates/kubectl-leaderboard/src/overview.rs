@@ -11,8 +11,8 @@ use kube::ResourceExt;
 use super::board::{self, Sight};
 use super::text::{Page, WIDTH, clean, cut, join, span};
 use super::why;
-use crate::api::conditions;
-use crate::api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
+use leaderboard_api::conditions;
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 
 /// How long an end may wait for another system before that is trouble.
 const PATIENCE_SECONDS: i64 = 300;

@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use serde_json::{Value, json};
 
 use super::text::WIDTH;
-use crate::api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission};
 
 /// The moment of every test.
 fn now() -> Timestamp {

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::board::{self, Sight};
 use super::text::{Page, when};
 use super::why::{command, has_ended, is_attempt_wished};
-use crate::api::{Deadlines, State, Submission, reasons};
+use leaderboard_api::{Deadlines, State, Submission, reasons};
 
 /// What a person wishes of a submission.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -6,14 +6,14 @@ use serde_json::json;
 use super::{
     cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
 };
-use crate::api::Submission;
-use crate::plugin::board::Sight;
-use crate::plugin::change::{Wish, plan};
-use crate::plugin::error::Error;
-use crate::plugin::transitions::Waiting;
-use crate::plugin::{overview, why};
+use crate::board::Sight;
+use crate::change::{Wish, plan};
+use crate::error::Error;
+use crate::transitions::Waiting;
+use crate::{overview, why};
+use leaderboard_api::Submission;
 
-const DOCS: &str = include_str!("../../../docs/plugin.md");
+const DOCS: &str = include_str!("../../../../docs/plugin.md");
 
 fn assert_shown(lines: &[String]) {
     let block = format!("```\n{}\n```\n", lines.join("\n"));

@@ -5,10 +5,10 @@ use serde_json::{Value, json};
 use super::{
     assert_width, cancelled, crashed, finished, leaderboard, node_lost, now, running, submission, waiting, with,
 };
-use crate::api::{State, Submission};
-use crate::plugin::board::Sight;
-use crate::plugin::change::{Plan, Wish, after_refusal, plan};
-use crate::plugin::transitions::Waiting;
+use crate::board::Sight;
+use crate::change::{Plan, Wish, after_refusal, plan};
+use crate::transitions::Waiting;
+use leaderboard_api::{State, Submission};
 
 fn planned(wish: Wish, submission: &Submission) -> Result<Plan, String> {
     let plan = plan(wish, submission, Sight::There(&leaderboard()), now());

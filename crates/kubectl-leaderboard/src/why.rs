@@ -9,10 +9,10 @@ use kube::ResourceExt;
 use super::board::{self, Sight};
 use super::steps;
 use super::text::{Page, join, span, when};
-use crate::api::conditions;
-use crate::api::{Failure, FailureClass, PairStatus, Rerun, State, Submission, SubmissionStatus, reasons};
-use crate::pod::report::FAILURE_LOG_KEY;
-use crate::text::sentence;
+use leaderboard_api::conditions;
+use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, FailureClass, PairStatus, Rerun, State, Submission, SubmissionStatus, reasons};
 
 /// What is known, and what is said of it so far.
 struct Story<'a> {

@@ -6,8 +6,8 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 
 use super::text::wrap;
-use crate::api::conditions;
-use crate::api::{State, Submission};
+use leaderboard_api::conditions;
+use leaderboard_api::{State, Submission};
 
 /// Columns before the words of a transition.
 const INDENT: usize = 10;

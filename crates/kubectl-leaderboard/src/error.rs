@@ -9,7 +9,7 @@ use kube::config::KubeconfigError;
 use kube::runtime::watcher;
 
 use super::text::clean;
-use crate::observability::text;
+use leaderboard_api::client_errors as text;
 
 /// Rights, and who has them, are in the plugin's documentation.
 const RIGHTS: &str = "Ask the host for the rights that docs/plugin.md lists";

@@ -2,9 +2,9 @@
 //!
 //! Called by `why`, `overview` and `change`. Pure.
 
-use crate::api::conditions;
-use crate::api::{Leaderboard, reasons};
-use crate::text::sentence;
+use leaderboard_api::conditions;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Leaderboard, reasons};
 
 /// What was seen of a submission's Leaderboard.
 #[derive(Clone, Copy, Debug)]

@@ -2,6 +2,8 @@
 //!
 //! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
 
+#[cfg(feature = "client-errors")]
+pub mod client_errors;
 pub mod conditions;
 pub mod effective;
 pub mod image;
@@ -14,6 +16,7 @@ pub mod ranges;
 pub mod reasons;
 pub mod submission;
 pub mod submission_status;
+pub mod text;
 
 pub use image::{ImageReference, NotAnImage};
 pub use ingested::{Ingested, RefusedAttempt};

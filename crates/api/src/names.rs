@@ -48,6 +48,9 @@ pub const CONTAINER_WORKSPACE: &str = "workspace";
 /// Name of the sidecar that merges, uploads and reports.
 pub const CONTAINER_LOGCOPY: &str = "logcopy";
 
+/// Key of the log that explains a failure, below the run's prefix. Of that prefix it is the one text that the controller writes.
+pub const FAILURE_LOG_KEY: &str = "evalai/environment_log.txt";
+
 /// Name of an agent's container; pairs count from 1.
 pub fn agent_container(pair: usize) -> String {
     format!("agent-{pair}")

@@ -1,6 +1,6 @@
 //! `kubectl leaderboard`: why a submission is where it is, and to cancel or resume it.
 //!
-//! Called by the binary `kubectl-leaderboard` alone. `why`, `overview`, `change` and `transitions` are pure and hold what is
+//! `why`, `overview`, `change` and `transitions` are pure and hold what is
 //! said and decided; `cluster` is the way to the API server. Knows no EvalAI and no AWS: it says what the status says.
 
 mod board;
@@ -30,8 +30,8 @@ use self::change::Wish;
 use self::cluster::{Cluster, Place};
 use self::error::Error;
 use self::transitions::Waiting;
-use crate::api::{State, Submission};
-use crate::observability::text::watch as watch_words;
+use leaderboard_api::client_errors::watch as watch_words;
+use leaderboard_api::{State, Submission};
 
 /// How often a race for the object is run before it is given up.
 const ROUNDS: usize = 4;
@@ -75,7 +75,7 @@ struct Target {
 }
 
 /// Runs what the command line asks for.
-pub fn run() -> ExitCode {
+fn main() -> ExitCode {
     let cli = Cli::parse();
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();

@@ -19,7 +19,7 @@ use serde_json::Value;
 use super::board::Sight;
 use super::error::{Error, of_kubeconfig};
 use super::near;
-use crate::api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission};
 
 /// Field manager of what people change.
 const MANAGER: &str = "kubectl-leaderboard";

@@ -3,7 +3,7 @@
 //!
 //! Called by `why` and `board`. Pure.
 
-const STATES: &str = include_str!("../../docs/states.md");
+const STATES: &str = include_str!("../../../docs/states.md");
 /// The chapter with the table of logs.
 const LOGS: &str = "## The log of a failure";
 
@@ -71,9 +71,9 @@ fn plain(markdown: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::api::reasons;
+    use leaderboard_api::reasons;
 
-    const REASONS: &str = include_str!("../api/reasons.rs");
+    const REASONS: &str = include_str!("../../api/src/reasons.rs");
 
     #[test]
     fn every_reason_has_a_meaning_and_a_next_step() {

@@ -6,11 +6,11 @@ use super::{
     assert_width, cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission,
     waiting, with,
 };
-use crate::api::{Leaderboard, Submission, reasons};
-use crate::plugin::board::Sight;
-use crate::plugin::why::explain;
+use crate::board::Sight;
+use crate::why::explain;
+use leaderboard_api::{Leaderboard, Submission, reasons};
 
-const REASONS: &str = include_str!("../../api/reasons.rs");
+const REASONS: &str = include_str!("../../../api/src/reasons.rs");
 
 fn said(submission: &Submission, sight: Sight<'_>) -> String {
     let lines = explain(submission, sight, now());
