@@ -19,7 +19,7 @@ use crate::observability::shutdown::on_signals;
 use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
-use leaderboard_api::client_errors as text;
+use leaderboard_api::client_errors;
 
 /// The commit that was built, where the build was given one.
 const REVISION: Option<&str> = option_env!("LEADERBOARD_REVISION");
@@ -108,9 +108,9 @@ async fn lead(options: Controller) -> Result<(), String> {
         .map_err(|e| e.to_string())?;
     let config = cluster().await?;
     let clients = Clients {
-        api: Client::try_from(config.clone()).map_err(|e| text::kube(&e))?,
-        watch: watch_client(config.clone()).map_err(|e| text::kube(&e))?,
-        lease: leader::lease_client(config).map_err(|e| text::kube(&e))?,
+        api: Client::try_from(config.clone()).map_err(|e| client_errors::kube(&e))?,
+        watch: watch_client(config.clone()).map_err(|e| client_errors::kube(&e))?,
+        lease: leader::lease_client(config).map_err(|e| client_errors::kube(&e))?,
     };
     let identity = Identity::of_pod(&options.pod_name, &options.pod_uid);
     let lease = leader::Settings::new(&options.lease_namespace, &options.lease, identity);
@@ -132,7 +132,7 @@ async fn serve_bridge(options: Server) -> Result<(), String> {
     let server = HealthServer::start(options.http, seen.clone())
         .await
         .map_err(|e| e.to_string())?;
-    let client = Client::try_from(cluster().await?).map_err(|e| text::kube(&e))?;
+    let client = Client::try_from(cluster().await?).map_err(|e| client_errors::kube(&e))?;
     let health = std::sync::Arc::new(Health::default());
     let settings = bridge::Settings {
         namespace: namespace(&options.namespace),

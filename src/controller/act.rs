@@ -28,7 +28,7 @@ use leaderboard_api::{State, Submission, SubmissionStatus, names};
 /// What a pass could not carry out.
 #[derive(thiserror::Error, Debug)]
 pub enum ActError {
-    #[error("{what} of {object} failed: {}", text::kube(source))]
+    #[error("{what} of {object} failed: {}", client_errors::kube(source))]
     Kubernetes {
         what: &'static str,
         object: String,
@@ -400,7 +400,7 @@ impl Actor<'_> {
         match tokio::time::timeout(CALL_TIMEOUT, call).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => {
-                let error = text::kube(&error);
+                let error = client_errors::kube(&error);
                 tracing::warn!(submission = %self.name(), reason = %event.reason, error, "an event could not be written");
             }
             Err(_) => tracing::warn!(submission = %self.name(), reason = %event.reason, "an event was not answered"),

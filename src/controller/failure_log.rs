@@ -220,7 +220,7 @@ async fn of_node(
         Ok(stream) => stream,
         // Gone, or the container has no earlier run that the node remembers.
         Err(kube::Error::Api(status)) if [400, 404].contains(&status.code) => return Ok(None),
-        Err(error) => return Err(text::kube(&error)),
+        Err(error) => return Err(client_errors::kube(&error)),
     };
     let mut bytes = Vec::new();
     let read = pin!(stream).take(NODE_BYTES).read_to_end(&mut bytes).await;

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
-use leaderboard_api;
+use leaderboard_api as api;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::ObjectKey;

@@ -16,9 +16,10 @@ use tokio::time::{Instant, sleep, timeout};
 use super::decide::{Decision, Leading, Loss, Seen, decide, is_overdue};
 use super::record::{Record, held, released};
 use super::{Fence, Leadership, Settings};
+use crate::observability::Observability;
 use crate::observability::liveness::Liveness;
 use crate::observability::metrics::Metrics;
-use crate::observability::{Observability, text};
+use leaderboard_api::client_errors;
 
 /// Looks at a Lease that changes while it is being released.
 const RELEASE_TRIES: u32 = 3;
@@ -169,8 +170,8 @@ impl Elector {
                 Err(CallError::Stale)
             }
             Ok(Err(error)) => Err(CallError::Failed {
-                reason: text::reason(&error),
-                text: text::kube(&error),
+                reason: client_errors::reason(&error),
+                text: client_errors::kube(&error),
             }),
             Err(_) => {
                 let text = format!("no answer within {:.1} s", limit.as_secs_f32());

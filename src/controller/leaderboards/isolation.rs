@@ -230,7 +230,7 @@ async fn apply(context: &Context, leaderboard: &Leaderboard) -> Policy {
         )),
         Ok(Err(error)) => Policy::NotApplied(format!(
             "The NetworkPolicy {name} could not be applied: {} It is tried again.",
-            sentence(&text::kube(&error))
+            sentence(&client_errors::kube(&error))
         )),
         Err(_) => Policy::NotApplied(format!(
             "The NetworkPolicy {name} could not be applied: the API server did not answer. It is tried again."

@@ -41,7 +41,7 @@ const RESYNC: Duration = Duration::from_mins(1);
 /// What could not be done for a Leaderboard.
 #[derive(thiserror::Error, Debug)]
 pub enum LeaderboardError {
-    #[error("{what} of Leaderboard {name} failed: {}", text::kube(source))]
+    #[error("{what} of Leaderboard {name} failed: {}", client_errors::kube(source))]
     Kubernetes {
         what: &'static str,
         name: String,

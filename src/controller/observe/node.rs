@@ -57,7 +57,7 @@ pub(super) async fn sight(context: &Context, pod: &PodView) -> NodeSight {
         Ok(Ok(Some(node))) => of(&node),
         Ok(Ok(None)) => NodeSight::Gone,
         Ok(Err(error)) => {
-            let error = text::kube(&error);
+            let error = client_errors::kube(&error);
             tracing::debug!(node = %name, error, "the node of a lost Pod cannot be read");
             NodeSight::Unknown
         }

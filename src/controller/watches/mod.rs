@@ -26,11 +26,12 @@ use serde::de::DeserializeOwned;
 
 pub use feed::{Touch, Touches};
 
+use crate::observability::Observability;
 use crate::observability::liveness::WatchProbe;
 use crate::observability::metrics::WatchMetrics;
 use crate::observability::readiness::Readiness;
 use crate::observability::shutdown::Stop;
-use crate::observability::{Observability, text};
+use leaderboard_api::client_errors;
 
 /// Longer than a watch may be silent: the server ends each after 290 s.
 const READ_TIMEOUT: Duration = Duration::from_mins(5);
@@ -336,7 +337,7 @@ impl<K: Watchable> Task<K> {
             }
             _ => self.probe.failed(),
         }
-        let told = text::watch(error);
+        let told = client_errors::watch(error);
         if let Error::WatchError(status) = error
             && status.code == 410
         {

@@ -13,7 +13,8 @@ use kube::core::GroupVersion;
 use kube::{Api, Client, discovery};
 use tokio::time::{sleep, timeout};
 
-use crate::observability::{Observability, text};
+use crate::observability::Observability;
+use leaderboard_api::client_errors;
 use leaderboard_api::{GROUP, VERSION};
 
 /// Name of the check for our kinds.
@@ -96,7 +97,7 @@ async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
         Ok(Err(kube::Error::Api(status))) if status.code == 404 => Vec::new(),
         // Discovery tells a group without kinds as an error of its own.
         Ok(Err(kube::Error::Discovery(_))) => Vec::new(),
-        Ok(Err(error)) => return Some(text::kube(&error)),
+        Ok(Err(error)) => return Some(client_errors::kube(&error)),
         Err(_) => {
             return Some(format!(
                 "the API server has not answered within {} s",
@@ -164,7 +165,10 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
     match timeout(CALL_TIMEOUT, reviews.create(&PostParams::default(), &review)).await {
         Ok(Ok(answer)) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
         Ok(Ok(_)) => Some(format!("may not {need}; add the verb to the operator's role")),
-        Ok(Err(error)) => Some(format!("can't ask whether it may {need}: {}", text::kube(&error))),
+        Ok(Err(error)) => Some(format!(
+            "can't ask whether it may {need}: {}",
+            client_errors::kube(&error)
+        )),
         Err(_) => Some(format!(
             "can't ask whether it may {need}: no answer within {} s",
             CALL_TIMEOUT.as_secs()
