@@ -6,6 +6,7 @@ pub mod bridge;
 pub mod cli;
 pub mod controller;
 pub mod crds;
+pub mod kubernetes;
 pub mod observability;
 pub mod pod;
 pub mod services;

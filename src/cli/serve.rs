@@ -11,7 +11,7 @@ use crate::bridge::{self, Health};
 use crate::controller::context::Settings;
 use crate::controller::leader::{self, Identity};
 use crate::controller::run::{self, Clients};
-use crate::controller::watches::watch_client;
+use crate::kubernetes::watch_client;
 use crate::observability::Observability;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};

@@ -23,7 +23,7 @@ use super::observe::report::Reports;
 use super::observe::{is_pod_of, uid_of};
 use super::reruns::Reruns;
 use super::sync::Sync;
-use super::watches::Synced;
+use crate::kubernetes::Synced;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
 use leaderboard_api::{Leaderboard, Storage, Submission};

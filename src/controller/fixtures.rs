@@ -23,7 +23,7 @@ use tower_test::mock::{Handle, pair};
 
 use super::context::{Context, Settings, Stores};
 use super::sync::Sync;
-use super::watches::Synced;
+use crate::kubernetes::Synced;
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;

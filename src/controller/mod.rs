@@ -27,4 +27,3 @@ pub mod significance;
 pub mod sync;
 pub mod turns;
 pub mod view;
-pub mod watches;

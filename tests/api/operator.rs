@@ -6,7 +6,7 @@ use kube::{Client, Config};
 use leaderboard_operator::controller::context::Settings;
 use leaderboard_operator::controller::leader::{self, Identity, Timing};
 use leaderboard_operator::controller::run::{self, Clients, RunError};
-use leaderboard_operator::controller::watches::watch_client;
+use leaderboard_operator::kubernetes::watch_client;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::services::aws::Aws;

@@ -7,8 +7,8 @@ use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::watcher::Config;
 use kube::{Api, ResourceExt};
 use leaderboard_api::Submission;
-use leaderboard_operator::controller::watches::preflight::{Need, access_missing, await_kinds};
-use leaderboard_operator::controller::watches::{Touches, guarded, spawn_watch};
+use leaderboard_operator::kubernetes::preflight::{Need, access_missing, await_kinds};
+use leaderboard_operator::kubernetes::{WatchEvents, guarded, spawn_watch};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use serde_json::json;
@@ -19,11 +19,11 @@ use crate::support::apiserver::server;
 /// Longer than anything here may take, also on a busy machine.
 const LIMIT: Duration = Duration::from_mins(2);
 
-/// The next touch that `is` waited for; earlier states may be told or not.
-async fn next(touches: &mut Touches<Submission>, is: impl Fn(&Submission, bool) -> bool) {
+/// The next event that `is` waited for; earlier states may come or not.
+async fn next(events: &mut WatchEvents<Submission>, is: impl Fn(&Submission, bool) -> bool) {
     let search = async {
-        while let Some(touch) = touches.next().await {
-            if is(&touch.object, touch.is_gone) {
+        while let Some(event) = events.next().await {
+            if is(&event.object, event.is_gone) {
                 return;
             }
         }
@@ -33,18 +33,18 @@ async fn next(touches: &mut Touches<Submission>, is: impl Fn(&Submission, bool) 
 }
 
 #[tokio::test]
-async fn creations_changes_and_deletions_are_told() {
+async fn creations_changes_and_deletions_are_events() {
     let (client, namespace) = (server().await.client(), server().await.namespace("watches").await);
     let (_sender, stop) = Stop::new();
-    let seen = Observability::new(stop);
-    seen.readiness.registered();
+    let telemetry = Observability::new(stop);
+    telemetry.readiness.registered();
     let watch = spawn_watch::<Submission>(
         guarded(client.clone(), Some(&namespace)),
         Config::default(),
         |_| {},
-        &seen,
+        &telemetry,
     );
-    let mut touches = watch.subscribe();
+    let mut events = watch.subscribe();
     watch.store.wait_until_ready().await.unwrap();
     let submissions = Api::<Submission>::namespaced(client, &namespace);
     let object = json!({"apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission", "metadata": {"name": "one"},
@@ -53,24 +53,28 @@ async fn creations_changes_and_deletions_are_told() {
         .create(&PostParams::default(), &serde_json::from_value(object).unwrap())
         .await
         .unwrap();
-    next(&mut touches, |object, is_gone| object.name_any() == "one" && !is_gone).await;
+    next(&mut events, |object, is_gone| object.name_any() == "one" && !is_gone).await;
     let patch = Patch::Merge(json!({"spec": {"priority": 7}}));
     submissions.patch("one", &PatchParams::default(), &patch).await.unwrap();
-    next(&mut touches, |object, _| object.spec.priority == 7).await;
+    next(&mut events, |object, _| object.spec.priority == 7).await;
     assert!(watch.store.state()[0].metadata.managed_fields.is_none());
     submissions.delete("one", &DeleteParams::default()).await.unwrap();
-    next(&mut touches, |object, is_gone| object.name_any() == "one" && is_gone).await;
-    assert!(watch.store.is_empty() && seen.readiness.missing().is_empty());
+    next(&mut events, |object, is_gone| object.name_any() == "one" && is_gone).await;
+    assert!(watch.store.is_empty() && telemetry.readiness.missing().is_empty());
 }
 
 #[tokio::test]
 async fn the_preflight_finds_the_kinds_and_the_permissions_of_an_administrator() {
     let client = server().await.client();
     let (_sender, stop) = Stop::new();
-    let seen = Observability::new(stop);
-    seen.readiness.registered();
-    let found = timeout(LIMIT, await_kinds(&client, &["leaderboards", "submissions"], &seen)).await;
-    assert!(found.expect("in time") && seen.readiness.missing().is_empty());
+    let telemetry = Observability::new(stop);
+    telemetry.readiness.registered();
+    let found = timeout(
+        LIMIT,
+        await_kinds(&client, &["leaderboards", "submissions"], &telemetry),
+    )
+    .await;
+    assert!(found.expect("in time") && telemetry.readiness.missing().is_empty());
     let need = |resource, verb| Need {
         group: "leaderboard.carla.org",
         resource,

@@ -18,7 +18,7 @@ use super::{Desk, POLICY_AGAIN, RESYNC, SOONEST};
 use crate::controller::context::{CALL_TIMEOUT, Context, Stores};
 use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::observe::uid_of;
-use crate::controller::watches::Touches;
+use crate::kubernetes::WatchEvents;
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::client_errors;
 use leaderboard_api::conditions::{self, Truth};
@@ -179,7 +179,11 @@ impl Desk {
 
 /// Restores what somebody has edited or deleted, and applies what a new spec asks for, until the process stops: a task of its
 /// own, because the reconcile of a Leaderboard may wait for a bucket or a token meanwhile.
-pub async fn restore(policies: Touches<NetworkPolicy>, leaderboards: Touches<Leaderboard>, context: Arc<Context>) {
+pub async fn restore(
+    policies: WatchEvents<NetworkPolicy>,
+    leaderboards: WatchEvents<Leaderboard>,
+    context: Arc<Context>,
+) {
     // The reconcile of a Leaderboard has a moment to do it itself.
     let of_spec = leaderboards.map(|touch| (Some(ObjectRef::from_obj(touch.object.as_ref())), false));
     let of_policy = policies.map(|touch| (Stores::leaderboard_of(touch.object.as_ref()), true));

@@ -12,10 +12,10 @@ use super::{Touched, board, owner};
 use crate::controller::context::Context;
 use crate::controller::leaderboards::isolation;
 use crate::controller::observe::board::Places;
-use crate::controller::watches::Touch;
+use crate::kubernetes::WatchEvent;
 use leaderboard_api::{Leaderboard, Submission};
 
-pub(super) fn of_leaderboards() -> impl FnMut(Touch<Leaderboard>) -> Vec<Touched> + Send {
+pub(super) fn of_leaderboards() -> impl FnMut(WatchEvent<Leaderboard>) -> Vec<Touched> + Send {
     let mut leaderboards = Fingerprints::default();
     move |touch| {
         let object = touch.object.as_ref();
@@ -30,7 +30,7 @@ pub(super) fn of_leaderboards() -> impl FnMut(Touch<Leaderboard>) -> Vec<Touched
     }
 }
 
-pub(super) fn of_submissions(context: Arc<Context>) -> impl FnMut(Touch<Submission>) -> Vec<Touched> + Send {
+pub(super) fn of_submissions(context: Arc<Context>) -> impl FnMut(WatchEvent<Submission>) -> Vec<Touched> + Send {
     let (mut submissions, mut places) = (Fingerprints::default(), Places::default());
     move |touch| {
         let object = touch.object.as_ref();
@@ -59,7 +59,7 @@ pub(super) fn of_submissions(context: Arc<Context>) -> impl FnMut(Touch<Submissi
 }
 
 /// A Pod concerns its Submission, and its Leaderboard once it has measured its isolation.
-pub(super) fn of_pods() -> impl FnMut(Touch<Pod>) -> Vec<Touched> + Send {
+pub(super) fn of_pods() -> impl FnMut(WatchEvent<Pod>) -> Vec<Touched> + Send {
     let mut measured = HashSet::new();
     move |touch| {
         let pod = touch.object.as_ref();

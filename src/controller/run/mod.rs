@@ -30,8 +30,8 @@ use super::leader::{self, Leader, Leadership};
 use super::leaderboards::isolation;
 use super::observe::children_selector;
 use super::sync::Sync;
-use super::watches::preflight::{self, await_kinds, watch_access};
-use super::watches::{Touch, Touches, Watch, Watchable, guarded, spawn_watch};
+use crate::kubernetes::preflight::{self, await_kinds, watch_access};
+use crate::kubernetes::{Watch, WatchEvent, WatchEvents, Watchable, guarded, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::ObjectKey;
@@ -171,7 +171,7 @@ impl Watches {
         forward(tasks, self.leaderboards.subscribe(), touched, events::of_leaderboards());
         let of_submissions = events::of_submissions(Arc::clone(context));
         forward(tasks, self.submissions.subscribe(), touched, of_submissions);
-        forward(tasks, self.jobs.subscribe(), touched, |touch: Touch<Job>| {
+        forward(tasks, self.jobs.subscribe(), touched, |touch: WatchEvent<Job>| {
             owner(touch.object.as_ref())
         });
         forward(tasks, self.pods.subscribe(), touched, events::of_pods());
@@ -185,7 +185,7 @@ impl Watches {
             tasks,
             self.policies.subscribe(),
             touched,
-            |touch: Touch<NetworkPolicy>| board(touch.object.as_ref()).into_iter().collect(),
+            |touch: WatchEvent<NetworkPolicy>| board(touch.object.as_ref()).into_iter().collect(),
         );
     }
 }
@@ -229,9 +229,9 @@ fn key(object: &impl ResourceExt) -> ObjectKey {
 
 fn forward<K: Watchable>(
     tasks: &Tasks,
-    mut touches: Touches<K>,
+    mut touches: WatchEvents<K>,
     touched: &mpsc::UnboundedSender<Touched>,
-    mut map: impl FnMut(Touch<K>) -> Vec<Touched> + Send + 'static,
+    mut map: impl FnMut(WatchEvent<K>) -> Vec<Touched> + Send + 'static,
 ) {
     let touched = touched.clone();
     tasks.stay(format!("events of {}", K::plural(&())), async move {

@@ -4,7 +4,7 @@
 //! for: the question itself, and each Leaderboard's Secret, whose absence its condition `Ready` shows (`TokenMissing`).
 
 use crate::controller::leader;
-use crate::controller::watches::preflight::Need;
+use crate::kubernetes::preflight::Need;
 use leaderboard_api::GROUP;
 
 /// Group, resource, verbs.

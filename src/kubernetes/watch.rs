@@ -1,31 +1,23 @@
-//! Watches: one task for each kind, a cache, and a feed of what was touched.
+//! Watches: one task for each kind, a cache, and a feed of what has changed.
 //!
-//! Started by the controller's wiring. One task each, because a shared back-off would let one sick watch hold up all
-//! others. Errors are logged, counted and mended here; readers only ever see objects. Knows no policy.
-
-mod feed;
-pub mod preflight;
-
-#[cfg(test)]
-mod tests;
+//! One task each, because a shared backoff would let one broken watch hold up all others. Errors are logged, counted and
+//! retried here; readers only ever get objects.
 
 use std::collections::HashMap;
-use std::fmt;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use futures::{Stream, StreamExt};
-use kube::core::{DeserializeGuard, NamespaceResourceScope};
+use kube::core::DeserializeGuard;
 use kube::runtime::reflector::{ObjectRef, Store, store::Writer};
 use kube::runtime::watcher::{Config, Error, Event};
 use kube::runtime::{WatchStreamExt, watcher};
-use kube::{Api, Client, Resource, ResourceExt};
-use serde::de::DeserializeOwned;
+use kube::{Api, ResourceExt};
 
-pub use feed::{Touch, Touches};
-
+use super::Watchable;
+use super::feed::{Feed, WatchEvents};
 use crate::observability::Observability;
 use crate::observability::liveness::WatchProbe;
 use crate::observability::metrics::WatchMetrics;
@@ -33,63 +25,30 @@ use crate::observability::readiness::Readiness;
 use crate::observability::shutdown::Stop;
 use leaderboard_api::client_errors;
 
-/// Longer than a watch may be silent: the server ends each after 290 s.
-const READ_TIMEOUT: Duration = Duration::from_mins(5);
 /// A watch that the API server has refused begins again with a list after this long.
 const REFUSED_AGAIN: Duration = Duration::from_secs(10);
 
-/// What can be watched.
-pub trait Watchable:
-    Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
-{
-}
-
-impl<K> Watchable for K where
-    K: Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
-{
-}
-
-/// A client for watches: a list or a watch on a dead connection ends in minutes, not never.
-///
-/// # Errors
-/// If the configuration holds no usable TLS or credentials.
-pub fn watch_client(mut config: kube::Config) -> Result<Client, kube::Error> {
-    config.read_timeout = Some(READ_TIMEOUT);
-    Client::try_from(config)
-}
-
-/// The door to a kind, in one namespace or in all, that lets malformed objects pass as such instead of failing.
-pub fn guarded<K>(client: Client, namespace: Option<&str>) -> Api<DeserializeGuard<K>>
-where
-    K: Watchable + Resource<Scope = NamespaceResourceScope>,
-{
-    match namespace {
-        Some(namespace) => Api::namespaced(client, namespace),
-        None => Api::all(client),
-    }
-}
-
 /// A running watch. Clones are the same one.
 pub struct Watch<K: Watchable> {
-    /// The objects as they were last seen.
+    /// The objects as they were last observed.
     pub store: Store<K>,
-    /// Whether the store follows the API server.
+    /// Whether the store is in sync with the API server.
     pub synced: Synced,
-    feed: feed::Feed<K>,
+    feed: Feed<K>,
 }
 
-/// Whether a watch has listed its kind and was not refused since: without it a store may show what is long gone. Clones are
+/// Whether a watch has listed its kind and was not refused since: otherwise a store may show what is long gone. Clones are
 /// the same one.
 #[derive(Clone, Debug, Default)]
 pub struct Synced(Arc<AtomicBool>);
 
 impl Synced {
-    /// It does.
+    /// It is in sync.
     pub fn is_true(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }
 
-    pub(super) fn set(&self, is_synced: bool) {
+    pub(crate) fn set(&self, is_synced: bool) {
         self.0.store(is_synced, Ordering::Release);
     }
 }
@@ -105,9 +64,8 @@ impl<K: Watchable> Clone for Watch<K> {
 }
 
 impl<K: Watchable> Watch<K> {
-    /// Everything that is there now, then everything that is touched, deletions included. The store is at least as new
-    /// as what is told.
-    pub fn subscribe(&self) -> Touches<K> {
+    /// All objects that exist now, then each that is added, changed or deleted. The store is at least as new as each event.
+    pub fn subscribe(&self) -> WatchEvents<K> {
         self.feed.subscribe(|| self.store.state())
     }
 }
@@ -118,20 +76,20 @@ pub fn spawn_watch<K: Watchable>(
     api: Api<DeserializeGuard<K>>,
     config: Config,
     trim: fn(&mut K),
-    seen: &Observability,
+    telemetry: &Observability,
 ) -> Watch<K> {
     let writer = Writer::<K>::new(());
     let watch = Watch {
         store: writer.as_reader(),
         synced: Synced::default(),
-        feed: feed::Feed::new(),
+        feed: Feed::new(),
     };
     let kind = K::kind(&()).into_owned();
     let task = Task {
         check: format!("{} synced", K::plural(&())),
-        probe: seen.liveness.watch(&kind),
-        metrics: seen.metrics.watch(&kind),
-        readiness: seen.readiness.clone(),
+        probe: telemetry.liveness.watch(&kind),
+        metrics: telemetry.metrics.watch(&kind),
+        readiness: telemetry.readiness.clone(),
         kind,
         trim,
         store: watch.store.clone(),
@@ -141,7 +99,9 @@ pub fn spawn_watch<K: Watchable>(
     };
     task.missing("the first list has not come yet");
     let name = format!("watch of {}", K::plural(&()));
-    seen.tasks.stay(name, task.run(api, config, seen.stop.clone()));
+    telemetry
+        .tasks
+        .stay(name, task.run(api, config, telemetry.stop.clone()));
     watch
 }
 
@@ -155,7 +115,7 @@ struct Task<K: Watchable> {
     trim: fn(&mut K),
     store: Store<K>,
     writer: Writer<K>,
-    feed: feed::Feed<K>,
+    feed: Feed<K>,
     synced: Synced,
 }
 
@@ -188,13 +148,13 @@ impl<K: Watchable> Task<K> {
                 Some(Ok(event)) => self.event(event),
                 Some(Err(error)) => {
                     self.error(&error);
-                    // Where it was is of no use: a watch without news would not tell that it has its right again.
+                    // A list, because a watch without news does not show that the right is back.
                     if matches!(error, Error::WatchStartFailed(_)) && is_refusal(&error) {
                         tokio::select! { () = stop.wait() => break, () = tokio::time::sleep(REFUSED_AGAIN) => {} }
                         events = begin(&api, &config);
                     }
                 }
-                // The stream has no end; should it find one, this task ends, and with it the process.
+                // The stream has no end; if it ends all the same, this task ends, and with it the process.
                 None => break,
             }
         }
@@ -203,7 +163,7 @@ impl<K: Watchable> Task<K> {
 
     fn event(&mut self, event: Event<DeserializeGuard<K>>) {
         if matches!(event, Event::Init) {
-            // The beginning of a list is a wish, not an answer.
+            // The beginning of a list is a request, not an answer.
             self.probe.listing();
             return self.writer.apply_watcher_event(&Event::Init);
         }
@@ -223,7 +183,7 @@ impl<K: Watchable> Task<K> {
         let before = self.store.get(&key);
         self.writer.apply_watcher_event(&Event::Apply(object));
         let after = self.store.get(&key);
-        // The end of an object that was replaced by a namesake between two looks.
+        // The end of an object that was replaced by another one of its name between two reads.
         if let Some(before) = before.filter(|b| after.as_ref().is_some_and(|a| a.uid() != b.uid())) {
             self.feed.push(&before, true);
         }
@@ -242,7 +202,7 @@ impl<K: Watchable> Task<K> {
             Err(invalid) => {
                 let mut key = ObjectRef::<K>::new(invalid.metadata.name.as_deref().unwrap_or_default());
                 key.namespace = invalid.metadata.namespace;
-                // An object that never could be read was never told of.
+                // No event was sent for an object that never could be read.
                 let Some(known) = self.store.get(&key) else { return };
                 known
             }
@@ -255,7 +215,7 @@ impl<K: Watchable> Task<K> {
         let namespace = object.namespace();
         let name = object.name_any();
         let object = self.read(object).or_else(|| {
-            // One that has become unreadable stays as it was last: it has not been deleted.
+            // One that has become unreadable stays as it was last read: it has not been deleted.
             let mut key = ObjectRef::<K>::new(&name);
             key.namespace = namespace;
             self.store.get(&key).map(|known| (*known).clone())
@@ -274,7 +234,7 @@ impl<K: Watchable> Task<K> {
             .collect();
         self.writer.apply_watcher_event(&Event::InitDone);
         self.probe.listed();
-        // Before anybody is woken by what was listed.
+        // Before anyone is woken by what was listed.
         if !self.synced.is_true() {
             self.synced.set(true);
             self.readiness.set(&self.check, Ok(()));
@@ -299,7 +259,7 @@ impl<K: Watchable> Task<K> {
         );
     }
 
-    /// The object, trimmed; None if it can't be read, which is told by its name.
+    /// The object, trimmed; None if it can't be read, which is logged with its name.
     fn read(&self, object: DeserializeGuard<K>) -> Option<K> {
         match object.0 {
             Ok(mut object) => {
@@ -314,7 +274,7 @@ impl<K: Watchable> Task<K> {
                     namespace,
                     name,
                     error = invalid.error,
-                    "left out an object that can't be read"
+                    "skipped an object that can't be read"
                 );
                 None
             }
@@ -337,17 +297,17 @@ impl<K: Watchable> Task<K> {
             }
             _ => self.probe.failed(),
         }
-        let told = client_errors::watch(error);
+        let cause = client_errors::watch(error);
         if let Error::WatchError(status) = error
             && status.code == 410
         {
             // The server has forgotten where the watch was: usual after an outage.
-            tracing::info!(kind = self.kind, error = told, "listing again");
+            tracing::info!(kind = self.kind, error = cause, "listing again");
         } else {
-            tracing::warn!(kind = self.kind, error = told, "a watch has failed and is tried again");
+            tracing::warn!(kind = self.kind, error = cause, "a watch has failed and is retried");
         }
         if !self.synced.is_true() {
-            self.missing(&told);
+            self.missing(&cause);
         }
     }
 

@@ -1,7 +1,7 @@
 //! What a process asks of the cluster before it works: that our kinds are served, and that it may do what it has to.
 //!
-//! Called by `main` at the start. Does not give up: CRDs and roles may be applied after the operator. Says what is missing
-//! in the log and in readiness.
+//! Called at the start. Does not give up: CRDs and roles may be applied after the operator. The log and readiness show what
+//! is missing.
 
 use std::fmt;
 use std::time::Duration;
@@ -14,20 +14,19 @@ use kube::{Api, Client, discovery};
 use tokio::time::{sleep, timeout};
 
 use crate::observability::Observability;
-use leaderboard_api::client_errors;
-use leaderboard_api::{GROUP, VERSION};
+use leaderboard_api::{GROUP, VERSION, client_errors};
 
 /// Name of the check for our kinds.
 const KINDS_CHECK: &str = "custom resources";
 /// Name of the check for permissions.
 const ACCESS_CHECK: &str = "permissions";
-/// Any one question.
+/// For any one request.
 const CALL_TIMEOUT: Duration = Duration::from_secs(10);
-/// Between looks for kinds.
+/// Between checks of the kinds.
 const KINDS_PAUSE: Duration = Duration::from_secs(2);
-/// Between looks for permissions.
+/// Between checks of the permissions.
 const ACCESS_PAUSE: Duration = Duration::from_secs(30);
-/// Questions at once.
+/// Requests at once.
 const AT_ONCE: usize = 8;
 
 /// One thing that the process has to be allowed.
@@ -61,29 +60,30 @@ impl fmt::Display for Need<'_> {
 }
 
 /// Registers both checks, so that the process is not ready before they are answered.
-pub fn register(seen: &Observability) {
+pub fn register(telemetry: &Observability) {
     for check in [KINDS_CHECK, ACCESS_CHECK] {
-        seen.readiness
+        telemetry
+            .readiness
             .set(check, Err("the API server has not been asked yet".to_owned()));
     }
 }
 
 /// Waits until the API server serves our kinds. False: the process was stopped meanwhile.
-pub async fn await_kinds(client: &Client, plurals: &[&str], seen: &Observability) -> bool {
+pub async fn await_kinds(client: &Client, plurals: &[&str], telemetry: &Observability) -> bool {
     let mut last = String::new();
     loop {
         let state = kinds_missing(client, plurals).await;
         let Some(missing) = state else {
-            seen.readiness.set(KINDS_CHECK, Ok(()));
-            seen.liveness.answered();
+            telemetry.readiness.set(KINDS_CHECK, Ok(()));
+            telemetry.liveness.answered();
             return true;
         };
         if missing != last {
             tracing::warn!(missing, "waiting for the custom resources");
         }
-        seen.readiness.set(KINDS_CHECK, Err(missing.clone()));
+        telemetry.readiness.set(KINDS_CHECK, Err(missing.clone()));
         last = missing;
-        if !pause(KINDS_PAUSE, seen).await {
+        if !pause(KINDS_PAUSE, telemetry).await {
             return false;
         }
     }
@@ -95,7 +95,7 @@ async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
         Ok(Ok(group)) => group.versioned_resources(VERSION),
         // For an unknown group the server answers plain text, so that only the code says what it means.
         Ok(Err(kube::Error::Api(status))) if status.code == 404 => Vec::new(),
-        // Discovery tells a group without kinds as an error of its own.
+        // For a group without kinds discovery has an error of its own.
         Ok(Err(kube::Error::Discovery(_))) => Vec::new(),
         Ok(Err(error)) => return Some(client_errors::kube(&error)),
         Err(_) => {
@@ -115,17 +115,17 @@ async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
     })
 }
 
-/// Asks until everything is allowed, and says what is not. Not to be waited for: much may work meanwhile.
-pub async fn watch_access(client: Client, needs: &[Need<'_>], seen: &Observability) {
+/// Asks until everything is allowed, and reports what is not. Runs as a task of its own: much may work meanwhile.
+pub async fn watch_access(client: Client, needs: &[Need<'_>], telemetry: &Observability) {
     loop {
         let missing = access_missing(&client, needs).await;
         if missing.is_empty() {
-            return seen.readiness.set(ACCESS_CHECK, Ok(()));
+            return telemetry.readiness.set(ACCESS_CHECK, Ok(()));
         }
-        let told = missing.join("; ");
-        tracing::error!(missing = told, "permissions are missing");
-        seen.readiness.set(ACCESS_CHECK, Err(told));
-        if !pause(ACCESS_PAUSE, seen).await {
+        let missing = missing.join("; ");
+        tracing::error!(missing, "permissions are missing");
+        telemetry.readiness.set(ACCESS_CHECK, Err(missing));
+        if !pause(ACCESS_PAUSE, telemetry).await {
             return;
         }
     }
@@ -177,9 +177,9 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
 }
 
 /// False: the process was stopped.
-async fn pause(time: Duration, seen: &Observability) -> bool {
+async fn pause(time: Duration, telemetry: &Observability) -> bool {
     tokio::select! {
         () = sleep(time) => true,
-        () = seen.stop.wait() => false,
+        () = telemetry.stop.wait() => false,
     }
 }

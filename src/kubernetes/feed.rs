@@ -1,7 +1,7 @@
-//! Hands the objects that a watch has touched to whoever subscribed, each to each, the newest state only.
+//! Hands the changed objects of a watch to all subscribers, the newest state only.
 //!
-//! Filled by a watch's task, read by the controller's queue. Never blocks the watch and loses nothing: what is not read
-//! yet is coalesced by UID, so that it takes no more room than the objects do. A subscriber that comes late gets all
+//! Filled by a watch's task. Never blocks the watch and loses nothing: what is not read
+//! yet is coalesced by UID, so that it takes no more memory than the objects do. A subscriber that comes late gets all
 //! objects that are there.
 
 use std::collections::{HashMap, VecDeque};
@@ -14,14 +14,14 @@ use kube::ResourceExt;
 
 /// An object that was added, changed or deleted.
 #[derive(Debug)]
-pub struct Touch<K> {
+pub struct WatchEvent<K> {
     /// As it is, or as it was last.
     pub object: Arc<K>,
     /// It no longer exists.
     pub is_gone: bool,
 }
 
-impl<K> Clone for Touch<K> {
+impl<K> Clone for WatchEvent<K> {
     fn clone(&self) -> Self {
         Self {
             object: self.object.clone(),
@@ -40,14 +40,14 @@ struct Lanes<K> {
 
 struct Lane<K> {
     order: VecDeque<String>,
-    latest: HashMap<String, Touch<K>>,
+    latest: HashMap<String, WatchEvent<K>>,
     waker: Option<Waker>,
     is_closed: bool,
 }
 
 /// A subscriber's end: a stream that ends with the watch. Dropping it unsubscribes.
 #[must_use = "a subscription gathers what is not read"]
-pub struct Touches<K>(Arc<Mutex<Lane<K>>>);
+pub struct WatchEvents<K>(Arc<Mutex<Lane<K>>>);
 
 impl<K> Clone for Feed<K> {
     fn clone(&self) -> Self {
@@ -64,7 +64,7 @@ impl<K: ResourceExt> Feed<K> {
     }
 
     /// `present` is asked under the feed's lock, so that nothing falls between what is there and what comes.
-    pub(super) fn subscribe(&self, present: impl FnOnce() -> Vec<Arc<K>>) -> Touches<K> {
+    pub(super) fn subscribe(&self, present: impl FnOnce() -> Vec<Arc<K>>) -> WatchEvents<K> {
         let mut feed = lock(&self.0);
         let is_closed = feed.is_closed;
         let mut lane = Lane {
@@ -74,16 +74,16 @@ impl<K: ResourceExt> Feed<K> {
             is_closed,
         };
         for object in present() {
-            lane.push(Touch { object, is_gone: false });
+            lane.push(WatchEvent { object, is_gone: false });
         }
         let lane = Arc::new(Mutex::new(lane));
         feed.lanes.push(Arc::downgrade(&lane));
-        Touches(lane)
+        WatchEvents(lane)
     }
 
     pub(super) fn push(&self, object: &Arc<K>, is_gone: bool) {
         self.for_each(|lane| {
-            lane.push(Touch {
+            lane.push(WatchEvent {
                 object: object.clone(),
                 is_gone,
             });
@@ -110,25 +110,25 @@ impl<K: ResourceExt> Feed<K> {
 }
 
 impl<K: ResourceExt> Lane<K> {
-    fn push(&mut self, touch: Touch<K>) {
-        let object = &touch.object;
+    fn push(&mut self, event: WatchEvent<K>) {
+        let object = &event.object;
         let key = object
             .uid()
             .unwrap_or_else(|| format!("{}/{}", object.namespace().unwrap_or_default(), object.name_any()));
-        if self.latest.insert(key.clone(), touch).is_none() {
+        if self.latest.insert(key.clone(), event).is_none() {
             self.order.push_back(key);
         }
     }
 }
 
-impl<K> Stream for Touches<K> {
-    type Item = Touch<K>;
+impl<K> Stream for WatchEvents<K> {
+    type Item = WatchEvent<K>;
 
-    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Touch<K>>> {
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<WatchEvent<K>>> {
         let mut lane = lock(&self.0);
         let next = lane.order.pop_front();
-        if let Some(touch) = next.and_then(|key| lane.latest.remove(&key)) {
-            return Poll::Ready(Some(touch));
+        if let Some(event) = next.and_then(|key| lane.latest.remove(&key)) {
+            return Poll::Ready(Some(event));
         }
         if lane.is_closed {
             return Poll::Ready(None);
@@ -156,8 +156,8 @@ mod tests {
         Arc::new(object)
     }
 
-    fn told(touches: &mut Touches<ConfigMap>) -> Vec<(String, String, bool)> {
-        std::iter::from_fn(|| touches.next().now_or_never().flatten())
+    fn read(events: &mut WatchEvents<ConfigMap>) -> Vec<(String, String, bool)> {
+        std::iter::from_fn(|| events.next().now_or_never().flatten())
             .map(|t| (t.object.name_any(), t.object.resource_version().unwrap(), t.is_gone))
             .collect()
     }
@@ -169,24 +169,24 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_read_yet_is_told_once_in_its_newest_state() {
+    fn what_is_not_read_yet_comes_once_in_its_newest_state() {
         let feed = Feed::new();
-        let mut touches = feed.subscribe(|| vec![object("a", "1", "1")]);
+        let mut events = feed.subscribe(|| vec![object("a", "1", "1")]);
         feed.push(&object("b", "2", "2"), false);
         feed.push(&object("a", "1", "3"), false);
         feed.push(&object("b", "2", "4"), true);
-        assert_eq!(told(&mut touches), expected(&[("a", "3", false), ("b", "4", true)]));
+        assert_eq!(read(&mut events), expected(&[("a", "3", false), ("b", "4", true)]));
         feed.push(&object("a", "1", "5"), false);
-        assert_eq!(told(&mut touches), expected(&[("a", "5", false)]));
+        assert_eq!(read(&mut events), expected(&[("a", "5", false)]));
     }
 
     #[test]
     fn the_end_of_an_object_is_not_covered_by_its_namesake() {
         let feed = Feed::new();
-        let mut touches = feed.subscribe(Vec::new);
+        let mut events = feed.subscribe(Vec::new);
         feed.push(&object("a", "old", "1"), true);
         feed.push(&object("a", "new", "2"), false);
-        assert_eq!(told(&mut touches), expected(&[("a", "1", true), ("a", "2", false)]));
+        assert_eq!(read(&mut events), expected(&[("a", "1", true), ("a", "2", false)]));
     }
 
     #[tokio::test]
@@ -210,14 +210,14 @@ mod tests {
         feed.push(&object("b", "2", "2"), false);
         feed.close();
         assert_eq!(
-            told(&mut three),
+            read(&mut three),
             expected(&[("b", "2", false)]),
-            "what came before the end is still told"
+            "what came before the end still comes"
         );
         assert!(three.next().await.is_none());
         assert!(
             feed.subscribe(Vec::new).next().await.is_none(),
-            "a watch that has ended tells nothing more"
+            "a watch that has ended has no more events"
         );
     }
 }

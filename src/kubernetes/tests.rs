@@ -10,8 +10,13 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 use tower_test::mock::{Handle, pair};
 
+use kube::ResourceExt;
+use kube::runtime::watcher::Config;
+
 use super::preflight::{Need, access_missing, await_kinds};
 use super::*;
+use crate::observability::Observability;
+use crate::observability::shutdown::Stop;
 use leaderboard_api::Leaderboard;
 
 /// Longer than anything here may take.
@@ -86,8 +91,8 @@ fn gone() -> Value {
 
 struct Rig {
     watch: Watch<Leaderboard>,
-    touches: Touches<Leaderboard>,
-    seen: Observability,
+    events: WatchEvents<Leaderboard>,
+    telemetry: Observability,
     stop: watch::Sender<bool>,
     script: Script,
 }
@@ -95,15 +100,15 @@ struct Rig {
 fn rig(answers: Vec<Answer>) -> Rig {
     let (client, script) = scripted(answers);
     let (stop, receiver) = Stop::new();
-    let seen = Observability::new(receiver);
-    seen.readiness.registered();
+    let telemetry = Observability::new(receiver);
+    telemetry.readiness.registered();
     let trim = |board: &mut Leaderboard| board.metadata.annotations = None;
-    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), trim, &seen);
-    let touches = watch.subscribe();
+    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), trim, &telemetry);
+    let events = watch.subscribe();
     Rig {
         watch,
-        touches,
-        seen,
+        events,
+        telemetry,
         stop,
         script,
     }
@@ -115,23 +120,23 @@ impl Rig {
     }
 
     async fn next(&mut self) -> (String, String, bool) {
-        let touch = timeout(LIMIT, self.touches.next())
+        let event = timeout(LIMIT, self.events.next())
             .await
             .expect("an event in time")
             .expect("a watch that goes on");
         (
-            touch.object.name_any(),
-            touch.object.resource_version().unwrap_or_default(),
-            touch.is_gone,
+            event.object.name_any(),
+            event.object.resource_version().unwrap_or_default(),
+            event.is_gone,
         )
     }
 
     fn metric(&self, line: &str) -> bool {
-        self.seen.metrics.text().unwrap().lines().any(|l| l == line)
+        self.telemetry.metrics.text().unwrap().lines().any(|l| l == line)
     }
 }
 
-fn told(name: &str, version: &str, is_gone: bool) -> (String, String, bool) {
+fn event(name: &str, version: &str, is_gone: bool) -> (String, String, bool) {
     (name.to_owned(), version.to_owned(), is_gone)
 }
 
@@ -142,31 +147,31 @@ fn the_test_object_is_one() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn objects_come_trimmed_and_deletions_are_told() {
+async fn objects_come_trimmed_and_deletions_are_events() {
     let mut rig = rig(vec![list(&[board("a", "1", "5")])]);
     assert_eq!(
-        rig.seen.readiness.missing(),
+        rig.telemetry.readiness.missing(),
         ["leaderboards synced: the first list has not come yet"]
     );
-    assert_eq!(rig.next().await, told("a", "5", false));
-    assert!(rig.seen.readiness.missing().is_empty());
+    assert_eq!(rig.next().await, event("a", "5", false));
+    assert!(rig.telemetry.readiness.missing().is_empty());
     let first = rig.watch.store.state().remove(0);
     assert!(first.metadata.managed_fields.is_none());
     rig.send(vec![Answer::Watch(vec![
         line("ADDED", &board("b", "2", "11")),
         line("DELETED", &board("a", "1", "12")),
     ])]);
-    assert_eq!(rig.next().await, told("b", "11", false));
-    assert_eq!(rig.next().await, told("a", "12", true));
+    assert_eq!(rig.next().await, event("b", "11", false));
+    assert_eq!(rig.next().await, event("a", "12", true));
     assert_eq!(rig.watch.store.len(), 1);
     assert!(rig.metric("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 0"));
     rig.stop.send(true).unwrap();
-    assert!(rig.touches.next().await.is_none());
-    assert!(rig.seen.liveness.problems().is_empty());
+    assert!(rig.events.next().await.is_none());
+    assert!(rig.telemetry.liveness.problems().is_empty());
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_list_after_an_expired_watch_tells_only_what_changed_and_what_went_away() {
+async fn a_list_after_an_expired_watch_reports_only_what_changed_and_what_went_away() {
     let all = [board("a", "1", "5"), board("b", "2", "6"), board("c", "3", "7")];
     let mut rig = rig(vec![list(&all)]);
     let mut first = vec![rig.next().await.0, rig.next().await.0, rig.next().await.0];
@@ -178,10 +183,14 @@ async fn a_list_after_an_expired_watch_tells_only_what_changed_and_what_went_awa
     second.sort();
     assert_eq!(
         second,
-        [told("b", "20", false), told("c", "21", false), told("c", "7", true)]
+        [event("b", "20", false), event("c", "21", false), event("c", "7", true)]
     );
     rig.send(vec![Answer::Watch(vec![line("ADDED", &board("last", "9", "30"))])]);
-    assert_eq!(rig.next().await, told("last", "30", false), "and a was not told again");
+    assert_eq!(
+        rig.next().await,
+        event("last", "30", false),
+        "and no second event for a"
+    );
     assert!(rig.metric("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 1"));
 }
 
@@ -197,12 +206,12 @@ async fn a_malformed_object_is_left_out_and_stops_nothing() {
         ]),
         list(&[malformed("a", "2", "11"), board("b", "3", "13")]),
     ]);
-    assert_eq!(rig.next().await, told("a", "5", false));
-    assert_eq!(rig.next().await, told("b", "13", false));
+    assert_eq!(rig.next().await, event("a", "5", false));
+    assert_eq!(rig.next().await, event("b", "13", false));
     rig.send(vec![Answer::Watch(vec![line("DELETED", &malformed("a", "2", "31"))])]);
     assert_eq!(
         rig.next().await,
-        told("a", "5", true),
+        event("a", "5", true),
         "kept as it was last until it is deleted"
     );
     assert_eq!(rig.watch.store.len(), 1);
@@ -210,17 +219,17 @@ async fn a_malformed_object_is_left_out_and_stops_nothing() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_refused_list_is_told_by_readiness_and_tried_again() {
+async fn a_refused_list_is_shown_by_readiness_and_retried() {
     let refused = json!({"kind": "Status", "status": "Failure", "reason": "Forbidden", "code": 403,
         "message": "leaderboards is forbidden"});
     let mut rig = rig(vec![Answer::Json(403, refused)]);
     tokio::time::sleep(Duration::from_secs(5)).await;
     assert!(rig.metric("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 1"));
-    let missing = rig.seen.readiness.missing().join("");
+    let missing = rig.telemetry.readiness.missing().join("");
     assert!(missing.contains("403: leaderboards is forbidden"), "{missing}");
     rig.send(vec![list(&[board("a", "1", "5")])]);
-    assert_eq!(rig.next().await, told("a", "5", false));
-    assert!(rig.seen.readiness.missing().is_empty());
+    assert_eq!(rig.next().await, event("a", "5", false));
+    assert!(rig.telemetry.readiness.missing().is_empty());
 }
 
 #[tokio::test(start_paused = true)]
@@ -231,26 +240,26 @@ async fn a_watch_that_is_refused_after_its_list_is_not_ready_until_it_is_listed_
         Answer::Json(403, status)
     };
     let mut rig = rig(vec![list(&[board("a", "1", "5")]), Answer::Watch(vec![])]);
-    assert_eq!(rig.next().await, told("a", "5", false));
-    assert!(rig.watch.synced.is_true() && rig.seen.readiness.missing().is_empty());
+    assert_eq!(rig.next().await, event("a", "5", false));
+    assert!(rig.watch.synced.is_true() && rig.telemetry.readiness.missing().is_empty());
     rig.send(vec![refused(), refused()]);
     tokio::time::sleep(Duration::from_secs(15)).await;
-    let missing = rig.seen.readiness.missing().join("");
+    let missing = rig.telemetry.readiness.missing().join("");
     assert!(missing.contains("403: leaderboards is forbidden"), "{missing}");
     assert!(!rig.watch.synced.is_true(), "what it shows may be long gone");
-    // Nothing has changed meanwhile, so that no event would tell that the right is back.
+    // Nothing has changed meanwhile, so that no event shows that the right is back.
     rig.send(vec![list(&[board("a", "1", "5")])]);
     tokio::time::sleep(Duration::from_secs(30)).await;
-    assert!(rig.watch.synced.is_true() && rig.seen.readiness.missing().is_empty());
+    assert!(rig.watch.synced.is_true() && rig.telemetry.readiness.missing().is_empty());
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_list_that_is_never_answered_fails_liveness_while_others_are() {
     let rig = rig(vec![]);
     tokio::time::sleep(Duration::from_mins(11)).await;
-    assert!(rig.seen.liveness.problems().is_empty());
-    rig.seen.liveness.answered();
-    let problems = rig.seen.liveness.problems();
+    assert!(rig.telemetry.liveness.problems().is_empty());
+    rig.telemetry.liveness.answered();
+    let problems = rig.telemetry.liveness.problems();
     assert!(
         problems.len() == 1 && problems[0].contains("watch of Leaderboard"),
         "{problems:?}"
@@ -260,7 +269,7 @@ async fn a_list_that_is_never_answered_fails_liveness_while_others_are() {
 #[tokio::test(start_paused = true)]
 async fn a_late_subscriber_gets_what_is_there() {
     let mut rig = rig(vec![list(&[board("a", "1", "5")])]);
-    assert_eq!(rig.next().await, told("a", "5", false));
+    assert_eq!(rig.next().await, event("a", "5", false));
     let mut late = rig.watch.clone().subscribe();
     assert_eq!(late.next().await.unwrap().object.name_any(), "a");
 }
@@ -282,25 +291,25 @@ async fn the_preflight_waits_for_the_kinds_and_names_the_missing_one() {
     let none = json!("404 page not found");
     let (client, script) = scripted(vec![Answer::Json(404, none), served(&["leaderboards"])]);
     let (stop, receiver) = Stop::new();
-    let seen = Observability::new(receiver);
-    seen.readiness.registered();
+    let telemetry = Observability::new(receiver);
+    telemetry.readiness.registered();
     let waiting = tokio::spawn({
-        let seen = seen.clone();
-        async move { await_kinds(&client, &["leaderboards", "submissions"], &seen).await }
+        let telemetry = telemetry.clone();
+        async move { await_kinds(&client, &["leaderboards", "submissions"], &telemetry).await }
     });
     tokio::time::sleep(Duration::from_secs(3)).await;
-    let missing = seen.readiness.missing().join("");
+    let missing = telemetry.readiness.missing().join("");
     assert!(
         missing.contains("does not serve submissions of leaderboard.carla.org/v1alpha1"),
         "{missing}"
     );
     send(&script, vec![served(&["leaderboards", "submissions"])]);
     assert!(timeout(LIMIT, waiting).await.unwrap().unwrap());
-    assert!(seen.readiness.missing().is_empty());
+    assert!(telemetry.readiness.missing().is_empty());
     drop(stop);
     let (client, _script) = scripted(vec![served(&[])]);
     assert!(
-        !await_kinds(&client, &["submissions"], &seen).await,
+        !await_kinds(&client, &["submissions"], &telemetry).await,
         "a stopping process waits for nothing"
     );
 }

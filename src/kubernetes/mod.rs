@@ -1,0 +1,54 @@
+//! What controller and bridge share of the API server: watches with their caches, and the checks before the start.
+//!
+//! Imports the API types and `observability`; knows no policy, and no module that uses it.
+
+mod feed;
+pub mod preflight;
+mod watch;
+
+#[cfg(test)]
+mod tests;
+
+use std::fmt;
+use std::time::Duration;
+
+use kube::core::{DeserializeGuard, NamespaceResourceScope};
+use kube::{Api, Client, Resource};
+use serde::de::DeserializeOwned;
+
+pub use feed::{WatchEvent, WatchEvents};
+pub use watch::{Synced, Watch, spawn_watch};
+
+/// Longer than a watch may be silent: the server ends each after 290 s.
+const READ_TIMEOUT: Duration = Duration::from_mins(5);
+
+/// What can be watched.
+pub trait Watchable:
+    Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
+{
+}
+
+impl<K> Watchable for K where
+    K: Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
+{
+}
+
+/// A client for watches: a list or a watch on a dead connection ends within minutes.
+///
+/// # Errors
+/// If the configuration holds no usable TLS or credentials.
+pub fn watch_client(mut config: kube::Config) -> Result<Client, kube::Error> {
+    config.read_timeout = Some(READ_TIMEOUT);
+    Client::try_from(config)
+}
+
+/// The API of a kind, in one namespace or in all. A malformed object is an item that says so, and fails no list.
+pub fn guarded<K>(client: Client, namespace: Option<&str>) -> Api<DeserializeGuard<K>>
+where
+    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+{
+    match namespace {
+        Some(namespace) => Api::namespaced(client, namespace),
+        None => Api::all(client),
+    }
+}
