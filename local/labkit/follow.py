@@ -18,7 +18,7 @@ FIELDS = (
     "{.status.progress.text}",
     "{.status.score}",
     "{.status.reason}",
-    "{.status.node}",
+    "{.status.nodeName}",
     CONDITION.format("Published"),
     CONDITION.format("Recorded"),
     "{.status.message}",

@@ -159,7 +159,7 @@ pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming:
         return Ingest::Deleting;
     }
     let spec = &existing.spec;
-    if spec.leaderboard != leaderboard || spec.evalai != Some(incoming.reference()) {
+    if spec.leaderboard_name != leaderboard || spec.evalai != Some(incoming.reference()) {
         return Ingest::IdTaken(owner(existing));
     }
     let Some(resource_version) = existing.metadata.resource_version.clone() else {
@@ -225,7 +225,7 @@ fn is_newer(existing: &Submission, incoming: &Incoming) -> bool {
 
 fn owner(existing: &Submission) -> String {
     let name = existing.metadata.name.as_deref().unwrap_or_default();
-    let leaderboard = &existing.spec.leaderboard;
+    let leaderboard = &existing.spec.leaderboard_name;
     match existing.spec.evalai {
         Some(of) => format!(
             "{name} belongs to leaderboard {leaderboard}, challenge {}, phase {}, submission {}",
@@ -248,7 +248,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
             ..ObjectMeta::default()
         },
         spec: SubmissionSpec {
-            leaderboard: leaderboard.to_owned(),
+            leaderboard_name: leaderboard.to_owned(),
             image: incoming.image.clone(),
             evalai: Some(incoming.reference()),
             track: None,

@@ -92,7 +92,7 @@ fn the_first_message_makes_the_object_with_everything_it_needs() {
     assert_eq!(record, json!({"message": "a", "sent": 100, "attempt": 1}));
     let spec = made.spec;
     assert_eq!(
-        (spec.leaderboard.as_str(), spec.attempt, spec.cancel),
+        (spec.leaderboard_name.as_str(), spec.attempt, spec.cancel),
         (BOARD, 1, false)
     );
     assert_eq!(spec.image.as_deref(), Some("r.example/a:1"));
@@ -343,7 +343,10 @@ fn a_name_of_another_submission_is_taken() {
         existing
     };
     let cases: Vec<(&str, Submission)> = vec![
-        ("leaderboard", other(|s| s.spec.leaderboard = "leaderboard-10".into())),
+        (
+            "leaderboard",
+            other(|s| s.spec.leaderboard_name = "leaderboard-10".into()),
+        ),
         ("challenge", other(|s| s.spec.evalai.as_mut().unwrap().challenge = 9)),
         ("phase", other(|s| s.spec.evalai.as_mut().unwrap().phase = 9)),
         (

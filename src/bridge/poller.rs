@@ -242,7 +242,7 @@ impl Poller {
     async fn bury(&mut self, reader: &Reader, message: &Received, reason: &DeadReason, readers: &Readers) -> Fate {
         let what = format!("message {} ({}): {}", message.id, reason.word(), reason.detail());
         let problem = match &readers.rules.dead_letter {
-            None => "no Leaderboard of this queue has queue.deadLetterUrl".to_owned(),
+            None => "no Leaderboard of this queue has queue.deadLetterURL".to_owned(),
             Some(url) => match reader.send_dead(url, message, reason).await {
                 Ok(()) => {
                     tracing::warn!(queue = self.url, message = message.id, reason = reason.word(), "{what}");

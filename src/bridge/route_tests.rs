@@ -14,7 +14,7 @@ pub(in crate::bridge) fn board(name: &str, second: i64) -> Leaderboard {
         "spec": {
             "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}, {"name": "map", "codename": "MAP", "phase": 3}],
-            "results": "V2",
+            "leaderboardVersion": "V2",
             "contents": {"image": "c"},
             "simulator": {"image": "s"},
             "storage": {"bucket": "bbb"}

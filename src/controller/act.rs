@@ -226,7 +226,7 @@ impl Actor<'_> {
         }
         tracing::info!(
             submission = %format_args!("{}/{}", self.namespace, self.name()),
-            leaderboard = self.submission().spec.leaderboard,
+            leaderboard = self.submission().spec.leaderboard_name,
             attempt = new.attempt,
             from = old.and_then(|status| status.state).map_or("none", State::as_str),
             to = new.state.map_or("none", State::as_str),

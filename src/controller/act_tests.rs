@@ -38,7 +38,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
     assert_eq!(lines.take(), "", "nothing was written");
     let node = Some("node-1".to_owned());
     write(SubmissionStatus {
-        node: node.clone(),
+        node_name: node.clone(),
         ..old.clone()
     })
     .await;
@@ -48,7 +48,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         text: "1/4".into(),
     });
     write(SubmissionStatus {
-        node: node.clone(),
+        node_name: node.clone(),
         progress,
         ..old.clone()
     })
@@ -59,7 +59,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         state: Some(State::Running),
         reason: Some("AgentRunning".into()),
         message: Some("Agents run.".into()),
-        node,
+        node_name: node,
         ..old
     };
     write(running).await;

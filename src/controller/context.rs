@@ -159,12 +159,12 @@ impl Context {
     /// Half the period of a submission's Leaderboard, in seconds.
     pub fn half_period(&self, submission: &Submission) -> f64 {
         let namespace = submission.namespace().unwrap_or_default();
-        let reference = ObjectRef::new(&submission.spec.leaderboard).within(&namespace);
+        let reference = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
         let period = self
             .stores
             .leaderboards
             .get(&reference)
-            .map_or(10, |l| l.spec.period_seconds);
+            .map_or(10, |l| l.spec.sync_period_seconds);
         Duration::from_secs(period.unsigned_abs()).as_secs_f64() / 2.0
     }
 

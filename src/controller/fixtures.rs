@@ -188,7 +188,7 @@ fn reply(method: &Method, path: &str, body: Value, known: &HashMap<String, Value
 /// A Leaderboard whose results go to a bucket at this endpoint.
 pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
     let spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2", "routes": 4, "pairs": 2,
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2", "routes": 4, "pairs": 2,
         "contents": {"image": "c"}, "simulator": {"image": "s"},
         "storage": {"bucket": format!("{name}-bucket"), "endpoint": endpoint},
         "table": {"name": "rows", "endpoint": endpoint, "partitionKey": "team_id", "sortKey": "submission_id"},
@@ -202,7 +202,7 @@ pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
 /// A submission whose Job was made, and that Job. Nothing says yet that it was scheduled.
 pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     let board_name = board.name_any();
-    let spec = json!({"leaderboard": board_name, "image": "agent:1", "track": "sensors", "team": {"id": "t1"}});
+    let spec = json!({"leaderboardName": board_name, "image": "agent:1", "track": "sensors", "team": {"id": "t1"}});
     let mut submission = Submission::new(name, serde_json::from_value(spec).unwrap());
     let uid = format!("uid-of-{name}");
     let now = Time(Timestamp::now());
@@ -220,7 +220,7 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
         attempt: Some(1),
         team: submission.spec.team.clone(),
         plan: Some(plan),
-        job: Some(job_name.clone()),
+        job_name: Some(job_name.clone()),
         times: Times {
             submitted: Some(now.clone()),
             accepted: Some(now.clone()),

@@ -154,7 +154,7 @@ impl Memory {
 
 /// Whether a change of its Leaderboard may let it start: it has no Job, or the one that it asked for may not be made.
 pub fn waits_for_leaderboard(status: &SubmissionStatus) -> bool {
-    status.job.is_none() || status.reason.as_deref() == Some(reasons::NOT_ISOLATED)
+    status.job_name.is_none() || status.reason.as_deref() == Some(reasons::NOT_ISOLATED)
 }
 
 /// Resource versions of one kind grow; the API promises that they can be compared as numbers.
@@ -169,7 +169,7 @@ mod tests {
     fn object(version: &str, reason: &str) -> Submission {
         let mut object = Submission::new(
             "s",
-            serde_json::from_value(serde_json::json!({"leaderboard": "l", "track": "t", "image": "i"})).unwrap(),
+            serde_json::from_value(serde_json::json!({"leaderboardName": "l", "track": "t", "image": "i"})).unwrap(),
         );
         object.metadata.uid = Some("u".into());
         object.metadata.resource_version = Some(version.into());
@@ -223,7 +223,7 @@ mod tests {
             (Some("s-1"), reasons::NOT_ISOLATED, true),
         ] {
             let mut object = object("1", reason);
-            object.status.as_mut().unwrap().job = job.map(str::to_owned);
+            object.status.as_mut().unwrap().job_name = job.map(str::to_owned);
             memory.wrote(&object);
             assert_eq!(memory.is_waiting(&object), expected, "{reason}");
             assert_eq!(waits_for_leaderboard(&object.status.unwrap()), expected, "{reason}");

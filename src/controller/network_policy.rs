@@ -158,7 +158,7 @@ mod tests {
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
             "metadata": {"name": "carla-2", "namespace": "challenge", "uid": "u-1"},
             "spec": {
-                "results": "V2", "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+                "leaderboardVersion": "V2", "tracks": [{"name": "sensors", "codename": "SENSORS"}],
                 "contents": {"image": "contents"}, "simulator": {"image": "simulator"},
                 "storage": {"bucket": "bucket"}, "network": network,
             },

@@ -1,4 +1,4 @@
-//! A Leaderboard's `pod`: a partial PodTemplateSpec laid over ours, and what it may not say.
+//! A Leaderboard's `podOverrides`: a partial PodTemplateSpec laid over ours, and what it may not say.
 //!
 //! Pure, and on JSON, so that Pod fields newer than this client survive. Called by `job_spec` (apply) and by the check of a
 //! Leaderboard (validate). The rules, for people too: objects are merged deep; lists by `name`, volumeMounts by

@@ -25,7 +25,7 @@ pub(super) fn original(
     let is_original = |other: &Submission| {
         let team = other.status.as_ref().and_then(|s| s.team.as_ref()?.id.clone());
         let of_phase = |s: &Submission| s.spec.evalai.map(|e| (e.challenge, e.phase));
-        other.spec.leaderboard == submission.spec.leaderboard
+        other.spec.leaderboard_name == submission.spec.leaderboard_name
             && of_phase(other) == of_phase(submission)
             && team.is_some()
             && team == row.team_id.map(|id| id.to_string())
@@ -88,7 +88,8 @@ mod tests {
     use serde_json::json;
 
     fn submission(id: i64, leaderboard: &str, phase: i64, team: &str) -> Submission {
-        let spec = json!({"leaderboard": leaderboard, "evalai": {"challenge": 1, "phase": phase, "submission": id}});
+        let spec =
+            json!({"leaderboardName": leaderboard, "evalai": {"challenge": 1, "phase": phase, "submission": id}});
         let mut submission = Submission::new(&format!("submission-{id}"), serde_json::from_value(spec).unwrap());
         submission.metadata.namespace = Some("ns".into());
         submission.status = Some(serde_json::from_value(json!({"team": {"id": team}})).unwrap());

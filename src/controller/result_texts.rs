@@ -17,7 +17,7 @@ use crate::pod::report::Report;
 use crate::pod::upload::hex;
 use crate::services::evalai::Payload;
 use crate::services::table::Row;
-use leaderboard_api::{FailureClass, LogTail, ResultsFormat, State, SubmissionStatus};
+use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus};
 
 /// Largest text that is passed on to EvalAI, in bytes.
 const MAX_TEXT: u64 = 16 << 20;
@@ -168,14 +168,14 @@ pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<
         submitted_time: text(status.times.submitted.as_ref()),
         start_time: text(status.times.started.as_ref()),
         end_time: text(status.times.finished.as_ref()),
-        results: status.results.clone().unwrap_or_default(),
+        results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         rerun_as: status
             .rerun_as
             .as_ref()
             .map(|r| r.submission_name.clone())
             .unwrap_or_default(),
-        metrics: columns(report.filter(|_| is_finished(status)), plan.results),
+        metrics: columns(report.filter(|_| is_finished(status)), plan.leaderboard_version),
     })
 }
 
@@ -195,10 +195,10 @@ fn table_status(state: Option<State>) -> &'static str {
 }
 
 /// The metric columns, as text with the digits of results.json; those without a value are to be removed.
-fn columns(report: Option<&Report>, format: ResultsFormat) -> Vec<(String, Option<String>)> {
+fn columns(report: Option<&Report>, format: LeaderboardVersion) -> Vec<(String, Option<String>)> {
     let format = match format {
-        ResultsFormat::V1 => Format::V1,
-        ResultsFormat::V2 => Format::V2,
+        LeaderboardVersion::V1 => Format::V1,
+        LeaderboardVersion::V2 => Format::V2,
     };
     let parsed: Value = report
         .and_then(|report| serde_json::from_str(&report.results).ok())
@@ -229,7 +229,7 @@ mod tests {
 
     fn plan() -> Value {
         json!({
-            "runId": "7", "results": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-3"], "routes": 4,
+            "runId": "7", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-3"], "routes": 4,
             "repetitions": 1, "storage": {"bucket": "b"}, "image": "i", "contentsImage": "c", "simulatorImage": "s",
         })
     }
@@ -237,7 +237,7 @@ mod tests {
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
         let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
-        let found = columns(Some(&report(results)), ResultsFormat::V2);
+        let found = columns(Some(&report(results)), LeaderboardVersion::V2);
         let get = |name: &str| found.iter().find(|(n, _)| n == name).and_then(|(_, v)| v.as_deref());
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
@@ -314,7 +314,7 @@ mod tests {
 
     #[test]
     fn a_broken_report_has_no_columns() {
-        let found = columns(Some(&report("not json")), ResultsFormat::V2);
+        let found = columns(Some(&report("not json")), LeaderboardVersion::V2);
         assert!(found.iter().all(|(_, value)| value.is_none()));
     }
 }

@@ -46,7 +46,7 @@ fn is_place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> bool {
 
 /// How long progress may wait since the last write.
 pub fn patience(leaderboard: Option<&LeaderboardSpec>) -> Duration {
-    let period = leaderboard.map_or(10, |l| l.period_seconds).unsigned_abs();
+    let period = leaderboard.map_or(10, |l| l.sync_period_seconds).unsigned_abs();
     LONGEST.min(Duration::from_secs(period) * PERIODS)
 }
 

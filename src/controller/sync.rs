@@ -185,7 +185,7 @@ fn run_of(submission: &Submission) -> Run {
         attempt,
         job: names::job(&submission.name_any(), attempt, 0),
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
-        has_job: status.is_some_and(|s| s.job.is_some() || s.retry > 0),
+        has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
     }
 }
 
@@ -240,7 +240,10 @@ fn may_wait(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> 
     let Some(deleted) = &view.submission.metadata.deletion_timestamp else {
         return view.now < patience;
     };
-    let seconds = view.leaderboard.as_ref().map_or(0, |l| l.spec.finalize_seconds);
+    let seconds = view
+        .leaderboard
+        .as_ref()
+        .map_or(0, |l| l.spec.deadlines.finalize_seconds);
     let release = until(deleted.0, SignedDuration::from_secs(seconds) - BEFORE_RELEASE);
     view.now < patience.min(release)
 }

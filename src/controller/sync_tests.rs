@@ -240,7 +240,7 @@ fn a_run_has_a_job_once_that_of_this_attempt_was_asked_for() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
     assert!(run_of(&submission).has_job);
     let status = submission.status.as_mut().unwrap();
-    (status.job, status.retry) = (None, 1);
+    (status.job_name, status.retry) = (None, 1);
     assert!(run_of(&submission).has_job, "between two tries");
     submission.status.as_mut().unwrap().retry = 0;
     assert!(!run_of(&submission).has_job);

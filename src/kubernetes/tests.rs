@@ -61,13 +61,13 @@ async fn serve(mut handle: Handle<Request<Body>, Response<Body>>, mut answers: m
 fn board(name: &str, uid: &str, version: &str) -> Value {
     json!({"apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": name, "namespace": "ns", "uid": uid, "resourceVersion": version, "managedFields": [{}]},
-        "spec": {"results": "V2", "tracks": [{"name": "SENSORS", "codename": "SENSORS"}],
+        "spec": {"leaderboardVersion": "V2", "tracks": [{"name": "SENSORS", "codename": "SENSORS"}],
             "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "storage": {"bucket": "b"}}})
 }
 
 fn malformed(name: &str, uid: &str, version: &str) -> Value {
     let mut object = board(name, uid, version);
-    object["spec"] = json!({"results": 7});
+    object["spec"] = json!({"leaderboardVersion": 7});
     object
 }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
 
 use super::run::{Run, STATUS_FOLDER};
-use leaderboard_api::{ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_api::{ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
 
 /// Two pairs of two routes each, once.
 pub(crate) fn run() -> Run {
@@ -17,7 +17,7 @@ pub(crate) fn run() -> Run {
         attempt: 1,
         plan: RunPlan {
             run_id: "77".to_owned(),
-            results: ResultsFormat::V2,
+            leaderboard_version: LeaderboardVersion::V2,
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),
             phase: None,
@@ -29,7 +29,7 @@ pub(crate) fn run() -> Run {
                 prefix: Some("2026/".to_owned()),
                 region: None,
                 endpoint: None,
-                limit: 1 << 30,
+                size_limit: ByteQuantity::gibibytes(1),
             },
             image: "image".to_owned(),
             contents_image: "contents".to_owned(),

@@ -16,7 +16,7 @@ use super::report::{ReportPair, StoredFile};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Stamp, Tree, TreeError};
 use super::upload::hex;
-use leaderboard_api::{ResultsFormat, Verify, effective};
+use leaderboard_api::{LeaderboardVersion, Verify, effective};
 
 /// Largest checkpoint that is read, in bytes.
 const CHECKPOINT_LIMIT: u64 = 64 << 20;
@@ -37,9 +37,9 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
     });
     let pairs: Vec<Slice> = slices.collect::<Result<_, _>>()?;
     let plan = Plan {
-        format: match run.plan.results {
-            ResultsFormat::V1 => Format::V1,
-            ResultsFormat::V2 => Format::V2,
+        format: match run.plan.leaderboard_version {
+            LeaderboardVersion::V1 => Format::V1,
+            LeaderboardVersion::V2 => Format::V2,
         },
         strictness: Strictness::Pod,
         routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),

@@ -83,7 +83,7 @@ pub async fn work(
 ) -> Result<(), LogcopyError> {
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
     let gatherer = Gatherer::new(results_plan(&setting.run)?, Arc::clone(&tree))?;
-    let limit = u64::try_from(setting.run.plan.storage.limit).unwrap_or(u64::MAX);
+    let limit = setting.run.plan.storage.size_limit.bytes();
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), limit);
 
     let (end, ending) = shutdown::Stop::new();

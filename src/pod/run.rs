@@ -25,11 +25,11 @@ pub const PODINFO: &str = "/podinfo";
 pub const STOP_FILE: &str = "stop";
 /// Folder of the `logs` volume with the status files, one sub-folder a writer.
 pub const STATUS_FOLDER: &str = "containers-status";
-/// Folder of the projected token of `podIdentity.roleArn`.
+/// Folder of the projected token of `podIdentity.roleARN`.
 pub const IDENTITY: &str = "/var/run/secrets/leaderboard";
 /// The token in it.
 pub const IDENTITY_TOKEN_FILE: &str = "token";
-/// Environment variable with the role of `podIdentity.roleArn`, in `workspace` and `logcopy`.
+/// Environment variable with the role of `podIdentity.roleARN`, in `workspace` and `logcopy`.
 pub const ENV_ROLE_ARN: &str = "LEADERBOARD_ROLE_ARN";
 
 /// Name of the file in the simulators' folder with what a pair's server has printed.

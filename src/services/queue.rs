@@ -24,8 +24,8 @@ impl QueueError {
             Fault::Denied => {
                 "the controller cannot tell whether it is there: give its AWS identity sqs:GetQueueAttributes on it"
             }
-            Fault::Missing => "create it, or correct queue.url, queue.deadLetterUrl, queue.region and queue.endpoint",
-            Fault::Refused => "check queue.url, queue.deadLetterUrl, queue.region and queue.endpoint",
+            Fault::Missing => "create it, or correct queue.url, queue.deadLetterURL, queue.region and queue.endpoint",
+            Fault::Refused => "check queue.url, queue.deadLetterURL, queue.region and queue.endpoint",
             Fault::Throttled | Fault::Unavailable | Fault::Conflict => {
                 "it is asked again; check queue.endpoint and the network if this stays"
             }

@@ -88,7 +88,7 @@ impl World {
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
             "storage": {"bucket": self.bucket(), "endpoint": endpoint},
             "table": {"name": self.table(), "endpoint": endpoint},
-            "queue": {"url": url("queue"), "deadLetterUrl": url("dead"), "endpoint": endpoint},
+            "queue": {"url": url("queue"), "deadLetterURL": url("dead"), "endpoint": endpoint},
         }})
     }
 
@@ -298,7 +298,7 @@ async fn a_missing_table_stops_no_submission() {
     world.says("False", reasons::TABLE_UNREACHABLE).await;
     let client = server().await.client();
     let api = Kind::Submission.api(&client, &world.namespace);
-    let patch = json!({"spec": {"leaderboard": NAME}});
+    let patch = json!({"spec": {"leaderboardName": NAME}});
     create(&api, Kind::Submission.object("one", &[&patch]), false)
         .await
         .unwrap();

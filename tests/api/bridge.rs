@@ -223,7 +223,7 @@ impl World {
                     "token": {"secretKeyRef": {"name": "evalai", "key": "token"}}
                 },
                 "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-                "results": "V2",
+                "leaderboardVersion": "V2",
                 "contents": {"image": "contents:1"},
                 "simulator": {"image": "simulator:1"},
                 "storage": {"bucket": "results"},
@@ -362,7 +362,7 @@ async fn the_sweep_begins_one_attempt_and_a_message_any() {
 async fn what_cannot_be_used_becomes_a_dead_letter_with_its_reason() {
     let world = World::new("bridge-dead").await;
     let (url, dead) = (world.stand_in.queue("q").await, world.stand_in.queue("dead").await);
-    let queue = json!({"url": url, "deadLetterUrl": dead, "unknownAfterSeconds": 0});
+    let queue = json!({"url": url, "deadLetterURL": dead, "unknownAfterSeconds": 0});
     world.leaderboard("a", 2, queue.clone()).await;
     world.leaderboard("b", 3, queue).await;
     let bridge = world.bridge();
@@ -411,7 +411,7 @@ async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_say
         "{note}"
     );
     assert!(
-        note.ends_with("no Leaderboard of this queue has queue.deadLetterUrl"),
+        note.ends_with("no Leaderboard of this queue has queue.deadLetterURL"),
         "{note}"
     );
     eventually("it is counted", async || bridge.count("blocked") == 1).await;

@@ -53,7 +53,7 @@ async fn short_names_and_the_category_are_served() {
         [
             r#"leaderboards ["lb"] ["challenges"]"#,
             "leaderboards/status [] []",
-            r#"submissions ["sub"] ["challenges"]"#,
+            r#"submissions ["lbsub"] ["challenges"]"#,
             "submissions/status [] []",
         ]
     );
@@ -67,32 +67,32 @@ async fn a_minimal_leaderboard_reads_back_whole() {
     assert_eq!(
         read.data["spec"],
         json!({
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-            "results": "V2",
-            "contents": {"image": "contents:1"},
-            "simulator": {"image": "simulator:1"},
-            "agent": {"logLimit": 2_147_483_648_i64},
-            "pairs": 4,
-            "routes": 20,
-            "retries": {"pair": 4, "infrastructure": 2},
-            "deadlines": {
-                "scheduleSeconds": 0,
-                "startSeconds": 1800,
-                "readySeconds": 3600,
-                "idleSeconds": 800,
-                "runSeconds": 86400,
-                "cancelSeconds": 120,
-                "flushSeconds": 1800,
-            },
-            "storage": {"bucket": "results", "limit": 21_474_836_480_i64},
-            "network": {"policy": "Managed", "enforcement": "Warn", "dns": true},
-            "running": {},
-            "paused": false,
-            "verify": "Warn",
-            "periodSeconds": 10,
-            "ttlSecondsAfterFinished": 86400,
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+        "leaderboardVersion": "V2",
+        "contents": {"image": "contents:1"},
+        "simulator": {"image": "simulator:1"},
+        "agent": {"logSizeLimit": "2Gi"},
+        "pairs": 4,
+        "routes": 20,
+        "retries": {"perPair": 4, "infrastructure": 2},
+        "deadlines": {
+            "scheduleSeconds": 0,
+            "startSeconds": 1800,
+            "readySeconds": 3600,
+            "idleSeconds": 800,
+            "runSeconds": 86400,
+            "cancelSeconds": 120,
+            "flushSeconds": 1800,
             "finalizeSeconds": 900,
-        })
+        },
+        "storage": {"bucket": "results", "sizeLimit": "20Gi"},
+        "network": {"policy": "Managed", "enforcement": "Warn", "dns": true},
+        "concurrency": {},
+        "paused": false,
+        "verify": "Warn",
+        "syncPeriodSeconds": 10,
+        "ttlSecondsAfterFinished": 86400,
+                })
     );
 }
 
@@ -104,7 +104,7 @@ async fn a_minimal_submission_reads_back_whole() {
     assert_eq!(
         read.data["spec"],
         json!({
-            "leaderboard": "local",
+            "leaderboardName": "local",
             "track": "sensors",
             "image": "agent:1",
             "priority": 0,
@@ -122,14 +122,18 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         (
             "agent",
             json!({"command": ["a"]}),
-            json!({"command": ["a"], "logLimit": 2_147_483_648_i64}),
+            json!({"command": ["a"], "logSizeLimit": "2Gi"}),
         ),
-        ("agent", json!({}), json!({"logLimit": 2_147_483_648_i64})),
-        ("retries", json!({"pair": 0}), json!({"pair": 0, "infrastructure": 2})),
+        ("agent", json!({}), json!({"logSizeLimit": "2Gi"})),
+        (
+            "retries",
+            json!({"perPair": 0}),
+            json!({"perPair": 0, "infrastructure": 2}),
+        ),
         (
             "retries",
             json!({"infrastructure": 0}),
-            json!({"pair": 4, "infrastructure": 0}),
+            json!({"perPair": 4, "infrastructure": 0}),
         ),
         (
             "deadlines",
@@ -142,6 +146,7 @@ fn half_filled_runs() -> Vec<HalfFilled> {
                 "runSeconds": 7200,
                 "cancelSeconds": 120,
                 "flushSeconds": 1800,
+                "finalizeSeconds": 900,
             }),
         ),
         (
@@ -159,7 +164,7 @@ fn half_filled_runs() -> Vec<HalfFilled> {
             json!({"dns": false, "policy": "External"}),
             json!({"dns": false, "policy": "External", "enforcement": "Warn"}),
         ),
-        ("running", json!({"total": 3}), json!({"total": 3})),
+        ("concurrency", json!({"total": 3}), json!({"total": 3})),
     ]
 }
 
@@ -195,7 +200,11 @@ fn half_filled_services() -> Vec<HalfFilled> {
             json!({"url": "https://sqs.example.org/1/a"}),
             json!({"url": "https://sqs.example.org/1/a", "unknownAfterSeconds": 900, "foreign": "DeadLetter"}),
         ),
-        ("podIdentity", json!({"secretRef": "aws"}), json!({"secretRef": "aws"})),
+        (
+            "podIdentity",
+            json!({"secretName": "aws"}),
+            json!({"secretName": "aws"}),
+        ),
         ("table", json!({"name": "results"}), json!({"name": "results"})),
         ("logGroup", json!({"name": "results"}), json!({"name": "results"})),
     ]
@@ -243,18 +252,18 @@ async fn a_null_is_as_good_as_a_field_left_out() {
     let nulls = [
         json!({
             "evalai": null, "repetitions": null, "queue": null, "table": null, "logGroup": null, "podIdentity": null,
-            "runtimeClassName": null, "pod": null, "agent": null, "retries": null, "deadlines": null, "network": null,
-            "running": null, "paused": null, "verify": null, "periodSeconds": null, "pairs": null,
+            "runtimeClassName": null, "podOverrides": null, "agent": null, "retries": null, "deadlines": null, "network": null,
+            "concurrency": null, "paused": null, "verify": null, "syncPeriodSeconds": null, "pairs": null,
         }),
         json!({
             "tracks": [{
                 "name": "sensors", "codename": "SENSORS", "phase": null, "pairs": null, "routeSubsets": null,
                 "routesFile": null,
             }],
-            "storage": {"bucket": "results", "prefix": null, "region": null, "endpoint": null, "limit": null},
+            "storage": {"bucket": "results", "prefix": null, "region": null, "endpoint": null, "sizeLimit": null},
             "deadlines": {"runSeconds": null},
-            "running": {"total": null, "perTeam": null},
-            "agent": {"command": null, "args": null, "resources": null, "logLimit": null},
+            "concurrency": {"total": null, "perTeam": null},
+            "agent": {"command": null, "args": null, "resources": null, "logSizeLimit": null},
             "contents": {"image": "contents:1", "command": null, "args": null, "securityContext": null},
         }),
     ];
@@ -309,11 +318,11 @@ async fn what_lies_in_pod_is_kept_as_it_is() {
     });
     let object = {
         let mut object = Kind::Leaderboard.object("a", &[]);
-        object["spec"]["pod"] = pod.clone();
+        object["spec"]["podOverrides"] = pod.clone();
         object
     };
     create(&api, object, false).await.unwrap();
-    assert_eq!(typed(&api.get("a").await.unwrap()).spec.pod, Some(pod));
+    assert_eq!(typed(&api.get("a").await.unwrap()).spec.pod_overrides, Some(pod));
 }
 
 #[tokio::test]
@@ -323,7 +332,7 @@ async fn submissions_are_found_by_leaderboard_id_and_state() {
     let api = Kind::Submission.api(&client, &namespace);
     let evalai = |id: i64| {
         let ids = json!({"challenge": 1, "phase": 7, "submission": id});
-        json!({"spec": {"track": null, "evalai": ids, "leaderboard": "carla"}})
+        json!({"spec": {"track": null, "evalai": ids, "leaderboardName": "carla"}})
     };
     for (name, patch) in [("a", json!({})), ("b", evalai(1)), ("c", evalai(2))] {
         create(&api, Kind::Submission.object(name, &[&patch]), false)
@@ -333,8 +342,8 @@ async fn submissions_are_found_by_leaderboard_id_and_state() {
     let running = Patch::Merge(json!({"status": {"state": "Running"}}));
     api.patch_status("c", &PatchParams::default(), &running).await.unwrap();
     for (selector, expected) in [
-        ("spec.leaderboard=carla", vec!["b", "c"]),
-        ("spec.leaderboard!=carla", vec!["a"]),
+        ("spec.leaderboardName=carla", vec!["b", "c"]),
+        ("spec.leaderboardName!=carla", vec!["a"]),
         ("spec.evalai.submission=2", vec!["c"]),
         ("status.state=Running", vec!["c"]),
         ("status.state=Running,spec.evalai.submission=1", vec![]),

@@ -126,7 +126,7 @@ async fn a_leaderboards_places_go_before_those_of_the_environment() {
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
         "storage": {"bucket": bucket, "endpoint": endpoint},
         "table": {"name": table, "endpoint": endpoint},
-        "queue": {"url": queue, "deadLetterUrl": dead, "endpoint": endpoint},
+        "queue": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint},
     }});
     let boards = Kind::Leaderboard.api(&client, &namespace);
     create(&boards, Kind::Leaderboard.object("board", &[&spec]), false)
@@ -156,7 +156,7 @@ async fn a_leaderboards_places_go_before_those_of_the_environment() {
     // A row.
     let object = Kind::Submission.object(
         "one",
-        &[&json!({"spec": {"leaderboard": "board", "team": {"id": "t1"}}})],
+        &[&json!({"spec": {"leaderboardName": "board", "team": {"id": "t1"}}})],
     );
     create(&Kind::Submission.api(&client, &namespace), object, false)
         .await

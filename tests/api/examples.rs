@@ -78,7 +78,7 @@ fn examples_run_what_their_comments_say() {
     }
     let submission: Submission = serde_saphyr::from_str(&read("submission-local.yaml")).unwrap();
     let local = leaderboard("leaderboard-local.yaml");
-    assert_eq!(Some(&submission.spec.leaderboard), local.metadata.name.as_ref());
+    assert_eq!(Some(&submission.spec.leaderboard_name), local.metadata.name.as_ref());
     assert!(
         local
             .spec

@@ -113,9 +113,9 @@ impl World {
                     "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
                 },
                 "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-                "results": "V2",
+                "leaderboardVersion": "V2",
                 "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
-                "pairs": 1, "routes": 1, "retries": {"pair": 1}, "periodSeconds": 1,
+                "pairs": 1, "routes": 1, "retries": {"perPair": 1}, "syncPeriodSeconds": 1,
                 "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
             },
         });
@@ -164,7 +164,7 @@ impl World {
     /// The object of a submission, as the bridge makes it.
     async fn object(&self, leaderboard: &str, phase: u64, pk: u64, image: &Value) -> String {
         let name = names::submission(i64::try_from(pk).unwrap());
-        let spec = json!({"leaderboard": leaderboard, "image": image,
+        let spec = json!({"leaderboardName": leaderboard, "image": image,
                           "evalai": {"challenge": 1, "phase": phase, "submission": pk}});
         let submission = Submission::new(&name, serde_json::from_value(spec).unwrap());
         self.api().create(&PostParams::default(), &submission).await.unwrap();
@@ -445,7 +445,7 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
     );
     world.pod(&next, &running()).await;
     let job = next.name_any();
-    let is_back = |s: &SubmissionStatus| runs(s) && s.job.as_ref() == Some(&job);
+    let is_back = |s: &SubmissionStatus| runs(s) && s.job_name.as_ref() == Some(&job);
     world.until(&name, "it runs again", is_back).await;
     let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
     assert_eq!((status.attempt, status.retry, status.failure), (Some(1), 1, None));

@@ -84,7 +84,7 @@ impl World {
 
     async fn submit(&self, name: &str) {
         let api = Kind::Submission.api(&self.client, &self.namespace);
-        let patch = json!({"spec": {"leaderboard": NAME}});
+        let patch = json!({"spec": {"leaderboardName": NAME}});
         create(&api, Kind::Submission.object(name, &[&patch]), false)
             .await
             .unwrap();

@@ -39,12 +39,12 @@ impl Kind {
         let spec = match self {
             Self::Leaderboard => json!({
                 "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-                "results": "V2",
+                "leaderboardVersion": "V2",
                 "contents": {"image": "contents:1"},
                 "simulator": {"image": "simulator:1"},
                 "storage": {"bucket": "results"},
             }),
-            Self::Submission => json!({"leaderboard": "local", "track": "sensors", "image": "agent:1"}),
+            Self::Submission => json!({"leaderboardName": "local", "track": "sensors", "image": "agent:1"}),
         };
         let resource = self.resource();
         let mut object = json!({

@@ -13,20 +13,20 @@ use super::objects::Kind;
 #[tokio::test]
 async fn why_says_state_cause_and_next_step() {
     let desk = Desk::new().await;
-    desk.leaderboard(&json!({"running": {"total": 2}})).await;
+    desk.leaderboard(&json!({"concurrency": {"total": 2}})).await;
     for (name, status, expected) in [
         (
             "in-line",
             waiting(),
             &[
                 "in-line is Pending since 2026-11-01 10:00:00 UTC (",
-                "In line:     place 3; it starts in about 20-35 min. running.total is 2.",
+                "In line:     place 3; it starts in about 20-35 min. concurrency.total is 2.",
                 "Next:        Wait, or raise the limits.",
             ][..],
         ),
         (
             "crashed",
-            failed("participant", "AgentCrashed"),
+            failed("Participant", "AgentCrashed"),
             &[
                 "Failure:     AgentCrashed, the participant's, charged, in pair 2.",
                 "aws s3 cp s3://results/42/evalai/environment_log.txt -",
@@ -35,7 +35,7 @@ async fn why_says_state_cause_and_next_step() {
         ),
         (
             "lost",
-            failed("infrastructure", "NodeLost"),
+            failed("Infrastructure", "NodeLost"),
             &[
                 "Failure:     NodeLost, the infrastructure's, not charged, in pair 2.",
                 &format!("kubectl leaderboard resume lost -n {}", desk.namespace),
@@ -47,7 +47,7 @@ async fn why_says_state_cause_and_next_step() {
             &[
                 "Routes:      20/20 done, driving score 43.13.",
                 "Results:     s3://results/42",
-                "EvalAI:      Written: EvalAI has the end.",
+                "EvalAI:      Published: EvalAI has the end.",
                 "Next:        Nothing.",
             ],
         ),
@@ -120,7 +120,7 @@ async fn cancel_is_wished_once_and_not_of_what_has_ended() {
 
     for (name, status) in [
         ("done", finished()),
-        ("failed", failed("participant", "Idle")),
+        ("failed", failed("Participant", "Idle")),
         ("stopped", end("Cancelled", "Cancelled")),
     ] {
         desk.submission(name, &json!({}), &status).await;
@@ -140,7 +140,7 @@ async fn cancel_is_wished_once_and_not_of_what_has_ended() {
 async fn resume_raises_the_attempt_of_what_failed_or_was_cancelled() {
     let desk = Desk::new().await;
     desk.leaderboard(&json!({})).await;
-    desk.submission("failed", &json!({}), &failed("infrastructure", "NodeLost"))
+    desk.submission("failed", &json!({}), &failed("Infrastructure", "NodeLost"))
         .await;
     let words = desk.run(&["resume", "failed"]).await.well();
     assert_has(
@@ -185,7 +185,7 @@ async fn resume_of_anything_else_is_refused_with_the_next_step() {
 #[tokio::test]
 async fn what_the_api_server_refuses_is_done_in_evalai() {
     let desk = Desk::new().await;
-    let mut status = failed("infrastructure", "NodeLost");
+    let mut status = failed("Infrastructure", "NodeLost");
     status["attempt"] = json!(9999);
     let mut spec = evalai(42);
     spec["attempt"] = json!(9999);
@@ -221,8 +221,8 @@ async fn who_waits_for_a_cancel_sees_the_states_until_the_end() {
 #[tokio::test]
 async fn who_waits_for_a_resume_hears_whether_it_finished() {
     let desk = Desk::new().await;
-    for (name, last, code) in [("good", finished(), 0), ("bad", failed("participant", "Idle"), 1)] {
-        desk.submission(name, &json!({}), &failed("infrastructure", "NodeLost"))
+    for (name, last, code) in [("good", finished(), 0), ("bad", failed("Participant", "Idle"), 1)] {
+        desk.submission(name, &json!({}), &failed("Infrastructure", "NodeLost"))
             .await;
         let mut waits = desk.waits(&["resume", name, "--wait"]);
         waits.until("is wished.").await;

@@ -21,7 +21,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{LogGroup, ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_api::{LeaderboardVersion, LogGroup, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::logcopy::{self, LogcopyError};
 use leaderboard_operator::pod::places::{Pace, Places, Setting};
 use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report};
@@ -232,7 +232,7 @@ fn run(bucket: &str) -> Run {
         attempt: 1,
         plan: RunPlan {
             run_id: "77".to_owned(),
-            results: ResultsFormat::V2,
+            leaderboard_version: LeaderboardVersion::V2,
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),
             phase: None,
@@ -244,7 +244,7 @@ fn run(bucket: &str) -> Run {
                 prefix: Some("runs/".to_owned()),
                 region: None,
                 endpoint: None,
-                limit: i64::try_from(LIMIT).unwrap(),
+                size_limit: LIMIT.to_string().parse().unwrap(),
             },
             image: "image".to_owned(),
             contents_image: "contents".to_owned(),

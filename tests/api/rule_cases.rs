@@ -100,7 +100,11 @@ fn kept() -> Vec<Case> {
     let prefix = |prefix: &Value| json!({"storage": {"prefix": prefix}});
     let keeps = |message, from: &Value, bad: &Value| update(Leaderboard, message, from, bad, &paused);
     vec![
-        keeps("results is immutable", &json!({}), &json!({"results": "V1"})),
+        keeps(
+            "leaderboardVersion is immutable",
+            &json!({}),
+            &json!({"leaderboardVersion": "V1"}),
+        ),
         keeps(
             "storage.bucket is immutable",
             &json!({}),
@@ -139,7 +143,7 @@ fn kept() -> Vec<Case> {
             Leaderboard,
             "results is immutable",
             &json!({}),
-            &json!({"results": "V1"}),
+            &json!({"leaderboardVersion": "V1"}),
             &served,
         ),
     ]
@@ -174,14 +178,20 @@ fn tracks() -> Vec<Case> {
 fn subsets() -> Vec<Case> {
     let subsets = |list: &Value| one_track(&json!({"pairs": 2, "routeSubsets": list}));
     let uneven = subsets(&json!(["0-14", "15-19"]));
-    let v1 = json!({"results": "V1", "tracks": [track(&json!({"scenariosFile": "/workspace/scenarios.json"}))]});
+    let v1 =
+        json!({"leaderboardVersion": "V1", "tracks": [track(&json!({"scenariosFile": "/workspace/scenarios.json"}))]});
     let case = |message, bad: &Value| create(Leaderboard, message, &uneven, &subsets(bad));
     vec![
         case("one entry for each of its pairs", &json!(["0-19"])),
         case("do not add up to routes", &json!(["0-9", "10-18"])),
         case("do not add up to routes", &json!(["0-10", "10-19"])),
         case("ends before it begins", &json!(["0-19", "20-19"])),
-        create(Leaderboard, "only V1 reads one", &v1, &json!({"results": "V2"})),
+        create(
+            Leaderboard,
+            "only V1 reads one",
+            &v1,
+            &json!({"leaderboardVersion": "V2"}),
+        ),
     ]
 }
 
@@ -202,8 +212,8 @@ fn times() -> Vec<Case> {
     vec![
         create(
             Leaderboard,
-            "idleSeconds must be longer than periodSeconds",
-            &json!({"periodSeconds": 60, "deadlines": {"idleSeconds": 61}}),
+            "idleSeconds must be longer than syncPeriodSeconds",
+            &json!({"syncPeriodSeconds": 60, "deadlines": {"idleSeconds": 61}}),
             &deadlines(json!({"idleSeconds": 60})),
         ),
         create(
@@ -226,9 +236,9 @@ fn times() -> Vec<Case> {
         ),
         create(
             Leaderboard,
-            "running.perTeam is larger than running.total",
-            &json!({"running": {"total": 2, "perTeam": 2}}),
-            &json!({"running": {"total": 1}}),
+            "concurrency.perTeam is larger than concurrency.total",
+            &json!({"concurrency": {"total": 2, "perTeam": 2}}),
+            &json!({"concurrency": {"total": 1}}),
         ),
     ]
 }
@@ -270,7 +280,7 @@ fn server() -> Vec<Case> {
 fn queue() -> Vec<Case> {
     let queue = |url: &str, dead: &str| {
         let at = |name: &str| format!("https://sqs.example.org/1/{name}");
-        json!({"queue": {"url": at(url), "deadLetterUrl": at(dead)}})
+        json!({"queue": {"url": at(url), "deadLetterURL": at(dead)}})
     };
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let alone = json!({"queue": {"url": "https://sqs.example.org/1/a"}});
@@ -295,14 +305,14 @@ fn pods_and_tables() -> Vec<Case> {
     let policy = |policy: &str, enforcement: &str| json!({"network": {"policy": policy, "enforcement": enforcement}});
     let identity = |identity: Value| json!({ "podIdentity": identity });
     let role = "arn:aws:iam::123456789012:role/pods";
-    let secret = identity(json!({"secretRef": "aws", "serviceAccountName": "pods"}));
-    let assumed = identity(json!({"roleArn": role, "serviceAccountName": "pods"}));
+    let secret = identity(json!({"secretName": "aws", "serviceAccountName": "pods"}));
+    let assumed = identity(json!({"roleARN": role, "serviceAccountName": "pods"}));
     let table = |sort_key: &Value| json!({"table": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}});
     let both = table(&json!("submission_id"));
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let probe = |probe: &str| json!({"network": {"probe": probe}});
     let not_a_probe = "network.probe is not an address and port";
-    let one_way = "exactly one of roleArn and secretRef";
+    let one_way = "exactly one of roleARN and secretName";
     vec![
         case("is not a range of addresses", &to("2001:db8::/32"), &to("10.0.0.1")),
         case(not_a_probe, &probe("192.0.2.1:443"), &probe("999.1.1.1:443")),
@@ -312,10 +322,10 @@ fn pods_and_tables() -> Vec<Case> {
             &policy("Managed", "Require"),
             &policy("External", "Require"),
         ),
-        case(one_way, &secret, &identity(json!({"roleArn": role}))),
-        case(one_way, &secret, &identity(json!({"secretRef": null}))),
+        case(one_way, &secret, &identity(json!({"roleARN": role}))),
+        case(one_way, &secret, &identity(json!({"secretName": null}))),
         case(
-            "roleArn needs serviceAccountName",
+            "roleARN needs serviceAccountName",
             &assumed,
             &identity(json!({"serviceAccountName": null})),
         ),
@@ -330,7 +340,11 @@ fn submissions() -> Vec<Case> {
     let first = json!({"priority": 5});
     let keeps = |message, from: &Value, bad: &Value| update(Submission, message, from, bad, &first);
     vec![
-        keeps("leaderboard is immutable", &json!({}), &json!({"leaderboard": "other"})),
+        keeps(
+            "leaderboardName is immutable",
+            &json!({}),
+            &json!({"leaderboardName": "other"}),
+        ),
         keeps("image is immutable", &json!({}), &json!({"image": "agent:2"})),
         keeps("image is immutable", &theirs, &json!({"image": "agent:2"})),
         keeps("evalai is immutable", &theirs, &json!({"evalai": ids(43)})),

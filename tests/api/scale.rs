@@ -202,7 +202,7 @@ impl Seen {
         if published.status == "True" {
             self.published.insert(name.clone());
         }
-        if published.status == "True" || published.reason == reasons::NOT_WANTED {
+        if published.status == "True" || published.reason == reasons::NOT_REQUIRED {
             self.settled.insert(name);
         }
     }
@@ -271,7 +271,7 @@ impl World {
 
     async fn apply(&self, pk: u64) {
         let spec = json!({"spec": {
-            "leaderboard": BOARD, "track": null, "evalai": {"challenge": 1, "phase": 1, "submission": pk},
+            "leaderboardName": BOARD, "track": null, "evalai": {"challenge": 1, "phase": 1, "submission": pk},
         }});
         let api = Kind::Submission.api(&self.client, &self.namespace);
         create(&api, Kind::Submission.object(&name(pk), &[&spec]), false)
@@ -455,7 +455,7 @@ async fn make_board(client: &Client, namespace: &str, size: &Size, evalai: &Hand
         },
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
         "storage": {"bucket": bucket, "endpoint": endpoint},
-        "periodSeconds": size.period_seconds,
+        "syncPeriodSeconds": size.period_seconds,
         "pairs": 1,
         "routes": ROUTES,
     }});

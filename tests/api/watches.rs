@@ -48,7 +48,7 @@ async fn creations_changes_and_deletions_are_events() {
     watch.store.wait_until_ready().await.unwrap();
     let submissions = Api::<Submission>::namespaced(client, &namespace);
     let object = json!({"apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission", "metadata": {"name": "one"},
-        "spec": {"leaderboard": "board", "image": "agent:1", "track": "SENSORS"}});
+        "spec": {"leaderboardName": "board", "image": "agent:1", "track": "SENSORS"}});
     submissions
         .create(&PostParams::default(), &serde_json::from_value(object).unwrap())
         .await

@@ -69,7 +69,7 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         scene.cloud.set_visibility(3).await;
         let change = json!({
             "pairs": 2, "routes": 6,
-            "retries": {"pair": 1},
+            "retries": {"perPair": 1},
             // At every start: what it has left takes less time than a stop needs to reach it.
             "agent": {"env": [{"name": "AGENT_KNOBS", "value": "pair=2,crash@3"}]},
         });
@@ -141,7 +141,7 @@ async fn a_leaderboard_applied_after_its_message_still_serves_it() {
             (state(&finished), score(&finished)),
             (Some(State::Finished), SIX_ROUTES)
         );
-        assert_eq!(finished.spec.leaderboard, "late");
+        assert_eq!(finished.spec.leaderboard_name, "late");
         assert_eq!(evalai.rows(pk).len(), 1);
     })
     .await;

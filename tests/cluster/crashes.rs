@@ -33,7 +33,7 @@ async fn kills_at_random_moments_change_no_score_and_cost_a_route_of_a_pair_each
     scenario("crashes", async |scene: &Scene| {
         let change = json!({
             "agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]},
-            "retries": {"pair": 20},
+            "retries": {"perPair": 20},
         });
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);

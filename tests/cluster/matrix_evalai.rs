@@ -200,7 +200,7 @@ async fn two_servers_with_the_same_ids_stay_apart() {
             .all::<Submission>()
             .await
             .into_iter()
-            .map(|s| s.spec.leaderboard)
+            .map(|s| s.spec.leaderboard_name)
             .collect();
         let right =
             apart && boards.len() == 2 && boards.contains(&"one".to_owned()) && boards.contains(&"other".to_owned());

@@ -121,7 +121,7 @@ fn of_agents() -> Vec<Row> {
             "agent idle",
             with(
                 agent("hang@2"),
-                json!({"deadlines": {"idleSeconds": 15}, "retries": {"pair": 1}}),
+                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 1}}),
             ),
             "Failed Idle (participant, charged); 1/2 routes; EvalAI failed",
         ),
@@ -135,7 +135,7 @@ fn of_agents() -> Vec<Row> {
         },
         row(
             "results malformed",
-            with(agent("nonsense@1"), json!({"retries": {"pair": 1}})),
+            with(agent("nonsense@1"), json!({"retries": {"perPair": 1}})),
             "Failed InvalidResults (participant, charged); EvalAI failed",
         ),
         row(
@@ -208,7 +208,7 @@ async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) -> Str
     let base = json!({
         "pairs": 1,
         "routes": 2,
-        "retries": {"pair": 2, "infrastructure": 0},
+        "retries": {"perPair": 2, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 20},
         "evalai": {"requestsPerMinute": 600},
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],

@@ -65,7 +65,7 @@ fn small(change: Value) -> Value {
     let mut base = json!({
         "pairs": 1,
         "routes": 2,
-        "retries": {"pair": 2, "infrastructure": 0},
+        "retries": {"perPair": 2, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 1},
     });
     lay_over(&mut base, change);
@@ -145,7 +145,7 @@ async fn quota(scene: &Scene) {
 
 async fn missing_secret(scene: &Scene) {
     let mut case = Case::open("missing Secret", "Pending ContainerConfig; Finished");
-    board(scene, "secret", json!({"podIdentity": {"secretRef": "aws-later"}})).await;
+    board(scene, "secret", json!({"podIdentity": {"secretName": "aws-later"}})).await;
     case.cause();
     scene.submit_to("secret", "secret", "agent:standard").await;
     case.shows(scene, "secret", "ContainerConfig", "secret \"aws-later\" not found")
@@ -242,7 +242,7 @@ async fn silent_registry(scene: &Scene) {
     );
     let silent = Registry::that_is_silent().await;
     board(scene, "silent", json!({})).await;
-    let spec = json!({"leaderboard": "silent", "track": "sensors", "image": silent.image()});
+    let spec = json!({"leaderboardName": "silent", "track": "sensors", "image": silent.image()});
     case.cause();
     scene.apply_submission("silent", spec).await;
     // What it is at is told after 45 s: a healthy Pod costs no write until then.
@@ -277,7 +277,7 @@ async fn pods_of(scene: &Scene, submission: &str) -> Vec<String> {
 async fn table_denied(scene: &Scene) {
     let mut case = Case::open(
         "DynamoDB denied and back",
-        "Finished; Recorded=False Refused; Recorded=True Written",
+        "Finished; Recorded=False Refused; Recorded=True Recorded",
     );
     scene.gate.deny("DynamoDB_20120810.UpdateItem");
     let table = json!({"name": scene.cloud.table, "region": crate::aws::REGION, "endpoint": scene.gate.url});
@@ -329,7 +329,7 @@ async fn evalai_away(scene: &Scene, name: &'static str, answer: Failure) {
     scene.evalai_leaderboard(&board, &evalai, change).await;
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
     let spec = json!({
-        "leaderboard": board,
+        "leaderboardName": board,
         "evalai": {"challenge": 1, "phase": 1, "submission": pk},
         "image": scene.lab.challenge("agent:standard"),
     });
@@ -373,7 +373,12 @@ async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, lab
         "nodeSelector": {NODE_LABEL: label},
         "tolerations": [{"key": NODE_LABEL, "operator": "Exists"}],
     });
-    board(scene, "lost-node", json!({"tracks": [track], "retries": {"pair": 1}})).await;
+    board(
+        scene,
+        "lost-node",
+        json!({"tracks": [track], "retries": {"perPair": 1}}),
+    )
+    .await;
     scene.submit_to("lost-node", "lost-node", "agent:standard").await;
     let pod = scene.first_pod("lost-node", LIMIT).await.name_any();
     let scheduled = |pod: Option<&Pod>| pod.is_some_and(|pod| pod.spec.as_ref().is_some_and(|s| s.node_name.is_some()));

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use fastrand::Rng;
 use futures::FutureExt;
 use futures::future::{self, BoxFuture};
-use leaderboard_api::ResultsFormat;
+use leaderboard_api::LeaderboardVersion;
 use leaderboard_operator::pod::watch::Watch;
 use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};
@@ -23,7 +23,7 @@ const RUNS: u64 = 40;
 const MOST_KILLS: u32 = 3;
 /// No run takes so long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(3);
-const FORMATS: [ResultsFormat; 2] = [ResultsFormat::V2, ResultsFormat::V1];
+const FORMATS: [LeaderboardVersion; 2] = [LeaderboardVersion::V2, LeaderboardVersion::V1];
 const ASK_EVERY: Duration = Duration::from_millis(5);
 
 /// What is killed.
@@ -293,7 +293,7 @@ fn number(variable: &str) -> Option<u64> {
 }
 
 /// The results of a run that nobody touches, and how long it takes.
-async fn undisturbed(bucket: &str, format: ResultsFormat, random: &mut Rng) -> (Results, Duration) {
+async fn undisturbed(bucket: &str, format: LeaderboardVersion, random: &mut Rng) -> (Results, Duration) {
     let began = Instant::now();
     let (results, _) = one(bucket, format, random, &[], &mut Tally::default()).await;
     (
@@ -305,7 +305,7 @@ async fn undisturbed(bucket: &str, format: ResultsFormat, random: &mut Rng) -> (
 /// One run; its story where it goes wrong.
 async fn one(
     bucket: &str,
-    format: ResultsFormat,
+    format: LeaderboardVersion,
     random: &mut Rng,
     kills: &[Kill],
     tally: &mut Tally,

@@ -11,7 +11,7 @@ use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use fastrand::Rng;
 use futures::StreamExt;
-use leaderboard_api::ResultsFormat;
+use leaderboard_api::LeaderboardVersion;
 
 use super::kubelet::Kubelet;
 use super::submission::{Submission, make_volumes};
@@ -69,8 +69,8 @@ async fn a_log_of_5_gb_is_stored_in_bounded_memory() {
     let serving = tokio::spawn(async move { axum::serve(listener, router).await.unwrap() });
 
     let bucket = server().await.bucket().await;
-    let mut submission = Submission::on(&endpoint, &bucket, ResultsFormat::V2, &mut Rng::new()).await;
-    submission.run.plan.storage.limit = 8 << 30;
+    let mut submission = Submission::on(&endpoint, &bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
+    submission.run.plan.storage.size_limit = leaderboard_api::ByteQuantity::gibibytes(8);
     submission.run.period_seconds = 1;
     let kubelet = Kubelet::new(&submission);
     let root = kubelet.folder().join("pod-1");

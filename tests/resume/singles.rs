@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use fastrand::Rng;
-use leaderboard_api::ResultsFormat;
+use leaderboard_api::LeaderboardVersion;
 use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 use nix::sys::signal::Signal;
 
@@ -20,7 +20,7 @@ const LIMIT: Duration = Duration::from_mins(1);
 async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything_is_final() {
     let mut random = Rng::new();
     let bucket = server().await.bucket().await;
-    let mut submission = Submission::new(&bucket, ResultsFormat::V2, &mut random).await;
+    let mut submission = Submission::new(&bucket, LeaderboardVersion::V2, &mut random).await;
     // The fifth route of a server is its pair's last; the next server has one route left.
     submission.simulator_knobs = "crash@5".to_owned();
     submission.route_ms = 200;
@@ -117,7 +117,7 @@ async fn until_reported(submission: &Submission, done: u32) {
 async fn a_last_flush_that_finds_no_s3_ends_in_time_and_says_so() {
     let bucket = server().await.bucket().await;
     let proxy = server().await.proxy().await;
-    let mut submission = Submission::on(&proxy.endpoint(), &bucket, ResultsFormat::V2, &mut Rng::new()).await;
+    let mut submission = Submission::on(&proxy.endpoint(), &bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
     submission.run.flush_seconds = 3;
     let mut kubelet = Kubelet::new(&submission);
     kubelet.make_pod();

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use leaderboard_api::{ResultsFormat, RunPlan, Storage, Verify};
+use leaderboard_api::{ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::places::Places;
 use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run};
 use leaderboard_operator::services::archive::Archive;
@@ -64,7 +64,7 @@ pub struct Submission {
 
 impl Submission {
     /// A prefix and ports of its own, on an endpoint of S3.
-    pub async fn on(endpoint: &str, bucket: &str, format: ResultsFormat, random: &mut fastrand::Rng) -> Self {
+    pub async fn on(endpoint: &str, bucket: &str, format: LeaderboardVersion, random: &mut fastrand::Rng) -> Self {
         static NUMBER: AtomicU32 = AtomicU32::new(1);
         let id = format!("run-{}", NUMBER.fetch_add(1, Ordering::Relaxed));
         let aws = ministack::aws(&server().await.endpoint()).await;
@@ -80,7 +80,7 @@ impl Submission {
         }
     }
 
-    pub async fn new(bucket: &str, format: ResultsFormat, random: &mut fastrand::Rng) -> Self {
+    pub async fn new(bucket: &str, format: LeaderboardVersion, random: &mut fastrand::Rng) -> Self {
         Self::on(&server().await.endpoint(), bucket, format, random).await
     }
 
@@ -170,12 +170,12 @@ impl Submission {
             let copy = places.status().join(member.to_string()).join(KEPT_CHECKPOINT);
             command.env("ROUTE_COPY", copy);
         }
-        match self.run.plan.results {
-            ResultsFormat::V1 => {
+        match self.run.plan.leaderboard_version {
+            LeaderboardVersion::V1 => {
                 let scenarios = contents("leaderboard/data/all_towns_traffic_scenarios_private.json");
                 command.arg(format!("--scenarios={}", scenarios.display()));
             }
-            ResultsFormat::V2 => {
+            LeaderboardVersion::V2 => {
                 command.arg(format!(
                     "--debug-checkpoint={}",
                     work.join("live_results.txt").display()
@@ -203,7 +203,7 @@ pub fn make_volumes(root: &Path) {
     fs::write(places.stop(), "").unwrap();
 }
 
-fn run(endpoint: &str, bucket: &str, id: &str, format: ResultsFormat) -> Run {
+fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Run {
     Run {
         namespace: "default".to_owned(),
         submission: id.to_owned(),
@@ -211,7 +211,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: ResultsFormat) -> Run {
         attempt: 1,
         plan: RunPlan {
             run_id: id.to_owned(),
-            results: format,
+            leaderboard_version: format,
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),
             phase: None,
@@ -223,7 +223,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: ResultsFormat) -> Run {
                 prefix: Some("runs/".to_owned()),
                 region: None,
                 endpoint: Some(endpoint.to_owned()),
-                limit: 1 << 30,
+                size_limit: ByteQuantity::gibibytes(1),
             },
             image: "image".to_owned(),
             contents_image: "contents".to_owned(),

@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use fastrand::Rng;
-use leaderboard_api::ResultsFormat;
+use leaderboard_api::LeaderboardVersion;
 use leaderboard_operator::pod::run::Stop;
 use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 
@@ -92,7 +92,7 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
         return;
     }
     let bucket = server().await.bucket().await;
-    let mut submission = Submission::new(&bucket, ResultsFormat::V2, &mut Rng::new()).await;
+    let mut submission = Submission::new(&bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
     submission.route_waits_for_copy = false;
     // Nobody writes anything while the disk is filled.
     submission.agent_knobs = "hang@3:once".to_owned();
@@ -167,7 +167,7 @@ async fn a_read_only_log_folder_costs_its_pair_and_nothing_else() {
         return;
     }
     let bucket = server().await.bucket().await;
-    let submission = Submission::new(&bucket, ResultsFormat::V2, &mut Rng::new()).await;
+    let submission = Submission::new(&bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
     let mut kubelet = Kubelet::new(&submission);
     kubelet.make_pod_on(|root| {
         let folder = root.join("logs/agent/agent1");

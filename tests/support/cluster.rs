@@ -206,7 +206,7 @@ impl Scene {
     /// Applies a local Leaderboard with 20 routes for 4 pairs; `change` is laid over its spec.
     pub async fn leaderboard(&self, name: &str, change: Value) {
         let spec = json!({
-            "results": "V2",
+            "leaderboardVersion": "V2",
             "tracks": [{"name": "sensors", "codename": "SENSORS"}, {"name": "map", "codename": "MAP"}],
             "contents": {"image": self.lab.challenge("contents:1")},
             "simulator": {"image": self.lab.challenge("simulator:1")},
@@ -216,14 +216,14 @@ impl Scene {
                 "region": REGION,
                 "endpoint": self.cloud.endpoint,
             },
-            "podIdentity": {"secretRef": "aws"},
+            "podIdentity": {"secretName": "aws"},
             // Nothing enforces policies here; only the test of that waits the minute until it is certain.
             "network": {
                 "dns": false,
                 "egress": [{"cidr": format!("{}/32", self.lab.host)}],
                 "enforcement": "Off",
             },
-            "periodSeconds": 1,
+            "syncPeriodSeconds": 1,
             "deadlines": {"readySeconds": 120, "idleSeconds": 60, "runSeconds": 1800},
         });
         self.apply_leaderboard(name, spec, change).await;
@@ -233,7 +233,7 @@ impl Scene {
     pub async fn evalai_leaderboard(&self, name: &str, evalai: &Evalai, change: Value) {
         let mut spec = json!({
             // Each period costs a request, and a minute has 54.
-            "periodSeconds": 2,
+            "syncPeriodSeconds": 2,
             "evalai": {
                 "apiServer": evalai.url,
                 "challenge": 1,
@@ -245,7 +245,7 @@ impl Scene {
             ],
             "queue": {
                 "url": self.cloud.queue_url,
-                "deadLetterUrl": self.cloud.dead_url,
+                "deadLetterURL": self.cloud.dead_url,
                 "region": REGION,
                 "endpoint": self.gate.url,
             },
@@ -296,7 +296,7 @@ impl Scene {
     /// Applies a Submission of a local Leaderboard, track sensors.
     pub async fn submit_to(&self, board: &str, name: &str, agent: &str) {
         let spec = json!({
-            "leaderboard": board,
+            "leaderboardName": board,
             "track": "sensors",
             "image": self.lab.challenge(agent),
             "team": {"id": "7", "name": "Team Seven"},
@@ -632,7 +632,7 @@ fn is_settled(submission: &Submission) -> bool {
     let Some(status) = &submission.status else { return false };
     let known = |type_: &str| {
         let condition = conditions::get(&status.conditions, type_);
-        condition.is_some_and(|c| c.status == "True" || c.reason == "NotWanted")
+        condition.is_some_and(|c| c.status == "True" || c.reason == "NotRequired")
     };
     status.attempt == Some(submission.spec.attempt)
         && is_true(submission, conditions::FINISHED)

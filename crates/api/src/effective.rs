@@ -2,7 +2,7 @@
 //!
 //! Pure. Called by the controller (plans, Jobs) and by the commands that run without a cluster.
 
-use super::leaderboard_parts::{ResultsFormat, Storage, Track};
+use super::leaderboard_parts::{LeaderboardVersion, Storage, Track};
 use super::submission::Submission;
 use super::{LeaderboardSpec, RunPlan};
 
@@ -23,10 +23,15 @@ pub struct Shape {
 pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
     let pairs = positive(track.pairs.unwrap_or(spec.pairs));
     let routes = positive(track.routes.unwrap_or(spec.routes));
-    let repetitions = positive(track.repetitions.or(spec.repetitions).unwrap_or(match spec.results {
-        ResultsFormat::V1 => 5,
-        ResultsFormat::V2 => 1,
-    }));
+    let repetitions = positive(
+        track
+            .repetitions
+            .or(spec.repetitions)
+            .unwrap_or(match spec.leaderboard_version {
+                LeaderboardVersion::V1 => 5,
+                LeaderboardVersion::V2 => 1,
+            }),
+    );
     let slices = track.route_subsets.clone().unwrap_or_else(|| slices(routes, pairs));
     Shape {
         pairs: slices.len(),
@@ -80,7 +85,7 @@ pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: String, image: String
     let shape = shape(spec, track);
     RunPlan {
         run_id,
-        results: spec.results,
+        leaderboard_version: spec.leaderboard_version,
         track: track.name.clone(),
         codename: track.codename.clone(),
         phase: track.phase,

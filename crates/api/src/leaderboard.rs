@@ -13,10 +13,10 @@ use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
 use super::leaderboard_parts::{
-    AgentContainer, ContentsContainer, Deadlines, Evalai, LogGroup, Network, PodIdentity, Queue, Retries, Running,
+    AgentContainer, Concurrency, ContentsContainer, Deadlines, Evalai, LogGroup, Network, PodIdentity, Queue, Retries,
     SimulatorContainer, Storage, Table, Track,
 };
-use super::leaderboard_parts::{ResultsFormat, Verify};
+use super::leaderboard_parts::{LeaderboardVersion, Verify};
 
 /// One leaderboard version: its tracks, the images that run it, and the services its results go to.
 #[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
@@ -45,7 +45,7 @@ use super::leaderboard_parts::{ResultsFormat, Verify};
 )]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("self.results == oldSelf.results").message("results is immutable: checkpoints of one format cannot be merged with the other's; make a new Leaderboard"),
+    validation = Rule::new("self.leaderboardVersion == oldSelf.leaderboardVersion").message("leaderboardVersion is immutable: checkpoints of one format cannot be merged with the other's; make a new Leaderboard"),
     validation = Rule::new("self.storage.bucket == oldSelf.storage.bucket").message("storage.bucket is immutable: finished results would no longer be found; make a new Leaderboard"),
     validation = Rule::new("has(self.storage.prefix) == has(oldSelf.storage.prefix) && (!has(self.storage.prefix) || self.storage.prefix == oldSelf.storage.prefix)").message("storage.prefix is immutable: finished results would no longer be found; make a new Leaderboard"),
     validation = Rule::new("!has(oldSelf.evalai) || has(self.evalai)").message("evalai cannot be removed: its submissions would never be published; make a new Leaderboard"),
@@ -57,8 +57,8 @@ use super::leaderboard_parts::{ResultsFormat, Verify};
     validation = Rule::new("self.tracks.all(t, (has(t.pairs) ? t.pairs : self.pairs) <= (has(t.routes) ? t.routes : self.routes))").message("a track has more pairs than routes, so a pair would have nothing to drive; lower pairs, or set the track's own"),
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || size(t.routeSubsets) == (has(t.pairs) ? t.pairs : self.pairs))").message("a track's routeSubsets must have one entry for each of its pairs"),
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || t.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.routes) ? t.routes : self.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
-    validation = Rule::new("self.results == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
-    validation = Rule::new("self.deadlines.idleSeconds > self.periodSeconds").message("deadlines.idleSeconds must be longer than periodSeconds: an agent would be stopped before its first report")
+    validation = Rule::new("self.leaderboardVersion == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
+    validation = Rule::new("self.deadlines.idleSeconds > self.syncPeriodSeconds").message("deadlines.idleSeconds must be longer than syncPeriodSeconds: an agent would be stopped before its first report")
 )]
 pub struct LeaderboardSpec {
     /// Where submissions come from and scores are published. Absent: a local leaderboard, nothing is reported.
@@ -68,8 +68,8 @@ pub struct LeaderboardSpec {
     #[schemars(length(min = 1, max = 32))]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub tracks: Vec<Track>,
-    /// Format of the checkpoints: V1 is Leaderboard 1.0, V2 is 2.0 and later.
-    pub results: ResultsFormat,
+    /// V1 is Leaderboard 1.0, V2 is 2.0 and later: the format of the checkpoints, the flags of the programs and some defaults.
+    pub leaderboard_version: LeaderboardVersion,
     /// The init container that brings the private contents.
     pub contents: ContentsContainer,
     /// The simulator of each pair.
@@ -118,7 +118,7 @@ pub struct LeaderboardSpec {
     pub runtime_class_name: Option<String>,
     /// How many submissions run at once.
     #[serde(default)]
-    pub running: Running,
+    pub concurrency: Concurrency,
     /// No new submission starts while true; running ones go on.
     #[serde(default)]
     pub paused: bool,
@@ -128,19 +128,15 @@ pub struct LeaderboardSpec {
     /// A partial PodTemplateSpec laid over ours: objects deep, lists by name, `simulator` and `agent` address all pairs, null removes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(schema_with = "super::leaderboard_parts::raw_object")]
-    pub pod: Option<serde_json::Value>,
+    pub pod_overrides: Option<serde_json::Value>,
     /// Time between two rounds of merging, uploading and reporting.
-    #[serde(default = "defaults::period_seconds")]
+    #[serde(default = "defaults::sync_period_seconds")]
     #[schemars(range(min = 1, max = 600))]
-    pub period_seconds: i64,
+    pub sync_period_seconds: i64,
     /// How long a finished Job is kept.
     #[serde(default = "defaults::ttl_seconds_after_finished")]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub ttl_seconds_after_finished: i32,
-    /// How long a deleted Submission waits for its results to be published.
-    #[serde(default = "defaults::finalize_seconds")]
-    #[schemars(range(min = 0, max = 604_800))]
-    pub finalize_seconds: i64,
 }
 
 impl Leaderboard {
@@ -196,13 +192,10 @@ mod defaults {
     pub(super) fn routes() -> i32 {
         20
     }
-    pub(super) fn period_seconds() -> i64 {
+    pub(super) fn sync_period_seconds() -> i64 {
         10
     }
     pub(super) fn ttl_seconds_after_finished() -> i32 {
         86_400
-    }
-    pub(super) fn finalize_seconds() -> i64 {
-        900
     }
 }

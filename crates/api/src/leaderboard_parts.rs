@@ -15,11 +15,12 @@ use kube::KubeSchema;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
+pub use super::byte_quantity::ByteQuantity;
 pub use super::leaderboard_services::*;
 
-/// Format of the checkpoints.
+/// A version of CARLA Leaderboard: it chooses the format of the checkpoints, the flags of the programs and some defaults.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ResultsFormat {
+pub enum LeaderboardVersion {
     /// Leaderboard 1.0.
     V1,
     /// Leaderboard 2.0 and later.
@@ -143,7 +144,10 @@ pub struct SimulatorContainer {
 /// How the submitted image is run in each pair.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
-#[x_kube(validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too"))]
+#[x_kube(
+    validation = Rule::new("!has(self.logSizeLimit) || (quantity(self.logSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.logSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.logSizeLimit must be 1Mi to 1Ti"),
+    validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too")
+)]
 pub struct AgentContainer {
     /// Default: the Leaderboard's evaluator with the flags of the version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -160,19 +164,19 @@ pub struct AgentContainer {
     /// In place of the safe default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security_context: Option<SecurityContext>,
-    /// Bytes of `leaderboard.log` after which the file is no longer written.
-    #[serde(default = "defaults::log_limit")]
-    #[schemars(range(min = 1_048_576, max = 1_099_511_627_776_i64))]
-    pub log_limit: i64,
+    /// Size of `leaderboard.log` at which it is no longer written: `1Mi` to `1Ti`.
+    #[serde(default = "defaults::log_size_limit")]
+    pub log_size_limit: ByteQuantity,
 }
 
 /// What is forgiven before a submission fails.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
 pub struct Retries {
     /// Crashes a pair may have.
-    #[serde(default = "defaults::retries_pair")]
+    #[serde(default = "defaults::retries_per_pair")]
     #[schemars(range(min = 0, max = 100))]
-    pub pair: i32,
+    pub per_pair: i32,
     /// New Jobs after infrastructure failures.
     #[serde(default = "defaults::retries_infrastructure")]
     #[schemars(range(min = 0, max = 100))]
@@ -220,14 +224,18 @@ pub struct Deadlines {
     #[serde(default = "defaults::flush_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub flush_seconds: i64,
+    /// How long a deleted Submission waits for its results to be published.
+    #[serde(default = "defaults::finalize_seconds")]
+    #[schemars(range(min = 0, max = 604_800))]
+    pub finalize_seconds: i64,
 }
 
 /// Who `workspace` and `logcopy` are towards S3. No other container of the Pod gets it.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("has(self.roleArn) != has(self.secretRef)").message("podIdentity needs exactly one of roleArn and secretRef"),
-    validation = Rule::new("!has(self.roleArn) || has(self.serviceAccountName)").message("podIdentity.roleArn needs serviceAccountName: the role trusts the token of that account")
+    validation = Rule::new("has(self.roleARN) != has(self.secretName)").message("podIdentity needs exactly one of roleARN and secretName"),
+    validation = Rule::new("!has(self.roleARN) || has(self.serviceAccountName)").message("podIdentity.roleARN needs serviceAccountName: the role trusts the token of that account")
 )]
 pub struct PodIdentity {
     /// ServiceAccount of the Pod; it needs no rights in the cluster.
@@ -235,13 +243,13 @@ pub struct PodIdentity {
     #[schemars(length(min = 1, max = 253))]
     pub service_account_name: Option<String>,
     /// Role assumed with the account's own token, limited to the run's prefix.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(rename = "roleARN", default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 2048), regex(pattern = r"^arn:"))]
     pub role_arn: Option<String>,
     /// Secret with `AWS_ACCESS_KEY_ID` and `AWS_SECRET_ACCESS_KEY`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 253))]
-    pub secret_ref: Option<String>,
+    pub secret_name: Option<String>,
 }
 
 /// Who makes the NetworkPolicy of the Pods.
@@ -312,8 +320,8 @@ pub struct Egress {
 /// How many submissions run at once; absent means no limit.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
-#[x_kube(validation = Rule::new("!has(self.total) || !has(self.perTeam) || self.perTeam <= self.total").message("running.perTeam is larger than running.total: it could never be reached"))]
-pub struct Running {
+#[x_kube(validation = Rule::new("!has(self.total) || !has(self.perTeam) || self.perTeam <= self.total").message("concurrency.perTeam is larger than concurrency.total: it could never be reached"))]
+pub struct Concurrency {
     /// Of this Leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]
@@ -332,7 +340,7 @@ impl Default for AgentContainer {
             env: Vec::new(),
             resources: None,
             security_context: None,
-            log_limit: defaults::log_limit(),
+            log_size_limit: defaults::log_size_limit(),
         }
     }
 }
@@ -340,7 +348,7 @@ impl Default for AgentContainer {
 impl Default for Retries {
     fn default() -> Self {
         Self {
-            pair: defaults::retries_pair(),
+            per_pair: defaults::retries_per_pair(),
             infrastructure: defaults::retries_infrastructure(),
         }
     }
@@ -368,6 +376,7 @@ impl Default for Deadlines {
             run_seconds: defaults::run_seconds(),
             cancel_seconds: defaults::cancel_seconds(),
             flush_seconds: defaults::flush_seconds(),
+            finalize_seconds: defaults::finalize_seconds(),
         }
     }
 }
@@ -378,10 +387,12 @@ pub(super) fn raw_object(_: &mut SchemaGenerator) -> Schema {
 }
 
 mod defaults {
-    pub(super) fn log_limit() -> i64 {
-        2 << 30
+    use super::ByteQuantity;
+
+    pub(super) fn log_size_limit() -> ByteQuantity {
+        ByteQuantity::gibibytes(2)
     }
-    pub(super) fn retries_pair() -> i32 {
+    pub(super) fn retries_per_pair() -> i32 {
         4
     }
     pub(super) fn retries_infrastructure() -> i32 {
@@ -407,6 +418,9 @@ mod defaults {
     }
     pub(super) fn flush_seconds() -> i64 {
         1800
+    }
+    pub(super) fn finalize_seconds() -> i64 {
+        900
     }
     pub(super) fn yes() -> bool {
         true

@@ -7,6 +7,8 @@ use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::byte_quantity::ByteQuantity;
+
 /// Who may read the tail of a failed submission's log in EvalAI.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LogTail {
@@ -118,8 +120,8 @@ pub enum Foreign {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.deadLetterUrl) || self.deadLetterUrl != self.url").message("queue.deadLetterUrl is the queue itself: a bad message would come back for ever"),
-    validation = Rule::new("!has(self.deadLetterUrl) || self.url.endsWith('.fifo') == self.deadLetterUrl.endsWith('.fifo')").message("a FIFO queue needs a FIFO dead-letter queue, a standard queue a standard one")
+    validation = Rule::new("!has(self.deadLetterURL) || self.deadLetterURL != self.url").message("queue.deadLetterURL is the queue itself: a bad message would come back for ever"),
+    validation = Rule::new("!has(self.deadLetterURL) || self.url.endsWith('.fifo') == self.deadLetterURL.endsWith('.fifo')").message("a FIFO queue needs a FIFO dead-letter queue, a standard queue a standard one")
 )]
 pub struct Queue {
     /// URL of the queue.
@@ -134,7 +136,7 @@ pub struct Queue {
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub endpoint: Option<String>,
     /// Where messages go that can't be used.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(rename = "deadLetterURL", default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub dead_letter_url: Option<String>,
     /// How long a message may wait for its Leaderboard to be applied.
@@ -147,8 +149,9 @@ pub struct Queue {
 }
 
 /// The S3 bucket of results and logs.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
+#[x_kube(validation = Rule::new("!has(self.sizeLimit) || (quantity(self.sizeLimit).compareTo(quantity('16Mi')) >= 0 && quantity(self.sizeLimit).compareTo(quantity('1Ti')) <= 0)").message("storage.sizeLimit must be 16Mi to 1Ti"))]
 pub struct Storage {
     /// Name of the bucket.
     #[schemars(length(min = 3, max = 63), regex(pattern = r"^[a-z0-9][a-z0-9.-]*[a-z0-9]$"))]
@@ -165,10 +168,9 @@ pub struct Storage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub endpoint: Option<String>,
-    /// Bytes one run may store; files beyond it are left out and named.
-    #[serde(default = "defaults::storage_limit")]
-    #[schemars(range(min = 16_777_216, max = 1_099_511_627_776_i64))]
-    pub limit: i64,
+    /// What one run may store, `16Mi` to `1Ti`; files beyond it are left out and named.
+    #[serde(default = "defaults::size_limit")]
+    pub size_limit: ByteQuantity,
 }
 
 /// The DynamoDB table of submissions.
@@ -218,6 +220,8 @@ pub struct LogGroup {
 }
 
 mod defaults {
+    use super::ByteQuantity;
+
     pub(super) fn split() -> String {
         "leaderboard".into()
     }
@@ -233,7 +237,7 @@ mod defaults {
     pub(super) fn unknown_after_seconds() -> i64 {
         900
     }
-    pub(super) fn storage_limit() -> i64 {
-        20 << 30
+    pub(super) fn size_limit() -> ByteQuantity {
+        ByteQuantity::gibibytes(20)
     }
 }

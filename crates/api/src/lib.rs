@@ -2,6 +2,7 @@
 //!
 //! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
 
+pub mod byte_quantity;
 #[cfg(feature = "client-errors")]
 pub mod client_errors;
 pub mod conditions;

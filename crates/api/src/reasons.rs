@@ -2,8 +2,8 @@
 //!
 //! Pure. Each reason appears in docs/states.md.
 
-/// No reason needed: all is well.
-pub const OK: &str = "Ok";
+/// Nothing holds a submission up.
+pub const NOT_STALLED: &str = "NotStalled";
 
 // Why a submission is Pending.
 pub const WAITING_FOR_SLOT: &str = "WaitingForSlot";
@@ -37,6 +37,8 @@ pub const RESUMED: &str = "Resumed";
 pub const REPLACING: &str = "Replacing";
 pub const STOPPING: &str = "Stopping";
 /// Scores do not follow from the infractions.
+/// The scores follow from the infractions again.
+pub const SCORES_EXPLAINED: &str = "ScoresExplained";
 pub const UNEXPLAINED_SCORES: &str = "UnexplainedScores";
 
 // Ends.
@@ -68,11 +70,12 @@ pub const JOB_FAILED: &str = "JobFailed";
 pub const NODE_LOST: &str = "NodeLost";
 
 // Of the other conditions.
-pub const NOT_WANTED: &str = "NotWanted";
-pub const OVERTAKEN: &str = "Overtaken";
+pub const NOT_REQUIRED: &str = "NotRequired";
+pub const CONCURRENT_UPDATE: &str = "ConcurrentUpdate";
 pub const STORED: &str = "Stored";
 pub const NOT_STORED: &str = "NotStored";
-pub const WRITTEN: &str = "Written";
+pub const PUBLISHED: &str = "Published";
+pub const RECORDED: &str = "Recorded";
 pub const WAITING: &str = "Waiting";
 /// The process before may still have requests under way.
 pub const WAITING_FOR_PREVIOUS_CONTROLLER: &str = "WaitingForPreviousController";

@@ -15,19 +15,19 @@ use super::submission_status::SubmissionStatus;
     version = "v1alpha1",
     kind = "Submission",
     plural = "submissions",
-    shortname = "sub",
+    shortname = "lbsub",
     category = "challenges",
     namespaced,
     status = "SubmissionStatus",
     doc = "One participant's image on one track of a Leaderboard.",
     derive = "PartialEq",
-    selectable = ".spec.leaderboard",
+    selectable = ".spec.leaderboardName",
     selectable = ".spec.evalai.submission",
     selectable = ".status.state",
     validation = Rule::new("size(self.metadata.name) <= 52").message("metadata.name may have at most 52 characters: Jobs and Pods add the attempt to it"),
     validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes the name of a Job and a label"),
     validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.state) || oldSelf.status.state != 'Finished' || self.spec.attempt == oldSelf.spec.attempt").message("a finished submission is not resumed; submit it again"),
-    printcolumn = r#"{"name":"Leaderboard","type":"string","jsonPath":".spec.leaderboard"}"#,
+    printcolumn = r#"{"name":"Leaderboard","type":"string","jsonPath":".spec.leaderboardName"}"#,
     printcolumn = r#"{"name":"Track","type":"string","jsonPath":".status.track"}"#,
     printcolumn = r#"{"name":"State","type":"string","jsonPath":".status.state"}"#,
     printcolumn = r#"{"name":"Progress","type":"string","jsonPath":".status.progress.text"}"#,
@@ -36,12 +36,12 @@ use super::submission_status::SubmissionStatus;
     printcolumn = r#"{"name":"Team","type":"string","jsonPath":".status.team.name","priority":1}"#,
     printcolumn = r#"{"name":"Attempt","type":"integer","jsonPath":".status.attempt","priority":1}"#,
     printcolumn = r#"{"name":"Reason","type":"string","jsonPath":".status.reason","priority":1}"#,
-    printcolumn = r#"{"name":"Node","type":"string","jsonPath":".status.node","priority":1}"#,
-    printcolumn = r#"{"name":"Results","type":"string","jsonPath":".status.results","priority":1}"#
+    printcolumn = r#"{"name":"Node","type":"string","jsonPath":".status.nodeName","priority":1}"#,
+    printcolumn = r#"{"name":"Results","type":"string","jsonPath":".status.resultsURL","priority":1}"#
 )]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("self.leaderboard == oldSelf.leaderboard").message("leaderboard is immutable; apply a new Submission"),
+    validation = Rule::new("self.leaderboardName == oldSelf.leaderboardName").message("leaderboardName is immutable; apply a new Submission"),
     validation = Rule::new("has(self.image) == has(oldSelf.image) && (!has(self.image) || self.image == oldSelf.image)").message("image is immutable; apply a new Submission"),
     validation = Rule::new("has(self.evalai) == has(oldSelf.evalai) && (!has(self.evalai) || self.evalai == oldSelf.evalai)").message("evalai is immutable; apply a new Submission"),
     validation = Rule::new("has(self.track) == has(oldSelf.track) && (!has(self.track) || self.track == oldSelf.track)").message("track is immutable; apply a new Submission"),
@@ -54,7 +54,7 @@ use super::submission_status::SubmissionStatus;
 pub struct SubmissionSpec {
     /// Name of the Leaderboard in the same namespace.
     #[schemars(length(min = 1, max = 52))]
-    pub leaderboard: String,
+    pub leaderboard_name: String,
     /// The participant's image; asked from EvalAI when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][^\s]*$"))]

@@ -6,7 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::leaderboard_parts::{ResultsFormat, Storage};
+use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::submission::Team;
 
 /// Where a submission stands, for people.
@@ -61,7 +61,7 @@ pub struct SubmissionStatus {
     pub recreated: i32,
     /// When the next Job of this attempt is made, after an infrastructure failure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub next_try: Option<Time>,
+    pub next_retry_time: Option<Time>,
     /// Why it stands there, one of `api::reasons`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
@@ -94,10 +94,10 @@ pub struct SubmissionStatus {
     pub times: Times,
     /// Name of the present Job.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub job: Option<String>,
+    pub job_name: Option<String>,
     /// Node of the present Pod.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub node: Option<String>,
+    pub node_name: Option<String>,
     /// The submission that this one re-runs: EvalAI made a new row for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rerun_of: Option<Rerun>,
@@ -105,8 +105,8 @@ pub struct SubmissionStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rerun_as: Option<Rerun>,
     /// Where the results are, `s3://bucket/prefix/id`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub results: Option<String>,
+    #[serde(rename = "resultsURL", default, skip_serializing_if = "Option::is_none")]
+    pub results_url: Option<String>,
     /// What went wrong.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Failure>,
@@ -122,8 +122,8 @@ pub struct SubmissionStatus {
 pub struct RunPlan {
     /// Run id: S3 prefix, sort key, log streams.
     pub run_id: String,
-    /// Format of the checkpoints.
-    pub results: ResultsFormat,
+    /// Which Leaderboard it is of: chooses the format of the checkpoints, flags and defaults.
+    pub leaderboard_version: LeaderboardVersion,
     /// Name of the track.
     pub track: String,
     /// CHALLENGE_TRACK_CODENAME.
@@ -251,7 +251,6 @@ impl Times {
 
 /// Whose failure it is.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq, Hash)]
-#[serde(rename_all = "lowercase")]
 pub enum FailureClass {
     Participant,
     Infrastructure,

@@ -76,7 +76,7 @@ fn cancel(submission: &Submission, leaderboard: Sight<'_>, now: jiff::Timestamp)
 /// What the operator does about a stop at this stage; docs/states.md tells it at length.
 fn how_it_stops(submission: &Submission, leaderboard: Sight<'_>) -> String {
     let status = submission.status.as_ref().filter(|_| !is_attempt_wished(submission));
-    if status.is_none_or(|s| s.job.is_none()) {
+    if status.is_none_or(|s| s.job_name.is_none()) {
         return "It has no Job, so it ends at once.".to_owned();
     }
     let seconds = match leaderboard {
@@ -105,7 +105,7 @@ fn resume(submission: &Submission, leaderboard: Sight<'_>) -> Result<Plan, Strin
     }
     let attempt = submission.spec.attempt.saturating_add(1);
     let mut page = Page::default();
-    let results = submission.status.as_ref().and_then(|s| s.results.as_deref());
+    let results = submission.status.as_ref().and_then(|s| s.results_url.as_deref());
     page.say(&format!("Attempt {attempt} of {name} is wished."));
     match results {
         Some(results) => page.say(&format!(
@@ -113,7 +113,7 @@ fn resume(submission: &Submission, leaderboard: Sight<'_>) -> Result<Plan, Strin
         )),
         None => page.say("Nothing of it is stored yet, as far as its status says, so it begins with the first route."),
     }
-    for trouble in board::troubles(&submission.spec.leaderboard, leaderboard) {
+    for trouble in board::troubles(&submission.spec.leaderboard_name, leaderboard) {
         page.say(&trouble.words);
     }
     if let Some(evalai) = submission.spec.evalai {

@@ -104,7 +104,7 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
 
 async fn explain(cluster: &Cluster, name: &str) -> Result<ExitCode, Error> {
     let submission = cluster.submission(name).await?;
-    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard).await?;
+    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
     print(&why::explain(&submission, leaderboard.sight(), Timestamp::now()));
     Ok(ExitCode::SUCCESS)
 }
@@ -137,7 +137,7 @@ async fn change(cluster: &Cluster, wish: Wish, target: &Target) -> Result<ExitCo
 async fn tell(cluster: &Cluster, wish: Wish, name: &str) -> Result<i64, Error> {
     for _ in 0..ROUNDS {
         let submission = cluster.submission(name).await?;
-        let leaderboard = cluster.leaderboard(&submission.spec.leaderboard).await?;
+        let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
         let plan = change::plan(wish, &submission, leaderboard.sight(), Timestamp::now()).map_err(Error::Unfit)?;
         if let Some(patch) = &plan.patch {
             match cluster.patch(name, patch).await? {

@@ -61,7 +61,7 @@ fn of_leaderboards(submissions: &[Submission], leaderboards: Option<&[Leaderboar
     };
     let mut sights: BTreeMap<String, Sight<'_>> = BTreeMap::new();
     let live = submissions.iter().filter(|s| !why::has_ended(s));
-    sights.extend(live.map(|s| (s.spec.leaderboard.clone(), Sight::Missing)));
+    sights.extend(live.map(|s| (s.spec.leaderboard_name.clone(), Sight::Missing)));
     sights.extend(leaderboards.iter().map(|l| (l.name_any(), Sight::There(l))));
     let troubles = sights.iter().flat_map(|(name, sight)| board::troubles(name, *sight));
     troubles.map(|trouble| trouble.words).collect()
@@ -136,7 +136,7 @@ fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
     let late = |c: &&Condition| {
         let age = now.duration_since(c.last_transition_time.0).as_secs();
         match c.reason.as_str() {
-            reasons::NOT_WANTED => false,
+            reasons::NOT_REQUIRED => false,
             reasons::WAITING_FOR_PREVIOUS_CONTROLLER => age > PATIENCE_SECONDS,
             reasons::WAITING => !c.message.is_empty() || age > PATIENCE_SECONDS,
             _ => true,

@@ -119,7 +119,7 @@ impl Story<'_> {
                 "It was deleted {asked}; it goes when every system has its end."
             ));
         }
-        for trouble in board::troubles(&self.submission.spec.leaderboard, self.leaderboard) {
+        for trouble in board::troubles(&self.submission.spec.leaderboard_name, self.leaderboard) {
             self.page.say(&trouble.words);
         }
     }
@@ -130,8 +130,8 @@ impl Story<'_> {
         let team = self.status.team.as_ref().or(spec.team.as_ref());
         let team = team.and_then(|team| team.name.as_deref().or(team.id.as_deref()));
         let mut words = match track {
-            Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard),
-            None => format!("not known yet, of Leaderboard {}", spec.leaderboard),
+            Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
+            None => format!("not known yet, of Leaderboard {}", spec.leaderboard_name),
         };
         if let Some(team) = team {
             words = format!("{words}, by {team}");
@@ -196,7 +196,7 @@ impl Story<'_> {
 
     /// The place in line, and what the Leaderboard lets run at once.
     fn line(&mut self) {
-        if let Some(at) = &self.status.next_try {
+        if let Some(at) = &self.status.next_retry_time {
             let words = format!("its next Job is made {}.", when(at.0, self.now));
             self.page.row("Next try", &words);
         }
@@ -209,10 +209,10 @@ impl Story<'_> {
         let mut words = format!("place {}; {eta}.", waiting.position);
         if let Some(leaderboard) = self.leaderboard.leaderboard() {
             let counts = leaderboard.status.as_ref().and_then(|s| s.counts);
-            let running = leaderboard.spec.running;
+            let concurrency = leaderboard.spec.concurrency;
             let now = counts.map(|c| format!("{} run, {} wait", c.running, c.pending));
-            let total = running.total.map(|n| format!("running.total is {n}"));
-            let team = running.per_team.map(|n| format!("running.perTeam is {n}"));
+            let total = concurrency.total.map(|n| format!("concurrency.total is {n}"));
+            let team = concurrency.per_team.map(|n| format!("concurrency.perTeam is {n}"));
             let facts: Vec<String> = [now, total, team].into_iter().flatten().collect();
             words = join(&[&words, &sentence(&facts.join(", "))]);
         }
@@ -262,11 +262,11 @@ impl Story<'_> {
             self.page.row(&format!("Pair {}", pair.id), &words);
         }
         if !has_ended(self.submission) {
-            let job = status.job.as_deref().unwrap_or_default();
-            let node = status.node.as_ref().map(|node| format!("on node {node}"));
+            let job = status.job_name.as_deref().unwrap_or_default();
+            let node = status.node_name.as_ref().map(|node| format!("on node {node}"));
             self.page.row("Job", &join(&[job, &node.unwrap_or_default()]));
         }
-        if let Some(results) = &status.results {
+        if let Some(results) = &status.results_url {
             self.page.whole("Results", results);
         }
     }
@@ -295,7 +295,7 @@ impl Story<'_> {
         let Some(failure) = self.status.failure.as_ref().filter(|_| has_ended(self.submission)) else {
             return;
         };
-        let (Some(whose), Some(results)) = (steps::log_of(&failure.reason), &self.status.results) else {
+        let (Some(whose), Some(results)) = (steps::log_of(&failure.reason), &self.status.results_url) else {
             return self
                 .page
                 .row("Log", "none explains it: the message says what is known.");
@@ -355,7 +355,7 @@ fn crashes(pair: &PairStatus, now: Timestamp) -> String {
 fn system_words(condition: &Condition, system: &str, now: Timestamp) -> String {
     let meaning = steps::meaning(&condition.reason).replacen("The other system", system, 1);
     let since = match (condition.status.as_str(), condition.reason.as_str()) {
-        ("True", _) | (_, reasons::NOT_WANTED) => String::new(),
+        ("True", _) | (_, reasons::NOT_REQUIRED) => String::new(),
         _ => format!("Since {}.", when(condition.last_transition_time.0, now)),
     };
     let message = sentence(&condition.message);
@@ -372,7 +372,7 @@ fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: S
     let troubles = if has_ended(submission) {
         Vec::new()
     } else {
-        board::troubles(&submission.spec.leaderboard, leaderboard)
+        board::troubles(&submission.spec.leaderboard_name, leaderboard)
     };
     reasons.extend(troubles.iter().filter_map(|trouble| trouble.reason.as_deref()));
     let pair = status.failure.as_ref().and_then(|failure| failure.pair);

@@ -104,7 +104,7 @@ fn ended_in_evalai(status: &str) -> String {
 
 /// What is said while the Leaderboard does not exist.
 pub(super) fn no_leaderboard(draft: &Draft<'_>) -> String {
-    let name = &draft.spec().leaderboard;
+    let name = &draft.spec().leaderboard_name;
     format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
 }
 
@@ -116,7 +116,7 @@ fn not_ready(draft: &Draft<'_>) -> Option<String> {
     blocks.then(|| {
         format!(
             "Leaderboard {} is not ready ({}): {} Fix it, and the submission goes on.",
-            draft.spec().leaderboard,
+            draft.spec().leaderboard_name,
             ready.reason,
             sentence(&ready.message)
         )
@@ -251,7 +251,7 @@ fn missing_track(draft: &Draft<'_>, leaderboard: &LeaderboardSpec) -> String {
     };
     format!(
         "{what} in Leaderboard {}, whose tracks are {}. Add it there, or cancel this submission.",
-        draft.spec().leaderboard,
+        draft.spec().leaderboard_name,
         known.join(", ")
     )
 }
@@ -282,7 +282,7 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
     let plan = match draft.status.plan.take() {
         // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
         // made; all else belongs to the submission.
-        Some(pinned) if draft.status.retry == 0 && draft.status.job.is_none() => leaderboard_api::RunPlan {
+        Some(pinned) if draft.status.retry == 0 && draft.status.job_name.is_none() => leaderboard_api::RunPlan {
             // The same, unless an earlier attempt had none.
             image,
             contents_image: leaderboard.contents.image.clone(),
@@ -295,7 +295,7 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
             effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume)
         }
     };
-    draft.status.results = Some(effective::results_url(&plan.storage, &plan.run_id));
+    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
     draft.status.plan = Some(plan);
     if draft.status.times.accepted.is_none() {
         draft.status.times.accepted = Some(draft.time());

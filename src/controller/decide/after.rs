@@ -100,7 +100,7 @@ fn farewell(draft: &Draft<'_>) -> Option<Timestamp> {
 }
 
 fn is_not_wanted(draft: &Draft<'_>, type_: &str) -> bool {
-    conditions::get(&draft.status.conditions, type_).is_some_and(|c| c.reason == reasons::NOT_WANTED)
+    conditions::get(&draft.status.conditions, type_).is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
 }
 
 /// A Leaderboard that is gone can't say what is wanted: what was decided before stands, and what never ran needs nothing.
@@ -179,7 +179,7 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
     if !is_ours || (is_evalais && !is_overtaken) {
-        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
         return Sync::Done;
     }
     if conditions::is_true(&draft.status.conditions, conditions::PUBLISHED)
@@ -212,7 +212,10 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             let failed = view.error.map(|e| format!("The last request failed: {}", sentence(&e)));
             let failed = failed.or(unread(draft));
             let (reason, message) = if is_overtaken {
-                (reasons::OVERTAKEN, failed.or_else(|| Some(TOLD_AGAIN.to_owned())))
+                (
+                    reasons::CONCURRENT_UPDATE,
+                    failed.or_else(|| Some(TOLD_AGAIN.to_owned())),
+                )
             } else if let Some(until) = draft.view.evalai_writes_from {
                 draft.requeue_at(until);
                 (
@@ -244,7 +247,7 @@ fn published(draft: &mut Draft<'_>, team: Option<&str>) {
         )
     });
     let shown = message.clone().unwrap_or_default();
-    draft.condition(conditions::PUBLISHED, Truth::True, reasons::WRITTEN, &shown);
+    draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
     draft.event(false, conditions::PUBLISHED, "EvalAI has the result.");
     if let Some(message) = message {
         draft.event(true, reasons::TEAM_DIFFERS, message);
@@ -279,7 +282,8 @@ fn unread(draft: &Draft<'_>) -> Option<String> {
 /// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
 fn is_overtaken(draft: &Draft<'_>) -> bool {
     let published = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
-    draft.view.evalai.as_ref().is_some_and(|e| e.overtaken) || published.is_some_and(|c| c.reason == reasons::OVERTAKEN)
+    draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
+        || published.is_some_and(|c| c.reason == reasons::CONCURRENT_UPDATE)
 }
 
 fn refused(draft: &mut Draft<'_>, message: &str) {
@@ -298,7 +302,7 @@ fn refused(draft: &mut Draft<'_>, message: &str) {
 
 /// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
 fn amend(draft: &mut Draft<'_>, status: &str) -> Sync {
-    draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_WANTED, "");
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
     if draft.status.state == Some(State::Cancelled) {
         return Sync::Done;
     }
@@ -323,21 +327,21 @@ fn record(draft: &mut Draft<'_>) -> Sync {
         return without_leaderboard(draft, conditions::RECORDED);
     }
     let Some(view) = draft.view.record.clone() else {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, "");
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, "");
         return Sync::Done;
     };
     if draft.status.plan.is_none() {
         let message = "The submission was never accepted, so the table has no row for it.";
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, message);
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
         return Sync::Done;
     }
     if draft.status.team.as_ref().and_then(|t| t.id.as_ref()).is_none() {
         let message = "The row needs a team; give spec.team.id to a submission that is not EvalAI's.";
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_WANTED, message);
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
         return Sync::Done;
     }
     if view.end_written {
-        draft.condition(conditions::RECORDED, Truth::True, reasons::WRITTEN, "");
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
         return Sync::Done;
     }
     draft.act(Action::Record { end: true });
@@ -375,7 +379,7 @@ fn release(draft: &mut Draft<'_>, complete: bool) {
     if complete {
         return draft.act(Action::ReleaseFinalizer);
     }
-    let patience = draft.leaderboard().map_or(900, |l| l.finalize_seconds);
+    let patience = draft.leaderboard().map_or(900, |l| l.deadlines.finalize_seconds);
     let until = after(deleted.0, patience);
     if draft.now() >= until {
         draft.event(

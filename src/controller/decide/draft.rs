@@ -140,7 +140,7 @@ impl<'a> Draft<'a> {
             plan: old.plan.map(|plan| leaderboard_api::RunPlan { resume: true, ..plan }),
             progress: old.progress,
             score: old.score.map(|s| if s.starts_with('~') { s } else { format!("~{s}") }),
-            results: old.results,
+            results_url: old.results_url,
             rerun_of: old.rerun_of,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,
@@ -250,7 +250,7 @@ impl<'a> Draft<'a> {
     }
 
     pub(super) fn moves(&mut self) {
-        self.condition(conditions::STALLED, Truth::False, reasons::OK, "");
+        self.condition(conditions::STALLED, Truth::False, reasons::NOT_STALLED, "");
     }
 
     /// Since when it is stalled for this reason.

@@ -149,11 +149,11 @@ fn retry(draft: &mut Draft<'_>, found: &Failure) {
     let delay = RETRY_SECONDS << draft.status.retry.clamp(0, MAX_DOUBLINGS);
     let at = after(draft.now(), delay);
     draft.status.retry += 1;
-    draft.status.job = None;
-    draft.status.node = None;
+    draft.status.job_name = None;
+    draft.status.node_name = None;
     draft.status.failure = None;
     draft.status.recreated = 0;
-    draft.status.next_try = Some(Time(at));
+    draft.status.next_retry_time = Some(Time(at));
     draft.status.times.scheduled = None;
     draft.status.times.stopping = None;
     for pair in &mut draft.status.pairs {
@@ -186,7 +186,7 @@ fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     draft.status.times.finished = Some(Time(ended.min(draft.now())));
     draft.status.waiting = None;
-    draft.status.next_try = None;
+    draft.status.next_retry_time = None;
     let stored = draft.view.report.ours().is_some_and(|r| r.is_final);
     let (truth, why) = if stored {
         (Truth::True, reasons::STORED)

@@ -257,7 +257,7 @@ fn is_before(end: &EndView, other: &EndView) -> bool {
 /// Whether a pair has crashed as often as it may, or cannot start at all. A count whose cause is not seen yet waits for it: an
 /// agent that followed its simulator is no cause, and the simulator's own end is seen moments later.
 pub(super) fn retries_used_up(draft: &Draft<'_>) -> Option<Failure> {
-    let limit = draft.retries().pair.max(1);
+    let limit = draft.retries().per_pair.max(1);
     let crashed = || draft.status.pairs.iter().filter(|p| p.crashes > 0);
     let hopeless = crashed().find(|p| last_word(p) == Some("cannotStart"));
     let worn = crashed().find(|p| p.crashes > limit || (p.crashes == limit && !waits_for_a_word(p, draft.now())));

@@ -21,7 +21,7 @@ pub(super) fn missing(draft: &Draft<'_>) -> Option<Missing> {
     if !is_managed || draft.view.is_policy_in_place {
         return None;
     }
-    let name = &draft.spec().leaderboard;
+    let name = &draft.spec().leaderboard_name;
     let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
     let isolated = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
     let why = isolated.filter(|c| c.status == "False" && c.observed_generation == leaderboard.metadata.generation);

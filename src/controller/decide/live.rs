@@ -23,7 +23,7 @@ const LOOK: Duration = Duration::from_secs(15);
 pub(super) fn decide(draft: &mut Draft<'_>) {
     let view = draft.view;
     // Without a plan (a status that was lost) nothing can be made again before it is accepted.
-    let has_job = draft.status.job.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
+    let has_job = draft.status.job_name.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
     match &view.job {
         // What was seen is of an earlier try; the next pass looks at the present one.
         JobSight::Ours(job) if job.name != own_job_name(draft) => draft.requeue_in(Duration::from_secs(1)),
@@ -89,7 +89,7 @@ fn in_line(draft: &mut Draft<'_>) {
             position,
             known_eta(draft, position).or(eta),
             reasons::WAITING_FOR_SLOT,
-            "All slots of the Leaderboard are in use; running.total and running.perTeam set their number.",
+            "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
         ),
         Turn::Paused { position } => (
             position,
@@ -120,7 +120,7 @@ fn known_eta(draft: &Draft<'_>, position: i32) -> Option<String> {
 }
 
 fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {
-    let Some(at) = draft.status.next_try.as_ref().map(|t| t.0) else {
+    let Some(at) = draft.status.next_retry_time.as_ref().map(|t| t.0) else {
         return false;
     };
     // A clock that was set back must not turn seconds into days.
@@ -139,10 +139,10 @@ fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {
 fn start_job(draft: &mut Draft<'_>) {
     let name = own_job_name(draft);
     let (attempt, retry) = (draft.status.attempt.unwrap_or(1), draft.status.retry);
-    let is_new = draft.status.job.is_none();
+    let is_new = draft.status.job_name.is_none();
     draft.status.waiting = None;
-    draft.status.next_try = None;
-    draft.status.job = Some(name.clone());
+    draft.status.next_retry_time = None;
+    draft.status.job_name = Some(name.clone());
     draft.act(Action::CreateJob { attempt, retry });
     draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
     if draft.is_running() {
@@ -211,9 +211,9 @@ fn without_its_job(draft: &mut Draft<'_>) {
 }
 
 fn with_job(draft: &mut Draft<'_>, job: &JobView) {
-    draft.status.job = Some(job.name.clone());
+    draft.status.job_name = Some(job.name.clone());
     draft.status.waiting = None;
-    draft.status.next_try = None;
+    draft.status.next_retry_time = None;
     // An object that was restored from a backup has lost its status and with it the plan.
     if draft.status.plan.is_none() && !draft.is_to_stop() && !accept::decide(draft) {
         return draft.requeue_in(LOOK);
@@ -254,8 +254,8 @@ fn with_job(draft: &mut Draft<'_>, job: &JobView) {
 }
 
 fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
-    let known = draft.status.node.take();
-    draft.status.node = pod.node.clone().or(known);
+    let known = draft.status.node_name.take();
+    draft.status.node_name = pod.node.clone().or(known);
     let times = &mut draft.status.times;
     times.scheduled = times.scheduled.take().or(pod.scheduled.map(Time));
     times.started = times.started.take().or(pod.agent_started.map(Time));
@@ -305,7 +305,7 @@ fn note_scores(draft: &mut Draft<'_>, report: &Report) {
             (Truth::False, reasons::UNEXPLAINED_SCORES, message)
         }
         None if conditions::get(&draft.status.conditions, conditions::PLAUSIBLE).is_none() => return,
-        None => (Truth::True, reasons::OK, String::new()),
+        None => (Truth::True, reasons::SCORES_EXPLAINED, String::new()),
     };
     draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
 }
@@ -365,5 +365,5 @@ fn record(draft: &mut Draft<'_>) {
 }
 
 fn period(draft: &Draft<'_>) -> Duration {
-    Duration::from_secs(draft.leaderboard().map_or(10, |l| l.period_seconds).unsigned_abs())
+    Duration::from_secs(draft.leaderboard().map_or(10, |l| l.sync_period_seconds).unsigned_abs())
 }

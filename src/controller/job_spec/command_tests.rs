@@ -291,7 +291,7 @@ fn the_evaluators_exit_code_is_the_commands() {
 #[test]
 fn the_runner_is_told_the_deadlines() {
     let deadlines = json!({"readySeconds": 60, "idleSeconds": 30, "flushSeconds": 50, "cancelSeconds": 40});
-    let job = Case::new("V2", json!({"deadlines": deadlines, "agent": {"logLimit": 2_097_152}})).json();
+    let job = Case::new("V2", json!({"deadlines": deadlines, "agent": {"logSizeLimit": "2Mi"}})).json();
     let (words, mut env) = started(container(&job, "simulator-3"), &[]);
     let (simulator, command) = behind_runner(&words, &mut env);
     let seconds = Duration::from_secs;

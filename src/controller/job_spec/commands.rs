@@ -4,7 +4,7 @@
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
 use super::pairs;
-use leaderboard_api::ResultsFormat;
+use leaderboard_api::LeaderboardVersion;
 
 /// A command with its arguments.
 pub(super) fn words(command: &[String], arguments: Option<&[String]>) -> Vec<String> {
@@ -38,10 +38,10 @@ cp -r ${CARLA_PYTHON_API_ROOT}/* /tmp/CARLA/
 }
 
 /// Starts CARLA's server. The values are Kubernetes' to expand.
-pub(super) fn simulator(format: ResultsFormat) -> Vec<String> {
+pub(super) fn simulator(format: LeaderboardVersion) -> Vec<String> {
     let flags: &[&str] = match format {
-        ResultsFormat::V1 => &["-carla-rpc-port=$(CARLA_PORT)", "-opengl", "-nosound"],
-        ResultsFormat::V2 => &[
+        LeaderboardVersion::V1 => &["-carla-rpc-port=$(CARLA_PORT)", "-opengl", "-nosound"],
+        LeaderboardVersion::V2 => &[
             "-vulkan",
             "-carla-rpc-port=$(CARLA_PORT)",
             "-RenderOffScreen",
@@ -57,7 +57,7 @@ pub(super) fn simulator(format: ResultsFormat) -> Vec<String> {
 ///
 /// `$(NAME)` are the runner's to expand, before the shell sources anything of the image: only TEAM_AGENT and TEAM_CONFIG
 /// are what the participant's files make of them.
-pub(super) fn agent(format: ResultsFormat) -> Vec<String> {
+pub(super) fn agent(format: LeaderboardVersion) -> Vec<String> {
     let flags: Vec<String> = agent_flags(format).iter().map(|flag| format!("  {flag}")).collect();
     let front = pairs::python_path();
     // The image may put its own modules on the path, but not in front of the contents' leaderboard.
@@ -77,9 +77,9 @@ exec python3 -u '$(LEADERBOARD_ROOT)/leaderboard/leaderboard_evaluator.py' \
     in_bash(script)
 }
 
-fn agent_flags(format: ResultsFormat) -> &'static [&'static str] {
+fn agent_flags(format: LeaderboardVersion) -> &'static [&'static str] {
     match format {
-        ResultsFormat::V1 => &[
+        LeaderboardVersion::V1 => &[
             "'--port=$(CARLA_PORT)'",
             "'--trafficManagerPort=$(CARLA_TM_PORT)'",
             r#""--agent=${TEAM_AGENT}""#,
@@ -94,7 +94,7 @@ fn agent_flags(format: ResultsFormat) -> &'static [&'static str] {
             "'--record=$(RECORD_PATH)'",
             "'--debug=$(DEBUG_CHALLENGE)'",
         ],
-        ResultsFormat::V2 => &[
+        LeaderboardVersion::V2 => &[
             "'--port=$(CARLA_PORT)'",
             "'--traffic-manager-port=$(CARLA_TM_PORT)'",
             r#""--agent=${TEAM_AGENT}""#,

@@ -101,7 +101,7 @@ fn a_track_that_was_taken_away_leaves_the_plan() {
 fn only_our_own_containers_have_an_identity() {
     let identities = [
         json!({"podIdentity": role()}),
-        json!({"podIdentity": {"secretRef": "writer"}}),
+        json!({"podIdentity": {"secretName": "writer"}}),
         json!({}),
     ];
     for identity in identities {
@@ -120,12 +120,12 @@ fn only_our_own_containers_have_an_identity() {
             if is_own(container) {
                 assert_eq!(
                     token,
-                    identity["podIdentity"]["roleArn"].is_string(),
+                    identity["podIdentity"]["roleARN"].is_string(),
                     "{}",
                     container["name"]
                 );
                 assert_eq!(value(container, ENV_ROLE_ARN).is_some(), token);
-                let secret = identity["podIdentity"]["secretRef"].is_string();
+                let secret = identity["podIdentity"]["secretName"].is_string();
                 assert_eq!(env(container, "AWS_SECRET_ACCESS_KEY").is_some(), secret);
                 assert_eq!(value(container, "AWS_REGION"), Some("eu-west-1"));
             } else {
@@ -145,7 +145,7 @@ fn only_our_own_containers_have_an_identity() {
 #[test]
 fn eks_is_told_every_stranger() {
     let pod = json!({"spec": {"initContainers": [{"name": "metrics", "image": "m", "restartPolicy": "Always"}]}});
-    let job = Case::new("V2", json!({"pairs": 2, "pod": pod})).json();
+    let job = Case::new("V2", json!({"pairs": 2, "podOverrides": pod})).json();
     assert_eq!(
         job["spec"]["template"]["metadata"]["annotations"]["eks.amazonaws.com/skip-containers"],
         "contents,metrics,simulator-1,simulator-2,agent-1,agent-2"
@@ -154,7 +154,7 @@ fn eks_is_told_every_stranger() {
 
 #[test]
 fn secrets_are_named_and_never_written() {
-    let job = Case::new("V2", json!({"podIdentity": {"secretRef": "writer"}})).json();
+    let job = Case::new("V2", json!({"podIdentity": {"secretName": "writer"}})).json();
     for name in ["workspace", "logcopy"] {
         let known = |key: &str| env(container(&job, name), key).unwrap().clone();
         for key in ["AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"] {
@@ -176,7 +176,7 @@ fn secrets_are_named_and_never_written() {
 
 #[test]
 fn a_hostile_image_name_cannot_ask_kubernetes_for_a_secret() {
-    let mut case = Case::new("V2", json!({"podIdentity": {"secretRef": "writer"}}));
+    let mut case = Case::new("V2", json!({"podIdentity": {"secretName": "writer"}}));
     case.plan.image = "x/$(AWS_SECRET_ACCESS_KEY)$$(AWS_SECRET_ACCESS_KEY)".into();
     let job = case.json();
     let written = value(container(&job, "logcopy"), "LEADERBOARD_RUN").unwrap();
@@ -190,7 +190,7 @@ fn a_hostile_image_name_cannot_ask_kubernetes_for_a_secret() {
 fn the_run_document_is_the_plan_and_its_times() {
     let mut case = Case::new(
         "V2",
-        json!({"periodSeconds": 5, "verify": "Refuse", "logGroup": {"name": "g"}}),
+        json!({"syncPeriodSeconds": 5, "verify": "Refuse", "logGroup": {"name": "g"}}),
     );
     case.attempt = 2;
     let run = run_document(&case.input());
@@ -264,7 +264,7 @@ fn logs_have_room_for_all_that_the_limits_allow() {
     let cases = [
         (json!({}), 20 + 4 * 2 + 1),
         (
-            json!({"pairs": 1, "agent": {"logLimit": gib}, "storage": {"bucket": "results", "limit": 5 * gib}}),
+            json!({"pairs": 1, "agent": {"logSizeLimit": "1Gi"}, "storage": {"bucket": "results", "sizeLimit": "5Gi"}}),
             5 + 1 + 1,
         ),
     ];

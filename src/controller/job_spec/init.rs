@@ -97,7 +97,7 @@ fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
     env.extend(region.map(|region| variable("AWS_REGION", region)));
     if let Some(identity) = &input.spec().pod_identity {
         env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));
-        env.extend(identity.secret_ref.iter().flat_map(|secret| {
+        env.extend(identity.secret_name.iter().flat_map(|secret| {
             [
                 from_secret(secret, "AWS_ACCESS_KEY_ID", false),
                 from_secret(secret, "AWS_SECRET_ACCESS_KEY", false),

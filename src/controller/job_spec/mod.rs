@@ -96,7 +96,7 @@ impl JobInput<'_> {
     }
 }
 
-/// The Job with the Leaderboard's `pod` laid over it, as far as this client's types know its fields.
+/// The Job with the Leaderboard's `podOverrides` laid over it, as far as this client's types know its fields.
 ///
 /// For reading. Create what [`build_json`] or [`build_object`] return: newer Pod fields survive there. An overlay that
 /// does not fit the types, which `pod_overlay::validate_overlay` refuses, is left out.
@@ -104,7 +104,7 @@ pub fn build(input: &JobInput<'_>) -> Job {
     serde_json::from_value(build_json(input)).unwrap_or_else(|_| ours(input))
 }
 
-/// The Job as it is created: ours, with the Leaderboard's `pod` laid over its template.
+/// The Job as it is created: ours, with the Leaderboard's `podOverrides` laid over its template.
 ///
 /// An overlay that `pod_overlay::validate_overlay` refuses is not applied at all, so that nothing gets around its rules.
 pub fn build_json(input: &JobInput<'_>) -> Value {
@@ -112,7 +112,7 @@ pub fn build_json(input: &JobInput<'_>) -> Value {
     let mut job = serde_json::to_value(ours(input)).unwrap_or_default();
     let overlay = input
         .spec()
-        .pod
+        .pod_overrides
         .as_ref()
         .filter(|pod| pod_overlay::validate_overlay(pod).is_ok());
     if let Some(template) = job.pointer_mut("/spec/template") {
@@ -145,7 +145,7 @@ pub fn run_document(input: &JobInput<'_>) -> Run {
         attempt: input.attempt,
         plan: input.plan.clone(),
         verify: spec.verify,
-        period_seconds: unsigned(spec.period_seconds),
+        period_seconds: unsigned(spec.sync_period_seconds),
         flush_seconds: unsigned(spec.deadlines.flush_seconds),
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
         log_group: spec.log_group.clone(),
@@ -230,7 +230,7 @@ fn backoff_limit(input: &JobInput<'_>) -> i32 {
     let pairs = i32::try_from(input.pairs()).unwrap_or(i32::MAX);
     pairs
         .saturating_mul(2)
-        .saturating_mul(input.spec().retries.pair)
+        .saturating_mul(input.spec().retries.per_pair)
         .saturating_add(SPARE_RESTARTS)
 }
 

@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{Container, EnvVar};
 
 use super::{JobInput, commands, init, variable, volumes};
 use crate::pod::run::{RUNNER, TOOLS, console_name};
-use leaderboard_api::{ResultsFormat, names};
+use leaderboard_api::{LeaderboardVersion, names};
 
 pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
 pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
@@ -61,7 +61,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         .command
         .as_deref()
         .map(|command| commands::words(command, spec.args.as_deref()));
-    let words = host.unwrap_or_else(|| commands::simulator(input.plan.results));
+    let words = host.unwrap_or_else(|| commands::simulator(input.plan.leaderboard_version));
     Container {
         image: Some(input.plan.simulator_image.clone()),
         command: Some(behind_runner("simulator", pair, flags, words)),
@@ -83,14 +83,14 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         format!("--checkpoint={CHECKPOINT}"),
         seconds("ready", deadlines.ready_seconds),
         seconds("idle", deadlines.idle_seconds),
-        format!("--log-limit={}", spec.log_limit),
+        format!("--log-limit={}", spec.log_size_limit.bytes()),
         format!("--python-path={}", python_path()),
     ];
     let host = spec
         .command
         .as_deref()
         .map(|command| commands::words(command, spec.args.as_deref()));
-    let words = host.unwrap_or_else(|| commands::agent(input.plan.results));
+    let words = host.unwrap_or_else(|| commands::agent(input.plan.leaderboard_version));
     // The runner expands these words, so that RESUME is what it is in this round.
     let words = words.iter().map(|word| commands::literal(word)).collect();
     Container {
@@ -158,10 +158,10 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         variable("SCENARIO_RUNNER_ROOT", SCENARIO_RUNNER_ROOT),
         variable("LEADERBOARD_ROOT", LEADERBOARD_ROOT),
     ];
-    env.push(match plan.results {
-        ResultsFormat::V1 => variable("SCENARIOS", scenarios),
+    env.push(match plan.leaderboard_version {
+        LeaderboardVersion::V1 => variable("SCENARIOS", scenarios),
         // The original's file lies in the contents, which are read-only here.
-        ResultsFormat::V2 => variable("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS),
+        LeaderboardVersion::V2 => variable("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS),
     });
     env.extend(graphics(pair));
     env

@@ -23,7 +23,7 @@ impl Case {
     /// A Leaderboard with one track, `more` laid over its spec.
     pub(super) fn new(format: &str, more: Value) -> Self {
         let mut spec = json!({
-            "results": format,
+            "leaderboardVersion": format,
             "tracks": [{"name": "sensors", "codename": "SENSORS"}],
             "contents": {"image": "registry.example/contents:1"},
             "simulator": {"image": "registry.example/carla:1", "resources": {"limits": {"nvidia.com/gpu": "1"}}},
@@ -42,7 +42,7 @@ impl Case {
         let submission: Submission = serde_json::from_value(json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
             "metadata": {"name": "submission-4711", "namespace": "challenge", "uid": "submission-uid"},
-            "spec": {"leaderboard": "carla", "evalai": {"challenge": 1, "phase": 2, "submission": 4711}},
+            "spec": {"leaderboardName": "carla", "evalai": {"challenge": 1, "phase": 2, "submission": 4711}},
         }))
         .unwrap();
         let image = "registry.example/team@sha256:0a1b".to_owned();
@@ -97,7 +97,7 @@ pub(super) fn container<'a>(job: &'a Value, name: &str) -> &'a Value {
 }
 
 pub(super) fn role() -> Value {
-    json!({"serviceAccountName": "submission-worker", "roleArn": "arn:aws:iam::123456789012:role/results"})
+    json!({"serviceAccountName": "submission-worker", "roleARN": "arn:aws:iam::123456789012:role/results"})
 }
 
 fn golden(name: &str, case: &Case) {
@@ -119,7 +119,7 @@ fn golden(name: &str, case: &Case) {
 fn the_job_of_leaderboard_1_is_as_committed() {
     golden(
         "v1.json",
-        &Case::new("V1", json!({"podIdentity": {"secretRef": "results-writer"}})),
+        &Case::new("V1", json!({"podIdentity": {"secretName": "results-writer"}})),
     );
 }
 
@@ -153,7 +153,10 @@ fn typed_and_dynamic_job_are_the_same() {
 
 #[test]
 fn a_field_that_this_client_does_not_know_survives() {
-    let case = Case::new("V2", json!({"pod": {"spec": {"fieldOfTheFuture": {"on": true}}}}));
+    let case = Case::new(
+        "V2",
+        json!({"podOverrides": {"spec": {"fieldOfTheFuture": {"on": true}}}}),
+    );
     assert_eq!(
         case.json()["spec"]["template"]["spec"]["fieldOfTheFuture"],
         json!({"on": true})
@@ -165,7 +168,7 @@ fn a_field_that_this_client_does_not_know_survives() {
 fn an_overlay_that_is_refused_is_not_applied() {
     let case = Case::new(
         "V2",
-        json!({"pod": {"spec": {"hostNetwork": true, "priorityClassName": "high"}}}),
+        json!({"podOverrides": {"spec": {"hostNetwork": true, "priorityClassName": "high"}}}),
     );
     assert_eq!(case.json(), Case::new("V2", json!({})).json());
     let pod = build(&case.input()).spec.unwrap().template.spec.unwrap();
@@ -217,12 +220,12 @@ fn the_nets_are_wider_than_the_rules_above_them() {
     let cases = [
         (json!({}), 52, 1800 + 86_400 + 120 + 1800 + 1800),
         (
-            json!({"pairs": 1, "retries": {"pair": 0}, "deadlines": {"runSeconds": 7200}}),
+            json!({"pairs": 1, "retries": {"perPair": 0}, "deadlines": {"runSeconds": 7200}}),
             20,
             1800 + 7200 + 120 + 1800 + 1800,
         ),
         (
-            json!({"pairs": 16, "retries": {"pair": 100}, "deadlines": {"runSeconds": i64::MAX}}),
+            json!({"pairs": 16, "retries": {"perPair": 100}, "deadlines": {"runSeconds": i64::MAX}}),
             3220,
             i32::MAX.into(),
         ),

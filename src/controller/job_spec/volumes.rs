@@ -40,7 +40,7 @@ const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;
 /// Room in `logs` beyond what the limits on uploads and logs add up to: filling it up evicts the Pod with 1 s of grace,
 /// so those limits must be met first.
-const LOGS_MARGIN: i64 = 1 << 30;
+const LOGS_MARGIN: u64 = 1 << 30;
 
 /// Every volume of the Pod.
 pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
@@ -63,13 +63,14 @@ pub(super) fn has_role(input: &JobInput<'_>) -> bool {
         .is_some_and(|identity| identity.role_arn.is_some())
 }
 
-fn logs_limit(input: &JobInput<'_>) -> i64 {
-    let pairs = i64::try_from(input.pairs()).unwrap_or(i64::MAX);
-    let agent_logs = pairs.saturating_mul(input.spec().agent.log_limit);
+fn logs_limit(input: &JobInput<'_>) -> u64 {
+    let pairs = u64::try_from(input.pairs()).unwrap_or(u64::MAX);
+    let agent_logs = pairs.saturating_mul(input.spec().agent.log_size_limit.bytes());
     input
         .plan
         .storage
-        .limit
+        .size_limit
+        .bytes()
         .saturating_add(agent_logs)
         .saturating_add(LOGS_MARGIN)
 }

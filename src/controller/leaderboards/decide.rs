@@ -43,7 +43,7 @@ pub struct LeaderboardView {
 /// How a Leaderboard stands with EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum EvalaiStanding {
-    NotWanted,
+    NotRequired,
     NoToken(String),
     TokenRefused(String),
     /// Its phases or labels do not fit the challenge.
@@ -175,7 +175,7 @@ fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
             (Truth::Unknown, reasons::ASKING_EVALAI, why)
         }
         EvalaiStanding::Fits { note } => (Truth::True, reasons::READY, note.clone().unwrap_or_default()),
-        EvalaiStanding::NotWanted => (Truth::True, reasons::READY, String::new()),
+        EvalaiStanding::NotRequired => (Truth::True, reasons::READY, String::new()),
     }
 }
 
@@ -257,7 +257,7 @@ mod tests {
         let spec = json!({
             "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-            "results": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
             "storage": {"bucket": "bucket", "prefix": prefix},
         });
         let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
@@ -456,7 +456,7 @@ mod tests {
             ),
             (EvalaiStanding::Misfit("x".into()), "False", reasons::LABELS_DIFFER),
             (EvalaiStanding::Unchecked(None), "Unknown", reasons::ASKING_EVALAI),
-            (EvalaiStanding::NotWanted, "True", reasons::READY),
+            (EvalaiStanding::NotRequired, "True", reasons::READY),
         ];
         for (evalai, status, expected) in cases {
             let seen = LeaderboardView {

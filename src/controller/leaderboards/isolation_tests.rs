@@ -9,7 +9,7 @@ use crate::observability::logging::tests::Lines;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
     let spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2", "contents": {"image": "c"},
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2", "contents": {"image": "c"},
         "simulator": {"image": "s"}, "storage": {"bucket": "bucket"}, "network": network,
     });
     let mut object = Leaderboard::new("carla", serde_json::from_value(spec).unwrap());

@@ -155,7 +155,7 @@ fn census(context: &Context, leaderboard: &Leaderboard) -> (Counts, usize) {
     let mut counts = Counts::default();
     let mut in_use = 0;
     let mine =
-        |s: &Submission| s.spec.leaderboard == leaderboard.name_any() && s.namespace() == leaderboard.namespace();
+        |s: &Submission| s.spec.leaderboard_name == leaderboard.name_any() && s.namespace() == leaderboard.namespace();
     for submission in context.stores.submissions.state().into_iter().filter(|s| mine(s)) {
         match submission.status.as_ref().and_then(|s| s.state) {
             None | Some(State::Pending) => counts.pending += 1,
@@ -180,7 +180,7 @@ fn needs_leaderboard(submission: &Submission) -> bool {
         .unwrap_or_default();
     let waits = |type_: &str| {
         conditions::get(conditions, type_)
-            .is_some_and(|c| c.status != "True" && c.reason != leaderboard_api::reasons::NOT_WANTED)
+            .is_some_and(|c| c.status != "True" && c.reason != leaderboard_api::reasons::NOT_REQUIRED)
     };
     !conditions::is_true(conditions, conditions::FINISHED)
         || waits(conditions::PUBLISHED)

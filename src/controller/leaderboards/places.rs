@@ -180,7 +180,7 @@ mod tests {
         let mut spec = json!({
             "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
-            "results": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
             "storage": {"bucket": "bucket"},
         });
         let places = |spec: &serde_json::Value| {
@@ -192,7 +192,7 @@ mod tests {
         };
         assert_eq!(places(&spec), ["the bucket bucket"]);
         spec["table"] = json!({"name": "rows", "region": "eu-west-1"});
-        spec["queue"] = json!({"url": "https://sqs/one", "deadLetterUrl": "https://sqs/dead"});
+        spec["queue"] = json!({"url": "https://sqs/one", "deadLetterURL": "https://sqs/dead"});
         let all = [
             "the bucket bucket",
             "the table rows at eu-west-1",

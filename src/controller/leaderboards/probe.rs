@@ -19,7 +19,7 @@ use crate::services::ObjectKey;
 use crate::services::evalai::{Labels, Target};
 use crate::services::token::{Token, TokenSource};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Evalai, Leaderboard, ResultsFormat, Submission, Token as TokenPlace, effective};
+use leaderboard_api::{Evalai, Leaderboard, LeaderboardVersion, Submission, Token as TokenPlace, effective};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -86,7 +86,7 @@ impl Probe {
         now: Timestamp,
     ) -> EvalaiStanding {
         if leaderboard.spec.evalai.is_none() {
-            return EvalaiStanding::NotWanted;
+            return EvalaiStanding::NotRequired;
         }
         let token = match &self.token {
             None => return EvalaiStanding::Unchecked(None),
@@ -166,9 +166,9 @@ async fn read_token(context: &Context, leaderboard: &Leaderboard, place: &TokenP
 }
 
 fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) {
-    let format = match leaderboard.spec.results {
-        ResultsFormat::V1 => leaderboard_results::Format::V1,
-        ResultsFormat::V2 => leaderboard_results::Format::V2,
+    let format = match leaderboard.spec.leaderboard_version {
+        LeaderboardVersion::V1 => leaderboard_results::Format::V1,
+        LeaderboardVersion::V2 => leaderboard_results::Format::V2,
     };
     let target = Target {
         api_server: evalai.server(),
@@ -177,7 +177,7 @@ fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &
         token: Arc::clone(token),
         requests_per_minute: evalai.requests_per_minute.unsigned_abs(),
         sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
-        period: Duration::from_secs(leaderboard.spec.period_seconds.unsigned_abs()),
+        period: Duration::from_secs(leaderboard.spec.sync_period_seconds.unsigned_abs()),
         phases: leaderboard.spec.tracks.iter().filter_map(|t| t.phase).collect(),
         labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
         since: leaderboard
@@ -214,8 +214,7 @@ async fn refused_pod(context: &Context, leaderboard: &Leaderboard) -> Option<Str
 
 fn sample_job(context: &Context, leaderboard: &Leaderboard) -> Option<DynamicObject> {
     let track = leaderboard.spec.tracks.first()?;
-    let spec =
-        serde_json::json!({ "leaderboard": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
+    let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
     let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
     sample.metadata.namespace = leaderboard.namespace();
     sample.metadata.uid = leaderboard.uid();
@@ -261,7 +260,7 @@ mod tests {
         let said = note(&labels(vec![unsent]), ends()).unwrap();
         assert_eq!(
             said,
-            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.results. EvalAI's token ends \
+            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \
              on 2027-01-01."
         );
     }

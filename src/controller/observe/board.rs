@@ -1,7 +1,7 @@
 //! The waiting line of each Leaderboard, worked out once for all who wait, and again only when something has changed.
 //!
 //! Holds the slots that were granted and whose Jobs the caches do not show yet, so that two passes at once never start
-//! more than `running.total`. Called by `observe`; the watch of Submissions tells it what has `moved`.
+//! more than `concurrency.total`. Called by `observe`; the watch of Submissions tells it what has `moved`.
 
 use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -55,7 +55,7 @@ impl Board {
         leaderboard: Option<&Leaderboard>,
         is_asked: bool,
     ) -> Turn {
-        let waits = submission.status.as_ref().is_none_or(|s| s.job.is_none()) && !is_over(submission);
+        let waits = submission.status.as_ref().is_none_or(|s| s.job_name.is_none()) && !is_over(submission);
         let Some(leaderboard) = leaderboard.filter(|_| waits && is_asked) else {
             return Turn::Go;
         };
@@ -87,7 +87,7 @@ impl Board {
     /// line like anyone.
     pub fn settle(&self, uid: &str, status: &SubmissionStatus) {
         let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
-        if is_over || (status.job.is_none() && status.retry == 0) {
+        if is_over || (status.job_name.is_none() && status.retry == 0) {
             self.release(uid);
         }
     }
@@ -136,8 +136,8 @@ impl Lines {
 fn limits(leaderboard: &Leaderboard) -> Limits {
     let spec = &leaderboard.spec;
     Limits {
-        total: spec.running.total.and_then(|n| usize::try_from(n).ok()),
-        per_team: spec.running.per_team.and_then(|n| usize::try_from(n).ok()),
+        total: spec.concurrency.total.and_then(|n| usize::try_from(n).ok()),
+        per_team: spec.concurrency.per_team.and_then(|n| usize::try_from(n).ok()),
         paused: spec.paused,
     }
 }
@@ -153,7 +153,7 @@ fn standing(
     let mut line = Vec::new();
     let mut past = Past::default();
     let is_of_it = |s: &&Arc<Submission>| {
-        s.spec.leaderboard == *name && s.metadata.namespace.as_deref().unwrap_or_default() == namespace
+        s.spec.leaderboard_name == *name && s.metadata.namespace.as_deref().unwrap_or_default() == namespace
     };
     for place in all.iter().filter(is_of_it).map(|s| Place::of(s)) {
         place.note(&mut past);
@@ -249,7 +249,7 @@ impl<'a> Place<'a> {
 
 impl Stand {
     fn of(submission: &Submission) -> Self {
-        let has_job = submission.status.as_ref().is_some_and(|s| s.job.is_some());
+        let has_job = submission.status.as_ref().is_some_and(|s| s.job_name.is_some());
         if is_over(submission) {
             Self::Over
         } else if has_job || is_between_tries(submission) {
@@ -285,7 +285,7 @@ impl Places {
 fn is_between_tries(submission: &Submission) -> bool {
     let is_finished = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::FINISHED);
     let status = submission.status.as_ref();
-    status.is_some_and(|s| s.retry > 0 && s.job.is_none() && !is_finished(s))
+    status.is_some_and(|s| s.retry > 0 && s.job_name.is_none() && !is_finished(s))
 }
 
 fn team(submission: &Submission) -> &str {
@@ -328,8 +328,8 @@ mod tests {
 
     fn leaderboard(running: &Value) -> Leaderboard {
         let spec = json!({
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2",
-            "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "b"}, "running": running,
+            "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2",
+            "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "b"}, "concurrency": running,
         });
         Leaderboard::new("lb", serde_json::from_value(spec).unwrap())
     }
@@ -340,7 +340,7 @@ mod tests {
 
     /// A submission of a team; `status` is what the cache shows of it.
     fn submission(name: &str, team: &str, second: i64, status: Value) -> Submission {
-        let spec = json!({"leaderboard": "lb", "image": "i", "track": "sensors", "team": {"id": team}});
+        let spec = json!({"leaderboardName": "lb", "image": "i", "track": "sensors", "team": {"id": team}});
         let mut object = Submission::new(name, serde_json::from_value(spec).unwrap());
         object.metadata.uid = Some(name.into());
         object.metadata.creation_timestamp = Some(time(second));
@@ -359,7 +359,7 @@ mod tests {
     }
 
     fn ended(attempt: i64) -> Value {
-        json!({"attempt": attempt, "job": "j", "track": "sensors", "conditions": [condition("Finished", "True")],
+        json!({"attempt": attempt, "jobName": "j", "track": "sensors", "conditions": [condition("Finished", "True")],
                "times": {"scheduled": time(0), "started": time(100), "finished": time(1500)}})
     }
 
@@ -463,7 +463,7 @@ mod tests {
                 "x-now",
                 "x",
                 2,
-                json!({"attempt": 1, "job": "j", "times": {"scheduled": time(2000)}}),
+                json!({"attempt": 1, "jobName": "j", "times": {"scheduled": time(2000)}}),
             ),
             submission("x-next", "x", 3, json!({})),
             submission("y-next", "y", 4, json!({})),
@@ -480,7 +480,7 @@ mod tests {
             spec: other.spec,
             status: other.status,
         };
-        other.spec.leaderboard = "another".into();
+        other.spec.leaderboard_name = "another".into();
         let mut all = all;
         all[0] = Arc::new(other);
         board.moved("", "lb");

@@ -74,9 +74,9 @@ fn leaderboard(total: Option<u8>, per_team: Option<u8>, paused: bool) -> Leaderb
         }
     }
     let spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "results": "V2",
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2",
         "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "b"},
-        "running": running, "paused": paused,
+        "concurrency": running, "paused": paused,
     });
     let mut object = Leaderboard::new("lb", serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some("ns".into());
@@ -84,7 +84,7 @@ fn leaderboard(total: Option<u8>, per_team: Option<u8>, paused: bool) -> Leaderb
 }
 
 fn submission(number: i64, team: u8, of_evalai: bool) -> Submission {
-    let mut spec = json!({"leaderboard": "lb", "image": "i", "track": "sensors", "team": {"id": team.to_string()}});
+    let mut spec = json!({"leaderboardName": "lb", "image": "i", "track": "sensors", "team": {"id": team.to_string()}});
     if of_evalai {
         spec["evalai"] = json!({"challenge": 1, "phase": 1, "submission": number});
     }
@@ -160,7 +160,7 @@ impl World {
             Step::Cancelled(n) => self.change(n, |object, _| object.spec.cancel = true),
             Step::Asks(n) => self.asks(n),
             Step::Scheduled(n) => self.change(n, |_, status| {
-                if status.job.is_some() {
+                if status.job_name.is_some() {
                     status.times.scheduled = Some(now);
                 }
             }),
@@ -171,7 +171,7 @@ impl World {
                 }
             }),
             Step::Lost(n) => self.change(n, |_, status| {
-                if status.job.take().is_some() {
+                if status.job_name.take().is_some() {
                     status.retry += 1;
                 }
             }),
@@ -206,7 +206,7 @@ impl World {
             .turn(|| self.all.clone(), &object, Some(&self.leaderboard), true);
         // Half of them write their Job's name later than the next one asks.
         if turn == Turn::Go && self.second % 200 == 0 {
-            self.change(n, |_, status| status.job = Some("job".into()));
+            self.change(n, |_, status| status.job_name = Some("job".into()));
         }
     }
 

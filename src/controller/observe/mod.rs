@@ -74,7 +74,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
 }
 
 fn leaderboard(context: &Context, submission: &Submission, namespace: &str) -> Option<Arc<Leaderboard>> {
-    let reference = ObjectRef::new(&submission.spec.leaderboard).within(namespace);
+    let reference = ObjectRef::new(&submission.spec.leaderboard_name).within(namespace);
     context.stores.leaderboards.get(&reference)
 }
 
@@ -105,7 +105,7 @@ pub(super) fn is_pod_of(pod: &Pod, job: &Job) -> bool {
 /// Whether the report of this submission has to be read at all.
 fn report_matters(submission: &Submission, job: &JobSight) -> bool {
     let status = submission.status.as_ref();
-    let known_job = status.is_some_and(|s| s.job.is_some()) || job.ours().is_some();
+    let known_job = status.is_some_and(|s| s.job_name.is_some()) || job.ours().is_some();
     let finished = status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
     known_job && !finished
 }

@@ -12,7 +12,7 @@ use crate::controller::job_spec::{
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 use leaderboard_api::{LeaderboardSpec, names};
 
-/// Why a Leaderboard's `pod` cannot be used. `path` is below `spec` of the Leaderboard.
+/// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]
 pub enum OverlayError {
     /// Something else where an object, a list or a name is needed.
@@ -24,7 +24,7 @@ pub enum OverlayError {
         expected: &'static str,
     },
     /// A field of another type than Kubernetes' own.
-    #[error("pod is not a partial Pod template: {message}")]
+    #[error("podOverrides is not a partial Pod template: {message}")]
     Template {
         /// What the types say.
         message: String,
@@ -99,29 +99,29 @@ const OWN_ENV: [&str; 6] = [
     "AWS_SESSION_TOKEN",
 ];
 
-/// Checks all of a Leaderboard that goes into its Pods: `pod`, and the variables of its containers.
+/// Checks all of a Leaderboard that goes into its Pods: `podOverrides`, and the variables of its containers.
 pub fn validate(spec: &LeaderboardSpec) -> Checked {
     for (side, env) in [("simulator", &spec.simulator.env), ("agent", &spec.agent.env)] {
         let names = env.iter().map(|variable: &EnvVar| variable.name.as_str());
         fixed_names(&format!("{side}.env"), names)?;
     }
-    spec.pod.as_ref().map_or(Ok(()), validate_overlay)
+    spec.pod_overrides.as_ref().map_or(Ok(()), validate_overlay)
 }
 
-/// Checks a Leaderboard's `pod`. The API server's answer to a dry run of the Job then judges what is left.
+/// Checks a Leaderboard's `podOverrides`. The API server's answer to a dry run of the Job then judges what is left.
 pub fn validate_overlay(pod: &Value) -> Checked {
-    let template = object(pod, "pod")?;
+    let template = object(pod, "podOverrides")?;
     only(
         template,
-        "pod",
+        "podOverrides",
         &["metadata", "spec"],
         "a template has metadata and spec",
     )?;
     if let Some(value) = template.get("metadata") {
-        metadata(object(value, "pod.metadata")?)?;
+        metadata(object(value, "podOverrides.metadata")?)?;
     }
     if let Some(value) = template.get("spec") {
-        spec(object(value, "pod.spec")?)?;
+        spec(object(value, "podOverrides.spec")?)?;
     }
     let typed: Result<PodTemplateSpec, _> = serde_json::from_value(without_nulls(pod));
     typed.map(|_| ()).map_err(|error| OverlayError::Template {
@@ -130,7 +130,7 @@ pub fn validate_overlay(pod: &Value) -> Checked {
 }
 
 fn metadata(metadata: &Map<String, Value>) -> Checked {
-    let path = "pod.metadata";
+    let path = "podOverrides.metadata";
     only(
         metadata,
         path,
@@ -154,13 +154,13 @@ fn metadata(metadata: &Map<String, Value>) -> Checked {
 }
 
 fn spec(spec: &Map<String, Value>) -> Checked {
-    fields(spec, "pod.spec", &POD_FIELDS)?;
+    fields(spec, "podOverrides.spec", &POD_FIELDS)?;
     if let Some(value) = spec.get("volumes") {
         volumes(value)?;
     }
     for (field, init) in [("initContainers", true), ("containers", false)] {
         let Some(value) = spec.get(field) else { continue };
-        for (path, container) in named(value, &format!("pod.spec.{field}"))? {
+        for (path, container) in named(value, &format!("podOverrides.spec.{field}"))? {
             check_container(&path, container, init)?;
         }
     }
@@ -168,7 +168,7 @@ fn spec(spec: &Map<String, Value>) -> Checked {
 }
 
 fn volumes(value: &Value) -> Checked {
-    for (path, volume) in named(value, "pod.spec.volumes")? {
+    for (path, volume) in named(value, "podOverrides.spec.volumes")? {
         if let Some(name) = volume["name"].as_str()
             && (OWN_VOLUMES.contains(&name) || CONTENTS_VOLUMES.iter().any(|(known, _, _)| *known == name))
         {

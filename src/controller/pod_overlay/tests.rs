@@ -185,49 +185,49 @@ fn refused(cases: &[(&str, &str)]) {
 fn refused_in(list: &str, cases: &[(&str, &str)]) {
     for (entry, expected) in cases {
         let overlay = format!(r#"{{"spec": {{"{list}": [{entry}]}}}}"#);
-        refused(&[(&overlay, &format!("pod.spec.{list}{expected}"))]);
+        refused(&[(&overlay, &format!("podOverrides.spec.{list}{expected}"))]);
     }
 }
 
 #[test]
 fn what_a_template_may_not_say() {
     refused(&[
-        ("[]", "pod is not an object"),
+        ("[]", "podOverrides is not an object"),
         (
             r#"{"kind": "Pod"}"#,
-            "pod.kind cannot be overridden: a template has metadata and spec",
+            "podOverrides.kind cannot be overridden: a template has metadata and spec",
         ),
         (
             r#"{"metadata": {"name": "x"}}"#,
-            "pod.metadata.name cannot be overridden: the Job names its Pods",
+            "podOverrides.metadata.name cannot be overridden: the Job names its Pods",
         ),
         (
             r#"{"metadata": {"labels": null}}"#,
-            "pod.metadata.labels is not an object",
+            "podOverrides.metadata.labels is not an object",
         ),
         (
             r#"{"metadata": {"labels": {"leaderboard.carla.org/run": "1"}}}"#,
-            "pod.metadata.labels[leaderboard.carla.org/run] cannot be overridden: the operator finds",
+            "podOverrides.metadata.labels[leaderboard.carla.org/run] cannot be overridden: the operator finds",
         ),
         (
             r#"{"metadata": {"labels": {"app.kubernetes.io/managed-by": null}}}"#,
-            "pod.metadata.labels[app.kubernetes.io/managed-by] cannot",
+            "podOverrides.metadata.labels[app.kubernetes.io/managed-by] cannot",
         ),
         (
             r#"{"metadata": {"labels": {"batch.kubernetes.io/job-name": "x"}}}"#,
-            "pod.metadata.labels[batch.kubernetes.io/job-name] cannot",
+            "podOverrides.metadata.labels[batch.kubernetes.io/job-name] cannot",
         ),
         (
             r#"{"metadata": {"annotations": {"leaderboard.carla.org/stop": "Cancel"}}}"#,
-            "pod.metadata.annotations[leaderboard.carla.org/stop] cannot",
+            "podOverrides.metadata.annotations[leaderboard.carla.org/stop] cannot",
         ),
         (
             r#"{"metadata": {"annotations": {"eks.amazonaws.com/skip-containers": null}}}"#,
-            "pod.metadata.annotations[eks.amazonaws.com/skip-containers] cannot",
+            "podOverrides.metadata.annotations[eks.amazonaws.com/skip-containers] cannot",
         ),
         (
             r#"{"spec": {"nodeSelector": {"a": 5}}}"#,
-            "pod is not a partial Pod template: invalid type: integer `5`, expected a string",
+            "podOverrides is not a partial Pod template: invalid type: integer `5`, expected a string",
         ),
     ]);
 }
@@ -247,11 +247,17 @@ fn what_a_pod_may_not_say() {
         ("ephemeralContainers", "[]"),
     ] {
         let overlay = format!(r#"{{"spec": {{"{field}": {value}}}}}"#);
-        refused(&[(&overlay, &format!("pod.spec.{field} cannot be overridden: "))]);
+        refused(&[(&overlay, &format!("podOverrides.spec.{field} cannot be overridden: "))]);
     }
     refused(&[
-        (r#"{"spec": {"volumes": null}}"#, "pod.spec.volumes is not a list"),
-        (r#"{"spec": {"containers": null}}"#, "pod.spec.containers is not a list"),
+        (
+            r#"{"spec": {"volumes": null}}"#,
+            "podOverrides.spec.volumes is not a list",
+        ),
+        (
+            r#"{"spec": {"containers": null}}"#,
+            "podOverrides.spec.containers is not a list",
+        ),
     ]);
     refused_in(
         "volumes",
@@ -394,7 +400,7 @@ fn what_may_not_be_mounted() {
 fn a_leaderboards_own_variables_are_checked_too() {
     let spec = |side: &str, name: &str| {
         let mut spec = json!({
-            "results": "V2", "tracks": [{"name": "t", "codename": "T"}], "storage": {"bucket": "bucket"},
+            "leaderboardVersion": "V2", "tracks": [{"name": "t", "codename": "T"}], "storage": {"bucket": "bucket"},
             "contents": {"image": "c"}, "simulator": {"image": "s"}, "agent": {},
         });
         spec[side]["env"] = json!([{"name": "FINE", "value": "1"}, {"name": name, "value": "2"}]);

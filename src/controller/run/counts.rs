@@ -66,7 +66,7 @@ mod tests {
     #[test]
     fn every_state_is_counted_also_with_nobody_in_it() {
         let spec: SubmissionSpec =
-            serde_json::from_value(serde_json::json!({"leaderboard": "one", "track": "map", "image": "agent:1"}))
+            serde_json::from_value(serde_json::json!({"leaderboardName": "one", "track": "map", "image": "agent:1"}))
                 .unwrap();
         let submission = |state| {
             let status = SubmissionStatus {

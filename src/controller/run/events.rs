@@ -35,10 +35,10 @@ pub(super) fn of_submissions(context: Arc<Context>) -> impl FnMut(WatchEvent<Sub
     move |touch| {
         let object = touch.object.as_ref();
         let namespace = object.namespace().unwrap_or_default();
-        let leaderboard = ObjectRef::new(&object.spec.leaderboard).within(&namespace);
+        let leaderboard = ObjectRef::new(&object.spec.leaderboard_name).within(&namespace);
         // Before anybody is woken by it.
         if places.moved(object, touch.is_gone) {
-            context.board.moved(&namespace, &object.spec.leaderboard);
+            context.board.moved(&namespace, &object.spec.leaderboard_name);
         }
         let original = context.reruns.moved(object, touch.is_gone);
         if touch.is_gone {

@@ -12,7 +12,7 @@ use leaderboard_api::Submission;
 pub(super) fn standing(submission: &Submission) -> String {
     let status = submission.status.as_ref();
     let state = status.and_then(|s| s.state).map(leaderboard_api::State::as_str);
-    format!("{state:?} {}", status.is_some_and(|s| s.job.is_some()))
+    format!("{state:?} {}", status.is_some_and(|s| s.job_name.is_some()))
 }
 
 /// What was last seen of each object, to tell our own status writes from what others did.

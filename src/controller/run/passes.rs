@@ -138,7 +138,7 @@ fn wake_waiting(
 ) {
     let waits = |s: &Submission| s.status.as_ref().is_none_or(waits_for_leaderboard);
     for submission in context.stores.submissions.state() {
-        let mine = submission.spec.leaderboard == board.name && submission.namespace() == board.namespace;
+        let mine = submission.spec.leaderboard_name == board.name && submission.namespace() == board.namespace;
         if mine && waits(&submission) && context.memory.is_waiting(&submission) {
             let _ = submissions.send(ObjectRef::from_obj(submission.as_ref()));
         }

@@ -107,7 +107,7 @@ mod tests {
         let spec = json!({
             "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}],
-            "results": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
         });
         let mut board = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
         board.metadata.namespace = Some(name.into());
@@ -182,7 +182,7 @@ mod tests {
             let (line, object) = asked.recv().await.unwrap();
             let path = "/apis/leaderboard.carla.org/v1alpha1/namespaces";
             assert_eq!(line, format!("POST {path}/{name}/submissions"));
-            assert_eq!(object["spec"]["leaderboard"], name);
+            assert_eq!(object["spec"]["leaderboardName"], name);
         }
     }
 }

@@ -210,7 +210,7 @@ impl Uploader {
             }
             let after = used - known.map_or(0, |known| known.stamp.size) + file.stamp.size;
             if after > self.limit && after > used && !file.essential {
-                let why = format!("storage.limit of {} bytes is reached", self.limit);
+                let why = format!("storage.sizeLimit of {} bytes is reached", self.limit);
                 left_out.insert(file.key.clone(), why);
                 continue;
             }

@@ -42,7 +42,7 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
     if !listing.complete {
         tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
     }
-    let limit = u64::try_from(run.plan.storage.limit).unwrap_or(0);
+    let limit = run.plan.storage.size_limit.bytes();
     let chosen = choose(listing.objects, run.plan.slices.len(), limit);
     let stored: Vec<Option<(String, Stored)>> = futures::stream::iter(chosen.objects)
         .map(|object| download(archive, tree, object))
@@ -59,7 +59,7 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
     if restored.left_out > 0 {
         tracing::warn!(
             objects = restored.left_out,
-            "not restored: impossible keys, or beyond storage.limit"
+            "not restored: impossible keys, or beyond storage.sizeLimit"
         );
     }
     Ok(restored)

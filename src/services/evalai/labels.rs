@@ -53,7 +53,7 @@ pub enum Misfit {
     #[error("the leaderboard of phase {phase} has no {}; add these labels to its schema", .labels.join(", "))]
     Unknown { phase: i64, labels: Vec<String> },
     /// The leaderboard has metrics that nobody sends: EvalAI shows them as `#`.
-    #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check spec.results", .labels.join(", "))]
+    #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion", .labels.join(", "))]
     Unsent { phase: i64, labels: Vec<String> },
 }
 

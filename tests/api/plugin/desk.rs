@@ -210,7 +210,7 @@ pub fn waiting() -> Value {
 pub fn running() -> Value {
     json!({
         "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
-        "job": "a-1", "times": {"started": TIME}, "conditions": [condition("Finished", "False", "Preparing")],
+        "jobName": "a-1", "times": {"started": TIME}, "conditions": [condition("Finished", "False", "Preparing")],
     })
 }
 
@@ -218,15 +218,15 @@ pub fn running() -> Value {
 pub fn end(state: &str, reason: &str) -> Value {
     json!({
         "state": state, "attempt": 1, "reason": reason, "message": "It has ended.", "track": "sensors",
-        "times": {"finished": TIME}, "results": "s3://results/42",
-        "conditions": [condition("Finished", "True", reason), condition("Published", "True", "Written")],
+        "times": {"finished": TIME}, "resultsURL": "s3://results/42",
+        "conditions": [condition("Finished", "True", reason), condition("Published", "True", "Published")],
     })
 }
 
 pub fn failed(class: &str, reason: &str) -> Value {
     let mut status = end("Failed", reason);
     let failure = json!({"class": class, "reason": reason, "message": "It has ended.",
-                         "charged": class == "participant", "pair": 2});
+                         "charged": class == "Participant", "pair": 2});
     merge(&mut status, &json!({ "failure": failure }));
     status
 }

@@ -24,7 +24,7 @@ fn says(plan: &Plan) -> String {
 
 #[test]
 fn a_cancel_says_what_happens_at_its_stage() {
-    let prepared = with(waiting(), &json!({"job": "submission-42-1", "reason": "Preparing"}));
+    let prepared = with(waiting(), &json!({"jobName": "submission-42-1", "reason": "Preparing"}));
     for (status, expected) in [
         (Value::Null, "It has no Job, so it ends at once."),
         (waiting(), "It has no Job, so it ends at once."),

@@ -26,7 +26,7 @@ fn named(name: &str, status: &Value) -> Submission {
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
         "metadata": {"name": name, "namespace": "carla", "creationTimestamp": "2026-11-01T10:00:00Z",
                      "resourceVersion": "17"},
-        "spec": {"leaderboard": "carla-20", "evalai": {"challenge": 3, "phase": 7, "submission": 42}},
+        "spec": {"leaderboardName": "carla-20", "evalai": {"challenge": 3, "phase": 7, "submission": 42}},
         "status": status,
     });
     serde_json::from_value(object).unwrap()
@@ -38,9 +38,9 @@ fn leaderboard() -> Leaderboard {
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": "carla-20", "namespace": "carla"},
         "spec": {
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 7}], "results": "V2",
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 7}], "leaderboardVersion": "V2",
             "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
-            "storage": {"bucket": "results"}, "running": {"total": 2},
+            "storage": {"bucket": "results"}, "concurrency": {"total": 2},
         },
         "status": {
             "counts": {"pending": 4, "running": 2, "finished": 0, "failed": 0, "cancelled": 0},
@@ -59,7 +59,7 @@ fn condition(type_: &str, truth: &str, reason: &str, message: &str) -> Value {
 fn waiting() -> Value {
     json!({
         "state": "Pending", "attempt": 1, "reason": "WaitingForSlot", "track": "sensors",
-        "message": "All slots of the Leaderboard are in use; running.total and running.perTeam set their number.",
+        "message": "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
         "team": {"id": "7", "name": "Team Seven"}, "waiting": {"position": 3, "eta": "20-35 min"},
         "conditions": [condition("Finished", "False", "Preparing", ""), condition("Accepted", "True", "Accepted", "")],
     })
@@ -69,10 +69,10 @@ fn waiting() -> Value {
 fn running() -> Value {
     json!({
         "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
-        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "job": "submission-42-1",
-        "node": "gpu-3", "results": "s3://results/v2/42", "times": {"started": "2026-11-01T11:00:00Z"},
+        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "jobName": "submission-42-1",
+        "nodeName": "gpu-3", "resultsURL": "s3://results/v2/42", "times": {"started": "2026-11-01T11:00:00Z"},
         "conditions": [condition("Finished", "False", "Preparing", ""), condition("Running", "True", "Running", ""),
-                       condition("Stalled", "False", "Ok", "")],
+                       condition("Stalled", "False", "NotStalled", "")],
     })
 }
 
@@ -82,9 +82,9 @@ fn crashed() -> Value {
                    agent and submits again.";
     json!({
         "state": "Failed", "attempt": 1, "reason": "AgentCrashed", "message": message, "track": "sensors",
-        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "job": "submission-42-1",
-        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
-        "failure": {"class": "participant", "reason": "AgentCrashed", "message": message, "charged": true, "pair": 2},
+        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "jobName": "submission-42-1",
+        "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "failure": {"class": "Participant", "reason": "AgentCrashed", "message": message, "charged": true, "pair": 2},
         "pairs": [
             {"id": 1, "done": 10, "total": 10, "crashes": 0, "state": "Done"},
             {"id": 2, "done": 2, "total": 10, "crashes": 4, "state": "Crashed",
@@ -104,9 +104,9 @@ fn node_lost() -> Value {
         "Node gpu-3 was lost and its Pod with it; finished routes are kept. Look at the node, then resume it.";
     json!({
         "state": "Failed", "attempt": 1, "retry": 2, "reason": "NodeLost", "message": message, "track": "sensors",
-        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
-        "failure": {"class": "infrastructure", "reason": "NodeLost", "message": message, "charged": false},
-        "conditions": [condition("Finished", "True", "NodeLost", message), condition("Published", "True", "Written", "")],
+        "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": message, "charged": false},
+        "conditions": [condition("Finished", "True", "NodeLost", message), condition("Published", "True", "Published", "")],
     })
 }
 
@@ -115,10 +115,10 @@ fn finished() -> Value {
     json!({
         "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": "43.13",
         "message": "20 of 20 routes, driving score 43.13.", "progress": {"done": 20, "total": 20, "text": "20/20"},
-        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
         "conditions": [
             condition("Finished", "True", "Finished", ""), condition("Archived", "True", "Stored", ""),
-            condition("Published", "True", "Written", ""), condition("Recorded", "True", "Written", ""),
+            condition("Published", "True", "Published", ""), condition("Recorded", "True", "Recorded", ""),
         ],
     })
 }
@@ -128,8 +128,8 @@ fn cancelled() -> Value {
     let message = "It was cancelled; what it had reached is kept.";
     json!({
         "state": "Cancelled", "attempt": 1, "reason": "Cancelled", "message": message,
-        "results": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
-        "conditions": [condition("Finished", "True", "Cancelled", message), condition("Published", "True", "Written", "")],
+        "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
+        "conditions": [condition("Finished", "True", "Cancelled", message), condition("Published", "True", "Published", "")],
     })
 }
 

@@ -36,11 +36,11 @@ fn one_in_line_says_its_place_and_estimate() {
 submission-42 is Pending since 2026-11-01 11:00:00 UTC (60 min ago).
 
 Track:       sensors of Leaderboard carla-20, by Team Seven; submission 42 of phase 7 in EvalAI
-Reason:      WaitingForSlot: As many run as running.total and running.perTeam allow. status.waiting
+Reason:      WaitingForSlot: As many run as concurrency.total and concurrency.perTeam allow. status.waiting
              has the place in line and an estimate.
-Message:     All slots of the Leaderboard are in use; running.total and running.perTeam set their
+Message:     All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their
              number.
-In line:     place 3; it starts in about 20-35 min. 2 run, 4 wait, running.total is 2.
+In line:     place 3; it starts in about 20-35 min. 2 run, 4 wait, concurrency.total is 2.
 Attempt:     1.
 
 Next:        Wait, or raise the limits."
@@ -55,7 +55,7 @@ fn a_participants_failure_says_whose_it_is_and_where_the_log_is() {
 submission-42 is Failed since 2026-11-01 11:57:00 UTC (3 min ago).
 
 Track:       sensors of Leaderboard carla-20; submission 42 of phase 7 in EvalAI
-Reason:      AgentCrashed: An agent crashed as often as retries.pair allows.
+Reason:      AgentCrashed: An agent crashed as often as retries.perPair allows.
 Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the
              participant fixes the agent and submits again.
 Failure:     AgentCrashed, the participant's, charged, in pair 2.
@@ -94,7 +94,7 @@ fn an_infrastructures_failure_is_not_charged_and_is_resumed() {
     for expected in [
         "Failure:     NodeLost, the infrastructure's, not charged.",
         "Attempt:     1; 2 of 2 retries after failures of the infrastructure, which cost nothing.",
-        "EvalAI:      Written: EvalAI has the end.",
+        "EvalAI:      Published: EvalAI has the end.",
         "Log:         none explains it",
         "Next:        Look at the node, then resume.\n             kubectl leaderboard resume submission-42 -n carla",
     ] {
@@ -114,7 +114,7 @@ fn the_next_step_of_a_failure_is_not_that_of_a_wait_for_the_same_reason() {
     ] {
         assert!(wait(reason).contains(waits), "{}", wait(reason));
         let message = "It could not be. Correct that, then resume it.";
-        let failure = json!({"class": "infrastructure", "charged": false, "reason": reason, "message": message});
+        let failure = json!({"class": "Infrastructure", "charged": false, "reason": reason, "message": message});
         let text = told(&with(
             node_lost(),
             &json!({"reason": reason, "message": message, "failure": failure}),
@@ -135,7 +135,7 @@ fn a_finished_one_has_its_score_and_results() {
         "Routes:      20/20 done, driving score 43.13.",
         "Results:     s3://results/v2/42",
         "S3:          Stored: The final results are in S3.",
-        "DynamoDB:    Written: DynamoDB has the end.",
+        "DynamoDB:    Recorded: DynamoDB has the end.",
         "Next:        Nothing.",
     ] {
         assert!(words.contains(expected), "{expected}\n\n{words}");
@@ -219,7 +219,7 @@ fn what_lasts_or_is_wished_is_said() {
     );
     let between = with(
         waiting(),
-        &json!({"reason": "Replacing", "retry": 1, "recreated": 2, "nextTry": "2026-11-01T12:00:12Z", "waiting": null,
+        &json!({"reason": "Replacing", "retry": 1, "recreated": 2, "nextRetryTime": "2026-11-01T12:00:12Z", "waiting": null,
                 "message": "Node gpu-3 was lost. It is tried again in 20 s; this costs no attempt."}),
     );
     let doubtful = with(
@@ -284,7 +284,7 @@ fn one_that_nobody_has_looked_at_says_so() {
 fn the_log_is_read_where_the_run_was_stored() {
     let storage =
         json!({"bucket": "results", "prefix": "v2/", "region": "eu-west-1", "endpoint": "http://127.0.0.1:4566"});
-    let plan = json!({"runId": "42", "results": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-9"],
+    let plan = json!({"runId": "42", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-9"],
                       "routes": 10, "repetitions": 1, "storage": storage, "image": "a:1", "contentsImage": "c:1",
                       "simulatorImage": "s:1"});
     let status = with(crashed(), &json!({"plan": plan}));

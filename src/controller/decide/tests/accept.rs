@@ -21,9 +21,9 @@ fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
     assert_eq!(condition(&plan, ACCEPTED), ("True".into(), reasons::ACCEPTED.into()));
     assert_eq!(condition(&plan, FINISHED).0, "False");
     let status = world.status();
-    assert_eq!(status.job.as_deref(), Some("sub-1"));
+    assert_eq!(status.job_name.as_deref(), Some("sub-1"));
     assert_eq!(status.track.as_deref(), Some("sensors"));
-    assert_eq!(status.results.as_deref(), Some("s3://results/sub"));
+    assert_eq!(status.results_url.as_deref(), Some("s3://results/sub"));
     assert_eq!(status.team.unwrap().id.as_deref(), Some("t1"));
     assert_eq!(status.times.submitted, Some(Time(at(0))));
     let pinned = status.plan.unwrap();
@@ -107,7 +107,7 @@ fn what_evalai_has_ended_never_runs_and_is_not_written() {
     assert!(!creates(&plan) && tells(&plan).is_empty());
     assert_eq!(
         condition(&plan, PUBLISHED),
-        ("False".into(), reasons::NOT_WANTED.into())
+        ("False".into(), reasons::NOT_REQUIRED.into())
     );
 }
 
@@ -149,7 +149,7 @@ fn not_ready(world: &mut World, reason: &str) {
         READY,
         conditions::Truth::False,
         reason,
-        "spec.pod: no",
+        "spec.podOverrides: no",
         None,
         &now,
     );
@@ -164,7 +164,7 @@ fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
         plan.status
             .message
             .unwrap()
-            .contains("(InvalidPod): spec.pod: no. Fix it")
+            .contains("(InvalidPod): spec.podOverrides: no. Fix it")
     );
 
     let mut world = World::local();
@@ -260,7 +260,10 @@ fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
     assert_eq!(tells(&world.pass()), [Tell::Failed], "the participant has an end");
     world.published();
     let plan = world.pass();
-    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::NOT_WANTED.into()));
+    assert_eq!(
+        condition(&plan, RECORDED),
+        ("False".into(), reasons::NOT_REQUIRED.into())
+    );
     assert!(has(&plan, |a| *a == Action::ForgetEvalai));
 }
 
@@ -272,7 +275,7 @@ fn a_submission_with_a_wrong_phase_is_taken_back_without_ending_the_row() {
     world.delete();
     let plan = world.pass_to(Cancelled, reasons::DELETED);
     assert_eq!(tells(&plan), []);
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_WANTED);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
     assert!(has(&plan, |a| *a == Action::ReleaseFinalizer), "{:?}", plan.actions);
 
     // It was accepted, and EvalAI has heard that it is queued.
@@ -365,14 +368,17 @@ fn a_row_of_another_phase_that_its_participant_deleted_is_ended_there() {
     (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
     assert_eq!(tells(&plan), [Tell::Cancelled], "EvalAI counts it as being processed");
-    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::OVERTAKEN.into()));
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::CONCURRENT_UPDATE.into())
+    );
     world.published();
     assert_eq!(condition(&world.pass(), PUBLISHED).0, "True");
 
     cancelled.in_evalai().cancelled = true;
     let plan = cancelled.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
     assert_eq!(tells(&plan), []);
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_WANTED);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
 }
 
 #[test]

@@ -91,7 +91,10 @@ fn a_cancel_that_our_own_write_may_have_undone_is_told_again() {
     world.view.report = ReportSight::Absent;
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
     assert_eq!(tells(&plan), [Tell::Cancelled]);
-    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::OVERTAKEN.into()));
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::CONCURRENT_UPDATE.into())
+    );
     // Also by a controller that has seen nothing of it.
     world.in_evalai().overtaken = false;
     assert_eq!(tells(&world.pass()), [Tell::Cancelled]);
@@ -109,7 +112,7 @@ fn evalais_end_wins_until_ours_is_answered_and_not_after() {
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert_eq!(
             condition(&plan, PUBLISHED),
-            ("False".into(), reasons::NOT_WANTED.into())
+            ("False".into(), reasons::NOT_REQUIRED.into())
         );
         assert_eq!(tells(&plan), []);
         world.recorded();
@@ -210,8 +213,8 @@ fn what_is_not_wanted_is_not_waited_for() {
     world.complete();
     world.report(final_report());
     let plan = world.pass_to(Finished, reasons::FINISHED);
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_WANTED);
-    assert_eq!(condition(&plan, RECORDED).1, reasons::NOT_WANTED);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
+    assert_eq!(condition(&plan, RECORDED).1, reasons::NOT_REQUIRED);
     assert_eq!(plan.requeue, None);
 
     let mut world = World::local();

@@ -31,7 +31,7 @@ pub fn at(second: i64) -> Timestamp {
 pub fn leaderboard(evalai: bool) -> Leaderboard {
     let mut spec = json!({
         "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-        "results": "V2",
+        "leaderboardVersion": "V2",
         "contents": {"image": "contents:1"},
         "simulator": {"image": "simulator:1"},
         "pairs": 2,
@@ -51,10 +51,10 @@ pub fn leaderboard(evalai: bool) -> Leaderboard {
 
 fn submission(evalai: bool) -> Submission {
     let spec = if evalai {
-        json!({"leaderboard": "carla", "image": "team/agent:1",
+        json!({"leaderboardName": "carla", "image": "team/agent:1",
                "evalai": {"challenge": 3, "phase": 7, "submission": 77}})
     } else {
-        json!({"leaderboard": "carla", "image": "team/agent:1", "track": "sensors", "team": {"id": "t1"}})
+        json!({"leaderboardName": "carla", "image": "team/agent:1", "track": "sensors", "team": {"id": "t1"}})
     };
     let mut submission = Submission::new("sub", serde_json::from_value(spec).unwrap());
     submission.metadata.uid = Some(UID.into());

@@ -203,7 +203,7 @@ fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_is_told_what_is_wrong_
         ("exited", None, reasons::AGENT_CRASHED),
     ] {
         let mut world = World::local().running();
-        world.leaderboard().retries.pair = 1;
+        world.leaderboard().retries.per_pair = 1;
         world.see(ended("agent-1", 0, word, 1, 20));
         world.pass_to(Running, reasons::STOPPING);
         world.complete();
@@ -261,7 +261,10 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         assert_eq!(events(&plan), [reasons::REPLACING]);
         assert_eq!(tells(&plan), [], "EvalAI keeps saying running");
         assert_eq!((plan.status.retry, plan.status.attempt), (n, Some(1)));
-        assert_eq!((plan.status.failure.as_ref(), plan.status.node.as_ref()), (None, None));
+        assert_eq!(
+            (plan.status.failure.as_ref(), plan.status.node_name.as_ref()),
+            (None, None)
+        );
         let message = plan.status.message.unwrap();
         assert!(
             message.contains(&format!("again in {pause} s")) && !message.contains("resume it"),

@@ -32,7 +32,7 @@ fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
     let plan = world.pass();
     assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: 1 }));
     assert_eq!(tells(&plan), [], "EvalAI keeps saying running");
-    assert_eq!(plan.status.job.as_deref(), Some("sub-1-r1"));
+    assert_eq!(plan.status.job_name.as_deref(), Some("sub-1-r1"));
 }
 
 /// A Pod that somebody else deletes at second 100 with a grace of 600 s, on a node that is seen like this.

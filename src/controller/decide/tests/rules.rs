@@ -65,7 +65,7 @@ fn one_job(view: &View, plan: &Plan) {
         );
         assert!(!is_finished(&plan.status));
         assert_eq!((plan.status.attempt, plan.status.retry), (Some(*attempt), *retry));
-        assert_eq!(plan.status.job, Some(job_name("sub", &plan.status)));
+        assert_eq!(plan.status.job_name, Some(job_name("sub", &plan.status)));
         assert!(plan.status.plan.is_some(), "a Job without a plan");
         let leaderboard = view.leaderboard.as_ref().expect("a Job without a Leaderboard");
         let is_external = leaderboard.spec.network.policy == PolicySource::External;

@@ -234,9 +234,9 @@ fn deadlines_and_retries_are_the_leaderboards_of_this_moment() {
 
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    world.leaderboard().retries.pair = 9;
+    world.leaderboard().retries.per_pair = 9;
     world.pass_to(Running, reasons::RUNNING);
-    world.leaderboard().retries.pair = 4;
+    world.leaderboard().retries.per_pair = 4;
     world.pass_to(Running, reasons::STOPPING);
 }
 

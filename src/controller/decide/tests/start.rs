@@ -22,7 +22,7 @@ fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
     let mut world = World::evalai().with_pod();
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert!(plan.events.is_empty());
-    assert_eq!(plan.status.node.as_deref(), Some("node-a"));
+    assert_eq!(plan.status.node_name.as_deref(), Some("node-a"));
     assert_eq!(tells(&plan), [Tell::Queued]);
     let before = world.status();
     for (second, name) in [(5, "contents"), (20, "workspace"), (40, "logcopy")] {
