@@ -1,20 +1,23 @@
 """Owns the order of all tests and what each layer needs around it. Called by `lab test`, which `make test` and `.ci/run` call.
 
-A layer's own output goes through unchanged, so that the closing lines of the runners can be seen; a table closes the run.
+A layer's own output goes through unchanged, so that the closing lines of the runners can be seen; a table and a summary of what
+failed close the run.
 """
 
 import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import IO, Any
 
 from . import build, charttest, cluster, demo, kube, pythonenv, tools
 from .console import say, seconds
 from .errors import LabError
+from .failures import Failure, Reader, Summary, failed_cases
 from .settings import Settings, client_environment, without_proxy
 from .toolsets import ENVTEST_TOOLS
 
@@ -25,6 +28,12 @@ OPERATOR = "leaderboard-operator"
 AT_ONCE = 4
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
+# A backtrace pushes the message out of what is kept of a long log; `cargo test` itself still gives one.
+TEST_OUTPUT = {"RUST_BACKTRACE": "0"}
+# So many tests of the cluster that failed next to others are run again; more are no accident of a busy machine.
+MOST_AGAIN = 4
+# A process that a test leaves behind may keep the output open: after the tests' end it is read for so many seconds.
+AFTER_END = 10
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,8 @@ class Plan:
 
     settings: Settings
     filter: str
+    # What failed, as far as the run has come.
+    summary: Summary = field(default_factory=Summary)
 
 
 @dataclass(frozen=True)
@@ -43,6 +54,16 @@ class Layer:
     work: Callable[[Plan], None]
     # Needs root and a node.
     is_cluster: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one run of `cargo test`."""
+
+    passed: bool
+    # Every test program came to its end, so that `failures` has all failed tests.
+    is_whole: bool
+    failures: list[Failure]
 
 
 @dataclass(frozen=True)
@@ -62,7 +83,7 @@ def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -
     results: list[Result] = []
     for layer in chosen:
         results.append(run_layer(plan, layer, results))
-    print(table(results), flush=True)
+    print("\n".join([table(results), *plan.summary.lines()]), flush=True)
     return not any(result.failure for result in results)
 
 
@@ -149,13 +170,19 @@ def in_cluster(plan: Plan) -> None:
         run_cluster_tests(plan, {**env, "LEADERBOARD_MATRIX": str(lines)})
     finally:
         if lines.exists():
-            print(matrix(lines.read_text()), flush=True)
+            text = lines.read_text()
+            plan.summary.cases += failed_cases(text)
+            print(matrix(text), flush=True)
 
 
 def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
     """Most at once, then one by one those that kill what the others need; these too if others have failed."""
     target = ["--test=cluster"]
-    passed = cargo_passes(plan, target, {**env, "RUST_TEST_THREADS": str(AT_ONCE)}, [plan.filter])
+
+    def at_once(threads: int, harness: Sequence[str]) -> Outcome:
+        return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
+
+    passed = settle(plan.summary, at_once(AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names]))
     alone = names_alone(ignored_tests(plan, target, env), plan.filter)
     if not alone and not plan.filter:
         raise LabError(
@@ -163,9 +190,29 @@ def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
         )
     if alone:
         say("now, one by one, the tests that disturb every other one")
-        passed &= cargo_passes(plan, target, {**env, "RUST_TEST_THREADS": "1"}, ["--ignored", "--exact", *alone])
+        last = at_once(1, ["--ignored", "--exact", *alone])
+        plan.summary.failed += last.failures
+        passed &= last.passed
     if not passed:
-        raise LabError("cargo test found failures, see above")
+        raise LabError("cargo test found failures, see below")
+
+
+def settle(summary: Summary, first: Outcome, again: Callable[[Sequence[str]], Outcome]) -> bool:
+    """Runs a few failed tests once more, alone; returns whether all passed in the end."""
+    names = [failure.name for failure in first.failures]
+    if first.passed or not first.is_whole or len(names) > MOST_AGAIN:
+        summary.failed += first.failures
+        return first.passed
+    say(f"now once more, one by one, what failed next to others: {', '.join(names)}")
+    second = again(names)
+    failed = {failure.name for failure in second.failures}
+    if not second.is_whole:
+        summary.failed += [*first.failures, *second.failures]
+        return False
+    # The message of the first failure is the one that a person must explain.
+    summary.failed += [failure for failure in first.failures if failure.name in failed]
+    summary.passed_alone += [failure for failure in first.failures if failure.name not in failed]
+    return second.passed
 
 
 def ignored_tests(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> str:
@@ -201,14 +248,27 @@ def test_environment(settings: Settings) -> dict[str, str]:
 
 
 def cargo_test(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> None:
-    if not cargo_passes(plan, targets, env, [plan.filter]):
-        raise LabError("cargo test found failures, see above")
+    outcome = cargo_outcome(plan, targets, env, [plan.filter])
+    plan.summary.failed += outcome.failures
+    if not outcome.passed:
+        raise LabError("cargo test found failures, see below")
 
 
-def cargo_passes(plan: Plan, targets: Sequence[str], env: dict[str, str], harness: Sequence[str]) -> bool:
-    """Runs tests; `harness` is said to the test programs: options and parts of names."""
+def cargo_outcome(plan: Plan, targets: Sequence[str], env: dict[str, str], harness: Sequence[str]) -> Outcome:
+    """Runs tests; `harness` are arguments of the test programs: options and parts of names."""
     build.check_cargo()
-    return call(plan, [*cargo_argv(targets), "--", *filter(None, harness)], env) == 0
+    reader = Reader()
+    argv = [*cargo_argv(targets), "--", *filter(None, harness)]
+    code = stream(plan, argv, {**env, **TEST_OUTPUT}, reader)
+    return outcome_of(code, reader)
+
+
+def outcome_of(code: int, reader: Reader) -> Outcome:
+    failures = reader.failures()
+    if code == 0 or failures and reader.is_whole():
+        return Outcome(code == 0, True, failures)
+    lost = Failure("a test program that ended without its result, or was not built", [list(reader.tail)])
+    return Outcome(False, False, [*failures, lost])
 
 
 def cargo_argv(targets: Sequence[str]) -> list[str]:
@@ -222,6 +282,39 @@ def call(plan: Plan, argv: Sequence[str], env: dict[str, str]) -> int:
     return subprocess.run(
         argv, cwd=plan.settings.repository, env=whole, stdin=subprocess.DEVNULL, check=False
     ).returncode
+
+
+def stream(plan: Plan, argv: Sequence[str], env: dict[str, str], reader: Reader) -> int:
+    """Runs a test runner; what it prints goes through unchanged, and to the reader."""
+    sys.stdout.flush()
+    whole = {**os.environ, "CARGO_TERM_PROGRESS_WHEN": "never", **env}
+    # No `with`: it would close the output, and wait for its reader, which may wait for a process that a test left behind.
+    process = subprocess.Popen(
+        argv,
+        cwd=plan.settings.repository,
+        env=whole,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    copier = threading.Thread(target=copy, args=(process.stdout, reader), daemon=True)
+    copier.start()
+    try:
+        code = process.wait()
+    except BaseException:
+        process.kill()
+        raise
+    copier.join(AFTER_END)
+    if not copier.is_alive():
+        process.stdout.close()
+    return code
+
+
+def copy(output: IO[bytes], reader: Reader) -> None:
+    for line in output:
+        sys.stdout.buffer.write(line)
+        sys.stdout.buffer.flush()
+        reader.feed(line.decode(errors="replace"))
 
 
 def test_targets(settings: Settings) -> list[str]:

@@ -1,8 +1,16 @@
-"""What the closing tables of a test run look like."""
+"""What is run again, what the closing tables of a test run look like, and that nothing is lost on the way."""
 
+import io
+import sys
 import unittest
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
 
 from labkit import testrun
+from labkit.failures import Failure, Reader, Summary
 
 
 class Matrix(unittest.TestCase):
@@ -34,3 +42,76 @@ cluster::audit::what_it_costs_for_an_hour: test
     def test_the_filter_chooses_among_them(self) -> None:
         self.assertEqual(testrun.names_alone(self.LISTED, "an_etcd"), ["cluster::restarts::an_etcd_that_dies"])
         self.assertEqual(testrun.names_alone(self.LISTED, "what_it_costs"), [])
+
+
+def outcome(*failed: str) -> testrun.Outcome:
+    return testrun.Outcome(not failed, True, [Failure(name, [[f"{name} failed"]]) for name in failed])
+
+
+class Again(unittest.TestCase):
+    """What comes of tests of the cluster that failed while others ran."""
+
+    def settle(self, first: testrun.Outcome, second: testrun.Outcome) -> tuple[bool, Summary, list[str]]:
+        asked: list[str] = []
+
+        def again(names: Sequence[str]) -> testrun.Outcome:
+            asked.extend(names)
+            return second
+
+        summary = Summary()
+        return testrun.settle(summary, first, again), summary, asked
+
+    def test_nothing_runs_again_when_all_passed(self) -> None:
+        passed, summary, asked = self.settle(outcome(), outcome())
+        self.assertEqual((passed, summary, asked), (True, Summary(), []))
+
+    def test_what_passes_alone_passes_and_is_named_with_its_first_message(self) -> None:
+        passed, summary, asked = self.settle(outcome("a", "b"), outcome())
+        self.assertTrue(passed)
+        self.assertEqual(asked, ["a", "b"])
+        self.assertEqual(summary.failed, [])
+        self.assertEqual(summary.passed_alone, outcome("a", "b").failures)
+        self.assertIn("failed next to others and passed alone: a", summary.lines())
+
+    def test_one_that_fails_again_fails_the_layer(self) -> None:
+        passed, summary, _ = self.settle(outcome("a", "b"), outcome("b"))
+        self.assertFalse(passed)
+        self.assertEqual([failure.name for failure in summary.failed], ["b"])
+        self.assertEqual([failure.name for failure in summary.passed_alone], ["a"])
+
+    def test_many_failures_are_no_accident(self) -> None:
+        names = [f"test_{number}" for number in range(testrun.MOST_AGAIN + 1)]
+        passed, summary, asked = self.settle(outcome(*names), outcome())
+        self.assertFalse(passed)
+        self.assertEqual(asked, [])
+        self.assertEqual(len(summary.failed), len(names))
+
+    def test_a_test_program_that_died_fails_the_layer(self) -> None:
+        reader = Reader()
+        reader.feed("running 2 tests\n")
+        died = testrun.outcome_of(101, reader)
+        for first, second in [(died, outcome()), (outcome("a"), died)]:
+            passed, summary, _ = self.settle(first, second)
+            self.assertFalse(passed)
+            self.assertTrue(summary.failed)
+            self.assertEqual(summary.passed_alone, [])
+
+
+class Streaming(unittest.TestCase):
+    def test_what_is_printed_goes_through_and_to_the_reader(self) -> None:
+        plan = testrun.Plan(SimpleNamespace(repository=Path("/")), "")
+        script = "import os, sys; print('out'); sys.stdout.flush(); os.write(2, b'\\xff err\\n'); sys.exit(3)"
+        shown = io.TextIOWrapper(io.BytesIO())
+        reader = Reader()
+        with redirect_stdout(shown):
+            code = testrun.stream(plan, [sys.executable, "-c", script], {}, reader)
+        self.assertEqual(code, 3)
+        self.assertEqual(shown.buffer.getvalue(), b"out\n\xff err\n")
+        self.assertEqual(list(reader.tail), ["out", "\ufffd err"])
+
+    def test_a_process_that_a_test_left_behind_holds_nothing_up(self) -> None:
+        plan = testrun.Plan(SimpleNamespace(repository=Path("/")), "")
+        script = "import subprocess; subprocess.Popen(['sleep', '30']); print('done')"
+        shown = io.TextIOWrapper(io.BytesIO())
+        with redirect_stdout(shown), patch.object(testrun, "AFTER_END", 0.1):
+            self.assertEqual(testrun.stream(plan, [sys.executable, "-c", script], {}, Reader()), 0)
