@@ -5,11 +5,11 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 
+use crate::app::{App, now};
 use crate::handlers::publish;
 use crate::model::FileState;
 use crate::reply::{Answer, Reply};
 use crate::seed::Seed;
-use crate::server::{App, now};
 use crate::state::State;
 use crate::submissions::{self, Bulk, NewSubmission, Upload};
 

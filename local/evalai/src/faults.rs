@@ -103,6 +103,8 @@ pub struct Knobs {
     pub put_turn_ms: u64,
     /// Between the reads and the saves of a PUT of results, in milliseconds.
     pub put_delay_ms: u64,
+    /// A PUT of results waits between its reads and its saves until this is false again.
+    pub put_held: bool,
     /// Between the reads and the saves of a PATCH of progress, in milliseconds.
     pub patch_delay_ms: u64,
     /// Between the read of a list and its answer, in milliseconds.
@@ -129,6 +131,7 @@ impl Default for Knobs {
             // two read before any was saved, one reads one row, and the others read two.
             put_turn_ms: 25,
             put_delay_ms: 40,
+            put_held: false,
             patch_delay_ms: 40,
             list_delay_ms: 0,
             list_row_ms: 10,

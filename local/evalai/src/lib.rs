@@ -5,8 +5,9 @@
 //! leaderboard rows after concurrent results, whole rows saved late).
 //!
 //! The pure part ([`state`], [`update`], [`submissions`], [`edit`], [`views`], [`python`], [`throttle`], [`routes`])
-//! knows no network and no clock; [`server`] and `handlers` put HTTP around it.
+//! knows no network and no clock; `app` is what requests share of it, and [`server`] puts HTTP around `handlers`.
 
+mod app;
 pub mod body;
 pub mod control;
 pub mod edit;
@@ -31,8 +32,9 @@ pub mod throttle;
 pub mod update;
 pub mod views;
 
+pub use app::Config;
 pub use faults::Knobs;
 pub use queue::{MemoryQueues, Message, Queues};
 pub use seed::Seed;
-pub use server::{Config, Handle, serve};
+pub use server::{Handle, serve};
 pub use state::State;

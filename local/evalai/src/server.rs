@@ -6,8 +6,8 @@
 use std::fmt;
 use std::net::SocketAddr;
 use std::pin::pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::Duration;
 
 use axum::body::{Body, Bytes, to_bytes};
 use axum::http::{HeaderMap, Request, header};
@@ -16,119 +16,22 @@ use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::TokioIo;
-use jiff::{Timestamp, Unit};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::watch;
 use tokio::task::JoinSet;
 
+use crate::app::{App, Config, now, throttled};
 use crate::faults::{Failure, Fault, Knobs, When};
 use crate::handlers::{self, Call};
 use crate::idle::Idle;
 use crate::log::{Entry, RequestLog};
 use crate::model::FileState;
-use crate::queue::{MemoryQueues, Queues};
 use crate::reply::{Answer, Reply};
 use crate::routes::{self, Found};
-use crate::seed::{Seed, SeedError};
 use crate::state::State;
-use crate::throttle::Throttle;
 use crate::{control, errors, pages};
 
 /// The largest body EvalAI's nginx lets through.
 const BODY_LIMIT: usize = 200 << 20;
-/// Requests a minute without signing in.
-const ANONYMOUS_LIMIT: usize = 100;
-
-/// What a stand-in is started with.
-pub struct Config {
-    /// What it holds at first, and after a reset.
-    pub seed: Seed,
-    /// Requests per user and minute; 0 is no limit.
-    pub throttle: usize,
-    /// Where messages go.
-    pub queues: Arc<dyn Queues>,
-}
-
-impl Config {
-    /// The built-in seed, 60 requests a minute, and queues in memory, which are handed back as well.
-    pub fn in_memory() -> Result<(Self, Arc<MemoryQueues>), SeedError> {
-        let queues = Arc::new(MemoryQueues::default());
-        Ok((
-            Self {
-                seed: Seed::built_in()?,
-                throttle: 60,
-                queues: Arc::clone(&queues) as Arc<dyn Queues>,
-            },
-            queues,
-        ))
-    }
-}
-
-/// Everything the requests share.
-pub(crate) struct App {
-    pub(crate) queues: Arc<dyn Queues>,
-    /// Held by the PUT whose turn it is: the server looks at one after the other.
-    pub(crate) turn: tokio::sync::Mutex<()>,
-    state: Mutex<State>,
-    knobs: Mutex<Knobs>,
-    log: Mutex<RequestLog>,
-    throttle: Mutex<Throttle>,
-    limit: usize,
-    started: Instant,
-    changes: watch::Sender<u64>,
-    stop: watch::Sender<bool>,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Now, to the microsecond, as the server's database keeps it.
-pub(crate) fn now() -> Timestamp {
-    let now = Timestamp::now();
-    now.round(Unit::Microsecond).unwrap_or(now)
-}
-
-impl App {
-    pub(crate) fn state(&self) -> MutexGuard<'_, State> {
-        lock(&self.state)
-    }
-
-    pub(crate) fn knobs(&self) -> MutexGuard<'_, Knobs> {
-        lock(&self.knobs)
-    }
-
-    pub(crate) fn log(&self) -> MutexGuard<'_, RequestLog> {
-        lock(&self.log)
-    }
-
-    pub(crate) fn forget_throttle(&self) {
-        lock(&self.throttle).clear();
-    }
-
-    fn check_throttle(&self, user: Option<u64>) -> Result<(), Reply> {
-        let limit = self.knobs().throttle.unwrap_or(self.limit);
-        let (key, limit) = match user {
-            Some(id) => (format!("user {id}"), limit),
-            None if limit == 0 => return Ok(()),
-            None => ("anonymous".to_owned(), ANONYMOUS_LIMIT),
-        };
-        lock(&self.throttle)
-            .check(&key, limit, self.started.elapsed())
-            .map_err(throttled)
-    }
-
-    fn changed(&self) {
-        self.changes.send_modify(|count| *count += 1);
-    }
-}
-
-fn throttled(seconds: u64) -> Reply {
-    let unit = if seconds == 1 { "second" } else { "seconds" };
-    let seconds = seconds.to_string();
-    Reply::error(&errors::THROTTLED, &[&seconds, unit]).with("retry-after", seconds)
-}
-
 /// A running stand-in. Dropped, it goes on until the runtime ends.
 pub struct Handle {
     app: Arc<App>,
@@ -171,14 +74,7 @@ impl Handle {
     /// Waits until `ready` holds, without a limit of its own. It is asked at once, and again whenever a request has
     /// begun or ended; it must not call the handle.
     pub async fn wait_until(&self, mut ready: impl FnMut(&State, &RequestLog) -> bool) {
-        let mut changes = self.app.changes.subscribe();
-        loop {
-            changes.mark_unchanged();
-            let done = ready(&self.app.state(), &self.app.log());
-            if done || changes.changed().await.is_err() {
-                return;
-            }
-        }
+        self.app.until(|| ready(&self.app.state(), &self.app.log())).await;
     }
 
     /// Closes listeners and connections, and waits for them.
@@ -190,18 +86,7 @@ impl Handle {
 
 /// Serves on listeners that are bound already. Must be called within a tokio runtime.
 pub fn serve(config: Config, listeners: Vec<TcpListener>) -> Handle {
-    let app = Arc::new(App {
-        queues: config.queues,
-        turn: tokio::sync::Mutex::default(),
-        state: Mutex::new(State::new(config.seed)),
-        knobs: Mutex::default(),
-        log: Mutex::default(),
-        throttle: Mutex::default(),
-        limit: config.throttle,
-        started: Instant::now(),
-        changes: watch::Sender::new(0),
-        stop: watch::Sender::new(false),
-    });
+    let app = Arc::new(App::new(config));
     let addresses = listeners
         .iter()
         .filter_map(|listener| listener.local_addr().ok())

@@ -101,6 +101,23 @@ async fn a_long_request_is_not_idle() {
 }
 
 #[tokio::test]
+async fn a_held_result_is_saved_when_it_is_let_go() {
+    let stand = Stand::start().await;
+    stand.submit().await;
+    stand.knobs(&json!({"put_held": true})).await;
+    let body = put_body(1, "finished", 1.0);
+    let mut put = std::pin::pin!(stand.put(UPDATE, &body));
+    let status = async || stand.list("").await.ok().json()[0]["status"].clone();
+    tokio::select! {
+        answer = &mut put => panic!("answered while it is held: {answer:?}"),
+        before = status() => assert_eq!(before, "submitted"),
+    }
+    stand.knobs(&json!({"put_held": false})).await;
+    put.await.ok();
+    assert_eq!(status().await, "finished");
+}
+
+#[tokio::test]
 async fn a_client_that_reuses_a_connection_as_it_is_closed_gets_no_answer() {
     let stand = Stand::start().await;
     let pk = stand.submit().await;

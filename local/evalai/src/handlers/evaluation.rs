@@ -5,9 +5,9 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::Call;
+use crate::app::now;
 use crate::errors;
 use crate::reply::{Answer, Reply};
-use crate::server::now;
 use crate::update::{self, Door};
 use crate::views;
 
@@ -38,6 +38,9 @@ pub(super) async fn update(call: &Call, challenge: u64, door: Door) -> Answer {
         if put { knobs.put_delay_ms } else { knobs.patch_delay_ms }
     };
     pause(delay).await;
+    if put {
+        call.app.until(|| !call.app.knobs().put_held).await;
+    }
     let progress = write.progress;
     let saved = update::commit(&mut call.app.state(), write, now());
     if progress {

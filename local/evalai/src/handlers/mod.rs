@@ -11,13 +11,13 @@ use std::sync::Arc;
 use axum::body::Bytes;
 use serde_json::{Value, json};
 
+use crate::app::{App, now};
 use crate::body::{self, Form};
 use crate::errors;
 use crate::model::{Submission, User};
 use crate::queue::{Message, uuid};
 use crate::reply::{Answer, Reply};
 use crate::routes::Endpoint;
-use crate::server::{App, now};
 use crate::state::Published;
 use crate::views;
 

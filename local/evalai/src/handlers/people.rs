@@ -3,12 +3,12 @@
 use serde_json::{Map, Value, json};
 
 use super::{Call, publish};
+use crate::app::now;
 use crate::body::Form;
 use crate::edit;
 use crate::errors;
 use crate::model::FileState;
 use crate::reply::{Answer, Reply};
-use crate::server::now;
 use crate::submissions::{self, NewSubmission, Upload};
 use crate::views;
 
