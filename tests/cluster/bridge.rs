@@ -12,6 +12,8 @@ use crate::evalai::Evalai;
 use crate::operator::{bridge, controller};
 use crate::scene::{Scene, names, reason, scenario, score, state};
 
+/// Patience with a busy machine; each wait ends with its event.
+const LIMIT: Duration = Duration::from_mins(3);
 const UNKNOWN_AFTER_SECONDS: i64 = 3;
 /// How often an AWS client tries a request whose connection breaks.
 const TRIES: u32 = 3;
@@ -32,7 +34,7 @@ async fn bad_messages_land_in_the_dead_letter_queue_with_their_reasons() {
 
         let mut reasons = BTreeMap::new();
         for _ in 0..sent.len() {
-            let letter = scene.cloud.dead_letter(Duration::from_secs(75)).await;
+            let letter = scene.cloud.dead_letter(LIMIT).await;
             let waited = letter.sent_ms - sent[letter.body.as_str()];
             let (reason, detail) = (&letter.attributes["reason"], &letter.attributes["detail"]);
             if reason == "UnknownPhase" {
@@ -56,7 +58,7 @@ async fn bad_messages_land_in_the_dead_letter_queue_with_their_reasons() {
             reason(unknown),
             ("UnknownPhase", format!("{nobody} challenge 1, phase 77").as_str())
         );
-        scene.cloud.await_messages([0, 0], Duration::from_secs(10)).await;
+        scene.cloud.await_messages([0, 0], LIMIT).await;
         assert_eq!(scene.all::<Submission>().await.len(), 0);
     })
     .await;
@@ -78,33 +80,33 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");
-        scene.gate.await_kept_back(3 * TRIES, Duration::from_mins(1)).await;
+        scene.gate.await_kept_back(3 * TRIES, LIMIT).await;
 
-        let failed = scene.settled(&name, Duration::from_mins(3)).await;
+        let failed = scene.settled(&name, LIMIT).await;
         let failure = failed.status.clone().unwrap().failure.unwrap();
         assert_eq!(
             (failure.class, failure.reason.as_str()),
             (FailureClass::Participant, "AgentCrashed")
         );
         // The message that began it comes again although the run has ended; each deletion is tried three times.
-        scene.gate.await_kept_back(2 * TRIES, Duration::from_mins(1)).await;
+        scene.gate.await_kept_back(2 * TRIES, LIMIT).await;
         assert_eq!(names(&scene.all::<Submission>().await), [name.as_str()]);
         assert_eq!(scene.jobs().await, [format!("{name}-1")]);
         let still = scene.api::<Submission>().get(&name).await.unwrap();
         assert_eq!((still.spec.attempt, state(&still)), (1, Some(State::Failed)));
 
         scene.gate.reopen();
-        scene.cloud.await_messages([0, 0], Duration::from_mins(1)).await;
-        evalai.await_status(pk, Status::Failed, Duration::from_secs(30)).await;
+        scene.cloud.await_messages([0, 0], LIMIT).await;
+        evalai.await_status(pk, Status::Failed, LIMIT).await;
         scene.change_leaderboard("lb", &json!({"agent": {"env": []}})).await;
         evalai.resume(pk).await;
         let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(2);
         scene
-            .submission(&name, "the second attempt begins", Duration::from_mins(1), resumed)
+            .submission(&name, "the second attempt begins", LIMIT, resumed)
             .await;
-        let running = scene.running(&name, Duration::from_mins(1)).await;
+        let running = scene.running(&name, LIMIT).await;
         assert_eq!((state(&running), reason(&running)), (Some(State::Resumed), "Resumed"));
-        let finished = scene.settled(&name, Duration::from_mins(3)).await;
+        let finished = scene.settled(&name, LIMIT).await;
         assert_eq!(
             (state(&finished), score(&finished)),
             (Some(State::Finished), SIX_ROUTES)
@@ -134,9 +136,9 @@ async fn a_leaderboard_applied_after_its_message_still_serves_it() {
         scene.evalai_leaderboard("early", &evalai, tracks("map", 2)).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
-        scene.cloud.await_messages([0, 1], Duration::from_secs(30)).await;
+        scene.cloud.await_messages([0, 1], LIMIT).await;
         scene.evalai_leaderboard("late", &evalai, tracks("sensors", 1)).await;
-        let finished = scene.settled(&format!("submission-{pk}"), Duration::from_mins(3)).await;
+        let finished = scene.settled(&format!("submission-{pk}"), LIMIT).await;
         assert_eq!(
             (state(&finished), score(&finished)),
             (Some(State::Finished), SIX_ROUTES)

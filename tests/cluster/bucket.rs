@@ -23,26 +23,27 @@ async fn a_killed_logcopy_and_two_minutes_without_s3_lose_no_score() {
         let s3 = Gate::open(&scene.lab.host, &scene.cloud.endpoint).await;
         let change = json!({
             "storage": {"endpoint": s3.url},
-            "agent": {"env": [{"name": "ROUTE_MS", "value": "2000"}]},
+            "agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]},
         });
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.submit("unstored", "agent:standard").await;
-        let nearly = |s: &Submission| done(s) >= 12;
+        // The status is behind the run on a busy machine: at least three routes of each pair are left.
+        let some = |s: &Submission| done(s) >= 4;
         scene
-            .submission("unstored", "12 routes are done", Duration::from_mins(3), nearly)
+            .submission("unstored", "4 routes are done", Duration::from_mins(3), some)
             .await;
         s3.shut();
         let away = sleep(S3_AWAY);
         let pod = scene.pod("unstored").await.name_any();
         let pod = scene
-            .wait(&pod, "all agents have ended", Duration::from_mins(1), have_agents_ended)
+            .wait(&pod, "all agents have ended", Duration::from_mins(3), have_agents_ended)
             .await
             .unwrap();
         kill_container(&pod, "logcopy");
         let again = |pod: Option<&Pod>| pod.is_some_and(|pod| restarts(pod, "logcopy") > 0);
         scene
-            .wait(&pod.name_any(), "logcopy runs again", Duration::from_mins(1), again)
+            .wait(&pod.name_any(), "logcopy runs again", Duration::from_mins(3), again)
             .await;
         away.await;
         let waiting = scene.api::<Submission>().get("unstored").await.unwrap();

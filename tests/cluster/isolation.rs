@@ -2,15 +2,28 @@
 
 use std::time::Duration;
 
+use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::DeleteParams;
 use leaderboard_api::{Leaderboard, State, conditions, reasons};
 use serde_json::json;
 
 use crate::operator::controller;
-use crate::scene::{Scene, scenario, state};
+use crate::scene::{Scene, containers, scenario, state};
 
 const POLICY: &str = "leaderboard-lb";
+const LIMIT: Duration = Duration::from_mins(4);
+/// How long workspace tries until it is certain; the kubelet's times are whole seconds.
+const A_MINUTE: Duration = Duration::from_secs(58);
+
+/// How long a Pod's workspace ran, by the kubelet.
+fn looked_for(pod: &Pod) -> Duration {
+    let all = containers(pod).into_iter();
+    let workspace = all.filter(|container| container.name == "workspace");
+    let ended = workspace.filter_map(|container| container.state?.terminated);
+    let mut took = ended.map(|ended| ended.finished_at.unwrap().0.duration_since(ended.started_at.unwrap().0));
+    took.next_back().expect("workspace has not ended").try_into().unwrap()
+}
 
 /// Whether the Leaderboard's condition `Isolated` says so.
 fn says(status: &'static str, reason: &'static str) -> impl Fn(Option<&Leaderboard>) -> bool {
@@ -29,20 +42,19 @@ async fn a_cluster_that_enforces_no_policy_is_found_out_and_loses_a_minute_once(
             .await;
         let _controller = controller(scene);
         scene.submit("first", "agent:standard").await;
-        scene.settled("first", Duration::from_mins(4)).await;
+        scene.settled("first", LIMIT).await;
         let open = says("False", reasons::NOT_ENFORCED);
         scene
-            .wait(
-                "lb",
-                "its policy is known not to be enforced",
-                Duration::from_secs(30),
-                open,
-            )
+            .wait("lb", "its policy is known not to be enforced", LIMIT, open)
             .await;
 
-        // The second Pod looks once; with another minute it would not be there in time.
+        // The first Pod has tried for a minute; the second looks once.
+        let first = looked_for(&scene.pod("first").await);
+        assert!(first >= A_MINUTE, "workspace looked for {first:?}");
         scene.submit("second", "agent:standard").await;
-        scene.running("second", Duration::from_secs(50)).await;
+        scene.running("second", LIMIT).await;
+        let second = looked_for(&scene.pod("second").await);
+        assert!(second < A_MINUTE, "workspace looked for {second:?}");
 
         let policies = scene.api::<NetworkPolicy>();
         let first = policies.get(POLICY).await.unwrap();
@@ -50,9 +62,7 @@ async fn a_cluster_that_enforces_no_policy_is_found_out_and_loses_a_minute_once(
         let back = move |found: Option<&NetworkPolicy>| {
             found.is_some_and(|f| f.metadata.uid != first.metadata.uid && f.spec == first.spec)
         };
-        scene
-            .wait(POLICY, "it is restored", Duration::from_secs(10), back)
-            .await;
+        scene.wait(POLICY, "it is restored", LIMIT, back).await;
     })
     .await;
 }
@@ -64,7 +74,7 @@ async fn a_pod_that_has_to_be_isolated_and_is_not_runs_nothing() {
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.submit("one", "agent:standard").await;
-        let failed = scene.settled("one", Duration::from_mins(4)).await;
+        let failed = scene.settled("one", LIMIT).await;
         assert_eq!(state(&failed), Some(State::Failed));
         let status = failed.status.unwrap();
         let failure = status.failure.unwrap();

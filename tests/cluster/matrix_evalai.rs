@@ -101,7 +101,11 @@ async fn deleted_by_the_participant(scene: &Scene, evalai: &Evalai, phase: u64) 
         "the participant deletes it while it runs",
         "Cancelled EndedInEvalAI; EvalAI cancelled; noticed within 60 s",
     );
-    let hangs = json!({"agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]}});
+    // Its own deadline must not come first.
+    let hangs = json!({
+        "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]},
+        "deadlines": {"idleSeconds": 600},
+    });
     board(scene, evalai, phase, hangs).await;
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
     let name = format!("submission-{pk}");
@@ -223,8 +227,8 @@ async fn a_server_that_closes_idle_connections_loses_no_write() {
         );
         let evalai = Evalai::start_wide(scene, 1).await;
         evalai.close_idle_connections();
-        // Long enough for several periods, whose lists leave connections idle.
-        let slow = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "4000"}]}});
+        // Long enough for several periods, whose lists leave connections idle, and for EvalAI's turn to hear that it runs.
+        let slow = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "10000"}]}});
         board(scene, &evalai, FIRST_PHASE, slow).await;
         let _operator = (controller(scene), bridge(scene));
         scene.ready(&format!("lb-{FIRST_PHASE}")).await;

@@ -256,7 +256,7 @@ async fn run(scene: &Scene, evalai: &Evalai, phase: u64, row: Row) {
 }
 
 /// Waits until the kubelet has tried the agent's image.
-async fn await_pull_error(scene: &Scene, name: &str) {
+pub async fn await_pull_error(scene: &Scene, name: &str) {
     let pod = scene.first_pod(name, LIMIT).await.name_any();
     let is_error = |container: &ContainerStatus| {
         let waiting = container.state.as_ref().and_then(|state| state.waiting.as_ref());
@@ -290,8 +290,7 @@ async fn disk_full(scene: &Scene, evalai: &Evalai, phase: u64) {
     board(scene, evalai, phase, change).await;
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
     let name = format!("submission-{pk}");
-    scene.running(&name, LIMIT).await;
-    let pod = scene.pod(&name).await.name_any();
+    let pod = scene.first_pod(&name, LIMIT).await.name_any();
     let evicted = |pod: Option<&Pod>| {
         let status = pod.and_then(|pod| pod.status.as_ref());
         status.is_some_and(|status| status.reason.as_deref() == Some("Evicted"))

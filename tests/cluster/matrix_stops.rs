@@ -11,6 +11,7 @@ use leaderboard_api::{State, Submission};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, measured, together};
+use super::matrix_runs::await_pull_error;
 use crate::evalai::{Evalai, FIRST_PHASE};
 use crate::operator::{bridge, controller};
 use crate::processes;
@@ -21,8 +22,6 @@ const LIMIT: Duration = Duration::from_mins(4);
 const CANCEL_SECONDS: u64 = 20;
 /// How long a Pod may be there after a cancel: it is told, then deleted, then removed by force.
 const POD_GONE: Duration = Duration::from_secs(CANCEL_SECONDS + 105);
-/// How slowly EvalAI saves what the last test puts.
-const PUT_DELAY: Duration = Duration::from_secs(10);
 
 #[tokio::test]
 async fn a_cancel_ends_a_submission_at_every_stage() {
@@ -65,7 +64,8 @@ async fn cancel(scene: &Scene, name: &str) {
 /// Cancels it, and sees it end with its Pods gone.
 async fn cancelled(case: &mut Case, scene: &Scene, name: &str) {
     let pods: Vec<_> = pods_of(scene, name).await;
-    case.cause();
+    // A node that pulls an image or copies contents may let go of the Pod only when it is removed by force.
+    case.cause_within(POD_GONE);
     cancel(scene, name).await;
     case.ends(scene, name, LIMIT).await;
     for pod in pods {
@@ -109,6 +109,7 @@ async fn while_an_image_is_pulled(scene: &Scene) {
     let mut case = Case::open("cancel while an image is pulled", "Pending ImagePull; Cancelled");
     board(scene, "pulling", json!({})).await;
     scene.submit_to("pulling", "pulling", "agent:nobody-pushed-this").await;
+    await_pull_error(scene, "pulling").await;
     case.shows(scene, "pulling", "ImagePull", "").await;
     cancelled(&mut case, scene, "pulling").await;
     case.close();
@@ -164,6 +165,7 @@ async fn ended_in_evalai_in_line(scene: &Scene, evalai: &Evalai, phase: u64) {
         "Pending Paused; Cancelled EndedInEvalAI; EvalAI cancelled; 0 PUTs",
     );
     evalai_board(scene, evalai, phase, json!({"paused": true})).await;
+    scene.ready(&format!("lb-{phase}")).await;
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
     let name = format!("submission-{pk}");
     case.shows(scene, &name, "Paused", "").await;
@@ -188,7 +190,11 @@ async fn archived_while_it_runs(scene: &Scene, evalai: &Evalai, phase: u64) {
         scene,
         evalai,
         phase,
-        json!({"agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]}}),
+        json!({
+            "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]},
+            // Its own deadline must not come first.
+            "deadlines": {"idleSeconds": 600},
+        }),
     )
     .await;
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
@@ -229,7 +235,7 @@ async fn while_the_end_is_published(scene: &Scene, evalai: &Evalai, phase: u64) 
         "cancel while the end is published",
         "Finished; EvalAI finished; row FINISHED; 1 final PUT",
     );
-    evalai.set_put_delay(PUT_DELAY);
+    evalai.hold_puts();
     // So long that its processes are seen while it runs.
     evalai_board(
         scene,
@@ -257,6 +263,10 @@ async fn while_the_end_is_published(scene: &Scene, evalai: &Evalai, phase: u64) 
         measured("last container's exit → EvalAI's final PUT", put - exit, "aim < 10 s");
     }
     cancel(scene, &name).await;
+    let cancelled = scene.api::<Submission>().get(&name).await.unwrap().metadata.generation;
+    let observed = move |s: &Submission| s.status.as_ref().and_then(|status| status.observed_generation) >= cancelled;
+    scene.submission(&name, "its cancel is observed", LIMIT, observed).await;
+    evalai.release_puts();
     case.ends(scene, &name, LIMIT).await;
     case.evalai(evalai.submission(pk).status);
     let rows = scene.cloud.rows(&scene.cloud.table).await;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use evalai_stand_in::faults::Failure;
 use evalai_stand_in::model::Status;
 use futures::FutureExt;
-use k8s_openapi::api::core::v1::{Node, Pod, ResourceQuota};
+use k8s_openapi::api::core::v1::{ContainerState, Node, Pod, ResourceQuota};
 use kube::ResourceExt;
 use kube::api::{Api, DeleteParams, ListParams, Patch, PatchParams, PostParams};
 use leaderboard_api::{State, Submission, conditions};
@@ -18,7 +18,7 @@ use super::matrix::{Case, SHOWN, together};
 use crate::evalai::Evalai;
 use crate::operator::controller;
 use crate::registry::Registry;
-use crate::scene::{Scene, lay_over, scenario, state};
+use crate::scene::{Scene, containers, lay_over, scenario, state};
 
 const WIDTH: usize = 7;
 /// An unanswered request to EvalAI costs 75 s, a stuck node 91 s; the rest is patience with the machine.
@@ -163,12 +163,29 @@ async fn contents_fail(scene: &Scene) {
     );
     let fails = json!({"contents": {"command": ["/bin/bash", "-c", "echo no such town >&2; exit 3"]}});
     board(scene, "contents", fails).await;
-    case.cause();
     scene.submit_to("contents", "contents", "agent:standard").await;
+    has_failed(scene, "contents", "contents").await;
+    case.cause();
     case.shows(scene, "contents", "Preparing", "contents fails").await;
     give_up(scene, "contents").await;
     case.ends(scene, "contents", LIMIT).await;
     case.close();
+}
+
+/// Waits until a container of a submission's Pod has failed, by the kubelet.
+async fn has_failed(scene: &Scene, submission: &str, container: &'static str) {
+    let pod = scene.first_pod(submission, LIMIT).await.name_any();
+    let failed = move |pod: Option<&Pod>| {
+        let all = pod.map(containers).unwrap_or_default();
+        let ended = |state: Option<&ContainerState>| {
+            state
+                .and_then(|s| s.terminated.as_ref())
+                .is_some_and(|t| t.exit_code != 0)
+        };
+        let mut ours = all.iter().filter(|status| status.name == container);
+        ours.any(|status| ended(status.state.as_ref()) || ended(status.last_state.as_ref()))
+    };
+    scene.wait(&pod, "a container of it has failed", LIMIT, failed).await;
 }
 
 async fn no_s3_in_the_pod(scene: &Scene) {
@@ -178,8 +195,9 @@ async fn no_s3_in_the_pod(scene: &Scene) {
     );
     // On loopback, where the operator is and no Pod.
     board(scene, "no-s3", json!({"storage": {"endpoint": scene.gate.url}})).await;
-    case.cause();
     scene.submit_to("no-s3", "no-s3", "agent:standard").await;
+    has_failed(scene, "no-s3", "workspace").await;
+    case.cause();
     case.shows(scene, "no-s3", "Preparing", "workspace fails").await;
     give_up(scene, "no-s3").await;
     case.ends(scene, "no-s3", LIMIT).await;

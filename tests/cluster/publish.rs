@@ -24,7 +24,7 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
         };
         evalai.handle.with_state(first_phase_shows_partials);
         // A run that is over at once would be finished before its turn comes to say that it runs.
-        let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "2000"}]}});
+        let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]}});
         scene.evalai_leaderboard("lb", &evalai, change).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         // A controller that has just begun has other questions first.

@@ -16,7 +16,7 @@ use tokio::select;
 use super::abrupt::assert_untouched;
 use super::matrix::Case;
 use crate::evalai::Evalai;
-use crate::operator::{bridge, controller, kept};
+use crate::operator::{bridge_process, controller_process, kept};
 use crate::scene::{Scene, containers, done, say, scenario};
 
 const EXPECTED: &str = "Finished; EvalAI finished; one Job, one row; the same Pod, nothing in it restarted";
@@ -55,8 +55,8 @@ async fn crashed(case: &'static str, part: &str) {
         // Who loses the Lease to the outage ends, and the kubelet starts it again.
         select! {
             () = survives(scene, &evalai, case, part) => {}
-            never = kept(scene, controller) => match never {},
-            never = kept(scene, bridge) => match never {},
+            never = kept(scene, controller_process) => match never {},
+            never = kept(scene, bridge_process) => match never {},
         }
     })
     .await;

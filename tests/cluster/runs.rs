@@ -15,7 +15,7 @@ use crate::scene::{Scene, is_true, scenario};
 async fn a_local_submission_runs_to_finished_with_the_expected_score() {
     scenario("local", async |scene: &Scene| {
         // Slow enough that a busy machine's controller sees it run.
-        let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "1500"}]}});
+        let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]}});
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.submit("first", "agent:standard").await;

@@ -16,25 +16,26 @@ use crate::scene::{Scene, done, scenario};
 
 const CANCEL_SECONDS: u64 = 20;
 
-/// Six routes for two pairs, one in 5 s.
-fn slow() -> Value {
+/// Long after what a busy machine needs for a look at something.
+const LIMIT: Duration = Duration::from_mins(3);
+
+/// Six routes for two pairs. Both stop in their second ones, so that the run waits for what ends it.
+fn endless() -> Value {
     json!({
         "pairs": 2,
         "routes": 6,
-        "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]},
-        "deadlines": {"cancelSeconds": CANCEL_SECONDS},
+        "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@2"}]},
+        "deadlines": {"cancelSeconds": CANCEL_SECONDS, "idleSeconds": 600},
     })
 }
 
-/// Waits until each pair has done a route and the next is under way.
+/// Waits until each pair has done a route.
 async fn under_way(scene: &Scene, name: &str) {
     let some = |s: &Submission| done(s) >= 2;
-    scene
-        .submission(name, "two routes are done", Duration::from_mins(3), some)
-        .await;
+    scene.submission(name, "two routes are done", LIMIT, some).await;
 }
 
-/// Waits until a Submission's Pod has ended: it has as long as a cancel may take.
+/// Waits until a Submission's Pod has ended: it is sent a SIGTERM, then deleted, then removed by force.
 async fn pod_ended(scene: &Scene, pod: &str) {
     let ended = |pod: Option<&Pod>| {
         let phase = pod
@@ -46,7 +47,7 @@ async fn pod_ended(scene: &Scene, pod: &str) {
         .wait(
             pod,
             "its Pod has ended",
-            Duration::from_secs(CANCEL_SECONDS + 20),
+            Duration::from_secs(CANCEL_SECONDS + 105),
             ended,
         )
         .await;
@@ -56,7 +57,7 @@ async fn pod_ended(scene: &Scene, pod: &str) {
 async fn assert_partial(scene: &Scene, run: &str) {
     let merged: Value = serde_json::from_str(&scene.cloud.text(run, "agent/agent_results.json").await).unwrap();
     let records = merged["_checkpoint"]["records"].as_array().map_or(0, Vec::len);
-    assert!((2..6).contains(&records), "{records} routes are kept");
+    assert_eq!(records, 2, "each pair's first route is kept");
     let keys = scene.cloud.keys(run).await;
     assert!(keys.contains_key("containers-status/simulation.cancel"), "{keys:?}");
 }
@@ -64,24 +65,24 @@ async fn assert_partial(scene: &Scene, run: &str) {
 #[tokio::test]
 async fn a_cancelled_submission_stops_in_time_and_keeps_its_results() {
     scenario("cancel", async |scene: &Scene| {
-        scene.leaderboard("lb", slow()).await;
+        scene.leaderboard("lb", endless()).await;
         let _controller = controller(scene);
         scene.submit("stopped", "agent:standard").await;
         under_way(scene, "stopped").await;
         let pod = scene.pod("stopped").await;
-        let agent = processes::named(&pod, "agent-1", "python3", Duration::from_mins(1)).await;
+        let agent = processes::named(&pod, "agent-1", "python3", LIMIT).await;
         let mut case = Case::open("cancel while it runs", "Cancelled");
         case.cause();
         let since = Instant::now();
         scene.change_submission("stopped", &json!({"cancel": true})).await;
-        let ended = processes::ended(&[agent], Duration::from_mins(1)).await;
+        let ended = processes::ended(&[agent], LIMIT).await;
         measured(
             "cancel by kubectl → SIGTERM in the container",
             ended - since,
             "aim p99 < 2 s",
         );
         pod_ended(scene, &pod.name_any()).await;
-        case.ends(scene, "stopped", Duration::from_mins(1)).await;
+        case.ends(scene, "stopped", LIMIT).await;
         assert_partial(scene, "stopped").await;
         case.close();
     })
@@ -92,13 +93,13 @@ async fn a_cancelled_submission_stops_in_time_and_keeps_its_results() {
 async fn a_cancel_in_evalai_stops_the_run() {
     scenario("evalai-cancel", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        scene.evalai_leaderboard("lb", &evalai, slow()).await;
+        scene.evalai_leaderboard("lb", &evalai, endless()).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");
         under_way(scene, &name).await;
         let pod = scene.pod(&name).await;
-        let agent = processes::named(&pod, "agent-1", "python3", Duration::from_mins(1)).await;
+        let agent = processes::named(&pod, "agent-1", "python3", LIMIT).await;
         let mut case = Case::open(
             "cancel in EvalAI while it runs",
             "Cancelled EndedInEvalAI; EvalAI cancelled",
@@ -106,14 +107,14 @@ async fn a_cancel_in_evalai_stops_the_run() {
         case.cause();
         let since = Instant::now();
         evalai.cancel(pk).await;
-        let ended = processes::ended(&[agent], Duration::from_mins(1)).await;
+        let ended = processes::ended(&[agent], LIMIT).await;
         measured(
             "cancel in EvalAI → SIGTERM in the container",
             ended - since,
             "aim < 15 s",
         );
         pod_ended(scene, &pod.name_any()).await;
-        case.ends(scene, &name, Duration::from_mins(1)).await;
+        case.ends(scene, &name, LIMIT).await;
         // Nothing revives it.
         case.evalai(evalai.submission(pk).status);
         let row = scene.cloud.row(&scene.cloud.table).await;
@@ -128,7 +129,7 @@ async fn a_cancel_in_evalai_stops_the_run() {
 async fn a_submission_deleted_while_it_runs_goes_when_its_end_is_published() {
     scenario("delete", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        scene.evalai_leaderboard("lb", &evalai, slow()).await;
+        scene.evalai_leaderboard("lb", &evalai, endless()).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");
@@ -143,7 +144,7 @@ async fn a_submission_deleted_while_it_runs_goes_when_its_end_is_published() {
         let uid = deleted.left().expect("a finalizer holds it").uid().unwrap();
         pod_ended(scene, &pod).await;
         let gone = move |found: Option<&Submission>| found.is_none_or(|found| found.uid().as_ref() != Some(&uid));
-        scene.wait(&name, "it is gone", Duration::from_mins(2), gone).await;
+        scene.wait(&name, "it is gone", LIMIT, gone).await;
         case.also("gone");
         case.evalai(evalai.submission(pk).status);
         let row = scene.cloud.row(&scene.cloud.table).await;

@@ -92,6 +92,19 @@ impl Evalai {
         });
     }
 
+    /// From now on EvalAI works on results until [`Evalai::release_puts`].
+    pub fn hold_puts(&self) {
+        self.handle.set_knobs(Knobs {
+            put_held: true,
+            ..Knobs::default()
+        });
+    }
+
+    /// What is worked on is saved.
+    pub fn release_puts(&self) {
+        self.handle.set_knobs(Knobs::default());
+    }
+
     /// A connection that was idle is closed in the very moment in which it is used again.
     pub fn close_idle_connections(&self) {
         self.handle.set_knobs(Knobs {
@@ -236,6 +249,16 @@ impl Evalai {
         let seen = timeout(limit, seen).await;
         seen.unwrap_or_else(|_| panic!("no result is put within {} s", limit.as_secs()));
         found
+    }
+
+    /// Waits until EvalAI has done what a request asked for, whether or not its client is still there.
+    pub async fn await_answer(&self, id: u64, limit: Duration) {
+        let answered = self.handle.wait_until(|_, log| {
+            let mut entries = log.entries();
+            entries.any(|entry| entry.id == id && entry.answered.is_some())
+        });
+        let answered = timeout(limit, answered).await;
+        answered.unwrap_or_else(|_| panic!("EvalAI still works on request {id} after {} s", limit.as_secs()));
     }
 }
 

@@ -1,0 +1,65 @@
+//! What tests read of objects.
+
+use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
+use kube::{Resource, ResourceExt};
+use leaderboard_api::{State, Submission, conditions};
+
+/// The STATE column.
+pub fn state(submission: &Submission) -> Option<State> {
+    submission.status.as_ref().and_then(|status| status.state)
+}
+
+/// The REASON column.
+pub fn reason(submission: &Submission) -> &str {
+    submission
+        .status
+        .as_ref()
+        .and_then(|status| status.reason.as_deref())
+        .unwrap_or_default()
+}
+
+/// Its driving score.
+pub fn score(submission: &Submission) -> &str {
+    submission
+        .status
+        .as_ref()
+        .and_then(|status| status.score.as_deref())
+        .unwrap_or_default()
+}
+
+/// Routes that are done.
+pub fn done(submission: &Submission) -> i32 {
+    let progress = submission.status.as_ref().and_then(|status| status.progress.as_ref());
+    progress.map_or(0, |progress| progress.done)
+}
+
+/// Whether a condition of a Submission is True.
+pub fn is_true(submission: &Submission, condition: &str) -> bool {
+    let status = submission.status.as_ref();
+    status.is_some_and(|status| conditions::is_true(&status.conditions, condition))
+}
+
+/// The names of objects, for messages.
+pub fn names<K: Resource>(objects: &[K]) -> Vec<String> {
+    objects.iter().map(ResourceExt::name_any).collect()
+}
+
+/// The statuses of all of a Pod's containers, init containers and sidecar first.
+pub fn containers(pod: &Pod) -> Vec<ContainerStatus> {
+    let status = pod.status.clone().unwrap_or_default();
+    let lists = [status.init_container_statuses, status.container_statuses];
+    lists.into_iter().flatten().flatten().collect()
+}
+
+/// Whether it has come to its end in Kubernetes, EvalAI and DynamoDB.
+pub fn is_settled(submission: &Submission) -> bool {
+    let Some(status) = &submission.status else { return false };
+    let known = |type_: &str| {
+        let condition = conditions::get(&status.conditions, type_);
+        condition.is_some_and(|c| c.status == "True" || c.reason == "NotRequired")
+    };
+    status.attempt == Some(submission.spec.attempt)
+        && is_true(submission, conditions::FINISHED)
+        && known(conditions::PUBLISHED)
+        && known(conditions::RECORDED)
+}
