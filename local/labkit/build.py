@@ -18,7 +18,7 @@ from .image import target_folder
 from .settings import Settings
 
 PROFILE = "local"
-# The test program that costs nearly nothing beside what is built anyway.
+# The test program that costs nearly nothing on top of what is built anyway.
 CHEAPEST_TEST = "programs"
 STATIC = "-C target-feature=+crt-static"
 

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from . import files, network
 from .settings import HOST_ADDRESS, NODE_LABEL, NODE_NAME, SERVICE_NETWORK, Settings, aws_environment
 
-# The stand-in runs code for whoever asks (Lambda and others), and Pods reach it: only what the operator needs is served.
+# The stand-in runs code for anyone who asks (Lambda and others), and Pods reach it: only what the operator needs is served.
 AWS_SERVICES = "sqs,s3,dynamodb,secretsmanager,logs,ecr,sts,iam"
 PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 

@@ -180,7 +180,7 @@ def submit_and_follow(settings: Settings, kube: Kube, agent: str) -> Submitted:
     row = evalai_server.submit(settings, PARTICIPANT, CHALLENGE, PHASE, agent)
     since = time.monotonic()
     submitted = Submitted(row["id"], row["participant_team"], f"submission-{row['id']}")
-    tell(
+    print_line(
         f"{'0 s':>8}  EvalAI has submission {submitted.key} and has put its message into SQS: {message(settings, submitted.key)}"
     )
     wait = ["wait", "--for=create", f"submission/{submitted.name}", f"--namespace={NAMESPACE}", "--timeout=60s"]
@@ -189,11 +189,11 @@ def submit_and_follow(settings: Settings, kube: Kube, agent: str) -> Submitted:
         raise LabError(
             f"the bridge made no Submission of the message within 60 s; see `kubectl -n {SYSTEM} logs deployment/{RELEASE}-bridge`"
         )
-    follow(kube, NAMESPACE, submitted.name, since, RUN_PATIENCE, tell)
+    follow(kube, NAMESPACE, submitted.name, since, RUN_PATIENCE, print_line)
     return submitted
 
 
-def tell(line: str) -> None:
+def print_line(line: str) -> None:
     print(f"    {line}", flush=True)
 
 

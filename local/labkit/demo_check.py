@@ -133,7 +133,7 @@ TIMES = {
 
 
 def moments_of(submission: dict[str, Any]) -> Iterator[tuple[datetime, str]]:
-    """Every moment that the object itself tells, causes before effects."""
+    """Every moment that the object itself records, causes before effects."""
     meta, status = submission.get("metadata", {}), submission.get("status", {})
     times = status.get("times", {})
     if "submitted" in times:

@@ -122,11 +122,11 @@ def failed_cases(matrix: str) -> list[str]:
     ]
 
 
-def _messages(failures: Sequence[Failure], room: int) -> list[str]:
+def _messages(failures: Sequence[Failure], left: int) -> list[str]:
     """Each failure's name and messages; all get the same share of the lines."""
     lines: list[str] = []
     for number, failure in enumerate(failures):
-        share = max((room - len(lines)) // (len(failures) - number), 0)
+        share = max((left - len(lines)) // (len(failures) - number), 0)
         if share < 2:
             break
         block = [f"{failure.name}:"]

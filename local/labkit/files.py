@@ -60,7 +60,7 @@ disabled_plugins = [
 
 
 def registry_host(settings: Settings) -> str:
-    """Tells containerd that the stand-in's registry speaks plain HTTP."""
+    """Configures containerd: the stand-in's registry speaks plain HTTP."""
     return f'server = "{settings.aws_endpoint}"\n\n[host."{settings.aws_endpoint}"]\n  capabilities = ["pull", "resolve"]\n'
 
 

@@ -63,8 +63,8 @@ def parse(line: str) -> Seen | None:
     return Seen(*(part.strip() for part in parts)) if len(parts) == len(FIELDS) else None
 
 
-def follow(kube: Kube, namespace: str, name: str, since: float, patience: float, tell: Callable[[str], None]) -> Seen:
-    """Tells every change, with the seconds since `since`, until the end is stored; raises if it is not a good one in time."""
+def follow(kube: Kube, namespace: str, name: str, since: float, patience: float, show: Callable[[str], None]) -> Seen:
+    """Shows every change, with the seconds since `since`, until the end is stored; raises if it is not a good one in time."""
     last: Seen | None = None
     deadline = time.monotonic() + patience
     for line in lines(kube, namespace, name, deadline):
@@ -72,7 +72,7 @@ def follow(kube: Kube, namespace: str, name: str, since: float, patience: float,
         if seen is None:
             continue
         if last is None or seen.line() != last.line():
-            tell(f"{seconds(time.monotonic() - since):>8}  {seen.line()}")
+            show(f"{seconds(time.monotonic() - since):>8}  {seen.line()}")
         last = seen
         if seen.is_stored:
             return seen

@@ -139,7 +139,7 @@ def unmount_all(settings: Settings) -> int:
 
 
 def shim_sockets(settings: Settings) -> list[Path]:
-    """The sockets of our shims, which containerd puts into a folder of the system; each bundle tells its own.
+    """The sockets of our shims, which containerd puts into a folder of the system; each bundle names its own.
 
     To be asked before the containers are killed: containerd removes the bundle of a dead container, but not the socket.
     """

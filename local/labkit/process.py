@@ -23,7 +23,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 @dataclass(frozen=True)
 class Identity:
-    """What tells our process from every other one, and the digest of what it was started with."""
+    """What distinguishes our process from every other one, and the digest of what it was started with."""
 
     pid: int
     start: int

@@ -160,7 +160,7 @@ def in_cluster(plan: Plan) -> None:
         **without_proxy(os.environ),
         **client_environment(plan.settings),
         "PATH": f"{folder}:{os.environ.get('PATH', '')}",
-        # What Pods run beside the participant's image; the test starts controller and bridge itself, to kill them.
+        # What Pods run next to the participant's image; the test starts controller and bridge itself, to kill them.
         "LEADERBOARD_OPERATOR_IMAGE": images[demo.OPERATOR],
         "LEADERBOARD_OPERATOR_BIN": str(build.program(plan.settings, OPERATOR)),
     }

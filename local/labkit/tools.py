@@ -135,5 +135,5 @@ def check_space(folder: Path) -> None:
     free = shutil.disk_usage(existing).free
     if free < LEAST_FREE_BYTES:
         raise LabError(
-            f"{existing} has {free / (1 << 30):.1f} GiB free and 5 GiB are needed: make room, then run the same command again"
+            f"{existing} has {free / (1 << 30):.1f} GiB free and 5 GiB are needed: free some space, then run the same command again"
         )

@@ -52,7 +52,7 @@ class Crash(unittest.TestCase):
     def test_the_part_alone_is_killed_and_runs_again_as_before(self) -> None:
         self.start_all()
         killed, other = self.identity("kubelet"), self.identity("kube-apiserver")
-        with mock.patch("labkit.crash.say") as told:
+        with mock.patch("labkit.crash.say") as said:
             crash.crash(self.lab, "kubelet", 0)
         self.assertFalse(process.running(killed))
         again = self.identity("kubelet")
@@ -61,7 +61,7 @@ class Crash(unittest.TestCase):
         self.assertNotEqual(again.pid, killed.pid)
         self.assertTrue(process.running(other))
         self.assertEqual(self.identity("kube-apiserver"), other)
-        (line,) = told.call_args.args
+        (line,) = said.call_args.args
         self.assertIn(f"kubelet (pid {killed.pid}) was killed, started again after 0 s", line)
 
     def test_what_can_t_be_crashed_names_what_can(self) -> None:

@@ -1,4 +1,4 @@
-"""What the demo compares, tells and sends: every place's difference is found, nothing else is one."""
+"""What the demo compares, shows and sends: every place's difference is found, nothing else is one."""
 
 import copy
 import json

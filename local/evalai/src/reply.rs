@@ -17,7 +17,7 @@ pub struct Reply {
     pub status: u16,
     /// The value of `Content-Type`.
     pub content_type: &'static str,
-    /// Headers beside the content type.
+    /// Headers other than the content type.
     pub headers: Vec<(&'static str, String)>,
     /// The body's bytes.
     pub body: Vec<u8>,

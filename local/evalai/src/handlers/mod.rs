@@ -52,7 +52,7 @@ impl Call {
             .map(|(_, value)| value.as_str())
     }
 
-    /// Refuses whoever is not a host of the challenge with the given error.
+    /// Refuses anyone who is not a host of the challenge, with the given error.
     fn host_of(&self, challenge: u64, refusal: &errors::ErrorText) -> Result<(), Reply> {
         if self.app.state().is_host(self.user()?, challenge) {
             Ok(())
