@@ -1,4 +1,4 @@
-//! The operator dies, or is stopped in mid-step and goes on beside its successor: the run does not notice.
+//! The operator dies, or is stopped in mid-step and goes on next to its successor: the run does not notice.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! What goes wrong with the participant's image, and what everybody is told of it.
+//! What goes wrong with the participant's image, and what each system shows of it.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use crate::operator::{bridge, controller};
 use crate::scene::{Scene, scenario};
 
 #[tokio::test]
-async fn an_agent_that_always_crashes_fails_and_everybody_is_told() {
+async fn an_agent_that_always_crashes_fails_in_every_system() {
     scenario("crash-always", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
         let change = json!({"pairs": 2, "routes": 6, "retries": {"perPair": 2}});

@@ -108,12 +108,12 @@ async fn a_job_deleted_by_hand_is_made_again() {
             .await;
         let mut case = Case::open("Job deleted by hand", REPEATED);
         assert_finished(&mut case, scene, "lost").await;
-        let told = scene.events("lost").await;
-        let told: Vec<_> = told
+        let events = scene.events("lost").await;
+        let events: Vec<_> = events
             .iter()
             .filter(|event| event.reason.as_deref() == Some("JobRecreated"))
             .collect();
-        assert_eq!(told.len(), 1, "{told:?}");
+        assert_eq!(events.len(), 1, "{events:?}");
         case.close();
     })
     .await;

@@ -1,7 +1,7 @@
 //! The matrix of what can happen to a submission: one line a case, with what was done, what everybody was to see of it, what
 //! they saw, and how long it took until `kubectl get submissions` said so.
 //!
-//! A case is opened before its cause and closed when its end is known; one that is neither closed nor filtered out is told
+//! A case is opened before its cause and closed when its end is known; one that is neither closed nor filtered out is shown
 //! as failed. Each line is printed at once, and `make test` prints the table at its end. The cases are in the modules
 //! `matrix_*`, and in tests of their own that other modules have.
 
@@ -24,7 +24,7 @@ pub const SHOWN: Duration = Duration::from_mins(2);
 /// How long a reason is waited for whose cause has no moment of its own: until then a Pod has been made, images were pulled, and
 /// containers were started.
 const PATIENCE: Duration = Duration::from_mins(5);
-/// File that the lines go into, for whoever prints them.
+/// File that the lines go into, for the program that prints them.
 const VARIABLE: &str = "LEADERBOARD_MATRIX";
 
 /// An open case.
@@ -116,7 +116,7 @@ impl Case {
         self.is_closed = true;
         let seen = self.seen.join("; ");
         let is_expected = seen == self.expected;
-        tell(
+        print_line(
             self.name,
             self.expected,
             if is_expected { "as expected" } else { &seen },
@@ -139,7 +139,7 @@ impl Drop for Case {
     fn drop(&mut self) {
         if !self.is_closed {
             let seen = format!("FAILED after {:?}", self.seen.join("; "));
-            tell(self.name, self.expected, &seen, self.shown);
+            print_line(self.name, self.expected, &seen, self.shown);
         }
     }
 }
@@ -175,7 +175,7 @@ fn last_crash(submission: &Submission) -> Option<Timestamp> {
 }
 
 /// Prints a line of the table.
-fn tell(name: &str, expected: &str, seen: &str, shown: Option<Duration>) {
+fn print_line(name: &str, expected: &str, seen: &str, shown: Option<Duration>) {
     let seconds = shown.map_or_else(|| "-".to_owned(), |shown| format!("{:.1}", shown.as_secs_f64()));
     let line = format!("{name}\t{expected}\t{seen}\t{seconds}\n");
     say(&format!("matrix: {}", line.trim_end().replace('\t', " | ")));
@@ -189,7 +189,7 @@ fn tell(name: &str, expected: &str, seen: &str, shown: Option<Duration>) {
 
 /// Prints a measurement among the table's lines.
 pub fn measured(what: &str, took: Duration, aim: &str) {
-    tell(what, aim, "measured", Some(took));
+    print_line(what, aim, "measured", Some(took));
 }
 
 /// Runs cases, so many at once, to the end of all of them; fails if one has failed.

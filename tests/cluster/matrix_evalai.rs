@@ -235,11 +235,11 @@ async fn a_server_that_closes_idle_connections_loses_no_write() {
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), FIRST_PHASE).await;
         case.ends(scene, &format!("submission-{pk}"), LIMIT).await;
         case.evalai(evalai.submission(pk).status);
-        let told = ["queued", "running"].map(|status| format!("{} {status}", evalai.told("PATCH", status)));
+        let updates = ["queued", "running"].map(|status| format!("{} {status}", evalai.updates("PATCH", status)));
         case.also(&format!(
             "{}, {} finished",
-            told.join(", "),
-            evalai.told("PUT", "finished")
+            updates.join(", "),
+            evalai.updates("PUT", "finished")
         ));
         case.close();
     })

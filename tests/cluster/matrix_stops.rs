@@ -1,4 +1,4 @@
-//! The matrix: cancels at every stage, ends that EvalAI had first, and how fast a stop and an end are told.
+//! The matrix: cancels at every stage, ends that EvalAI had first, and how fast a stop and an end are passed on.
 
 use std::time::{Duration, Instant};
 
@@ -20,7 +20,7 @@ use crate::scene::{Scene, containers, lay_over, scenario, state};
 const WIDTH: usize = 5;
 const LIMIT: Duration = Duration::from_mins(4);
 const CANCEL_SECONDS: u64 = 20;
-/// How long a Pod may be there after a cancel: it is told, then deleted, then removed by force.
+/// How long a Pod may be there after a cancel: its containers get a SIGTERM, then it is deleted, then removed by force.
 const POD_GONE: Duration = Duration::from_secs(CANCEL_SECONDS + 105);
 
 #[tokio::test]
@@ -63,7 +63,7 @@ async fn cancel(scene: &Scene, name: &str) {
 
 /// Cancels it, and sees it end with its Pods gone.
 async fn cancelled(case: &mut Case, scene: &Scene, name: &str) {
-    let pods: Vec<_> = pods_of(scene, name).await;
+    let pods: Vec<_> = scene.pods_of(name).await;
     // A node that pulls an image or copies contents may let go of the Pod only when it is removed by force.
     case.cause_within(POD_GONE);
     cancel(scene, name).await;
@@ -75,16 +75,6 @@ async fn cancelled(case: &mut Case, scene: &Scene, name: &str) {
         };
         scene.wait(&pod, "its Pod has ended", POD_GONE, ended).await;
     }
-}
-
-async fn pods_of(scene: &Scene, submission: &str) -> Vec<String> {
-    let pods = scene.all::<Pod>().await.into_iter();
-    let ours = |pod: &Pod| {
-        pod.labels()
-            .get("leaderboard.carla.org/submission")
-            .is_some_and(|name| name == submission)
-    };
-    pods.filter(ours).map(|pod| pod.name_any()).collect()
 }
 
 /// No Job of a submission was ever made.
@@ -169,7 +159,7 @@ async fn ended_in_evalai_in_line(scene: &Scene, evalai: &Evalai, phase: u64) {
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
     let name = format!("submission-{pk}");
     case.shows(scene, &name, "Paused", "").await;
-    // What EvalAI is told of it must not come after the cancel and hide it.
+    // A later update of ours must not hide the cancel.
     evalai.await_status(pk, Status::Queued, LIMIT).await;
     case.cause();
     evalai.cancel(pk).await;
@@ -200,7 +190,7 @@ async fn archived_while_it_runs(scene: &Scene, evalai: &Evalai, phase: u64) {
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
     let name = format!("submission-{pk}");
     scene.running(&name, LIMIT).await;
-    // What EvalAI is told of the run must not come after this and hide it.
+    // A later update of ours must not hide what follows.
     evalai.await_status(pk, Status::Running, LIMIT).await;
     evalai.set_status(pk, Status::Archived).await;
     scene

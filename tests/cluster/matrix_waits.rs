@@ -1,4 +1,4 @@
-//! The matrix: what a submission waits for, said aloud, and that it goes on when it is mended. Also lost nodes, and other
+//! The matrix: what a submission waits for, as its status shows it, and that it goes on once that is fixed. Also lost nodes, and other
 //! systems that are away: all of these take time and little of the machine, so they share a scene.
 
 use std::collections::BTreeMap;
@@ -31,7 +31,7 @@ const NODE_LABEL: &str = "leaderboard.carla.org/matrix";
 const REAL_NODE: &str = "leaderboard-local";
 
 #[tokio::test]
-async fn each_wait_says_why_and_goes_on_when_it_is_mended() {
+async fn each_wait_shows_why_and_goes_on_once_it_is_fixed() {
     scenario("matrix-waits", async |scene: &Scene| {
         let _controller = controller(scene);
         let cases = vec![
@@ -263,14 +263,14 @@ async fn silent_registry(scene: &Scene) {
     let spec = json!({"leaderboardName": "silent", "track": "sensors", "image": silent.image()});
     case.cause();
     scene.apply_submission("silent", spec).await;
-    // What it is at is told after 45 s: a healthy Pod costs no write until then.
+    // What it waits for is shown after 45 s: a healthy Pod costs no write until then.
     case.shows(scene, "silent", "Preparing", "images are pulled").await;
     give_up(scene, "silent").await;
     let ended = case.ends(scene, "silent", LIMIT).await;
     // Now the node comes to itself.
     drop(silent);
     let gone = |pod: Option<&Pod>| pod.is_none();
-    for pod in pods_of(scene, "silent").await {
+    for pod in scene.pods_of("silent").await {
         scene.wait(&pod, "it is gone", LIMIT, gone).await;
     }
     let later = scene.api::<Submission>().get("silent").await.unwrap();
@@ -280,16 +280,6 @@ async fn silent_registry(scene: &Scene) {
     assert!(results.is_empty(), "{results:?}");
     case.also("nothing stored later");
     case.close();
-}
-
-async fn pods_of(scene: &Scene, submission: &str) -> Vec<String> {
-    let pods = scene.all::<Pod>().await.into_iter();
-    let ours = |pod: &Pod| {
-        pod.labels()
-            .get("leaderboard.carla.org/submission")
-            .is_some_and(|name| name == submission)
-    };
-    pods.filter(ours).map(|pod| pod.name_any()).collect()
 }
 
 async fn table_denied(scene: &Scene) {
@@ -355,7 +345,7 @@ async fn evalai_away(scene: &Scene, name: &'static str, answer: Failure) {
     finishes(&mut case, scene, &board).await;
     assert_eq!(evalai.submission(pk).status, Status::Finished);
     case.evalai(Status::Finished);
-    assert!(evalai.told("PUT", "finished") > 1, "nothing went wrong");
+    assert!(evalai.updates("PUT", "finished") > 1, "nothing went wrong");
     case.also(&format!("{} row", evalai.rows(pk).len()));
     case.close();
 }
@@ -427,14 +417,14 @@ async fn label_node(nodes: &Api<Node>, name: &str, value: Value) {
 }
 
 fn fake_node(label: &str) -> Node {
-    let room = json!({"cpu": "4", "memory": "8Gi", "pods": "10", "ephemeral-storage": "10Gi"});
+    let capacity = json!({"cpu": "4", "memory": "8Gi", "pods": "10", "ephemeral-storage": "10Gi"});
     let node = json!({
         "metadata": {"name": label, "labels": {NODE_LABEL: label}},
         // Nobody else's Pod may come here.
         "spec": {"taints": [{"key": NODE_LABEL, "effect": "NoSchedule"}]},
         "status": {
-            "capacity": room,
-            "allocatable": room,
+            "capacity": capacity,
+            "allocatable": capacity,
             "conditions": [{"type": "Ready", "status": "True", "reason": "KubeletReady"}],
         },
     });

@@ -47,12 +47,12 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
         assert_partials(&evalai.requests());
         for status in ["queued", "running"] {
             assert_eq!(
-                evalai.told("PATCH", status),
+                evalai.updates("PATCH", status),
                 1,
                 "each PATCH starts EvalAI's clock again: {status}"
             );
         }
-        assert_eq!(evalai.told("PUT", "finished"), 1);
+        assert_eq!(evalai.updates("PUT", "finished"), 1);
 
         let row = scene.cloud.row(&scene.cloud.table).await;
         assert_row(&row);

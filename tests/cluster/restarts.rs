@@ -103,7 +103,7 @@ async fn crash(part: &str) {
     let mut command = Command::new(lab);
     command.args(["crash", part, "--away", AWAY]).stdin(Stdio::null());
     let done = command.output().await.unwrap();
-    let told = String::from_utf8_lossy(&done.stderr);
-    assert!(done.status.success(), "{part} was not crashed: {told}");
-    say(told.trim_end());
+    let output = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success(), "{part} was not crashed: {output}");
+    say(output.trim_end());
 }

@@ -26,7 +26,10 @@ async fn a_local_submission_runs_to_finished_with_the_expected_score() {
             assert!(is_true(&submission, condition), "{condition}");
         }
         for condition in [conditions::PUBLISHED, conditions::RECORDED] {
-            assert!(!is_true(&submission, condition), "nobody is told: {condition}");
+            assert!(
+                !is_true(&submission, condition),
+                "no other system needs the end: {condition}"
+            );
         }
         assert_eq!(scene.jobs().await, ["first-1"]);
         assert_layout(&scene.cloud.keys("first").await);
@@ -120,17 +123,17 @@ async fn assert_columns(scene: &Scene) {
     }
 }
 
-/// Each transition is told once, and in order.
+/// Each transition has one event, in order.
 async fn assert_events(scene: &Scene) {
     let events = scene.events("first").await;
-    let told: Vec<_> = events
+    let reasons: Vec<_> = events
         .iter()
         .map(|event| event.reason.clone().unwrap_or_default())
         .collect();
-    assert_eq!(told, ["Preparing", "JobCreated", "Running", "Finished"]);
+    assert_eq!(reasons, ["Preparing", "JobCreated", "Running", "Finished"]);
     assert!(
         events.iter().all(|event| event.series.is_none()),
-        "an event was told again: {events:?}"
+        "an event was sent again: {events:?}"
     );
 }
 

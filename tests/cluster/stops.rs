@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use super::matrix::{Case, measured};
 use crate::evalai::Evalai;
-use crate::operator::{bridge, controller};
+use crate::operator::{Kept, bridge, controller};
 use crate::processes;
 use crate::scene::{Scene, done, scenario};
 
@@ -89,13 +89,19 @@ async fn a_cancelled_submission_stops_in_time_and_keeps_its_results() {
     .await;
 }
 
+/// A submission of EvalAI, with what serves it.
+async fn submitted(scene: &Scene) -> (Evalai, [Kept; 2], u64) {
+    let evalai = Evalai::start(scene).await;
+    scene.evalai_leaderboard("lb", &evalai, endless()).await;
+    let operator = [controller(scene), bridge(scene)];
+    let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+    (evalai, operator, pk)
+}
+
 #[tokio::test]
 async fn a_cancel_in_evalai_stops_the_run() {
     scenario("evalai-cancel", async |scene: &Scene| {
-        let evalai = Evalai::start(scene).await;
-        scene.evalai_leaderboard("lb", &evalai, endless()).await;
-        let (_controller, _bridge) = (controller(scene), bridge(scene));
-        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        let (evalai, _operator, pk) = submitted(scene).await;
         let name = format!("submission-{pk}");
         under_way(scene, &name).await;
         let pod = scene.pod(&name).await;
@@ -128,10 +134,7 @@ async fn a_cancel_in_evalai_stops_the_run() {
 #[tokio::test]
 async fn a_submission_deleted_while_it_runs_goes_when_its_end_is_published() {
     scenario("delete", async |scene: &Scene| {
-        let evalai = Evalai::start(scene).await;
-        scene.evalai_leaderboard("lb", &evalai, endless()).await;
-        let (_controller, _bridge) = (controller(scene), bridge(scene));
-        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
+        let (evalai, _operator, pk) = submitted(scene).await;
         let name = format!("submission-{pk}");
         under_way(scene, &name).await;
         let pod = scene.pod(&name).await.name_any();

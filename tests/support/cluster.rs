@@ -1,5 +1,5 @@
 //! A scene: one test's namespace on the lab's cluster, with its own things in AWS; how it waits for what happens in it, and
-//! what it tells of itself when the test fails.
+//! what it shows of itself when the test fails.
 //!
 //! Knows the API server and the nodes' containers; the operator's programs are in `operator`, EvalAI is in `evalai`.
 
@@ -12,10 +12,11 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use futures::FutureExt;
-use k8s_openapi::api::core::v1::{Namespace, Secret};
+use k8s_openapi::api::core::v1::{Namespace, Pod, Secret};
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{Api, ListParams, Patch, PatchParams, PostParams};
-use kube::{Client, Config, Resource};
+use kube::{Client, Config, Resource, ResourceExt};
+use leaderboard_api::names::LABEL_SUBMISSION;
 use leaderboard_api::{Leaderboard, Submission};
 use serde_json::{Value, json};
 use tokio::sync::Semaphore;
@@ -92,7 +93,7 @@ pub struct Scene {
     pub ended: Arc<Mutex<Vec<String>>>,
 }
 
-/// Runs one test in a scene of its own. If it fails, tells what the scene looked like; clears it away in any case, unless
+/// Runs one test in a scene of its own. If it fails, shows what the scene looked like; clears it away in any case, unless
 /// `LEADERBOARD_TEST_KEEP` is set.
 pub async fn scenario(name: &str, body: impl AsyncFnOnce(&Scene)) {
     let lab = Lab::from_environment();
@@ -308,6 +309,17 @@ impl Scene {
         self.api::<K>().list(&ListParams::default()).await.unwrap().items
     }
 
+    /// The names of a Submission's Pods.
+    pub async fn pods_of(&self, submission: &str) -> Vec<String> {
+        let pods = self.all::<Pod>().await.into_iter();
+        let ours = |pod: &Pod| {
+            pod.labels()
+                .get(LABEL_SUBMISSION)
+                .is_some_and(|name| name == submission)
+        };
+        pods.filter(ours).map(|pod| pod.name_any()).collect()
+    }
+
     /// The events about an object, oldest first.
     pub async fn events(&self, name: &str) -> Vec<Event> {
         let all = self.all::<Event>().await.into_iter();
@@ -322,7 +334,7 @@ impl Scene {
         found
     }
 
-    /// The names of all Jobs that ever had a Pod here, deleted ones too, as the Job controller's events tell. A Job that was
+    /// The names of all Jobs that ever had a Pod here, deleted ones too, as the Job controller's events show. A Job that was
     /// made twice is there twice.
     pub async fn jobs(&self) -> Vec<String> {
         let events = self.all::<Event>().await.into_iter();

@@ -211,8 +211,8 @@ impl Evalai {
         all.filter(|entry| entry.token.as_deref() == Some(HOST_TOKEN)).collect()
     }
 
-    /// The operator's PATCHes that say so, and PUTs of such results.
-    pub fn told(&self, method: &str, status: &str) -> usize {
+    /// How many PATCHes or PUTs of the operator have this status.
+    pub fn updates(&self, method: &str, status: &str) -> usize {
         self.requests()
             .iter()
             .filter(|entry| is_update(entry, method, status))
