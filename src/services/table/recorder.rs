@@ -14,6 +14,7 @@ use tokio::time::Instant;
 
 use super::ledger::{Ledger, TableId, View, Wish};
 use super::{Row, Table, TableError, Written};
+use crate::backoff::Backoff;
 use crate::observability::tasks::Tasks;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
@@ -21,8 +22,8 @@ use leaderboard_api as api;
 
 /// Time between the starts of two writes to one table: the stock table has one write unit.
 const SPACING: Duration = Duration::from_secs(2);
-/// Longest pause after failures.
-const LONGEST_PAUSE: Duration = Duration::from_mins(5);
+/// Pauses after failures in a row, half of which is no less than the spacing.
+const RETRY: Backoff = Backoff::new(Duration::from_secs(4), Duration::from_mins(5));
 /// How often a fence that is down is looked at.
 const FENCE_PAUSE: Duration = Duration::from_secs(1);
 
@@ -145,7 +146,7 @@ impl Worker {
                     let begun = Instant::now();
                     let is_sick = self.write(key, wish).await;
                     failures = if is_sick { failures.saturating_add(1) } else { 0 };
-                    Some(begun + pause(failures, fastrand::f64()))
+                    Some(begun + if failures == 0 { SPACING } else { RETRY.after(failures) })
                 }
             };
             let wait = async {
@@ -173,16 +174,6 @@ impl Worker {
             let _ = self.shared.wake.send(key);
         }
         is_sick
-    }
-}
-
-/// The spacing; after failures it doubles up to five minutes, between half of it and all.
-fn pause(failures: u32, chance: f64) -> Duration {
-    let whole = SPACING.saturating_mul(1 << failures.min(10)).min(LONGEST_PAUSE);
-    if failures == 0 {
-        SPACING
-    } else {
-        whole.mul_f64(0.5 + chance / 2.0).max(SPACING)
     }
 }
 

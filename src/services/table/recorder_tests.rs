@@ -151,14 +151,6 @@ async fn a_sick_table_is_tried_ever_more_slowly_until_it_is_well() {
     );
 }
 
-#[test]
-fn pauses_stay_within_their_limits() {
-    assert_eq!(pause(0, 0.0), SPACING);
-    assert_eq!(pause(1, 0.0), SPACING);
-    assert_eq!(pause(1, 1.0), Duration::from_secs(4));
-    assert_eq!(pause(50, 1.0), LONGEST_PAUSE);
-}
-
 #[tokio::test(start_paused = true)]
 async fn a_worker_that_panics_is_a_failed_task_of_the_process() {
     struct Broken;

@@ -10,6 +10,7 @@ use jiff::SignedDuration;
 use super::poll::pause;
 use super::sub::{RETRY_END, Sub};
 use super::{Busy, Now, Queue, Ticket};
+use crate::backoff::Backoff;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::payload::digest;
 use crate::services::evalai::request::{Reply, Request, Subject};
@@ -20,8 +21,8 @@ use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);
 
-/// Longest wait after a write that EvalAI broke down over: results are to be there two minutes after an outage.
-const OUTAGE_PAUSE: Duration = Duration::from_secs(90);
+/// Waits after a write that EvalAI broke down over: results are to be there two minutes after an outage.
+const OUTAGE: Backoff = Backoff::new(Duration::from_secs(30), Duration::from_secs(90));
 /// So many such waits are well over an hour.
 const OUTAGE_TRIES: u32 = 60;
 
@@ -209,11 +210,11 @@ impl Queue {
     }
 }
 
-/// The wait before a write that EvalAI broke down over is tried again: short while it may be an outage, whose end nobody
-/// announces; long once it must be this row, which only EvalAI's own people can mend.
+/// The wait before a write that EvalAI broke down over is retried: short while it may be an outage, whose end nobody
+/// announces; long once it must be this row, which only EvalAI's administrators can fix.
 fn broken_pause(failures: u32) -> Duration {
     if failures < OUTAGE_TRIES {
-        (pause(failures) * 6).min(OUTAGE_PAUSE)
+        OUTAGE.bound(failures.saturating_add(1))
     } else {
         RETRY_END
     }

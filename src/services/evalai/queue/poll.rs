@@ -7,14 +7,13 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use crate::backoff::Backoff;
 use crate::services::evalai::labels::Catalog;
 use crate::services::evalai::request::{Purpose, Request};
 use crate::services::evalai::row::{Phase, Split};
 
-/// Longest wait after failures.
-const LONGEST_PAUSE: Duration = Duration::from_mins(1);
-/// Wait after the first failure.
-const FIRST_PAUSE: Duration = Duration::from_secs(5);
+/// Waits after failures in a row. Without jitter: one task makes all requests of a token.
+const RETRY: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_mins(1));
 
 /// Something asked again and again, one request at a time.
 #[derive(Clone, Copy, Debug, Default)]
@@ -48,9 +47,9 @@ impl Poll {
     }
 }
 
-/// The wait after the n-th failure in a row.
+/// The wait after a failure that follows so many in a row.
 pub(super) fn pause(failures: u32) -> Duration {
-    (FIRST_PAUSE * 2_u32.saturating_pow(failures.min(10))).min(LONGEST_PAUSE)
+    RETRY.bound(failures.saturating_add(1))
 }
 
 /// A challenge, as far as it is asked about as a whole.
