@@ -382,7 +382,7 @@ fn hub(
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
-        fence: Arc::new(move || writes.may_write()),
+        write_guard: Arc::new(move || writes.may_write()),
         not_before,
         changed,
         sweep,

@@ -12,7 +12,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::answer::{About, Answer, Refusal, Silence, classify};
-use super::request::{Reply, Request, Subject};
+use super::request::{Reply, Request, SubmissionRef};
 use super::row::image;
 use super::types::{ImageAnswer, Payload};
 use crate::services::meter::Meter;
@@ -286,7 +286,7 @@ fn is_canceled(error: &(dyn std::error::Error + 'static)) -> bool {
     })
 }
 
-fn update(subject: &Subject) -> String {
+fn update(subject: &SubmissionRef) -> String {
     format!("jobs/challenge/{}/update_submission/", subject.challenge)
 }
 
@@ -295,7 +295,7 @@ fn list(challenge: i64, status: &str, after: Timestamp) -> String {
     format!("jobs/challenge/{challenge}/submission/?status={status}&submitted_after={after}")
 }
 
-fn put<'a>(subject: &Subject, status: &'a str, results: bool, payload: &'a Payload) -> Put<'a> {
+fn put<'a>(subject: &SubmissionRef, status: &'a str, results: bool, payload: &'a Payload) -> Put<'a> {
     Put {
         submission: subject.pk,
         submission_status: status,

@@ -13,7 +13,7 @@ use super::{Busy, Now, Queue, Ticket};
 use crate::backoff::Backoff;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::payload::digest;
-use crate::services::evalai::request::{Reply, Request, Subject};
+use crate::services::evalai::request::{Reply, Request, SubmissionRef};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Status};
 use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
@@ -44,7 +44,7 @@ impl Queue {
     pub fn not_sent(&mut self, ticket: &Ticket) {
         if let Some(lane) = ticket
             .request
-            .subject()
+            .submission()
             .and_then(|subject| self.lanes.get_mut(&subject.pk))
         {
             lane.busy = None;
@@ -71,7 +71,7 @@ impl Queue {
         }
     }
 
-    fn took_row(&mut self, subject: &Subject, requested: Duration, answer: Answer<Row>, now: &Now) {
+    fn took_row(&mut self, subject: &SubmissionRef, requested: Duration, answer: Answer<Row>, now: &Now) {
         let lane = self.lanes.entry(subject.pk).or_default();
         let for_write = lane.busy.take() == Some(Busy::ReadForWrite);
         let row = match answer {
@@ -111,7 +111,7 @@ impl Queue {
         }
     }
 
-    fn took_image(&mut self, subject: &Subject, answer: Answer<ImageAnswer>, now: &Now) {
+    fn took_image(&mut self, subject: &SubmissionRef, answer: Answer<ImageAnswer>, now: &Now) {
         self.lanes.entry(subject.pk).or_default().busy = None;
         self.change(subject, |sub| {
             sub.view.image = Some(match answer {
@@ -128,7 +128,7 @@ impl Queue {
         });
     }
 
-    fn read_failed(&mut self, subject: &Subject, answer: &Answer<Row>, now: &Now) {
+    fn read_failed(&mut self, subject: &SubmissionRef, answer: &Answer<Row>, now: &Now) {
         let everybodys = matches!(answer, Answer::Throttled(_))
             || matches!(answer, Answer::Refused(refusal) if refusal.about == About::Token);
         match answer.error() {
@@ -137,12 +137,12 @@ impl Queue {
         }
     }
 
-    fn went_wrong(&mut self, subject: &Subject, why: String, now: &Now) {
+    fn went_wrong(&mut self, subject: &SubmissionRef, why: String, now: &Now) {
         self.change(subject, |sub| sub.read_failed(why, now));
     }
 
     fn wrote(&mut self, request: &Request, answer: Answer<()>, now: &Now) {
-        let Some(subject) = request.subject() else { return };
+        let Some(subject) = request.submission() else { return };
         self.lanes.entry(subject.pk).or_default().busy = None;
         match answer {
             Answer::Done(()) => self.change(subject, |sub| done(sub, request, now)),
@@ -160,7 +160,7 @@ impl Queue {
         }
     }
 
-    fn refused(&mut self, subject: &Subject, request: &Request, refusal: Refusal, now: &Now) {
+    fn refused(&mut self, subject: &SubmissionRef, request: &Request, refusal: Refusal, now: &Now) {
         self.change(subject, |sub| match (refusal.about, request) {
             (About::Token, _) => {}
             (About::Missing, _) => sub.outdated = true,
@@ -172,7 +172,7 @@ impl Queue {
         });
     }
 
-    fn unanswered(&mut self, subject: &Subject, silence: Silence, now: &Now) {
+    fn unanswered(&mut self, subject: &SubmissionRef, silence: Silence, now: &Now) {
         if !silence.sent {
             return self.change(subject, |sub| {
                 sub.write_failed(silence.why, pause(sub.write_failures), now);
@@ -193,7 +193,7 @@ impl Queue {
     }
 
     /// Changes the object a request was about, if it is still at that attempt.
-    fn change(&mut self, subject: &Subject, change: impl FnOnce(&mut Sub)) {
+    fn change(&mut self, subject: &SubmissionRef, change: impl FnOnce(&mut Sub)) {
         let Some(sub) = self.subs.get_mut(&subject.key) else {
             return;
         };

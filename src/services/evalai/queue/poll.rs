@@ -61,7 +61,7 @@ pub(super) struct Challenge {
     pub sweep: Option<(Duration, Timestamp)>,
     /// When each of its lists is due. One that was never asked for is due at once.
     pub lists: BTreeMap<Purpose, Poll>,
-    pub look: Look,
+    pub check: ChallengeCheck,
     /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when we said so.
     pub swept: BTreeMap<i64, (Timestamp, Duration)>,
 }
@@ -72,7 +72,7 @@ impl Challenge {
             period,
             sweep: None,
             lists: BTreeMap::new(),
-            look: Look::default(),
+            check: ChallengeCheck::default(),
             swept: BTreeMap::new(),
         }
     }
@@ -84,7 +84,7 @@ impl Challenge {
 
 /// Reading what a challenge's leaderboards look like, request by request.
 #[derive(Debug, Default)]
-pub(super) struct Look {
+pub(super) struct ChallengeCheck {
     pub poll: Poll,
     /// Phases whose splits are of interest.
     pub wanted: Vec<i64>,
@@ -99,7 +99,7 @@ pub(super) struct Look {
     pub is_forbidden: bool,
 }
 
-impl Look {
+impl ChallengeCheck {
     /// Starts anew.
     pub fn restart(&mut self) {
         (self.phases, self.splits) = (None, None);
