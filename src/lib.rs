@@ -1,7 +1,8 @@
-//! Runs the submissions of an AI challenge on Kubernetes and keeps EvalAI, S3 and DynamoDB true.
+//! Runs the submissions of an AI challenge on Kubernetes and keeps EvalAI, S3 and DynamoDB in sync.
 //!
-//! The rooms and who may know what are drawn in docs/architecture.md.
+//! The modules and what each may import are drawn in docs/architecture.md.
 
+pub mod backoff;
 pub mod bridge;
 pub mod cli;
 pub mod controller;

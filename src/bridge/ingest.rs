@@ -14,7 +14,9 @@ use thiserror::Error;
 
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
-use leaderboard_api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
+use leaderboard_api::{
+    EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, client_errors, conditions, names,
+};
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 pub const SWEEP_AGE_MS: i64 = 120_000;
@@ -402,7 +404,7 @@ async fn call<T>(
         Ok(Err(error)) => Err(IngestError::Failed {
             name,
             verb,
-            text: super::world::chain(&error),
+            text: client_errors::chain(&error),
         }),
         Err(_) => Err(IngestError::Timeout { name, verb }),
     }

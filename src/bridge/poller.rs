@@ -1,4 +1,4 @@
-//! Reads one queue: receives, lets `route` and `ingest` decide, and carries the fate of each message out.
+//! Reads one queue: receives, lets `route` and `ingest` decide, and carries out the outcome of each message.
 //!
 //! One task for each queue, started and stopped by the supervisor. Holds no policy.
 
@@ -13,13 +13,14 @@ use kube::{Api, Resource};
 use tokio::sync::{OnceCell, watch};
 use tokio::time::Instant;
 
-use super::ingest::{self, Incoming, Outcome, Source};
+use super::ingest::{self, Incoming, IngestError, Outcome, Source};
+use super::leaderboards::Leaderboards;
 use super::message::{self, Message};
 use super::queue::{QueueError, Reader, Received, batch_size};
-use super::route::{self, DeadReason, Envelope, Fate, Rules};
-use super::world::{self, World};
+use super::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
 use super::{PULSE_LIMIT, Shared};
-use leaderboard_api::{Leaderboard, names, reasons};
+use crate::backoff::Backoff;
+use leaderboard_api::{Leaderboard, client_errors, names, reasons};
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);
@@ -29,8 +30,8 @@ const EXTENSION: i32 = 30;
 const LONGEST_VISIBILITY: i32 = 43_200;
 /// How often the queue's attributes are read anew.
 const REOPEN: Duration = Duration::from_mins(10);
-/// Longest pause after a failure.
-const LONGEST_PAUSE: Duration = Duration::from_mins(1);
+/// Pauses after failures in a row.
+const RETRY: Backoff = Backoff::new(Duration::from_secs(1), Duration::from_mins(1));
 /// Time between two events with the same reason about one queue.
 const EVENT_PAUSE: Duration = Duration::from_mins(1);
 
@@ -39,7 +40,6 @@ pub struct Poller {
     url: String,
     sqs: Sqs,
     shared: Arc<Shared>,
-    world: watch::Receiver<World>,
     stop: watch::Receiver<bool>,
     reader: Option<(Reader, Instant)>,
     /// Mean time that a message takes.
@@ -47,29 +47,22 @@ pub struct Poller {
     events: HashMap<&'static str, Instant>,
 }
 
-/// The Leaderboards that read the queue, while one batch is dealt with.
+/// The Leaderboards that read the queue, while one batch is processed.
 struct Readers {
     all: Vec<Arc<Leaderboard>>,
     rules: Rules,
     is_complete: bool,
     /// The same read without a cache, when a message is about to be given up.
-    fresh: OnceCell<Option<(Vec<Arc<Leaderboard>>, bool)>>,
+    fresh: OnceCell<Option<Leaderboards>>,
 }
 
 impl Poller {
     /// A poller of the queue at `url` that runs until `stop` becomes true.
-    pub fn new(
-        url: String,
-        sqs: Sqs,
-        shared: Arc<Shared>,
-        world: watch::Receiver<World>,
-        stop: watch::Receiver<bool>,
-    ) -> Self {
+    pub fn new(url: String, sqs: Sqs, shared: Arc<Shared>, stop: watch::Receiver<bool>) -> Self {
         Self {
             url,
             sqs,
             shared,
-            world,
             stop,
             reader: None,
             each: Duration::from_millis(50),
@@ -77,7 +70,7 @@ impl Poller {
         }
     }
 
-    /// Reads the queue until it is told to stop, and finishes what is in hand.
+    /// Reads the queue until the stop, and finishes what is in hand.
     pub async fn run(mut self) {
         let mut failures: u32 = 0;
         while !*self.stop.borrow() {
@@ -86,7 +79,7 @@ impl Poller {
                 continue;
             };
             failures = failures.saturating_add(1);
-            let pause = pause(failures, fastrand::f64());
+            let pause = RETRY.after(failures);
             tracing::warn!(
                 queue = self.url,
                 problem,
@@ -94,13 +87,13 @@ impl Poller {
                 "the queue is not read"
             );
             if !*self.stop.borrow() {
-                self.shared.settings.health.queue(&self.url, Some(problem));
+                self.shared.problems.set(&self.url, Some(problem));
             }
             let _ = tokio::time::timeout(pause, self.stop.wait_for(|stop| *stop)).await;
         }
     }
 
-    /// Receives once and deals with what came.
+    /// Receives once and processes what came.
     async fn round(&mut self) -> Result<(), String> {
         let pulse = self.shared.check_pulse().await;
         pulse.map_err(|text| {
@@ -121,11 +114,8 @@ impl Poller {
 
     async fn receive(&mut self) -> Result<Vec<Received>, QueueError> {
         if self.reader.as_ref().is_none_or(|(_, since)| since.elapsed() > REOPEN) {
-            let observer = self.shared.settings.observer.clone();
-            self.reader = Some((
-                Reader::open(self.sqs.clone(), &self.url, observer).await?,
-                Instant::now(),
-            ));
+            let meter = self.shared.aws.meter().clone();
+            self.reader = Some((Reader::open(self.sqs.clone(), &self.url, meter).await?, Instant::now()));
         }
         let Some((reader, _)) = &self.reader else {
             return Ok(Vec::new());
@@ -137,7 +127,7 @@ impl Poller {
             received = reader.receive(most) => received?,
         };
         if !*self.stop.borrow() {
-            self.shared.settings.health.queue(&self.url, None);
+            self.shared.problems.set(&self.url, None);
         }
         Ok(received)
     }
@@ -147,20 +137,20 @@ impl Poller {
             return;
         };
         let begun = Instant::now();
-        let readers = Readers::of(&self.url, &self.world.borrow());
-        let fates = self.fates(&reader, &received, &readers).await;
+        let readers = Readers::of(&self.url, &Leaderboards::cached(&self.shared.leaderboards));
+        let outcomes = self.outcomes(&reader, &received, &readers).await;
         let count = u32::try_from(received.len()).unwrap_or(1);
         self.each = (self.each * 3 + begun.elapsed() / count) / 4;
         let mut deletes = Vec::new();
-        for (message, mut fate) in received.iter().zip(fates) {
-            if let Fate::Dead(reason) = &fate {
-                fate = self.bury(&reader, message, reason, &readers).await;
+        for (message, mut outcome) in received.iter().zip(outcomes) {
+            if let MessageOutcome::Dead(reason) = &outcome {
+                outcome = self.dead_letter(&reader, message, reason, &readers).await;
             }
-            self.shared.settings.observer.messages(fate.word(), 1);
-            match fate {
-                Fate::Delete(_) | Fate::Dead(_) => deletes.push(message.receipt.as_str()),
-                Fate::Later { seconds, .. } => report(reader.hold(&[&message.receipt], seconds).await),
-                Fate::Lapse | Fate::Ingest { .. } => {}
+            self.shared.telemetry.metrics.sqs_message(outcome.as_str());
+            match outcome {
+                MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message.receipt.as_str()),
+                MessageOutcome::Later { seconds, .. } => report(reader.hold(&[&message.receipt], seconds).await),
+                MessageOutcome::Lapse | MessageOutcome::Ingest { .. } => {}
             }
         }
         report(reader.delete(&deletes).await);
@@ -168,8 +158,8 @@ impl Poller {
     }
 
     /// Decides on all messages at once; extends their visibility if half of it is over before all are decided.
-    async fn fates(&self, reader: &Reader, received: &[Received], readers: &Readers) -> Vec<Fate> {
-        let work = join_all(received.iter().map(|message| self.fate(message, readers)));
+    async fn outcomes(&self, reader: &Reader, received: &[Received], readers: &Readers) -> Vec<MessageOutcome> {
+        let work = join_all(received.iter().map(|message| self.outcome(message, readers)));
         let receipts: Vec<&str> = received.iter().map(|message| message.receipt.as_str()).collect();
         let seconds = i32::try_from(reader.visibility().as_secs()).unwrap_or(i32::MAX);
         let seconds = seconds.clamp(EXTENSION, LONGEST_VISIBILITY);
@@ -177,38 +167,39 @@ impl Poller {
         extended(work, reader.visibility() / 2, extend).await
     }
 
-    async fn fate(&self, received: &Received, readers: &Readers) -> Fate {
+    async fn outcome(&self, received: &Received, readers: &Readers) -> MessageOutcome {
         let envelope = Envelope {
             content: message::parse(&received.body),
             sent_ms: received.sent_ms,
             receives: received.receives,
         };
-        let fate = match route::route(&envelope, &readers.all, now_ms(), readers.is_complete) {
-            // The watch may be behind: nothing is given up on its word alone.
-            Fate::Dead(DeadReason::Unknown(_)) => match self.fresh(readers).await {
-                Some((fresh, is_complete)) => route::route(&envelope, fresh, now_ms(), *is_complete),
-                None => Fate::Lapse,
+        let outcome = match route::route(&envelope, &readers.all, now_ms(), readers.is_complete) {
+            // The watch may be behind: nothing is given up by its cache alone.
+            MessageOutcome::Dead(DeadReason::Unknown(_)) => match self.fresh(readers).await {
+                Some(fresh) => route::route(&envelope, &fresh.all, now_ms(), fresh.is_complete),
+                None => MessageOutcome::Lapse,
             },
-            fate => fate,
+            outcome => outcome,
         };
-        match (&envelope.content, fate) {
-            (Ok(content), Fate::Ingest { namespace, leaderboard }) => {
+        match (&envelope.content, outcome) {
+            (Ok(content), MessageOutcome::Ingest { namespace, leaderboard }) => {
                 let incoming = incoming(content, received);
-                self.ingest(&namespace, &leaderboard, &incoming, &envelope, &readers.rules)
-                    .await
+                let ingested = self.ingest(&namespace, &leaderboard, &incoming).await;
+                ingested.map_or(MessageOutcome::Lapse, |ingested| {
+                    route::settle(&envelope, &ingested, &readers.rules, now_ms())
+                })
             }
-            (_, fate) => fate,
+            (_, outcome) => outcome,
         }
     }
 
+    /// Applies it, and logs what came of it. None: there was no answer in time.
     async fn ingest(
         &self,
         namespace: &str,
         leaderboard: &str,
         incoming: &Incoming,
-        envelope: &Envelope,
-        rules: &Rules,
-    ) -> Fate {
+    ) -> Option<Result<Outcome, IngestError>> {
         let api = Api::namespaced(self.shared.client.clone(), namespace);
         let applied = tokio::time::timeout(MESSAGE_LIMIT, ingest::apply(&api, leaderboard, incoming)).await;
         let submission = format!("{namespace}/{}", names::submission(incoming.submission));
@@ -218,7 +209,7 @@ impl Poller {
                 leaderboard,
                 "the API server is too slow; the message will come back"
             );
-            return Fate::Lapse;
+            return None;
         };
         match &outcome {
             Ok(Outcome::Created) => tracing::info!(submission, leaderboard, "created"),
@@ -235,24 +226,35 @@ impl Poller {
             ),
             Err(error) => tracing::warn!(submission, leaderboard, %error, "not ingested"),
         }
-        route::settle(envelope, &outcome, rules, now_ms())
+        Some(outcome)
     }
 
     /// Moves a message to the dead-letter queue, or lets it come back later if that can't be done.
-    async fn bury(&mut self, reader: &Reader, message: &Received, reason: &DeadReason, readers: &Readers) -> Fate {
-        let what = format!("message {} ({}): {}", message.id, reason.word(), reason.detail());
+    async fn dead_letter(
+        &mut self,
+        reader: &Reader,
+        message: &Received,
+        reason: &DeadReason,
+        readers: &Readers,
+    ) -> MessageOutcome {
+        let what = format!("message {} ({}): {}", message.id, reason.as_str(), reason.detail());
         let problem = match &readers.rules.dead_letter {
             None => "no Leaderboard of this queue has queue.deadLetterURL".to_owned(),
             Some(url) => match reader.send_dead(url, message, reason).await {
                 Ok(()) => {
-                    tracing::warn!(queue = self.url, message = message.id, reason = reason.word(), "{what}");
-                    self.tell(
+                    tracing::warn!(
+                        queue = self.url,
+                        message = message.id,
+                        reason = reason.as_str(),
+                        "{what}"
+                    );
+                    self.publish(
                         readers,
                         "DeadLetter",
                         &format!("Moved to the dead-letter queue: {what}"),
                     )
                     .await;
-                    return Fate::Dead(reason.clone());
+                    return MessageOutcome::Dead(reason.clone());
                 }
                 Err(error) => error.to_string(),
             },
@@ -260,17 +262,17 @@ impl Poller {
         tracing::warn!(
             queue = self.url,
             message = message.id,
-            reason = reason.word(),
+            reason = reason.as_str(),
             problem,
             "{what}"
         );
         let note = format!("A message can't be used and stays in the queue: {what}. {problem}");
-        self.tell(readers, reasons::QUEUE_BLOCKED, &note).await;
+        self.publish(readers, reasons::QUEUE_BLOCKED, &note).await;
         route::blocked(message.receives)
     }
 
     /// An event on the oldest Leaderboard of the queue.
-    async fn tell(&mut self, readers: &Readers, reason: &'static str, note: &str) {
+    async fn publish(&mut self, readers: &Readers, reason: &'static str, note: &str) {
         let is_recent = self.events.get(reason).is_some_and(|at| at.elapsed() < EVENT_PAUSE);
         let Some(leaderboard) = readers.all.first().filter(|_| !is_recent) else {
             return;
@@ -287,30 +289,36 @@ impl Poller {
         let published = self.shared.recorder.publish(&event, &reference);
         match tokio::time::timeout(PULSE_LIMIT, published).await {
             Ok(Ok(())) => {}
-            Ok(Err(error)) => tracing::warn!(error = world::chain(&error), reason, "an event could not be written"),
+            Ok(Err(error)) => tracing::warn!(
+                error = client_errors::kube(&error),
+                reason,
+                "an event could not be written"
+            ),
             Err(_) => tracing::warn!(reason, "an event could not be written in time"),
         }
     }
 
     /// The Leaderboards as they are now, asked once for a batch.
-    async fn fresh<'a>(&self, readers: &'a Readers) -> Option<&'a (Vec<Arc<Leaderboard>>, bool)> {
+    async fn fresh<'a>(&self, readers: &'a Readers) -> Option<&'a Leaderboards> {
         let ask = || async {
-            let api = world::api(self.shared.client.clone(), self.shared.settings.namespace.as_deref());
-            let answer = tokio::time::timeout(PULSE_LIMIT, world::read(&api)).await;
-            let world = answer.ok()?.ok()?;
-            Some((route::readers(&self.url, &world.leaderboards()), world.is_complete()))
+            let read = Leaderboards::read(self.shared.client.clone(), self.shared.namespace.as_deref());
+            let read = tokio::time::timeout(PULSE_LIMIT, read).await.ok()?.ok()?;
+            Some(Leaderboards {
+                all: route::readers(&self.url, &read.all),
+                ..read
+            })
         };
         readers.fresh.get_or_init(ask).await.as_ref()
     }
 }
 
 impl Readers {
-    fn of(url: &str, world: &World) -> Self {
-        let all = route::readers(url, &world.leaderboards());
+    fn of(url: &str, leaderboards: &Leaderboards) -> Self {
+        let all = route::readers(url, &leaderboards.all);
         Self {
             rules: route::rules(&all),
             all,
-            is_complete: world.is_complete(),
+            is_complete: leaderboards.is_complete,
             fresh: OnceCell::new(),
         }
     }
@@ -336,12 +344,6 @@ async fn extended<T>(work: impl Future<Output = T>, half: Duration, extend: impl
         () = tokio::time::sleep(half) => {}
     }
     join(work, extend).await.0
-}
-
-/// Doubles from 1 s to a minute, between half of it and all.
-fn pause(failures: u32, chance: f64) -> Duration {
-    let whole = Duration::from_secs(1 << failures.saturating_sub(1).min(6)).min(LONGEST_PAUSE);
-    whole.mul_f64(0.5 + chance / 2.0)
 }
 
 fn now_ms() -> i64 {
@@ -371,14 +373,5 @@ mod tests {
             assert_eq!(count.into_inner(), want, "{work} s");
             assert_eq!(begun.elapsed().as_secs(), work);
         }
-    }
-
-    #[test]
-    fn pauses_double_up_to_a_minute() {
-        let seconds: Vec<u64> = [1, 2, 3, 6, 7, 40]
-            .map(|failures| pause(failures, 1.0).as_secs())
-            .into();
-        assert_eq!(seconds, [1, 2, 4, 32, 60, 60]);
-        assert_eq!(pause(2, 0.0), Duration::from_secs(1));
     }
 }

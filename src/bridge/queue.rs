@@ -2,7 +2,6 @@
 //!
 //! Called by the poller. Knows no Leaderboards and no policy; errors name the queue and what to do.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use aws_sdk_sqs::config::http::HttpResponse;
@@ -14,9 +13,9 @@ use aws_sdk_sqs::types::{
 use aws_sdk_sqs::{Client, operation::receive_message::ReceiveMessageOutput};
 use thiserror::Error;
 
-use super::Observer;
 use super::route::DeadReason;
 use crate::services::fault::{self, Fault};
+use crate::services::meter::Meter;
 
 /// How long a receive waits for a message, in seconds: the longest that SQS allows.
 const LONG_POLL: i32 = 20;
@@ -54,7 +53,7 @@ pub struct QueueError {
     pub action: &'static str,
     /// What kind of failure.
     pub fault: Fault,
-    /// SQS's words.
+    /// SQS's message.
     pub text: String,
 }
 
@@ -67,7 +66,7 @@ impl QueueError {
             ),
             Fault::Missing => "check queue.url, queue.region and queue.endpoint of its Leaderboards".to_owned(),
             Fault::Refused => "check the queue's settings".to_owned(),
-            Fault::Throttled | Fault::Unavailable | Fault::Conflict => "it is tried again".to_owned(),
+            Fault::Throttled | Fault::Unavailable | Fault::Conflict => "it is retried".to_owned(),
         }
     }
 }
@@ -77,24 +76,21 @@ pub struct Reader {
     client: Client,
     url: String,
     visibility: Duration,
-    observer: Arc<dyn Observer>,
+    meter: Meter,
 }
 
 impl Reader {
     /// Opens a queue: reads how long its messages stay invisible.
-    pub async fn open(client: Client, url: &str, observer: Arc<dyn Observer>) -> Result<Self, QueueError> {
+    pub async fn open(client: Client, url: &str, meter: Meter) -> Result<Self, QueueError> {
         let mut reader = Self {
             client,
             url: url.to_owned(),
             visibility: DEFAULT_VISIBILITY,
-            observer,
+            meter,
         };
-        let answer = reader.client.get_queue_attributes().queue_url(url);
-        let answer = answer
-            .attribute_names(QueueAttributeName::VisibilityTimeout)
-            .send()
-            .await;
-        match reader.answered("GetQueueAttributes", answer) {
+        let request = reader.client.get_queue_attributes().queue_url(url);
+        let request = request.attribute_names(QueueAttributeName::VisibilityTimeout);
+        match reader.call("GetQueueAttributes", request.send()).await {
             Ok(output) => {
                 let all = output.attributes();
                 let seconds = all.and_then(|all| all.get(&QueueAttributeName::VisibilityTimeout)?.parse().ok());
@@ -115,7 +111,7 @@ impl Reader {
 
     /// Waits up to 20 s for up to `most` messages.
     pub async fn receive(&self, most: i32) -> Result<Vec<Received>, QueueError> {
-        let answer = self
+        let request = self
             .client
             .receive_message()
             .queue_url(&self.url)
@@ -125,9 +121,8 @@ impl Reader {
             .message_system_attribute_names(MessageSystemAttributeName::ApproximateFirstReceiveTimestamp)
             .message_system_attribute_names(MessageSystemAttributeName::ApproximateReceiveCount)
             .message_system_attribute_names(MessageSystemAttributeName::MessageGroupId)
-            .send()
-            .await;
-        let output: ReceiveMessageOutput = self.answered("ReceiveMessage", answer)?;
+            .send();
+        let output: ReceiveMessageOutput = self.call("ReceiveMessage", request).await?;
         Ok(output
             .messages
             .unwrap_or_default()
@@ -150,7 +145,7 @@ impl Reader {
                     .build();
                 request = request.entries(entry.map_err(|error| self.unsendable("ChangeMessageVisibility", &error))?);
             }
-            self.answered("ChangeMessageVisibility", request.send().await)?;
+            self.call("ChangeMessageVisibility", request.send()).await?;
         }
         Ok(())
     }
@@ -167,7 +162,7 @@ impl Reader {
                     .build();
                 request = request.entries(entry.map_err(|error| self.unsendable("DeleteMessage", &error))?);
             }
-            let output = self.answered("DeleteMessage", request.send().await)?;
+            let output = self.call("DeleteMessage", request.send()).await?;
             // An invalid receipt means that it is deleted, or was received again and is deleted then.
             for failed in output
                 .failed()
@@ -190,7 +185,7 @@ impl Reader {
     /// makes two copies.
     pub async fn send_dead(&self, to: &str, message: &Received, reason: &DeadReason) -> Result<(), QueueError> {
         let fields = [
-            ("reason", reason.word().to_owned()),
+            ("reason", reason.as_str().to_owned()),
             ("detail", reason.detail().to_owned()),
             ("queue", self.url.clone()),
             ("messageId", message.id.clone()),
@@ -207,38 +202,29 @@ impl Reader {
         if let Some(group) = &message.group {
             request = request.message_group_id(group).message_deduplication_id(&message.id);
         }
-        let answer = self.answered("SendMessage", request.send().await);
+        let answer = self.call("SendMessage", request.send()).await;
         answer.map(|_| ()).map_err(|error| QueueError {
             queue: to.to_owned(),
             ..error
         })
     }
 
-    /// Counts an answer and turns an error into one that names the queue.
-    fn answered<T, E>(
+    /// Counts a call and turns an error into one that names the queue.
+    async fn call<T, E>(
         &self,
         action: &'static str,
-        answer: Result<T, SdkError<E, HttpResponse>>,
+        request: impl Future<Output = Result<T, SdkError<E, HttpResponse>>> + Send,
     ) -> Result<T, QueueError>
     where
         E: ProvideErrorMetadata + std::error::Error + 'static,
     {
-        match answer {
-            Ok(output) => {
-                self.observer.call("sqs", action, "ok");
-                Ok(output)
-            }
-            Err(error) => {
-                let fault = fault::of(&error);
-                self.observer.call("sqs", action, fault.as_str());
-                Err(QueueError {
-                    queue: self.url.clone(),
-                    action,
-                    fault,
-                    text: fault::sentence(&error),
-                })
-            }
-        }
+        let answer = self.meter.aws("sqs", action, request).await;
+        answer.map_err(|error| QueueError {
+            queue: self.url.clone(),
+            action,
+            fault: fault::of(&error),
+            text: fault::sentence(&error),
+        })
     }
 
     fn unsendable(&self, action: &'static str, error: &aws_sdk_sqs::error::BuildError) -> QueueError {
@@ -310,18 +296,18 @@ mod tests {
             queue: "https://q/1".into(),
             action: "ReceiveMessage",
             fault,
-            text: "words".into(),
+            text: "text".into(),
         };
         assert_eq!(
             error(Fault::Denied).to_string(),
-            "queue https://q/1: ReceiveMessage failed: words; check the operator's AWS credentials and that they allow sqs:ReceiveMessage"
+            "queue https://q/1: ReceiveMessage failed: text; check the operator's AWS credentials and that they allow sqs:ReceiveMessage"
         );
         assert!(
             error(Fault::Missing)
                 .to_string()
                 .ends_with("check queue.url, queue.region and queue.endpoint of its Leaderboards")
         );
-        assert!(error(Fault::Throttled).to_string().ends_with("it is tried again"));
+        assert!(error(Fault::Throttled).to_string().ends_with("it is retried"));
     }
 
     #[test]

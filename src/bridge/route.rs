@@ -28,7 +28,7 @@ pub struct Envelope {
     pub receives: i32,
 }
 
-/// What the Leaderboards that share a queue say about it.
+/// What the Leaderboards that share a queue want done with its messages.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Rules {
     /// Where messages go that can't be used: the oldest Leaderboard's that names one.
@@ -48,13 +48,13 @@ pub enum DeadReason {
     Unknown(String),
     /// The name of its Submission belongs to another one.
     IdTaken(String),
-    /// The API server won't have its Submission.
+    /// The API server refuses its Submission.
     Refused(String),
 }
 
 impl DeadReason {
-    /// The word that the dead letter carries as its attribute `reason`.
-    pub fn word(&self) -> &'static str {
+    /// The attribute `reason` of the dead letter.
+    pub fn as_str(&self) -> &'static str {
         match self {
             Self::Malformed(_) => "Malformed",
             Self::Unknown(_) => "UnknownPhase",
@@ -63,7 +63,7 @@ impl DeadReason {
         }
     }
 
-    /// The sentence that the dead letter carries as its attribute `detail`.
+    /// The attribute `detail` of the dead letter: a sentence.
     pub fn detail(&self) -> &str {
         match self {
             Self::Malformed(text) | Self::Unknown(text) | Self::IdTaken(text) | Self::Refused(text) => text,
@@ -73,7 +73,7 @@ impl DeadReason {
 
 /// What becomes of a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Fate {
+pub enum MessageOutcome {
     /// It is for this Leaderboard.
     Ingest { namespace: String, leaderboard: String },
     /// It can't be used.
@@ -95,9 +95,9 @@ pub enum Later {
     Foreign,
     /// Its Submission's predecessor is being deleted.
     Deleting,
-    /// The API server would not have its Submission.
+    /// The API server refused its Submission.
     Refused,
-    /// It belongs in a dead-letter queue and there is none.
+    /// It belongs in a dead-letter queue, and the queue has none.
     Blocked,
 }
 
@@ -109,9 +109,9 @@ pub enum Done {
     Repeat,
 }
 
-impl Fate {
-    /// A word for metrics and logs.
-    pub fn word(&self) -> &'static str {
+impl MessageOutcome {
+    /// The value of the metric's label.
+    pub fn as_str(&self) -> &'static str {
         match self {
             Self::Ingest { .. } => "ingest",
             Self::Dead(_) => "dead_letter",
@@ -147,7 +147,7 @@ pub fn queue_of(leaderboard: &Leaderboard) -> Option<&Queue> {
     leaderboard.spec.queue.as_ref()
 }
 
-/// What the readers of a queue, the oldest first, say about it together.
+/// The rules of a queue, from all its readers, the oldest first.
 pub fn rules(readers: &[Arc<Leaderboard>]) -> Rules {
     let queues = || readers.iter().filter_map(|lb| queue_of(lb));
     Rules {
@@ -161,11 +161,11 @@ pub fn rules(readers: &[Arc<Leaderboard>]) -> Rules {
     }
 }
 
-/// Tells whom a message is for. `readers` are the queue's, the oldest first; `synced` says that none can be missing.
-pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, synced: bool) -> Fate {
-    // The last Leaderboard of the queue is going away: whoever reads it next decides.
+/// Finds the Leaderboard of a message. `readers` are the queue's, the oldest first; `is_complete`: none can be missing.
+pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, is_complete: bool) -> MessageOutcome {
+    // The last Leaderboard of the queue is being deleted: the next reader decides.
     if readers.is_empty() {
-        return Fate::Lapse;
+        return MessageOutcome::Lapse;
     }
     let rules = rules(readers);
     let message = match &envelope.content {
@@ -173,10 +173,10 @@ pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, syn
         Err(Malformed::StaticDataset) if rules.leaves_foreign => {
             return later(envelope.receives, SHORT_WAIT, Later::Foreign);
         }
-        Err(malformed) => return Fate::Dead(DeadReason::Malformed(malformed.to_string())),
+        Err(malformed) => return MessageOutcome::Dead(DeadReason::Malformed(malformed.to_string())),
     };
     if let Some(leaderboard) = readers.iter().find(|lb| lb.serves(message.challenge, message.phase)) {
-        return Fate::Ingest {
+        return MessageOutcome::Ingest {
             namespace: leaderboard.namespace().unwrap_or_default(),
             leaderboard: leaderboard.name_any(),
         };
@@ -184,35 +184,40 @@ pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, syn
     if rules.leaves_foreign {
         return later(envelope.receives, SHORT_WAIT, Later::Foreign);
     }
-    if !synced || !is_overdue(envelope, &rules, now_ms) {
+    if !is_complete || !is_overdue(envelope, &rules, now_ms) {
         return later(envelope.receives, LONGEST_WAIT, Later::Unknown);
     }
-    Fate::Dead(DeadReason::Unknown(format!(
+    MessageOutcome::Dead(DeadReason::Unknown(format!(
         "no Leaderboard that reads this queue serves challenge {}, phase {}",
         message.challenge, message.phase
     )))
 }
 
 /// What becomes of a message after its Submission was, or could not be, created or bumped.
-pub fn settle(envelope: &Envelope, outcome: &Result<Outcome, IngestError>, rules: &Rules, now_ms: i64) -> Fate {
+pub fn settle(
+    envelope: &Envelope,
+    outcome: &Result<Outcome, IngestError>,
+    rules: &Rules,
+    now_ms: i64,
+) -> MessageOutcome {
     match outcome {
-        Ok(Outcome::Created) => Fate::Delete(Done::Created),
-        Ok(Outcome::Bumped(_)) => Fate::Delete(Done::Bumped),
+        Ok(Outcome::Created) => MessageOutcome::Delete(Done::Created),
+        Ok(Outcome::Bumped(_)) => MessageOutcome::Delete(Done::Bumped),
         // Only the sweep is refused an attempt.
-        Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => Fate::Delete(Done::Repeat),
+        Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => MessageOutcome::Delete(Done::Repeat),
         Ok(Outcome::Deleting) => later(envelope.receives, SHORT_WAIT, Later::Deleting),
-        Ok(Outcome::IdTaken(owner)) => Fate::Dead(DeadReason::IdTaken(owner.clone())),
+        Ok(Outcome::IdTaken(owner)) => MessageOutcome::Dead(DeadReason::IdTaken(owner.clone())),
         // Definitions that are newer or older than this program may refuse what others accept.
         Err(IngestError::Refused { .. }) if !is_overdue(envelope, rules, now_ms) => {
             later(envelope.receives, LONGEST_WAIT, Later::Refused)
         }
-        Err(IngestError::Refused { text, .. }) => Fate::Dead(DeadReason::Refused(text.clone())),
-        Err(_) => Fate::Lapse,
+        Err(IngestError::Refused { text, .. }) => MessageOutcome::Dead(DeadReason::Refused(text.clone())),
+        Err(_) => MessageOutcome::Lapse,
     }
 }
 
 /// A dead letter without a dead-letter queue comes back ever more slowly.
-pub fn blocked(receives: i32) -> Fate {
+pub fn blocked(receives: i32) -> MessageOutcome {
     later(receives, LONGEST_WAIT, Later::Blocked)
 }
 
@@ -220,9 +225,9 @@ fn is_overdue(envelope: &Envelope, rules: &Rules, now_ms: i64) -> bool {
     now_ms.saturating_sub(envelope.sent_ms) > rules.unknown_after_ms
 }
 
-fn later(receives: i32, longest: i32, why: Later) -> Fate {
+fn later(receives: i32, longest: i32, why: Later) -> MessageOutcome {
     let doublings = u32::try_from(receives - 1).unwrap_or(0).min(10);
-    Fate::Later {
+    MessageOutcome::Later {
         seconds: (FIRST_WAIT << doublings).min(longest),
         why,
     }

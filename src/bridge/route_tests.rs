@@ -53,19 +53,19 @@ fn envelope(challenge: i64, phase: i64, age_seconds: i64) -> Envelope {
     }
 }
 
-fn to(name: &str) -> Fate {
-    Fate::Ingest {
+fn to(name: &str) -> MessageOutcome {
+    MessageOutcome::Ingest {
         namespace: "ns".into(),
         leaderboard: name.into(),
     }
 }
 
-fn wait(seconds: i32, why: Later) -> Fate {
-    Fate::Later { seconds, why }
+fn wait(seconds: i32, why: Later) -> MessageOutcome {
+    MessageOutcome::Later { seconds, why }
 }
 
-fn unknown(challenge: i64, phase: i64) -> Fate {
-    Fate::Dead(DeadReason::Unknown(format!(
+fn unknown(challenge: i64, phase: i64) -> MessageOutcome {
+    MessageOutcome::Dead(DeadReason::Unknown(format!(
         "no Leaderboard that reads this queue serves challenge {challenge}, phase {phase}"
     )))
 }
@@ -78,7 +78,7 @@ fn queue_mut(leaderboard: &mut Leaderboard) -> &mut Queue {
     leaderboard.spec.queue.as_mut().unwrap()
 }
 
-fn check(what: &str, envelope: &Envelope, readers: &[Arc<Leaderboard>], synced: bool, want: &Fate) {
+fn check(what: &str, envelope: &Envelope, readers: &[Arc<Leaderboard>], synced: bool, want: &MessageOutcome) {
     assert_eq!(route(envelope, readers, NOW, synced), *want, "{what}");
 }
 
@@ -100,7 +100,7 @@ fn a_known_message_goes_to_its_leaderboard() {
         &envelope(1, 2, 0),
         &[],
         true,
-        &Fate::Lapse,
+        &MessageOutcome::Lapse,
     );
 }
 
@@ -136,7 +136,7 @@ fn a_malformed_message_is_given_up_at_once() {
         content: Err(why),
         ..envelope(1, 2, 0)
     };
-    let dead = |why: &Malformed| Fate::Dead(DeadReason::Malformed(why.to_string()));
+    let dead = |why: &Malformed| MessageOutcome::Dead(DeadReason::Malformed(why.to_string()));
     for why in [
         Malformed::NotAnObject,
         Malformed::Missing("phase_pk"),
@@ -173,7 +173,7 @@ fn waits_double_up_to_their_limit() {
         NOW,
         true,
     ) {
-        Fate::Later { seconds, .. } => seconds,
+        MessageOutcome::Later { seconds, .. } => seconds,
         other => panic!("{other:?}"),
     };
     let receives = [0, 1, 2, 3, 4, 5, 6, 7, 1000, i32::MAX];
@@ -250,24 +250,24 @@ fn each_outcome_of_ingest_settles_its_message() {
             name: "submission-7".into(),
         })
     };
-    let cases: Vec<(Result<Outcome, IngestError>, i64, Fate)> = vec![
-        (Ok(Outcome::Created), 0, Fate::Delete(Done::Created)),
-        (Ok(Outcome::Bumped(2)), 0, Fate::Delete(Done::Bumped)),
-        (Ok(Outcome::Repeat), 0, Fate::Delete(Done::Repeat)),
+    let cases: Vec<(Result<Outcome, IngestError>, i64, MessageOutcome)> = vec![
+        (Ok(Outcome::Created), 0, MessageOutcome::Delete(Done::Created)),
+        (Ok(Outcome::Bumped(2)), 0, MessageOutcome::Delete(Done::Bumped)),
+        (Ok(Outcome::Repeat), 0, MessageOutcome::Delete(Done::Repeat)),
         (Ok(Outcome::Deleting), 90_000, wait(30, Later::Deleting)),
         (
             Ok(Outcome::IdTaken("x".into())),
             0,
-            Fate::Dead(DeadReason::IdTaken("x".into())),
+            MessageOutcome::Dead(DeadReason::IdTaken("x".into())),
         ),
         (refused(), 900, wait(30, Later::Refused)),
         (
             refused(),
             901,
-            Fate::Dead(DeadReason::Refused("spec.image is wrong".into())),
+            MessageOutcome::Dead(DeadReason::Refused("spec.image is wrong".into())),
         ),
-        (timeout(), 90_000, Fate::Lapse),
-        (contended(), 90_000, Fate::Lapse),
+        (timeout(), 90_000, MessageOutcome::Lapse),
+        (contended(), 90_000, MessageOutcome::Lapse),
     ];
     let rules = rules(&one());
     for (outcome, age, want) in cases {

@@ -1,8 +1,7 @@
-//! The command line of `leaderboard-operator`: flags, environment, and which room each subcommand enters.
+//! The command line of `leaderboard-operator`: flags, environment, and which module each subcommand runs.
 //!
 //! Called by the binary alone. Every flag of a server can be given as an environment variable, as the chart does.
 
-mod counters;
 mod offline;
 mod serve;
 
@@ -22,17 +21,17 @@ pub struct Cli {
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Drives Submissions through their states; the leader of its replicas does.
+    /// Run the controller (only the elected leader reconciles).
     Controller(Controller),
-    /// Makes a Submission from each message of the Leaderboards' queues.
+    /// Create a Submission for each message of the Leaderboards' queues.
     Bridge(Server),
-    /// Prepares the volumes of a submission's Pod (an init container).
+    /// Prepare the volumes of a submission's Pod (an init container).
     Workspace(InPod),
-    /// Merges, uploads and reports the results of a submission's Pod (a sidecar).
+    /// Merge, upload and report the results of a submission's Pod (a sidecar).
     Logcopy(InPod),
-    /// Prints the custom resource definitions.
+    /// Print the custom resource definitions.
     Crd,
-    /// Merges and renders checkpoint files without a cluster.
+    /// Merge and render checkpoint files without a cluster.
     #[command(after_help = offline::EXIT_CODES)]
     Results(offline::Results),
 }
@@ -40,13 +39,13 @@ enum Command {
 /// What the servers have in common.
 #[derive(Args, Debug)]
 struct Server {
-    /// Only this namespace; all of them if empty.
+    /// The namespace to serve; all namespaces if empty.
     #[arg(long, env = "LEADERBOARD_NAMESPACE", default_value = "")]
     namespace: String,
-    /// Where /livez, /readyz and /metrics are served.
+    /// Address of /livez, /readyz and /metrics.
     #[arg(long, env = "LEADERBOARD_HTTP", default_value = "0.0.0.0:8080")]
     http: std::net::SocketAddr,
-    /// Form of the log.
+    /// Log format.
     #[arg(long, env = "LEADERBOARD_LOG_FORMAT", value_enum, default_value = "auto")]
     log_format: Format,
 }
@@ -55,13 +54,13 @@ struct Server {
 struct Controller {
     #[command(flatten)]
     server: Server,
-    /// The operator's own image, which Pods use for workspace and logcopy.
+    /// The operator's own image, used in Pods for workspace and logcopy.
     #[arg(long, env = "LEADERBOARD_IMAGE")]
     image: String,
     /// Pull policy of that image in Pods.
     #[arg(long, env = "LEADERBOARD_IMAGE_PULL_POLICY")]
     image_pull_policy: Option<String>,
-    /// Passes at once.
+    /// Maximum concurrent reconciles.
     #[arg(long, env = "LEADERBOARD_CONCURRENCY", default_value_t = 16, value_parser = clap::value_parser!(u16).range(1..=256))]
     concurrency: u16,
     /// Namespace of the Lease: the operator's own.
@@ -78,13 +77,13 @@ struct Controller {
     pod_uid: String,
 }
 
-/// How to run a Pod's program outside of a Pod. In one, all of it is as it is by default.
+/// How to run a Pod's program outside of a Pod. Within a Pod the defaults are right.
 #[derive(Args, Debug)]
 struct InPod {
-    /// Folder below which the Pod's mounts lie.
+    /// Folder with the Pod's mounts.
     #[arg(long, default_value = "/", hide = true)]
     root: std::path::PathBuf,
-    /// Divides the times it waits for what cannot be seen.
+    /// Divides the times it waits for what cannot be observed.
     #[arg(long, default_value_t = 1, hide = true)]
     faster: u32,
 }

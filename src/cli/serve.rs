@@ -1,5 +1,5 @@
 //! Subcommands that stay: `controller`, `bridge`, and the two programs of a Pod. Sets up logging, TLS, clients and the
-//! stop signal, then enters a room.
+//! stop signal, then runs the program's module.
 
 use std::future::Future;
 use std::process::ExitCode;
@@ -7,11 +7,11 @@ use std::process::ExitCode;
 use kube::{Client, Config};
 
 use super::{Controller, InPod, Server};
-use crate::bridge::{self, Health};
+use crate::bridge;
 use crate::controller::context::Settings;
 use crate::controller::leader::{self, Identity};
-use crate::controller::run::{self, Clients};
-use crate::kubernetes::watch_client;
+use crate::controller::run;
+use crate::kubernetes::{Clients, watch_client};
 use crate::observability::Observability;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
@@ -59,7 +59,7 @@ fn setting(options: &InPod) -> Result<Setting, String> {
     Setting::read(Places::below(&options.root), pace).map_err(|e| e.to_string())
 }
 
-/// Logs, then works until the end; an error is the last line of the log and the exit code.
+/// Sets up the log, then works until the end; an error is the last line of the log and the exit code.
 fn start<W>(program: &'static str, format: Format, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
@@ -102,12 +102,12 @@ where
 }
 
 async fn lead(options: Controller) -> Result<(), String> {
-    let seen = Observability::new(on_signals().map_err(|e| e.to_string())?);
-    let health = HealthServer::start(options.server.http, seen.clone())
+    let telemetry = Observability::new(on_signals().map_err(|e| e.to_string())?);
+    let health = HealthServer::start(options.server.http, telemetry.clone())
         .await
         .map_err(|e| e.to_string())?;
     let config = cluster().await?;
-    let clients = Clients {
+    let clients = run::Clients {
         api: Client::try_from(config.clone()).map_err(|e| client_errors::kube(&e))?,
         watch: watch_client(config.clone()).map_err(|e| client_errors::kube(&e))?,
         lease: leader::lease_client(config).map_err(|e| client_errors::kube(&e))?,
@@ -122,27 +122,18 @@ async fn lead(options: Controller) -> Result<(), String> {
         namespace: namespace(&options.server.namespace),
         concurrency: options.concurrency,
     };
-    let result = run::run(clients, lease, settings, aws, seen).await;
+    let result = run::run(clients, lease, settings, aws, telemetry).await;
     health.close().await;
     result.map_err(|e| e.to_string())
 }
 
 async fn serve_bridge(options: Server) -> Result<(), String> {
-    let seen = Observability::new(on_signals().map_err(|e| e.to_string())?);
-    let server = HealthServer::start(options.http, seen.clone())
+    let telemetry = Observability::new(on_signals().map_err(|e| e.to_string())?);
+    let server = HealthServer::start(options.http, telemetry.clone())
         .await
         .map_err(|e| e.to_string())?;
-    let client = Client::try_from(cluster().await?).map_err(|e| client_errors::kube(&e))?;
-    let health = std::sync::Arc::new(Health::default());
-    let settings = bridge::Settings {
-        namespace: namespace(&options.namespace),
-        health: std::sync::Arc::clone(&health),
-        observer: std::sync::Arc::new(super::counters::BridgeCounters::new(&seen)),
-    };
-    let reporting = super::counters::report_readiness(health, seen.clone());
-    let reporting = seen.tasks.stay("readiness", reporting);
-    let result = bridge::run(client, Aws::load().await, seen.tasks.clone(), settings).await;
-    reporting.abort();
+    let clients = Clients::new(cluster().await?).map_err(|e| client_errors::kube(&e))?;
+    let result = bridge::run(clients, Aws::load().await, namespace(&options.namespace), telemetry).await;
     server.close().await;
     result.map_err(|e| e.to_string())
 }

@@ -90,7 +90,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         mpsc::unbounded_channel().0,
     );
     let hub = Hub::new(Options {
-        fence: std::sync::Arc::new(|| true),
+        write_guard: std::sync::Arc::new(|| true),
         not_before: Instant::now(),
         changed,
         sweep,

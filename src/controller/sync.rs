@@ -15,7 +15,9 @@ use super::reruns;
 use super::result_texts::{self, TextError};
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
 use crate::services::ObjectKey;
-use crate::services::evalai::{self, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Target, Wish};
+use crate::services::evalai::{
+    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Subject, SubmissionState, Target,
+};
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
 
@@ -97,27 +99,27 @@ impl Sync {
 
     /// Asks EvalAI whether a submission wants to run, or what became of one that has ended.
     pub fn ask(&self, view: &View) {
-        let Some(way) = self.way(view) else { return };
+        let Some(subject) = self.subject(view) else { return };
         let wants_image = wants_image(&view.submission);
-        let asked = self.hub.ask(&way.target, &way.key, way.pk, &way.run, wants_image);
+        let asked = self.hub.ask(&subject, wants_image);
         log_refused(&view.submission, asked);
     }
 
     /// Looks for a submission's end in EvalAI from now on, also while it waits before anything of it runs.
     pub fn follow(&self, view: &View, status: &SubmissionStatus) {
-        let Some(way) = self.way(view) else { return };
+        let Some(subject) = self.subject(view) else { return };
         let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
-        let followed = self.hub.live(&way.target, &way.key, way.pk, &way.run, since);
+        let followed = self.hub.live(&subject, since);
         log_refused(&view.submission, followed);
     }
 
     /// Tells EvalAI. Texts that cannot be read now are told by a later pass.
     pub async fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: Tell) {
-        let Some(way) = self.way(view) else { return };
-        let wish = match tell {
-            Tell::Queued => Some(Wish::Queued),
-            Tell::Running => Some(Wish::Running),
-            Tell::Partial => partial(context, view).await.map(Wish::Partial),
+        let Some(subject) = self.subject(view) else { return };
+        let update = match tell {
+            Tell::Queued => Some(DesiredUpdate::Queued),
+            Tell::Running => Some(DesiredUpdate::Running),
+            Tell::Partial => partial(context, view).await.map(DesiredUpdate::Partial),
             Tell::Finished => final_wish(context, view, status, Outcome::Finished).await,
             Tell::Failed => final_wish(context, view, status, Outcome::Failed).await,
             Tell::Cancelled => final_wish(context, view, status, Outcome::Cancelled).await,
@@ -125,11 +127,8 @@ impl Sync {
         if matches!(tell, Tell::Queued | Tell::Running) {
             self.follow(view, status);
         }
-        if let Some(wish) = wish {
-            log_refused(
-                &view.submission,
-                self.hub.wish(&way.target, &way.key, way.pk, &way.run, wish),
-            );
+        if let Some(update) = update {
+            log_refused(&view.submission, self.hub.update(&subject, update));
         }
     }
 
@@ -165,10 +164,10 @@ impl Sync {
         self.recorder.forget(key);
     }
 
-    fn way(&self, view: &View) -> Option<Way> {
+    fn subject(&self, view: &View) -> Option<Subject> {
         let evalai = view.submission.spec.evalai?;
         let target = self.target(view.leaderboard.as_deref()?)?;
-        Some(Way {
+        Some(Subject {
             target,
             key: object_key(view.submission.as_ref()),
             pk: evalai.submission,
@@ -187,13 +186,6 @@ fn run_of(submission: &Submission) -> Run {
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
         has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
     }
-}
-
-struct Way {
-    target: Arc<Target>,
-    key: ObjectKey,
-    pk: i64,
-    run: Run,
 }
 
 async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
@@ -248,7 +240,12 @@ fn may_wait(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> 
     view.now < patience.min(release)
 }
 
-async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> Option<Wish> {
+async fn final_wish(
+    context: &Context,
+    view: &View,
+    status: &SubmissionStatus,
+    outcome: Outcome,
+) -> Option<DesiredUpdate> {
     let sight = last_report(context, view).await;
     let mut payload = match &sight {
         ReportSight::Ours(report) => match result_texts::payload(context, view, report).await {
@@ -276,7 +273,7 @@ async fn final_wish(context: &Context, view: &View, status: &SubmissionStatus, o
         let tail = context.failure_logs.tail(&uid, status);
         result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
     }
-    Some(Wish::Final(outcome, Arc::new(payload)))
+    Some(DesiredUpdate::Final(outcome, Arc::new(payload)))
 }
 
 /// Whether it is run only with an image that EvalAI names.
@@ -286,7 +283,7 @@ fn wants_image(submission: &Submission) -> bool {
     submission.spec.image.is_none() && !has_ended
 }
 
-fn map_view(seen: &evalai::View, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
+fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
     let attempt = submission.spec.attempt;
     // An image that was asked for is waited for; why there is none is an answer too.
     let image_known = !wants_image(submission) || seen.image.is_some();
@@ -348,7 +345,7 @@ fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
 
 fn log_refused(submission: &Submission, result: Result<(), evalai::client::ClientError>) {
     if let Err(error) = result {
-        tracing::error!(submission = %submission.name_any(), %error, "EvalAI cannot be spoken to");
+        tracing::error!(submission = %submission.name_any(), %error, "cannot create EvalAI client");
     }
 }
 

@@ -17,7 +17,7 @@ use kube::{Api, Client, Resource};
 use serde::de::DeserializeOwned;
 
 pub use feed::{WatchEvent, WatchEvents};
-pub use watch::{Synced, Watch, spawn_watch};
+pub use watch::{Synced, Unreadable, Watch, spawn_watch};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.
 const READ_TIMEOUT: Duration = Duration::from_mins(5);
@@ -33,12 +33,36 @@ impl<K> Watchable for K where
 {
 }
 
+/// One client for calls, one whose dead connections end for watches.
+#[derive(Clone)]
+pub struct Clients {
+    pub api: Client,
+    pub watch: Client,
+}
+
+impl Clients {
+    /// Both for one API server.
+    ///
+    /// # Errors
+    /// If the configuration holds no usable TLS or credentials.
+    pub fn new(config: kube::Config) -> Result<Self, kube::Error> {
+        Ok(Self {
+            api: Client::try_from(config.clone())?,
+            watch: watch_client(config)?,
+        })
+    }
+}
+
 /// A client for watches: a list or a watch on a dead connection ends within minutes.
 ///
 /// # Errors
 /// If the configuration holds no usable TLS or credentials.
-pub fn watch_client(mut config: kube::Config) -> Result<Client, kube::Error> {
-    config.read_timeout = Some(READ_TIMEOUT);
+pub fn watch_client(config: kube::Config) -> Result<Client, kube::Error> {
+    client_with(config, READ_TIMEOUT)
+}
+
+fn client_with(mut config: kube::Config, read_timeout: Duration) -> Result<Client, kube::Error> {
+    config.read_timeout = Some(read_timeout);
     Client::try_from(config)
 }
 

@@ -266,6 +266,80 @@ async fn a_list_that_is_never_answered_fails_liveness_while_others_are() {
     );
 }
 
+/// An API server that lists one Leaderboard; its watches bring nothing and never end, as on a half-open connection.
+async fn silent_server(watches: mpsc::UnboundedSender<()>) -> kube::Config {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let router = axum::Router::new().fallback(move |request: axum::extract::Request| {
+        let is_watch = request.uri().query().is_some_and(|query| query.contains("watch=true"));
+        let watches = watches.clone();
+        async move {
+            if is_watch {
+                watches.send(()).unwrap();
+                let silence = futures::stream::pending::<Result<Vec<u8>, std::io::Error>>();
+                return axum::body::Body::from_stream(silence);
+            }
+            let Answer::Json(_, list) = list(&[board("a", "1", "5")]) else {
+                unreachable!()
+            };
+            axum::body::Body::from(list.to_string())
+        }
+    });
+    tokio::spawn(async move { axum::serve(listener, router).await });
+    kube::Config::new(format!("http://{address}").parse().unwrap())
+}
+
+#[tokio::test]
+async fn a_watch_on_a_half_open_connection_ends_by_the_read_timeout_and_begins_again() {
+    let (begun, mut watches) = mpsc::unbounded_channel();
+    let config = silent_server(begun).await;
+    let client = client_with(config, Duration::from_millis(200)).unwrap();
+    let (_stop, receiver) = Stop::new();
+    let telemetry = Observability::new(receiver);
+    let watch = spawn_watch::<Leaderboard>(guarded(client, Some("ns")), Config::default(), |_| {}, &telemetry);
+    for _ in 0..2 {
+        timeout(LIMIT, watches.recv()).await.unwrap().unwrap();
+    }
+    let metrics = telemetry.metrics.text().unwrap();
+    assert!(
+        metrics.contains("leaderboard_watch_errors_total{kind=\"Leaderboard\"} 1"),
+        "{metrics}"
+    );
+    assert_eq!(watch.store.len(), 1);
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_unreadable_object_leaves_the_cache_incomplete_until_it_can_be_read() {
+    let mut rig = rig(vec![list(&[board("a", "1", "5")])]);
+    assert!(!rig.watch.is_complete());
+    assert_eq!(rig.next().await, event("a", "5", false));
+    assert!(rig.watch.is_complete());
+    rig.send(vec![Answer::Watch(vec![
+        line("ADDED", &malformed("bad", "2", "11")),
+        line("ADDED", &board("b", "3", "12")),
+    ])]);
+    assert_eq!(rig.next().await, event("b", "12", false));
+    assert!(!rig.watch.is_complete());
+    rig.send(vec![Answer::Watch(vec![line("MODIFIED", &board("bad", "2", "13"))])]);
+    assert_eq!(rig.next().await, event("bad", "13", false));
+    assert!(rig.watch.is_complete());
+    rig.send(vec![
+        Answer::Watch(vec![gone()]),
+        list(&[malformed("bad", "2", "20"), board("b", "3", "21")]),
+    ]);
+    let mut listed = vec![rig.next().await, rig.next().await];
+    listed.sort();
+    assert_eq!(listed, [event("a", "5", true), event("b", "21", false)]);
+    assert!(!rig.watch.is_complete());
+    rig.send(vec![Answer::Watch(vec![
+        line("DELETED", &malformed("bad", "2", "22")),
+        line("MODIFIED", &board("b", "3", "23")),
+    ])]);
+    assert_eq!(rig.next().await, event("bad", "13", true));
+    assert_eq!(rig.next().await, event("b", "23", false));
+    assert!(rig.watch.is_complete());
+}
+
 #[tokio::test(start_paused = true)]
 async fn a_late_subscriber_gets_what_is_there() {
     let mut rig = rig(vec![list(&[board("a", "1", "5")])]);

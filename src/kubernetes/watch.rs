@@ -3,10 +3,10 @@
 //! One task each, because a shared backoff would let one broken watch hold up all others. Errors are logged, counted and
 //! retried here; readers only ever get objects.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::pin::Pin;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use futures::{Stream, StreamExt};
@@ -34,6 +34,8 @@ pub struct Watch<K: Watchable> {
     pub store: Store<K>,
     /// Whether the store is in sync with the API server.
     pub synced: Synced,
+    /// What exists and is not in the store, or only as it was before.
+    pub unreadable: Unreadable,
     feed: Feed<K>,
 }
 
@@ -53,17 +55,44 @@ impl Synced {
     }
 }
 
+/// The objects that this program can't read now, by namespace and name. Clones are the same.
+#[derive(Clone, Debug, Default)]
+pub struct Unreadable(Arc<Mutex<BTreeSet<ObjectName>>>);
+
+type ObjectName = (Option<String>, String);
+
+impl Unreadable {
+    /// There is none.
+    pub fn is_empty(&self) -> bool {
+        self.names().is_empty()
+    }
+
+    fn names(&self) -> MutexGuard<'_, BTreeSet<ObjectName>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn name_of(object: &impl ResourceExt) -> ObjectName {
+    (object.namespace(), object.name_any())
+}
+
 impl<K: Watchable> Clone for Watch<K> {
     fn clone(&self) -> Self {
         Self {
             store: self.store.clone(),
             synced: self.synced.clone(),
+            unreadable: self.unreadable.clone(),
             feed: self.feed.clone(),
         }
     }
 }
 
 impl<K: Watchable> Watch<K> {
+    /// Whether the store holds every object, each as it is.
+    pub fn is_complete(&self) -> bool {
+        self.synced.is_true() && self.unreadable.is_empty()
+    }
+
     /// All objects that exist now, then each that is added, changed or deleted. The store is at least as new as each event.
     pub fn subscribe(&self) -> WatchEvents<K> {
         self.feed.subscribe(|| self.store.state())
@@ -82,6 +111,7 @@ pub fn spawn_watch<K: Watchable>(
     let watch = Watch {
         store: writer.as_reader(),
         synced: Synced::default(),
+        unreadable: Unreadable::default(),
         feed: Feed::new(),
     };
     let kind = K::kind(&()).into_owned();
@@ -96,6 +126,8 @@ pub fn spawn_watch<K: Watchable>(
         writer,
         feed: watch.feed.clone(),
         synced: watch.synced.clone(),
+        unreadable: watch.unreadable.clone(),
+        listing: BTreeSet::new(),
     };
     task.missing("the first list has not come yet");
     let name = format!("watch of {}", K::plural(&()));
@@ -117,6 +149,9 @@ struct Task<K: Watchable> {
     writer: Writer<K>,
     feed: Feed<K>,
     synced: Synced,
+    unreadable: Unreadable,
+    /// The unreadable objects of the list under way.
+    listing: BTreeSet<ObjectName>,
 }
 
 type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<DeserializeGuard<K>>, Error>> + Send>>;
@@ -165,6 +200,7 @@ impl<K: Watchable> Task<K> {
         if matches!(event, Event::Init) {
             // The beginning of a list is a request, not an answer.
             self.probe.listing();
+            self.listing.clear();
             return self.writer.apply_watcher_event(&Event::Init);
         }
         self.metrics.event();
@@ -178,7 +214,12 @@ impl<K: Watchable> Task<K> {
 
     fn apply(&mut self, object: DeserializeGuard<K>) {
         self.probe.running();
-        let Some(object) = self.read(object) else { return };
+        let name = name_of(&object);
+        let Some(object) = self.read(object) else {
+            self.unreadable.names().insert(name);
+            return;
+        };
+        self.unreadable.names().remove(&name);
         let key = ObjectRef::from_obj(&object);
         let before = self.store.get(&key);
         self.writer.apply_watcher_event(&Event::Apply(object));
@@ -194,6 +235,7 @@ impl<K: Watchable> Task<K> {
 
     fn delete(&mut self, object: DeserializeGuard<K>) {
         self.probe.running();
+        self.unreadable.names().remove(&name_of(&object));
         let last = match object.0 {
             Ok(mut object) => {
                 self.trim(&mut object);
@@ -212,9 +254,9 @@ impl<K: Watchable> Task<K> {
     }
 
     fn listed(&mut self, object: DeserializeGuard<K>) {
-        let namespace = object.namespace();
-        let name = object.name_any();
+        let (namespace, name) = name_of(&object);
         let object = self.read(object).or_else(|| {
+            self.listing.insert((namespace.clone(), name.clone()));
             // One that has become unreadable stays as it was last read: it has not been deleted.
             let mut key = ObjectRef::<K>::new(&name);
             key.namespace = namespace;
@@ -233,6 +275,7 @@ impl<K: Watchable> Task<K> {
             .map(|object| (object.uid(), object))
             .collect();
         self.writer.apply_watcher_event(&Event::InitDone);
+        *self.unreadable.names() = std::mem::take(&mut self.listing);
         self.probe.listed();
         // Before anyone is woken by what was listed.
         if !self.synced.is_true() {

@@ -1,6 +1,6 @@
 //! Every metric of the operator, as one typed struct: what is counted, with which labels.
 //!
-//! Parts call the methods; the health server asks for the text. Labels hold kinds, outcomes and fixed words only, never
+//! Parts call the methods; the health server asks for the text. Labels hold kinds, outcomes and other fixed values only, never
 //! the name of an object, so that their number stays small.
 
 use std::fmt;
@@ -68,8 +68,8 @@ struct ServiceOp {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
-struct Fate {
-    fate: &'static str,
+struct MessageOutcome {
+    outcome: &'static str,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -81,24 +81,48 @@ struct Build {
 #[derive(Debug)]
 pub struct Metrics {
     registry: Registry,
-    reconciles: Family<KindOutcome, Counter>,
-    reconcile_seconds: Timings<Kind>,
-    reconcile_errors: Family<KindReason, Counter>,
-    waiting_passes: Gauge,
-    watch_errors: Family<Kind, Counter>,
-    watch_malformed: Family<Kind, Counter>,
-    watch_last_event: Family<Kind, FloatGauge>,
-    is_leader: Gauge,
-    leader_term: Gauge,
-    lease_errors: Family<Reason, Counter>,
+    reconciles: Reconciles,
+    watches: Watches,
+    leader: Leader,
     submissions: Family<State, Gauge>,
-    evalai_requests: Family<Op, Counter>,
-    evalai_request_seconds: Timings<ServiceOp>,
-    evalai_budget_used: Gauge,
-    evalai_waiting: Gauge,
-    cloud_calls: Family<Call, Counter>,
-    cloud_call_seconds: Timings<ServiceOp>,
-    sqs_messages: Family<Fate, Counter>,
+    evalai: Evalai,
+    cloud: Cloud,
+}
+
+#[derive(Debug)]
+struct Reconciles {
+    total: Family<KindOutcome, Counter>,
+    seconds: Timings<Kind>,
+    errors: Family<KindReason, Counter>,
+}
+
+#[derive(Debug)]
+struct Watches {
+    errors: Family<Kind, Counter>,
+    malformed: Family<Kind, Counter>,
+    last_event: Family<Kind, FloatGauge>,
+}
+
+#[derive(Debug)]
+struct Leader {
+    leads: Gauge,
+    term: Gauge,
+    errors: Family<Reason, Counter>,
+}
+
+#[derive(Debug)]
+struct Evalai {
+    requests: Family<Op, Counter>,
+    seconds: Timings<ServiceOp>,
+    budget_used: Gauge,
+    waiting: Gauge,
+}
+
+#[derive(Debug)]
+struct Cloud {
+    calls: Family<Call, Counter>,
+    seconds: Timings<ServiceOp>,
+    messages: Family<MessageOutcome, Counter>,
 }
 
 impl Default for Metrics {
@@ -107,17 +131,83 @@ impl Default for Metrics {
     }
 }
 
-/// From 1 ms to half a minute: passes and calls.
-fn timing() -> Histogram {
-    Histogram::new([
-        0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0,
-    ])
+/// From 1 ms to half a minute: reconciles and calls.
+fn timings<L: Clone + std::hash::Hash + Eq>() -> Timings<L> {
+    Family::new_with_constructor(|| {
+        Histogram::new([
+            0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0,
+        ])
+    })
 }
 
 /// Registers a metric and hands it back.
 fn add<M: Metric + Clone>(registry: &mut Registry, name: &str, help: &str, metric: M) -> M {
     registry.register(name, help, metric.clone());
     metric
+}
+
+/// Registers a metric that begins at zero.
+fn zero<M: Metric + Clone + Default>(registry: &mut Registry, name: &str, help: &str) -> M {
+    add(registry, name, help, M::default())
+}
+
+impl Reconciles {
+    fn new(r: &mut Registry) -> Self {
+        Self {
+            total: zero(r, "reconciles", "Reconciliations by kind and outcome"),
+            seconds: add(r, "reconcile_seconds", "Duration of a reconciliation", timings()),
+            errors: zero(r, "reconcile_errors", "Failed reconciliations by kind and reason"),
+        }
+    }
+}
+
+impl Watches {
+    fn new(r: &mut Registry) -> Self {
+        Self {
+            errors: zero(r, "watch_errors", "Errors of a kind's watch"),
+            malformed: zero(r, "watch_malformed_objects", "Objects that could not be read"),
+            last_event: zero(
+                r,
+                "watch_last_event_timestamp_seconds",
+                "Unix time of a watch's last event",
+            ),
+        }
+    }
+}
+
+impl Leader {
+    fn new(r: &mut Registry) -> Self {
+        Self {
+            leads: zero(r, "is_leader", "1 while this process leads"),
+            term: zero(r, "leader_term", "Term in which this process leads or led last"),
+            errors: zero(r, "lease_errors", "Failed calls about the Lease by reason"),
+        }
+    }
+}
+
+impl Evalai {
+    fn new(r: &mut Registry) -> Self {
+        Self {
+            requests: zero(r, "evalai_requests", "Requests to EvalAI by operation and outcome"),
+            seconds: add(r, "evalai_request_seconds", "Duration of requests to EvalAI", timings()),
+            budget_used: zero(r, "evalai_budget_used", "Requests to EvalAI within the last minute"),
+            waiting: zero(
+                r,
+                "evalai_waiting",
+                "Updates and questions that wait for a request to EvalAI",
+            ),
+        }
+    }
+}
+
+impl Cloud {
+    fn new(r: &mut Registry) -> Self {
+        Self {
+            calls: zero(r, "cloud_calls", "Calls to AWS by service, operation and outcome"),
+            seconds: add(r, "cloud_call_seconds", "Duration of calls to AWS", timings()),
+            messages: zero(r, "sqs_messages", "Messages by outcome"),
+        }
+    }
 }
 
 impl Metrics {
@@ -128,81 +218,14 @@ impl Metrics {
         let build = Build {
             version: env!("CARGO_PKG_VERSION"),
         };
-        r.register("build", "The program that runs", Info::new(build));
+        r.register("build", "The running program", Info::new(build));
         Self {
-            reconciles: add(r, "reconciles", "Passes by kind and outcome", Family::default()),
-            reconcile_seconds: add(
-                r,
-                "reconcile_seconds",
-                "Duration of a pass",
-                Family::new_with_constructor(timing as fn() -> _),
-            ),
-            reconcile_errors: add(r, "reconcile_errors", "Failed passes by reason", Family::default()),
-            waiting_passes: add(r, "waiting_passes", "Objects that wait for a pass", Gauge::default()),
-            watch_errors: add(r, "watch_errors", "Errors of a kind's watch", Family::default()),
-            watch_malformed: add(
-                r,
-                "watch_malformed_objects",
-                "Objects that could not be read",
-                Family::default(),
-            ),
-            watch_last_event: add(
-                r,
-                "watch_last_event_seconds",
-                "Unix time of a watch's last event",
-                Family::default(),
-            ),
-            is_leader: add(r, "is_leader", "1 while this process leads", Gauge::default()),
-            leader_term: add(
-                r,
-                "leader_term",
-                "Term in which this process leads or led last",
-                Gauge::default(),
-            ),
-            lease_errors: add(
-                r,
-                "lease_errors",
-                "Failed calls about the Lease by reason",
-                Family::default(),
-            ),
-            submissions: add(r, "submissions", "Submissions by state", Family::default()),
-            evalai_requests: add(
-                r,
-                "evalai_requests",
-                "Requests to EvalAI by operation and outcome",
-                Family::default(),
-            ),
-            evalai_request_seconds: add(
-                r,
-                "evalai_request_seconds",
-                "Duration of requests to EvalAI",
-                Family::new_with_constructor(timing as fn() -> _),
-            ),
-            evalai_budget_used: add(
-                r,
-                "evalai_budget_used",
-                "Requests to EvalAI within the last minute",
-                Gauge::default(),
-            ),
-            evalai_waiting: add(
-                r,
-                "evalai_waiting",
-                "Wishes that wait for a request to EvalAI",
-                Gauge::default(),
-            ),
-            cloud_calls: add(
-                r,
-                "cloud_calls",
-                "Calls to AWS by service, operation and outcome",
-                Family::default(),
-            ),
-            cloud_call_seconds: add(
-                r,
-                "cloud_call_seconds",
-                "Duration of calls to AWS",
-                Family::new_with_constructor(timing as fn() -> _),
-            ),
-            sqs_messages: add(r, "sqs_messages", "Messages by what became of them", Family::default()),
+            reconciles: Reconciles::new(r),
+            watches: Watches::new(r),
+            leader: Leader::new(r),
+            submissions: zero(r, "submissions", "Submissions by state"),
+            evalai: Evalai::new(r),
+            cloud: Cloud::new(r),
             registry,
         }
     }
@@ -217,78 +240,79 @@ impl Metrics {
         Ok(text)
     }
 
-    /// A pass over an object of a kind is done.
+    /// A reconciliation of an object of a kind is done.
     pub fn reconciled(&self, kind: &'static str, outcome: &'static str, took: Duration) {
-        self.reconciles.get_or_create(&KindOutcome { kind, outcome }).inc();
-        self.reconcile_seconds
+        self.reconciles
+            .total
+            .get_or_create(&KindOutcome { kind, outcome })
+            .inc();
+        self.reconciles
+            .seconds
             .get_or_create(&Kind { kind: kind.to_owned() })
             .observe(took.as_secs_f64());
     }
 
-    /// A pass has failed; `reason` is a fixed word.
+    /// A reconciliation has failed; `reason` is one of a fixed set.
     pub fn reconcile_failed(&self, kind: &'static str, reason: &'static str) {
-        self.reconcile_errors.get_or_create(&KindReason { kind, reason }).inc();
-    }
-
-    /// So many objects wait for a pass.
-    pub fn set_waiting_passes(&self, count: usize) {
-        self.waiting_passes.set(whole(count));
+        self.reconciles.errors.get_or_create(&KindReason { kind, reason }).inc();
     }
 
     /// The counters of one kind's watch; they appear at once, at zero.
     pub fn watch(&self, kind: &str) -> WatchMetrics {
         let label = Kind { kind: kind.to_owned() };
         WatchMetrics {
-            errors: self.watch_errors.get_or_create_owned(&label),
-            malformed: self.watch_malformed.get_or_create_owned(&label),
-            last_event: self.watch_last_event.get_or_create_owned(&label),
+            errors: self.watches.errors.get_or_create_owned(&label),
+            malformed: self.watches.malformed.get_or_create_owned(&label),
+            last_event: self.watches.last_event.get_or_create_owned(&label),
         }
     }
 
     /// This process leads in a term, or does not lead.
     pub fn set_leading(&self, term: Option<i32>) {
-        self.is_leader.set(i64::from(term.is_some()));
+        self.leader.leads.set(i64::from(term.is_some()));
         if let Some(term) = term {
-            self.leader_term.set(term.into());
+            self.leader.term.set(term.into());
         }
     }
 
     /// A call about the Lease has failed.
     pub fn lease_failed(&self, reason: &'static str) {
-        self.lease_errors.get_or_create(&Reason { reason }).inc();
+        self.leader.errors.get_or_create(&Reason { reason }).inc();
     }
 
-    /// So many Submissions are in a state. States with none are to be told, too.
+    /// So many Submissions are in a state. States with none are to be set, too.
     pub fn set_submissions(&self, state: &'static str, count: usize) {
         self.submissions.get_or_create(&State { state }).set(whole(count));
     }
 
-    /// EvalAI was asked something.
+    /// A request to EvalAI is over.
     pub fn evalai_request(&self, op: &'static str, outcome: &'static str, took: Duration) {
         let service = "evalai";
-        self.evalai_requests.get_or_create(&Op { op, outcome }).inc();
-        self.evalai_request_seconds
+        self.evalai.requests.get_or_create(&Op { op, outcome }).inc();
+        self.evalai
+            .seconds
             .get_or_create(&ServiceOp { service, op })
             .observe(took.as_secs_f64());
     }
 
-    /// Requests within the last minute, over all tokens, and the wishes that wait for one.
+    /// Requests within the last minute, over all tokens, and the updates that wait for one.
     pub fn set_evalai_load(&self, used: usize, waiting: usize) {
-        self.evalai_budget_used.set(whole(used));
-        self.evalai_waiting.set(whole(waiting));
+        self.evalai.budget_used.set(whole(used));
+        self.evalai.waiting.set(whole(waiting));
     }
 
     /// A call to a service of AWS is over.
     pub fn cloud_call(&self, service: &'static str, op: &'static str, outcome: &'static str, took: Duration) {
-        self.cloud_calls.get_or_create(&Call { service, op, outcome }).inc();
-        self.cloud_call_seconds
+        self.cloud.calls.get_or_create(&Call { service, op, outcome }).inc();
+        self.cloud
+            .seconds
             .get_or_create(&ServiceOp { service, op })
             .observe(took.as_secs_f64());
     }
 
     /// What became of a message.
-    pub fn sqs_message(&self, fate: &'static str) {
-        self.sqs_messages.get_or_create(&Fate { fate }).inc();
+    pub fn sqs_message(&self, outcome: &'static str) {
+        self.cloud.messages.get_or_create(&MessageOutcome { outcome }).inc();
     }
 }
 
@@ -327,11 +351,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_metric_is_told_under_its_name_with_its_labels() {
+    fn every_metric_has_its_name_and_its_labels() {
         let metrics = Metrics::new();
         metrics.reconciled("Submission", "ok", Duration::from_millis(20));
         metrics.reconcile_failed("Submission", "conflict");
-        metrics.set_waiting_passes(3);
         let watch = metrics.watch("Job");
         watch.failed();
         watch.event();
@@ -348,7 +371,6 @@ mod tests {
             "leaderboard_reconciles_total{kind=\"Submission\",outcome=\"ok\"} 1",
             "leaderboard_reconcile_seconds_bucket{le=\"0.025\",kind=\"Submission\"} 1",
             "leaderboard_reconcile_errors_total{kind=\"Submission\",reason=\"conflict\"} 1",
-            "leaderboard_waiting_passes 3",
             "leaderboard_watch_errors_total{kind=\"Job\"} 1",
             "leaderboard_watch_malformed_objects_total{kind=\"Job\"} 0",
             "leaderboard_is_leader 1",
@@ -360,12 +382,12 @@ mod tests {
             "leaderboard_evalai_budget_used 54",
             "leaderboard_evalai_waiting 1",
             "leaderboard_cloud_calls_total{service=\"s3\",op=\"GetObject\",outcome=\"ok\"} 1",
-            "leaderboard_sqs_messages_total{fate=\"created\"} 1",
+            "leaderboard_sqs_messages_total{outcome=\"created\"} 1",
         ] {
             assert!(text.lines().any(|l| l == line), "{line} is missing in\n{text}");
         }
         assert!(
-            text.contains("leaderboard_watch_last_event_seconds{kind=\"Job\"} 1"),
+            text.contains("leaderboard_watch_last_event_timestamp_seconds{kind=\"Job\"} 1"),
             "a time since 1970 in\n{text}"
         );
         assert!(text.ends_with("# EOF\n"));

@@ -1,4 +1,4 @@
-//! What a failed AWS call means: whether somebody has to act, and a sentence for people.
+//! What a failed AWS call means: whether a person has to act, and a sentence for people.
 //!
 //! Called by everything that talks to AWS. Knows no service: error codes and HTTP statuses only.
 
@@ -6,6 +6,7 @@ use std::error::Error;
 
 use aws_sdk_sqs::config::http::HttpResponse;
 use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
+use leaderboard_api::client_errors;
 
 /// The kinds of failure that callers treat differently.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -25,7 +26,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// A word for metrics.
+    /// The value of a metric's label.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Denied => "denied",
@@ -38,7 +39,7 @@ impl Fault {
     }
 }
 
-/// Tells the kind of a failed call.
+/// The kind of a failed call.
 pub fn of<E>(error: &SdkError<E, HttpResponse>) -> Fault
 where
     E: ProvideErrorMetadata + Error + 'static,
@@ -104,7 +105,7 @@ fn of_answer(code: &str, status: u16) -> Fault {
     }
 }
 
-/// The failure as one line for people: the service's code and words, or what kept the request from being answered.
+/// The failure as one line for people: the service's code and message, or what kept the request from being answered.
 pub fn sentence<E>(error: &SdkError<E, HttpResponse>) -> String
 where
     E: ProvideErrorMetadata + Error + 'static,
@@ -116,17 +117,7 @@ where
             None => format!("{code} (HTTP {})", answer.raw().status().as_u16()),
         };
     }
-    let mut parts: Vec<String> = Vec::new();
-    let mut next: Option<&dyn Error> = Some(error);
-    while let Some(current) = next {
-        let text = current.to_string();
-        // Wrappers often repeat what they wrap.
-        if parts.last().is_none_or(|last| !last.contains(&text)) {
-            parts.push(text);
-        }
-        next = current.source();
-    }
-    parts.join(": ")
+    client_errors::chain(error)
 }
 
 #[cfg(test)]
@@ -134,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_and_statuses_tell_the_kind() {
+    fn the_kind_follows_from_code_and_status() {
         for (code, status, want) in [
             ("AccessDenied", 403, Fault::Denied),
             ("AWS.SimpleQueueService.NonExistentQueue", 400, Fault::Missing),

@@ -12,6 +12,7 @@ use aws_sdk_sqs::config::http::HttpResponse;
 use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
 
 use super::fault;
+use crate::observability::metrics::Metrics;
 
 /// A call that is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,6 +43,15 @@ impl Meter {
     /// Tells `listener` of every call.
     pub fn new(listener: impl Fn(&Call) + Send + Sync + 'static) -> Self {
         Self(Some(Arc::new(listener)))
+    }
+
+    /// Counts every call in the metrics of the process.
+    pub fn for_metrics(metrics: &Arc<Metrics>) -> Self {
+        let metrics = Arc::clone(metrics);
+        Self::new(move |call| match call.service {
+            "evalai" => metrics.evalai_request(call.op, call.outcome, call.took),
+            service => metrics.cloud_call(service, call.op, call.outcome, call.took),
+        })
     }
 
     /// A call begins. One that is dropped without an end, by a limit of time or a stop, was abandoned.

@@ -1,4 +1,4 @@
-//! Whether an SQS queue is there. Called by the controller's checks of a Leaderboard; messages are the bridge's alone.
+//! Whether an SQS queue exists. Called by the controller's checks of a Leaderboard; messages are the bridge's alone.
 
 use aws_sdk_sqs::types::QueueAttributeName;
 
@@ -6,7 +6,7 @@ use super::aws::Aws;
 use super::fault::{self, Fault};
 use leaderboard_api as api;
 
-/// Why a queue could not be looked at.
+/// Why a queue could not be checked.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("queue {url}: {text}; {}", self.next_step())]
 pub struct QueueError {
@@ -14,7 +14,7 @@ pub struct QueueError {
     pub url: String,
     /// What kind of failure.
     pub fault: Fault,
-    /// SQS's words.
+    /// SQS's message.
     pub text: String,
 }
 
@@ -22,19 +22,19 @@ impl QueueError {
     fn next_step(&self) -> &'static str {
         match self.fault {
             Fault::Denied => {
-                "the controller cannot tell whether it is there: give its AWS identity sqs:GetQueueAttributes on it"
+                "the controller cannot check whether it exists: give its AWS identity sqs:GetQueueAttributes on it"
             }
             Fault::Missing => "create it, or correct queue.url, queue.deadLetterURL, queue.region and queue.endpoint",
             Fault::Refused => "check queue.url, queue.deadLetterURL, queue.region and queue.endpoint",
             Fault::Throttled | Fault::Unavailable | Fault::Conflict => {
-                "it is asked again; check queue.endpoint and the network if this stays"
+                "it is retried; check queue.endpoint and the network if this stays"
             }
         }
     }
 }
 
-/// Looks whether a queue answers: the one that is read, or its dead-letter queue.
-pub async fn look(aws: &Aws, queue: &api::Queue, url: &str) -> Result<(), QueueError> {
+/// Checks whether a queue answers: the one that is read, or its dead-letter queue.
+pub async fn check(aws: &Aws, queue: &api::Queue, url: &str) -> Result<(), QueueError> {
     let client = aws.sqs(queue.region.as_deref(), queue.endpoint.as_deref());
     let request = client.get_queue_attributes().queue_url(url);
     let request = request.attribute_names(QueueAttributeName::QueueArn).send();

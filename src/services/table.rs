@@ -17,7 +17,7 @@ use aws_sdk_dynamodb::types::{
 };
 use thiserror::Error;
 
-pub use ledger::View;
+pub use ledger::RowState;
 pub use recorder::Recorder;
 
 use crate::services::aws::Aws;
@@ -58,7 +58,7 @@ pub struct Row {
     pub track_name: String,
     /// The participant's image.
     pub submitted_image_uri: String,
-    /// When it was submitted, as `time_text` writes it.
+    /// When it was submitted, as `2026-11-20 10:00:00 UTC`.
     pub submitted_time: String,
     /// When the attempt started.
     pub start_time: String,
@@ -111,11 +111,6 @@ fn condition(row: &Row) -> String {
 /// Columns and their values; those without one are removed.
 type Columns<'a> = BTreeMap<&'a str, Option<&'a str>>;
 
-/// A time as the columns hold it: `2026-11-20 10:00:00 UTC`.
-pub fn time_text(time: jiff::Timestamp) -> String {
-    time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string()
-}
-
 /// What became of a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Written {
@@ -138,14 +133,14 @@ pub enum TableError {
     /// There is no such table.
     #[error("table {table} does not exist: {text}; check table.name, table.region and table.endpoint")]
     Missing { table: String, text: String },
-    /// DynamoDB may take it later.
-    #[error("table {table}: {action} failed: {text}; it is tried again")]
+    /// DynamoDB may accept it later.
+    #[error("table {table}: {action} failed: {text}; it is retried")]
     Passing {
         table: String,
         action: &'static str,
         text: String,
     },
-    /// DynamoDB won't take it.
+    /// DynamoDB refuses it.
     #[error("table {table}: {action} was refused: {text}")]
     Refused {
         table: String,
@@ -220,11 +215,6 @@ impl Table {
             partition,
             sort,
         })
-    }
-
-    /// Names of partition and sort key.
-    pub fn key_names(&self) -> (&str, &str) {
-        (&self.partition.name, &self.sort.name)
     }
 
     /// Writes a row, unless the table holds a later one. Safe twice.
@@ -477,11 +467,5 @@ mod tests {
         let removed = |column| BTreeMap::from([(STATUS, Some("FAILED")), (column, None)]);
         assert!(is_same(&old("2", "FAILED"), 2, &removed("b")));
         assert!(!is_same(&old("2", "FAILED"), 2, &removed("a")), "it is still there");
-    }
-
-    #[test]
-    fn times_are_written_as_the_pipeline_did() {
-        let time: jiff::Timestamp = "2026-11-20T10:00:07.9Z".parse().unwrap();
-        assert_eq!(time_text(time), "2026-11-20 10:00:07 UTC");
     }
 }

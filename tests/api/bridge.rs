@@ -3,19 +3,22 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use aws_sdk_sqs::types::QueueAttributeName;
+use futures::StreamExt;
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{Api, ApiResource, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
+use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
 use leaderboard_api::{Ingested, Leaderboard, Submission, names};
+use leaderboard_operator::bridge;
 use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
-use leaderboard_operator::bridge::{self, Health, Observer, Settings};
+use leaderboard_operator::kubernetes::Clients;
+use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::observability::tasks::{TaskFailed, Tasks};
+use leaderboard_operator::observability::tasks::TaskFailed;
 use leaderboard_operator::services::aws::Aws;
 use leaderboard_operator::services::evalai::Swept;
 use serde_json::{Value, json};
@@ -78,12 +81,12 @@ impl StandIn {
             .unwrap();
     }
 
-    /// Waits until nothing is left in a queue, seen or unseen.
+    /// Waits until nothing is left in a queue, visible or in flight.
     pub(super) async fn drained(&self, url: &str) {
         eventually("the queue is empty", async || self.depth(url).await == (0, 0)).await;
     }
 
-    /// Messages that can be received, and that are in somebody's hands.
+    /// Messages that can be received, and messages in flight.
     pub(super) async fn depth(&self, url: &str) -> (u32, u32) {
         let all = self
             .sqs()
@@ -132,44 +135,37 @@ async fn eventually(what: &str, mut holds: impl AsyncFnMut() -> bool) {
     assert!(tokio::time::timeout(LIMIT, wait).await.is_ok(), "{what}");
 }
 
-/// Counts fates.
-#[derive(Default)]
-struct Counter(Mutex<BTreeMap<&'static str, u64>>);
-
-impl Observer for Counter {
-    fn messages(&self, fate: &'static str, count: u64) {
-        *self.0.lock().unwrap().entry(fate).or_default() += count;
-    }
-}
-
 /// A bridge of one namespace that runs until it is dropped.
 struct Bridge {
-    health: Arc<Health>,
-    counter: Arc<Counter>,
+    telemetry: Observability,
     stop: watch::Sender<bool>,
     task: tokio::task::JoinHandle<Result<(), TaskFailed>>,
 }
 
 impl Bridge {
-    fn start(client: Client, stand_in: &StandIn, namespace: &str) -> Self {
+    fn start(clients: Clients, stand_in: &StandIn, namespace: &str) -> Self {
         let (stop, stopped) = Stop::new();
-        let (health, counter) = (Arc::new(Health::default()), Arc::new(Counter::default()));
-        let settings = Settings {
-            namespace: Some(namespace.to_owned()),
-            health: health.clone(),
-            observer: counter.clone(),
-        };
-        let task = tokio::spawn(bridge::run(client, stand_in.aws.clone(), Tasks::new(stopped), settings));
+        let telemetry = Observability::new(stopped);
+        let aws = stand_in.aws.clone();
+        let running = bridge::run(clients, aws, Some(namespace.to_owned()), telemetry.clone());
         Self {
-            health,
-            counter,
+            telemetry,
             stop,
-            task,
+            task: tokio::spawn(running),
         }
     }
 
-    fn count(&self, fate: &str) -> u64 {
-        self.counter.0.lock().unwrap().get(fate).copied().unwrap_or_default()
+    /// So many messages had this outcome.
+    fn count(&self, outcome: &str) -> u64 {
+        let sample = format!("leaderboard_sqs_messages_total{{outcome=\"{outcome}\"}} ");
+        let text = self.telemetry.metrics.text().unwrap();
+        let value = text.lines().find_map(|line| line.strip_prefix(&sample));
+        value.map_or(0, |value| value.parse().unwrap())
+    }
+
+    /// What /readyz shows.
+    fn missing(&self) -> String {
+        self.telemetry.readiness.missing().join("; ")
     }
 
     async fn stop(self) {
@@ -185,6 +181,7 @@ impl Bridge {
 /// A namespace of the API server, and a stand-in of AWS.
 struct World {
     client: Client,
+    clients: Clients,
     namespace: String,
     stand_in: StandIn,
 }
@@ -194,13 +191,14 @@ impl World {
         let server = apiserver::server().await;
         Self {
             client: server.client(),
+            clients: Clients::new(server.config()).unwrap(),
             namespace: server.namespace(name).await,
             stand_in: StandIn::start().await,
         }
     }
 
     fn bridge(&self) -> Bridge {
-        Bridge::start(self.client.clone(), &self.stand_in, &self.namespace)
+        Bridge::start(self.clients.clone(), &self.stand_in, &self.namespace)
     }
 
     fn submissions(&self) -> Api<Submission> {
@@ -283,10 +281,17 @@ async fn two_bridges_make_each_submission_once() {
     assert_eq!(one.labels()[names::LABEL_LEADERBOARD], "lb");
     assert_eq!(one.labels()[names::LABEL_PHASE], "2");
     assert_eq!(one.finalizers(), [names::FINALIZER_SUBMISSION]);
-    let count = |fate| bridges.iter().map(|bridge| bridge.count(fate)).sum::<u64>();
+    let count = |outcome| bridges.iter().map(|bridge| bridge.count(outcome)).sum::<u64>();
     assert_eq!((count("created"), count("repeat")), (20, 40));
     for bridge in bridges {
-        assert!(bridge.health.readiness().ready);
+        assert_eq!(bridge.missing(), "");
+        let metrics = bridge.telemetry.metrics.text().unwrap();
+        let receives = "leaderboard_cloud_call_seconds_sum{service=\"sqs\",op=\"ReceiveMessage\"} ";
+        let seconds = metrics.lines().find_map(|line| line.strip_prefix(receives));
+        assert!(
+            seconds.unwrap().parse::<f64>().unwrap() > 0.0,
+            "calls take time: {metrics}"
+        );
         bridge.stop().await;
     }
 }
@@ -395,16 +400,17 @@ async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_say
     let bridge = world.bridge();
     world.stand_in.send(&url, "no json").await;
     let events: Api<Event> = Api::namespaced(world.client.clone(), &world.namespace);
-    let mut note = None;
-    eventually("an event is written", async || {
-        let all = events.list(&ListParams::default()).await.unwrap().items;
-        note = all
-            .into_iter()
-            .find(|event| event.reason.as_deref() == Some("QueueBlocked"))
-            .and_then(|event| event.note);
-        note.is_some()
-    })
-    .await;
+    let mut written = std::pin::pin!(watcher(events, watcher::Config::default()).touched_objects());
+    let search = async {
+        loop {
+            let event = written.next().await.unwrap();
+            match event {
+                Ok(event) if event.reason.as_deref() == Some("QueueBlocked") => return event.note,
+                _ => {}
+            }
+        }
+    };
+    let note = tokio::time::timeout(LIMIT, search).await.expect("an event is written");
     let note = note.unwrap();
     assert!(
         note.contains("(Malformed): the body is not JSON (line 1, column 2)"),
@@ -426,26 +432,27 @@ async fn one_bad_queue_among_several_is_named_and_the_others_are_read() {
     let missing = format!("{}/000000000000/nowhere", world.stand_in.endpoint);
     world.leaderboard("bad", 3, json!({"url": missing})).await;
     let bridge = world.bridge();
-    let (health, named) = (
-        bridge.health.clone(),
-        format!("queue {missing}: GetQueueAttributes failed"),
-    );
+    let named = format!("queue {missing}: GetQueueAttributes failed");
     eventually("a bridge that can read nothing is not ready", async || {
-        let told = health.readiness();
-        !told.ready && told.text.contains(&named)
+        bridge.missing().contains(&named)
     })
     .await;
     // Its poller is started when the Leaderboard is applied.
     world.leaderboard("good", 2, json!({"url": url})).await;
     world.stand_in.send(&url, &body(2, 7)).await;
     world.submission("submission-7", |_| true).await;
-    eventually("the other one makes it ready", async || health.readiness().ready).await;
-    assert!(health.readiness().text.contains(&named), "{}", health.readiness().text);
-    // And ended when it is deleted.
+    eventually("the other one makes it ready", async || bridge.missing().is_empty()).await;
+    // Without it, the bridge can read nothing again.
     let api: Api<Leaderboard> = Api::namespaced(world.client.clone(), &world.namespace);
-    api.delete("bad", &kube::api::DeleteParams::default()).await.unwrap();
+    let delete = async |name| api.delete(name, &kube::api::DeleteParams::default()).await.unwrap();
+    delete("good").await;
+    eventually("a bridge that can read nothing is not ready", async || {
+        bridge.missing().contains(&named)
+    })
+    .await;
+    delete("bad").await;
     eventually("a queue that nobody names is forgotten", async || {
-        health.readiness().text.is_empty()
+        bridge.missing().is_empty()
     })
     .await;
     bridge.stop().await;
@@ -464,13 +471,8 @@ async fn a_queue_that_goes_away_for_a_while_loses_no_message() {
     world.stand_in.send(&url, &body(2, 7)).await;
     world.submission("submission-7", |_| true).await;
     proxy.set_away(true);
-    let health = bridge.health.clone();
-    eventually("it is not ready", async || !health.readiness().ready).await;
-    assert!(
-        health.readiness().text.ends_with("it is tried again"),
-        "{}",
-        health.readiness().text
-    );
+    eventually("it is not ready", async || !bridge.missing().is_empty()).await;
+    assert!(bridge.missing().ends_with("it is retried"), "{}", bridge.missing());
     for id in 8..=20 {
         world.stand_in.send(&url, &body(2, id)).await;
     }
@@ -478,7 +480,7 @@ async fn a_queue_that_goes_away_for_a_while_loses_no_message() {
     for id in 8..=20 {
         world.submission(&names::submission(id), |_| true).await;
     }
-    eventually("it is ready again", async || health.readiness().ready).await;
+    eventually("it is ready again", async || bridge.missing().is_empty()).await;
     world.stand_in.drained(&url).await;
     bridge.stop().await;
 }

@@ -20,8 +20,8 @@ use jiff::{SignedDuration, Timestamp};
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::evalai::{
-    Changed, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status, SweepRow, Target,
-    Timeouts, Timing, View, Wish,
+    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status,
+    Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
 };
 use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
@@ -94,9 +94,9 @@ impl World {
         let (wake, changed) = mpsc::unbounded_channel();
         let (found, sweep) = mpsc::unbounded_channel();
         let leads = Arc::new(AtomicBool::new(true));
-        let fence = leads.clone();
+        let guard = leads.clone();
         let hub = Hub::new(Options {
-            fence: Arc::new(move || fence.load(Ordering::SeqCst)),
+            write_guard: Arc::new(move || guard.load(Ordering::SeqCst)),
             not_before,
             changed: wake,
             sweep: found,
@@ -163,17 +163,26 @@ impl World {
             .count()
     }
 
+    fn subject(&self, pk: i64) -> Subject {
+        Subject {
+            target: Arc::new(self.target.clone()),
+            key: key(pk),
+            pk,
+            run: run(pk, 1),
+        }
+    }
+
     fn ask(&self, pk: i64, image: bool) {
-        self.hub.ask(&self.target, &key(pk), pk, &run(pk, 1), image).unwrap();
+        self.hub.ask(&self.subject(pk), image).unwrap();
     }
 
     fn live(&self, pk: i64) {
         let at = self.server.state().submissions[&u64::try_from(pk).unwrap()].submitted_at;
-        self.hub.live(&self.target, &key(pk), pk, &run(pk, 1), at).unwrap();
+        self.hub.live(&self.subject(pk), at).unwrap();
     }
 
-    fn wish(&self, pk: i64, wish: Wish) {
-        self.hub.wish(&self.target, &key(pk), pk, &run(pk, 1), wish).unwrap();
+    fn update(&self, pk: i64, update: DesiredUpdate) {
+        self.hub.update(&self.subject(pk), update).unwrap();
     }
 
     fn fail(&self, method: &str, part: &str, answer: Failure, when: When) {
@@ -191,7 +200,7 @@ impl World {
     }
 
     /// Waits until the view of a submission is as wanted.
-    async fn until(&mut self, pk: i64, wanted: impl Fn(&View) -> bool) -> View {
+    async fn until(&mut self, pk: i64, wanted: impl Fn(&SubmissionState) -> bool) -> SubmissionState {
         loop {
             if let Some(view) = self.hub.view(&key(pk)).filter(|view| wanted(view)) {
                 return view;
@@ -278,14 +287,17 @@ async fn a_submission_lives_through_all_of_it() {
         (Some(ImageAnswer::Named("registry.example/team-a:1".into())), None)
     );
     world.live(pk);
-    world.wish(pk, Wish::Queued);
+    world.update(pk, DesiredUpdate::Queued);
     world.until(pk, |view| view.progress == Some(Progress::Queued)).await;
-    world.wish(pk, Wish::Running);
+    world.update(pk, DesiredUpdate::Running);
     world.until(pk, |view| view.progress == Some(Progress::Running)).await;
-    world.wish(pk, Wish::Partial(results(&world.target, 41.0)));
+    world.update(pk, DesiredUpdate::Partial(results(&world.target, 41.0)));
     world.until(pk, |view| view.partial_at.is_some()).await;
     assert_eq!(world.stored(pk), Stored::PartiallyEvaluated);
-    world.wish(pk, Wish::Final(Outcome::Finished, results(&world.target, 43.0)));
+    world.update(
+        pk,
+        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
+    );
     assert!(matches!(
         world.ended(pk).await,
         Ended::Published {
@@ -328,7 +340,7 @@ async fn the_table_of_ends() {
         cases.push((90_000 + i64::try_from(cases.len()).unwrap(), Status::Missing, wanted));
     }
     for (pk, _, wanted) in &cases {
-        world.wish(*pk, Wish::Final(*wanted, results(&world.target, 43.0)));
+        world.update(*pk, DesiredUpdate::Final(*wanted, results(&world.target, 43.0)));
     }
     for (pk, status, wanted) in cases {
         let before = world
@@ -382,7 +394,7 @@ async fn a_submission_that_was_deleted_while_it_ran_is_noticed_and_cancelled() {
     let mut world = World::with(timing, timeouts()).await;
     let pk = world.submit();
     world.live(pk);
-    world.wish(pk, Wish::Partial(results(&world.target, 41.0)));
+    world.update(pk, DesiredUpdate::Partial(results(&world.target, 41.0)));
     world.until(pk, |view| view.partial_at.is_some()).await;
     world.delete(pk);
     let view = world.until(pk, |view| view.ended.is_some()).await;
@@ -392,7 +404,10 @@ async fn a_submission_that_was_deleted_while_it_ran_is_noticed_and_cancelled() {
         Stored::PartiallyEvaluated,
         "its deletion ended nothing"
     );
-    world.wish(pk, Wish::Final(Outcome::Cancelled, results(&world.target, 41.0)));
+    world.update(
+        pk,
+        DesiredUpdate::Final(Outcome::Cancelled, results(&world.target, 41.0)),
+    );
     assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
     assert_eq!(world.stored(pk), Stored::Cancelled);
 }
@@ -402,7 +417,7 @@ async fn without_the_lease_nothing_is_written() {
     let mut world = World::new().await;
     world.leads.store(false, Ordering::SeqCst);
     let pk = world.submit();
-    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+    world.update(pk, DesiredUpdate::Final(Outcome::Failed, results(&world.target, 0.0)));
     world.ask(pk, false);
     world.until(pk, |view| view.answered == 1).await;
     assert_eq!(world.stored(pk), Stored::Submitted);

@@ -1,7 +1,6 @@
 //! One queue as the bridge reads it, against the AWS stand-in.
 #![cfg(test)]
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use aws_credential_types::provider::error::CredentialsError;
@@ -11,11 +10,12 @@ use leaderboard_operator::bridge::queue::{Reader, Received};
 use leaderboard_operator::bridge::route::DeadReason;
 use leaderboard_operator::services::aws::Aws;
 use leaderboard_operator::services::fault::Fault;
+use leaderboard_operator::services::meter::Meter;
 
 use super::bridge::{LIMIT, StandIn};
 
 async fn reader(stand_in: &StandIn, url: &str) -> Reader {
-    Reader::open(stand_in.sqs(), url, Arc::new(())).await.unwrap()
+    Reader::open(stand_in.sqs(), url, Meter::default()).await.unwrap()
 }
 
 async fn receive(reader: &Reader, count: usize) -> Vec<Received> {
@@ -72,7 +72,7 @@ async fn a_dead_letter_says_why_and_from_where_it_came() {
     let message = receive(&reader, 1).await.remove(0);
     assert_eq!(message.group.as_deref(), Some("3-12"));
     let reason = DeadReason::Malformed("challenge_pk is\nmissing".into());
-    // A crash between sending and deleting sends it twice; FIFO queues tell.
+    // A crash between sending and deleting sends it twice; a FIFO queue keeps one.
     reader.send_dead(&dead, &message, &reason).await.unwrap();
     reader.send_dead(&dead, &message, &reason).await.unwrap();
     assert_eq!(stand_in.depth(&dead).await, (1, 0));
@@ -106,7 +106,7 @@ async fn a_dead_letter_says_why_and_from_where_it_came() {
 async fn a_queue_that_cannot_be_used_is_named_with_what_to_do() {
     let stand_in = StandIn::start().await;
     let missing = format!("{}/000000000000/nowhere", stand_in.endpoint);
-    let error = Reader::open(stand_in.sqs(), &missing, Arc::new(()))
+    let error = Reader::open(stand_in.sqs(), &missing, Meter::default())
         .await
         .err()
         .unwrap();
@@ -126,7 +126,7 @@ async fn a_queue_that_cannot_be_used_is_named_with_what_to_do() {
         .unwrap()
         .port();
     let nobody = stand_in.aws.sqs(None, Some(&format!("http://127.0.0.1:{port}")));
-    let error = Reader::open(nobody, &missing, Arc::new(())).await.err().unwrap();
+    let error = Reader::open(nobody, &missing, Meter::default()).await.err().unwrap();
     assert_eq!(error.fault, Fault::Unavailable, "{error}");
     let anonymous = aws_config::SdkConfig::builder()
         .behavior_version(aws_config::BehaviorVersion::latest())
@@ -134,8 +134,8 @@ async fn a_queue_that_cannot_be_used_is_named_with_what_to_do() {
         .credentials_provider(SharedCredentialsProvider::new(Nobody))
         .build();
     let anonymous = Aws::from_config(anonymous).sqs(None, Some(&stand_in.endpoint));
-    // Without the attribute the usual visibility is assumed; the receive then tells.
-    let reader = Reader::open(anonymous, &missing, Arc::new(())).await.unwrap();
+    // Without the attribute the usual visibility is assumed; the receive then fails.
+    let reader = Reader::open(anonymous, &missing, Meter::default()).await.unwrap();
     let error = reader.receive(1).await.err().unwrap();
     assert_eq!(error.fault, Fault::Denied, "{error}");
     assert!(

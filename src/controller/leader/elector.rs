@@ -16,6 +16,7 @@ use tokio::time::{Instant, sleep, timeout};
 use super::decide::{Decision, Leading, Loss, Seen, decide, is_overdue};
 use super::record::{Record, held, released};
 use super::{Fence, Leadership, Settings};
+use crate::backoff::jittered;
 use crate::observability::Observability;
 use crate::observability::liveness::Liveness;
 use crate::observability::metrics::Metrics;
@@ -229,11 +230,11 @@ impl Elector {
         let timing = &self.settings.timing;
         let pause = match error {
             // Two candidates that met once are kept from meeting again.
-            CallError::Stale => jitter(timing.retry / 8),
+            CallError::Stale => jittered(timing.retry / 8, 0.1),
             CallError::Failed { reason, text } => {
                 self.metrics.lease_failed(reason);
                 tracing::warn!(lease = self.settings.name, "the Lease could not be {what}: {text}");
-                jitter(timing.retry / 2)
+                jittered(timing.retry / 2, 0.1)
             }
         };
         Next::After(pause.min(self.time_left()))
@@ -249,7 +250,7 @@ impl Elector {
     }
 
     fn retry(&self) -> Duration {
-        jitter(self.settings.timing.retry)
+        jittered(self.settings.timing.retry, 0.1)
     }
 
     async fn hand_over(&mut self, answer: oneshot::Sender<Result<(), String>>) {
@@ -297,9 +298,4 @@ impl Elector {
             .await
             .map(|_| ())
     }
-}
-
-/// Nine to eleven tenths of a pause, so that candidates don't move in step.
-fn jitter(pause: Duration) -> Duration {
-    pause.mul_f64(0.9 + 0.2 * fastrand::f64())
 }

@@ -83,10 +83,10 @@ fn ask<'a>(context: &'a Context, leaderboard: &'a Leaderboard, place: Place) -> 
         (Place::Table, Some(table), _) => {
             async move { of_table(Table::describe(aws, table).await.map(|_| ())) }.boxed()
         }
-        (Place::Queue, _, Some(queue)) => async move { of_queue(queue::look(aws, queue, &queue.url).await) }.boxed(),
+        (Place::Queue, _, Some(queue)) => async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed(),
         (Place::DeadLetterQueue, _, Some(queue)) => {
             let url = queue.dead_letter_url.as_deref().unwrap_or_default();
-            async move { of_queue(queue::look(aws, queue, url).await) }.boxed()
+            async move { of_queue(queue::check(aws, queue, url).await) }.boxed()
         }
         // It is named by nobody.
         _ => async { Finding::Good }.boxed(),

@@ -5,16 +5,18 @@
 //! nobody knows yet what is wrong with one that says nothing.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
+use crate::backoff::Backoff;
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::reasons;
 
 /// What was good is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
-/// The first wait after a look that found something wrong; it doubles up to [`AGAIN`].
-const FIRST_PAUSE: SignedDuration = SignedDuration::from_secs(5);
+/// The waits after checks that found something wrong, up to [`AGAIN`].
+const RETRY: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_mins(5));
 /// How long what was last found is held to be true while there is no answer.
 const PATIENCE: SignedDuration = SignedDuration::from_mins(2);
 
@@ -169,7 +171,7 @@ impl Known {
 fn pause(failures: u32) -> SignedDuration {
     match failures {
         0 => AGAIN,
-        n => FIRST_PAUSE.saturating_mul(1 << (n - 1).min(10)).min(AGAIN),
+        n => SignedDuration::try_from(RETRY.bound(n)).unwrap_or(AGAIN),
     }
 }
 

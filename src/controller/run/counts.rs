@@ -1,4 +1,4 @@
-//! Joins the controller's parts to the process's metrics: calls to services as they happen, loads and states every few seconds.
+//! Joins the controller's parts to the process's metrics: loads and states every few seconds.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,7 +8,6 @@ use kube::runtime::reflector::Store;
 
 use crate::observability::Observability;
 use crate::services::evalai::Hub;
-use crate::services::meter::Meter;
 use leaderboard_api::{State, Submission};
 
 /// How often what is not an event is counted: more often than anybody scrapes.
@@ -22,15 +21,6 @@ const STATES: [State; 6] = [
     State::Failed,
     State::Cancelled,
 ];
-
-/// Counts calls to EvalAI and AWS.
-pub(super) fn meter(seen: &Observability) -> Meter {
-    let metrics = Arc::clone(&seen.metrics);
-    Meter::new(move |call| match call.service {
-        "evalai" => metrics.evalai_request(call.op, call.outcome, call.took),
-        service => metrics.cloud_call(service, call.op, call.outcome, call.took),
-    })
-}
 
 /// Keeps gauges true until the stop.
 pub(super) async fn keep(hub: Hub, submissions: Store<Submission>, seen: Observability) {

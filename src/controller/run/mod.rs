@@ -37,6 +37,7 @@ use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
+use crate::services::meter::Meter;
 use crate::services::table::Recorder;
 use leaderboard_api::{Leaderboard, Submission};
 
@@ -101,7 +102,7 @@ async fn work(
     let parts = Parts {
         client: clients.api,
         settings,
-        aws: aws.counted_by(counts::meter(&seen)),
+        aws: aws.counted_by(Meter::for_metrics(&seen.metrics)),
         watches,
         seen,
     };
@@ -381,13 +382,13 @@ fn hub(
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
-        fence: Arc::new(move || writes.may_write()),
+        write_guard: Arc::new(move || writes.may_write()),
         not_before,
         changed,
         sweep,
         timing: Timing::default(),
         timeouts: Timeouts::default(),
-        meter: counts::meter(seen),
+        meter: Meter::for_metrics(&seen.metrics),
         tasks: seen.tasks.clone(),
     })
 }

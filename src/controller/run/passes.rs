@@ -10,6 +10,7 @@ use kube::{Resource, ResourceExt};
 use tokio::sync::mpsc;
 
 use super::{Touched, key};
+use crate::backoff::jittered;
 use crate::controller::act::{ActError, act};
 use crate::controller::backoff::BackoffMap;
 use crate::controller::context::Context;
@@ -205,7 +206,7 @@ fn finish(
 
 /// Spreads the resync of many objects.
 fn jittered_resync() -> Duration {
-    RESYNC.mul_f64(0.8 + 0.4 * fastrand::f64())
+    jittered(RESYNC, 0.2)
 }
 
 fn after_error(object: &impl Resource, error: &PassError, shared: &Shared) -> Action {

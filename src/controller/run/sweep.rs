@@ -33,7 +33,7 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
         phase: row.phase,
         submission: row.submission,
         image: None,
-        source: Source::Sweep(row.says),
+        source: Source::Sweep(row.kind),
         sent_ms: row.time.as_millisecond(),
     };
     let (server, leaderboard) = (&row.server, board.name_any());
@@ -121,7 +121,7 @@ mod tests {
             challenge: 1,
             phase,
             submission: 7,
-            says: Swept::New,
+            kind: Swept::New,
             time: Timestamp::from_second(100).unwrap(),
         }
     }

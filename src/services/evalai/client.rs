@@ -12,11 +12,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::answer::{About, Answer, Refusal, Silence, classify};
-use super::request::{Reply, Request, Subject};
+use super::request::{Reply, Request, SubmissionRef};
 use super::row::image;
 use super::types::{ImageAnswer, Payload};
 use crate::services::meter::Meter;
 use crate::services::token::Token;
+use leaderboard_api::client_errors;
 
 /// Largest answer that is read, a list of many thousand rows, in bytes.
 const LARGEST: usize = 64 << 20;
@@ -94,7 +95,7 @@ impl Client {
                 // may have been served: nothing is written for over a minute. At some 54 requests a minute nothing is kept open.
                 .pool_max_idle_per_host(0)
         };
-        let made = |builder: reqwest::ClientBuilder| builder.build().map_err(|e| ClientError(chain(&e)));
+        let made = |builder: reqwest::ClientBuilder| builder.build().map_err(|e| ClientError(client_errors::chain(&e)));
         Ok(Self {
             api: made(builder().redirect(reqwest::redirect::Policy::none()))?,
             files: made(builder().redirect(reqwest::redirect::Policy::limited(5)))?,
@@ -271,7 +272,7 @@ fn silence(error: reqwest::Error) -> Silence {
     };
     Silence {
         sent: !error.is_connect() && !error.is_builder() && !is_canceled(&error),
-        why: format!("{what} ({})", chain(&error)),
+        why: format!("{what} ({})", client_errors::chain(&error)),
     }
 }
 
@@ -285,13 +286,7 @@ fn is_canceled(error: &(dyn std::error::Error + 'static)) -> bool {
     })
 }
 
-/// An error with its causes, which reqwest leaves to the reader.
-fn chain(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(Some(error), |error| error.source());
-    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
-}
-
-fn update(subject: &Subject) -> String {
+fn update(subject: &SubmissionRef) -> String {
     format!("jobs/challenge/{}/update_submission/", subject.challenge)
 }
 
@@ -300,7 +295,7 @@ fn list(challenge: i64, status: &str, after: Timestamp) -> String {
     format!("jobs/challenge/{challenge}/submission/?status={status}&submitted_after={after}")
 }
 
-fn put<'a>(subject: &Subject, status: &'a str, results: bool, payload: &'a Payload) -> Put<'a> {
+fn put<'a>(subject: &SubmissionRef, status: &'a str, results: bool, payload: &'a Payload) -> Put<'a> {
     Put {
         submission: subject.pk,
         submission_status: status,

@@ -53,8 +53,8 @@ async fn serve(listener: TcpListener, reused: Arc<AtomicUsize>) {
     }
 }
 
-fn subject() -> Subject {
-    Subject {
+fn submission() -> SubmissionRef {
+    SubmissionRef {
         key: Key {
             namespace: "carla".into(),
             name: "submission-7".into(),

@@ -1,7 +1,7 @@
-//! The controller's door to EvalAI: wishes in, what is known out, nothing waits.
+//! The controller's way to EvalAI: desired updates in, what is known out, nothing waits.
 //!
-//! Called by the controller's passes. Sorts what it is told to the queue of the right server and token, and starts a task
-//! for each. Knows no policy.
+//! Called by the controller's reconciles. Hands each update to the queue of the right server and token, and starts a task for
+//! each, which ends when nothing uses the token any more. Knows no policy.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -13,32 +13,20 @@ use tokio::time::Instant;
 
 use super::client::{Client, ClientError, Timeouts};
 use super::labels::Labels;
-use super::queue::{Queue, Timing};
-use super::task::{Outlets, Shared, now, run};
-use super::types::{Changed, Key, Run, SweepRow, Target, View, Wish};
+use super::queue::{Now, Queue, Timing};
+use super::task::{Outlets, Shared, Task, now, run};
+use super::types::{Changed, DesiredUpdate, Key, Subject, SubmissionState, SweepRow, Target, WriteGuard};
 use crate::observability::tasks::Tasks;
 use crate::services::meter::Meter;
 
-/// Says, right before each write, whether this process still leads.
-pub trait Fence: Send + Sync + 'static {
-    /// True while the lease was renewed less than 10 s ago, by a clock that counts pauses of the machine.
-    fn may_write(&self) -> bool;
-}
-
-impl<F: Fn() -> bool + Send + Sync + 'static> Fence for F {
-    fn may_write(&self) -> bool {
-        self()
-    }
-}
-
 /// What a hub needs.
 pub struct Options {
-    pub fence: Arc<dyn Fence>,
+    pub write_guard: Arc<dyn WriteGuard>,
     /// No write before: after a takeover, what the process before has sent may still be worked on.
     pub not_before: Instant,
-    /// Told what has changed.
+    /// Receives what has changed.
     pub changed: mpsc::UnboundedSender<Changed>,
-    /// Told of submissions whose message was lost.
+    /// Receives submissions whose message was lost.
     pub sweep: mpsc::UnboundedSender<SweepRow>,
     pub timing: Timing,
     pub timeouts: Timeouts,
@@ -56,7 +44,7 @@ struct Inner {
     options: Options,
     /// All queues count time from here, so that a moment means the same in each.
     start: Instant,
-    /// `not_before` on the clock of people.
+    /// `not_before` as wall-clock time.
     writes_from: Timestamp,
     outlets: Outlets,
     closing: watch::Sender<bool>,
@@ -75,8 +63,48 @@ type Account = (String, String);
 
 struct Entry {
     shared: Arc<Shared>,
+    /// So many objects are in its queue.
+    users: usize,
     /// None once its end is waited for.
     task: Option<JoinHandle<Option<bool>>>,
+}
+
+impl State {
+    /// Puts an object into the queue of an account. Returns the one that it was in before, if that is another one.
+    fn enter(&mut self, key: &Key, account: &Account) -> Option<Account> {
+        let before = self.places.insert(key.clone(), account.clone());
+        if before.as_ref() == Some(account) {
+            return None;
+        }
+        self.count(account, 1);
+        before
+    }
+
+    fn leave(&mut self, key: &Key) -> Option<Arc<Shared>> {
+        let account = self.places.remove(key)?;
+        self.count(&account, -1)
+    }
+
+    fn count(&mut self, account: &Account, by: isize) -> Option<Arc<Shared>> {
+        let entry = self.tokens.get_mut(account)?;
+        entry.users = entry.users.saturating_add_signed(by);
+        Some(entry.shared.clone())
+    }
+
+    /// Removes an account that no object uses. False if one does.
+    fn remove_unused(&mut self, account: &Account) -> bool {
+        let is_unused = self.tokens.get(account).is_none_or(|entry| entry.users == 0);
+        if is_unused {
+            self.tokens.remove(account);
+        }
+        is_unused
+    }
+}
+
+impl Inner {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl Hub {
@@ -112,52 +140,33 @@ impl Hub {
 
     /// A Leaderboard is gone.
     pub fn retire(&self, leaderboard: &Key) {
-        if let Some(shared) = self.place(leaderboard) {
-            shared.queue().retire(leaderboard, shared.now());
-        }
-        self.state().places.remove(leaderboard);
+        self.leave(leaderboard, |queue, now| queue.retire(leaderboard, now));
     }
 
-    /// Wants to know whether an attempt may run; with `image`, also which image it is. The answer is in the view:
-    /// `answered` reaches the attempt, `ended` says whether it may run.
-    pub fn ask(&self, target: &Target, key: &Key, pk: i64, run: &Run, image: bool) -> Result<(), ClientError> {
-        self.with(key, Some(pk), target, |queue, now| {
-            queue.ask(target, key, pk, run, image, now)
-        })
+    /// Asks whether an attempt may run; with `image`, also which image it is. The answer is in the state:
+    /// `answered` reaches the attempt, `ended` shows whether it may run.
+    pub fn ask(&self, subject: &Subject, image: bool) -> Result<(), ClientError> {
+        self.with_subject(subject, |queue, now| queue.ask(subject, image, now))
     }
 
     /// From now on, until its end or [`Hub::forget`], a cancellation of this attempt is looked for each period.
     /// `submitted_at` is EvalAI's own time of the submission.
-    pub fn live(
-        &self,
-        target: &Target,
-        key: &Key,
-        pk: i64,
-        run: &Run,
-        submitted_at: Timestamp,
-    ) -> Result<(), ClientError> {
-        self.with(key, Some(pk), target, |queue, _| {
-            queue.live(target, key, pk, run, submitted_at)
-        })
+    pub fn live(&self, subject: &Subject, submitted_at: Timestamp) -> Result<(), ClientError> {
+        self.with_subject(subject, |queue, _| queue.live(subject, submitted_at))
     }
 
-    /// Wants EvalAI to say something. May be called in each pass: what is already said or wished changes nothing.
-    pub fn wish(&self, target: &Target, key: &Key, pk: i64, run: &Run, wish: Wish) -> Result<(), ClientError> {
-        self.with(key, Some(pk), target, |queue, now| {
-            queue.wish(target, key, pk, run, wish, now)
-        })
+    /// Requests an update of EvalAI. May be called in each reconcile: what is already done or requested changes nothing.
+    pub fn update(&self, subject: &Subject, update: DesiredUpdate) -> Result<(), ClientError> {
+        self.with_subject(subject, |queue, now| queue.update(subject, update, now))
     }
 
-    /// The object is gone, or nothing more is to be said of it. What is on its way is still waited for.
+    /// The object is gone, or needs no further update. What is on its way is still waited for.
     pub fn forget(&self, key: &Key) {
-        if let Some(shared) = self.place(key) {
-            shared.queue().forget(key, shared.now());
-        }
-        self.state().places.remove(key);
+        self.leave(key, |queue, now| queue.forget(key, now));
     }
 
     /// What is known of a submission.
-    pub fn view(&self, key: &Key) -> Option<View> {
+    pub fn view(&self, key: &Key) -> Option<SubmissionState> {
         self.place(key)?.queue().view(key)
     }
 
@@ -180,7 +189,7 @@ impl Hub {
         Some(used)
     }
 
-    /// Requests of the last minute, and wishes that wait for one, over all tokens.
+    /// Requests of the last minute, and updates that wait for one, over all tokens.
     pub fn load(&self) -> (usize, usize) {
         let queues: Vec<_> = self.state().tokens.values().map(|entry| entry.shared.clone()).collect();
         queues.iter().fold((0, 0), |(used, waiting), shared| {
@@ -190,7 +199,7 @@ impl Hub {
         })
     }
 
-    /// What EvalAI says of a Leaderboard's token, while it refuses it, at all or for the challenge.
+    /// Why EvalAI refuses a Leaderboard's token, at all or for the challenge; none while it does not.
     pub fn token_refused(&self, leaderboard: &Key) -> Option<String> {
         let shared = self.place(leaderboard)?;
         let queue = shared.queue();
@@ -217,7 +226,16 @@ impl Hub {
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
-        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.state()
+    }
+
+    /// Takes an object out of its queue, whose task may then end.
+    fn leave(&self, key: &Key, act: impl FnOnce(&mut Queue, Now)) {
+        let left = self.state().leave(key);
+        if let Some(shared) = left {
+            act(&mut shared.queue(), shared.now());
+            shared.notify.notify_one();
+        }
     }
 
     fn place(&self, key: &Key) -> Option<Arc<Shared>> {
@@ -226,13 +244,17 @@ impl Hub {
         state.tokens.get(account).map(|entry| entry.shared.clone())
     }
 
+    fn with_subject(&self, subject: &Subject, act: impl FnOnce(&mut Queue, Now) -> bool) -> Result<(), ClientError> {
+        self.with(&subject.key, Some(subject.pk), &subject.target, act)
+    }
+
     /// Does something with the queue that an object belongs to, and wakes its task.
     fn with(
         &self,
         key: &Key,
         pk: Option<i64>,
         target: &Target,
-        act: impl FnOnce(&mut Queue, super::queue::Now) -> bool,
+        act: impl FnOnce(&mut Queue, Now) -> bool,
     ) -> Result<(), ClientError> {
         if *self.0.closing.borrow() {
             return Ok(());
@@ -259,19 +281,16 @@ impl Hub {
         let shared = if let Some(entry) = state.tokens.get(&account) {
             entry.shared.clone()
         } else {
-            let entry = self.start(target)?;
+            let entry = self.start(target, &account)?;
             let shared = entry.shared.clone();
             state.tokens.insert(account.clone(), entry);
             shared
         };
-        let before = state
-            .places
-            .insert(key.clone(), account.clone())
-            .filter(|before| *before != account);
-        let old = before.and_then(|before| state.tokens.get(&before).map(|entry| entry.shared.clone()));
+        let old = state.enter(key, &account).and_then(|before| state.count(&before, -1));
         drop(state);
         if let Some(old) = old {
             self.move_over(key, pk, &old, &shared);
+            old.notify.notify_one();
         }
         Ok(shared)
     }
@@ -290,7 +309,7 @@ impl Hub {
         }
     }
 
-    fn start(&self, target: &Target) -> Result<Entry, ClientError> {
+    fn start(&self, target: &Target, account: &Account) -> Result<Entry, ClientError> {
         let inner = &self.0;
         let client = Client::new(&target.api_server, inner.options.timeouts)?;
         let not_before = inner.options.not_before.saturating_duration_since(inner.start);
@@ -301,23 +320,27 @@ impl Hub {
             now(inner.start),
         );
         let shared = Arc::new(Shared::new(queue, target.token.clone(), inner.start));
-        let work = run(
-            shared.clone(),
-            client.counted_by(inner.options.meter.clone()),
-            inner.options.fence.clone(),
-            inner.outlets.clone(),
-            inner.closing.subscribe(),
-        );
+        let (weak, account) = (Arc::downgrade(inner), account.clone());
+        let work = run(Task {
+            shared: shared.clone(),
+            client: client.counted_by(inner.options.meter.clone()),
+            guard: inner.options.write_guard.clone(),
+            outlets: inner.outlets.clone(),
+            closing: inner.closing.subscribe(),
+            is_unused: Box::new(move || weak.upgrade().is_none_or(|hub| hub.state().remove_unused(&account))),
+        });
         let name = format!("EvalAI requests of {}", target.token.identity());
-        let task = inner.options.tasks.stay(name, work);
+        // It ends when its token is no longer used.
+        let task = inner.options.tasks.may_end(name, work);
         Ok(Entry {
             shared,
+            users: 0,
             task: Some(task),
         })
     }
 }
 
-/// A moment on the clock of people, if it is still to come.
+/// A moment as wall-clock time, if it is still to come.
 fn wall(at: Instant) -> Timestamp {
     let now = Timestamp::now();
     let wait = SignedDuration::try_from(at.saturating_duration_since(Instant::now())).unwrap_or_default();
@@ -335,8 +358,8 @@ mod tests {
         let (_stop, signal) = Stop::new();
         let tasks = Tasks::new(signal);
         let hub = Hub::new(Options {
-            // Nothing is sent anywhere: the fence's panic stands for any of the task's own.
-            fence: Arc::new(|| -> bool { panic!("on purpose") }),
+            // Nothing is sent anywhere: the guard's panic stands for any of the task's own.
+            write_guard: Arc::new(|| -> bool { panic!("on purpose") }),
             not_before: Instant::now(),
             changed: mpsc::unbounded_channel().0,
             sweep: mpsc::unbounded_channel().0,

@@ -11,7 +11,7 @@ use super::types::{ImageAnswer, Key, Payload};
 
 /// Whom a request is about.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Subject {
+pub struct SubmissionRef {
     pub key: Key,
     pub challenge: i64,
     /// Id of the submission.
@@ -61,12 +61,12 @@ impl Purpose {
 /// One request.
 #[derive(Clone, Debug)]
 pub enum Request {
-    Get(Subject),
+    Get(SubmissionRef),
     /// The uploaded file: not of the API, and not counted by it.
-    Image(Subject, String),
-    Progress(Subject, Progress, Option<String>),
-    Partial(Subject, Arc<Payload>),
-    Final(Subject, Outcome, Arc<Payload>),
+    Image(SubmissionRef, String),
+    Progress(SubmissionRef, Progress, Option<String>),
+    Partial(SubmissionRef, Arc<Payload>),
+    Final(SubmissionRef, Outcome, Arc<Payload>),
     List {
         challenge: i64,
         purpose: Purpose,
@@ -89,7 +89,7 @@ impl Request {
     }
 
     /// Whom it is about, if a submission.
-    pub fn subject(&self) -> Option<&Subject> {
+    pub fn submission(&self) -> Option<&SubmissionRef> {
         match self {
             Self::Get(subject)
             | Self::Image(subject, _)

@@ -12,10 +12,9 @@ use tokio::time::Instant;
 
 use super::answer::{Answer, Silence};
 use super::client::Client;
-use super::hub::Fence;
 use super::queue::{Next, Now, Queue, Ticket};
 use super::request::Reply;
-use super::types::{Changed, SweepRow};
+use super::types::{Changed, SweepRow, WriteGuard};
 use crate::services::token::Token;
 
 /// How long answers are waited for at the end: longer than a write may take.
@@ -25,7 +24,7 @@ const DRAIN: Duration = Duration::from_secs(70);
 pub(super) struct Shared {
     queue: Mutex<Queue>,
     token: Mutex<Arc<Token>>,
-    /// Told when something new is wished.
+    /// Notified of new updates and questions.
     pub notify: Notify,
     /// The queue's time counts from here.
     start: Instant,
@@ -72,7 +71,7 @@ impl Shared {
         self.token.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Tells what has changed.
+    /// Reports what has changed.
     pub fn publish(&self, outlets: &Outlets) {
         let (changes, sweep) = {
             let mut queue = self.queue();
@@ -96,23 +95,42 @@ pub(super) fn now(start: Instant) -> Now {
     }
 }
 
-/// Runs until `closing` turns true. Returns whether every write is answered: only then may another process write at once.
-pub(super) async fn run(
-    shared: Arc<Shared>,
-    client: Client,
-    fence: Arc<dyn Fence>,
-    outlets: Outlets,
-    mut closing: watch::Receiver<bool>,
-) -> bool {
+/// What a task works with.
+pub(super) struct Task {
+    pub shared: Arc<Shared>,
+    pub client: Client,
+    pub guard: Arc<dyn WriteGuard>,
+    pub outlets: Outlets,
+    pub closing: watch::Receiver<bool>,
+    /// Asked when nothing is on its way: true, once, if nobody uses the token any more. Then it is not handed out again.
+    pub is_unused: Box<dyn Fn() -> bool + Send + Sync>,
+}
+
+/// Runs until `closing` turns true, or its token is no longer used. Returns whether every write is answered: only then may
+/// another process write at once.
+pub(super) async fn run(task: Task) -> bool {
+    let Task {
+        shared,
+        client,
+        guard,
+        outlets,
+        mut closing,
+        is_unused,
+    } = task;
     let mut in_flight = FuturesUnordered::new();
     while !*closing.borrow() {
         let wait = loop {
-            let next = shared.queue().next(shared.now(), fence.may_write());
+            let next = shared.queue().next(shared.now(), guard.may_write());
             match next {
-                Next::Send(ticket) => in_flight.push(send(&shared, &client, &*fence, ticket)),
+                Next::Send(ticket) => in_flight.push(send(&shared, &client, &*guard, ticket)),
                 Next::Wait(until) => break until,
             }
         };
+        let settled_at = shared.queue().settled_at(shared.now());
+        if in_flight.is_empty() && settled_at.is_none() && is_unused() {
+            return true;
+        }
+        let wait = wait.into_iter().chain(settled_at).min();
         shared.publish(&outlets);
         let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
         tokio::select! {
@@ -131,10 +149,10 @@ pub(super) async fn run(
     all && !shared.queue().is_unsure(shared.now())
 }
 
-/// Sends one request, unless the fence has fallen since it was chosen. None as reply: it was not sent.
-async fn send(shared: &Shared, client: &Client, fence: &dyn Fence, ticket: Ticket) -> (Ticket, Option<Reply>) {
+/// Sends one request, unless the guard forbids writes since it was chosen. None as reply: it was not sent.
+async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: Ticket) -> (Ticket, Option<Reply>) {
     let write = ticket.request.is_write();
-    if write && !fence.may_write() {
+    if write && !guard.may_write() {
         return (ticket, None);
     }
     let started = Instant::now();
@@ -155,13 +173,13 @@ fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
     let request = ticket.request.name();
     let submission = ticket
         .request
-        .subject()
+        .submission()
         .map(|subject| subject.key.to_string())
         .unwrap_or_default();
     let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);
     match answer {
         Answer::Done(()) if ticket.request.is_write() => {
-            tracing::info!(request, submission, milliseconds, "EvalAI has taken it");
+            tracing::info!(request, submission, milliseconds, "EvalAI has stored the update");
         }
         Answer::Done(()) => tracing::debug!(request, submission, milliseconds, "EvalAI has answered"),
         Answer::Unanswered(Silence { sent: true, why }) if ticket.request.is_write() => {
@@ -170,12 +188,12 @@ fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
                 submission,
                 milliseconds,
                 why,
-                "EvalAI has not answered a write; nothing more is written for a while"
+                "EvalAI has not answered a write; no further write to this submission for a while"
             );
         }
         other => {
             let why = other.error().unwrap_or_default();
-            tracing::warn!(request, submission, milliseconds, why, "EvalAI has not done it");
+            tracing::warn!(request, submission, milliseconds, why, "EvalAI request failed");
         }
     }
 }

@@ -1,6 +1,6 @@
-//! What the controller says to this room, and what it gets back.
+//! What the controller hands in, and what it gets back.
 //!
-//! Pure. A [`Key`] names the object that is woken, a [`Run`] the attempt that a wish speaks of.
+//! Pure. A [`Key`] names the object that is woken, a [`Run`] the attempt that an update is about.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use super::status::{Outcome, Progress, Status};
 pub use crate::services::ObjectKey as Key;
 use crate::services::token::Token;
 
-/// The challenge of a Leaderboard and how it is spoken to.
+/// The challenge of a Leaderboard and how it is asked.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Target {
     /// Root of the server.
@@ -37,12 +37,35 @@ pub struct Target {
     pub since: Timestamp,
 }
 
+/// Tells, right before each write, whether this process still leads.
+pub trait WriteGuard: Send + Sync + 'static {
+    /// True while the lease was renewed less than 10 s ago, by a clock that counts pauses of the machine.
+    fn may_write(&self) -> bool;
+}
+
+impl<F: Fn() -> bool + Send + Sync + 'static> WriteGuard for F {
+    fn may_write(&self) -> bool {
+        self()
+    }
+}
+
+/// An attempt of a submission, and whom to ask about it.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    pub target: Arc<Target>,
+    /// The object that is woken.
+    pub key: Key,
+    /// Id of the submission in EvalAI.
+    pub pk: i64,
+    pub run: Run,
+}
+
 /// One attempt of a submission.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Run {
     /// From 1.
     pub attempt: i64,
-    /// Name of the attempt's first Job, told to EvalAI with `queued`: found there again, it says that EvalAI knows of the
+    /// Name of the attempt's first Job, sent to EvalAI with `queued`: found there again, it shows that EvalAI knows of the
     /// attempt.
     pub job: String,
     /// A person has begun it here: EvalAI has not asked for it by a message, nor by its row.
@@ -51,9 +74,9 @@ pub struct Run {
     pub has_job: bool,
 }
 
-/// What EvalAI is to say.
+/// What EvalAI is to show.
 #[derive(Clone, Debug)]
-pub enum Wish {
+pub enum DesiredUpdate {
     /// The run waits for its Pod.
     Queued,
     /// An agent runs.
@@ -83,55 +106,55 @@ pub struct Payload {
 
 /// What is known of a submission in EvalAI. Memory only.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct View {
+pub struct SubmissionState {
     /// Its row, as last read.
     pub row: Option<Arc<Row>>,
     /// When the row was read.
     pub read_at: Option<Timestamp>,
     /// The newest attempt whose `ask` the row answers; 0 is none.
     pub answered: i64,
-    /// What the uploaded file says of the image; none before it was asked for and answered.
+    /// What the uploaded file names as the image; none before it was asked for and answered.
     pub image: Option<ImageAnswer>,
     /// The attempt that all below speaks of.
     pub attempt: i64,
     /// How far EvalAI knows this attempt to be.
     pub progress: Option<Progress>,
-    /// EvalAI has ended this attempt, by somebody else's hand.
+    /// EvalAI has ended this attempt, and not because of us.
     pub ended: Option<Status>,
-    /// EvalAI may yet say otherwise: a write of ours was under way when it was ended there and may have undone that, or it was
+    /// EvalAI may yet show another status: a write of ours was under way when it was ended there and may have undone that, or it was
     /// deleted, which ends nothing there.
     pub overtaken: bool,
-    /// What became of the wish for an end.
+    /// What became of the update to an end.
     pub end: Option<Ended>,
     /// When partial results were last taken.
     pub partial_at: Option<Timestamp>,
-    /// The last thing that went wrong; none after the next thing that went well.
+    /// The last error; none after the next success.
     pub last_error: Option<String>,
     /// Nothing is written until then, because a write was not answered.
     pub unanswered_until: Option<Timestamp>,
 }
 
-/// What the uploaded file says of the image.
+/// What the uploaded file names as the image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ImageAnswer {
     /// It names this one.
     Named(String),
     /// It was read and names none that could be pulled, and why: no later read changes that.
     NotAnImage(String),
-    /// It could not be read yet, and why. It is tried again.
+    /// It could not be read yet, and why. It is retried.
     Unread(String),
 }
 
-/// What became of a wish for an end.
+/// What became of an update to an end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ended {
     /// EvalAI has taken it.
     Published { outcome: Outcome, at: Timestamp },
-    /// EvalAI said as much already; nothing was written.
+    /// EvalAI showed it already; nothing was written.
     Agreed(Status),
     /// EvalAI has ended the run itself: the outcome becomes Cancelled, nothing was written.
     Otherwise(Status),
-    /// EvalAI refuses it, or would file it wrongly. It is tried again from time to time, and at once with other texts; a cancel
+    /// EvalAI refuses it, or would file it wrongly. It is retried from time to time, and at once with other texts; a cancel
     /// that such a try finds makes it `Otherwise`.
     Refused(String),
 }
@@ -145,7 +168,7 @@ pub enum Changed {
     Leaderboard(Key),
 }
 
-/// What a swept row says of the run that it asks for. Its participant can edit all of it but when it was submitted.
+/// What kind of run a swept row asks for. Its participant can edit all of it but when it was submitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Swept {
     /// `submitted`, and nothing of it was ever run.
@@ -166,7 +189,7 @@ pub struct SweepRow {
     pub challenge: i64,
     pub phase: i64,
     pub submission: i64,
-    pub says: Swept,
+    pub kind: Swept,
     /// When it asked to be run: its re-run or resume, else its submission.
     pub time: Timestamp,
 }

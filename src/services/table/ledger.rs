@@ -37,7 +37,7 @@ impl From<&api::Table> for TableId {
 
 /// What is known of an object's newest row.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct View {
+pub struct RowState {
     /// The newest attempt that a row was handed in for.
     pub attempt: i64,
     /// True if the end of that attempt is in the table.
@@ -48,7 +48,7 @@ pub struct View {
 
 /// A row that is to be written.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Wish {
+pub struct RowUpdate {
     pub row: Arc<Row>,
     pub end: bool,
 }
@@ -58,7 +58,7 @@ struct Entry {
     table: TableId,
     /// Place in line, kept while newer rows replace older ones.
     turn: u64,
-    newest: Wish,
+    newest: RowUpdate,
     is_pending: bool,
     is_written: bool,
     refused_until: Option<Instant>,
@@ -74,29 +74,29 @@ pub struct Ledger {
 
 impl Ledger {
     /// Takes a row in. False if there is nothing to write for it.
-    pub fn record(&mut self, table: TableId, key: &ObjectKey, wish: Wish, now: Instant) -> bool {
+    pub fn record(&mut self, table: TableId, key: &ObjectKey, update: RowUpdate, now: Instant) -> bool {
         self.turns += 1;
         let turn = self.turns;
         if let Some(entry) = self.entries.get_mut(key).filter(|entry| entry.table == table) {
             let old = &entry.newest;
-            let is_older = (wish.row.attempt, wish.end) < (old.row.attempt, old.end);
+            let is_older = (update.row.attempt, update.end) < (old.row.attempt, old.end);
             let waits = entry.refused_until.is_some_and(|until| now < until);
-            let is_known = wish == *old && (entry.is_pending || entry.is_written || waits);
+            let is_known = update == *old && (entry.is_pending || entry.is_written || waits);
             if is_older || is_known {
                 return false;
             }
-            if wish.row.attempt != old.row.attempt {
+            if update.row.attempt != old.row.attempt {
                 entry.error = None;
             }
             entry.turn = if entry.is_pending { entry.turn } else { turn };
-            entry.newest = wish;
+            entry.newest = update;
             (entry.is_pending, entry.is_written, entry.refused_until) = (true, false, None);
             return true;
         }
         let entry = Entry {
             table,
             turn,
-            newest: wish,
+            newest: update,
             is_pending: true,
             is_written: false,
             refused_until: None,
@@ -107,7 +107,7 @@ impl Ledger {
     }
 
     /// The row of a table that goes next: ends first, then who has waited longest.
-    pub fn next(&self, table: &TableId) -> Option<(ObjectKey, Wish)> {
+    pub fn next(&self, table: &TableId) -> Option<(ObjectKey, RowUpdate)> {
         let waiting = self
             .entries
             .iter()
@@ -117,14 +117,20 @@ impl Ledger {
     }
 
     /// Takes in what became of a write. True if the view of the object has changed.
-    pub fn report(&mut self, key: &ObjectKey, wish: &Wish, result: Result<Written, TableError>, now: Instant) -> bool {
+    pub fn report(
+        &mut self,
+        key: &ObjectKey,
+        update: &RowUpdate,
+        result: Result<Written, TableError>,
+        now: Instant,
+    ) -> bool {
         let before = self.view(key);
         self.turns += 1;
         let Some(entry) = self.entries.get_mut(key) else {
             return false;
         };
-        let is_newest = entry.newest == *wish;
-        match stale_is_an_error(&entry.table, wish, result) {
+        let is_newest = entry.newest == *update;
+        match stale_is_an_error(&entry.table, update, result) {
             Ok(()) if is_newest => {
                 (entry.is_pending, entry.is_written, entry.error) = (false, true, None);
             }
@@ -144,8 +150,8 @@ impl Ledger {
     }
 
     /// What is known of an object.
-    pub fn view(&self, key: &ObjectKey) -> Option<View> {
-        self.entries.get(key).map(|entry| View {
+    pub fn view(&self, key: &ObjectKey) -> Option<RowState> {
+        self.entries.get(key).map(|entry| RowState {
             attempt: entry.newest.row.attempt,
             end_written: entry.newest.end && entry.is_written,
             error: entry.error.clone(),
@@ -158,12 +164,16 @@ impl Ledger {
     }
 }
 
-/// A row before the end that comes too late needs no telling; an end that was not taken does.
-fn stale_is_an_error(table: &TableId, wish: &Wish, result: Result<Written, TableError>) -> Result<(), TableError> {
+/// A row before the end that comes too late is no error; an end that was not stored is.
+fn stale_is_an_error(
+    table: &TableId,
+    update: &RowUpdate,
+    result: Result<Written, TableError>,
+) -> Result<(), TableError> {
     match result? {
-        Written::Stale if wish.end => Err(TableError::Stale {
+        Written::Stale if update.end => Err(TableError::Stale {
             table: table.name.clone(),
-            run_id: wish.row.run_id.clone(),
+            run_id: update.row.run_id.clone(),
         }),
         Written::Stored | Written::Stale => Ok(()),
     }
@@ -190,18 +200,18 @@ mod tests {
         }
     }
 
-    fn wish(attempt: i64, progress: &str, end: bool) -> Wish {
+    fn update(attempt: i64, progress: &str, end: bool) -> RowUpdate {
         let row = Row {
             attempt,
             progress: progress.into(),
             run_id: "7".into(),
             ..Row::default()
         };
-        Wish { row: row.into(), end }
+        RowUpdate { row: row.into(), end }
     }
 
-    fn view(attempt: i64, end_written: bool, error: Option<&str>) -> View {
-        View {
+    fn view(attempt: i64, end_written: bool, error: Option<&str>) -> RowState {
+        RowState {
             attempt,
             end_written,
             error: error.map(str::to_owned),
@@ -219,64 +229,64 @@ mod tests {
     #[test]
     fn the_newest_row_wins_and_what_is_known_is_not_written_again() {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
-        let mut record = |wish: Wish| {
+        let mut record = |update: RowUpdate| {
             (
-                ledger.record(table("t"), &a, wish, now),
+                ledger.record(table("t"), &a, update, now),
                 ledger.next(&table("t")).unwrap().1,
             )
         };
-        assert_eq!(record(wish(1, "1/9", false)), (true, wish(1, "1/9", false)));
-        assert_eq!(record(wish(1, "1/9", false)), (false, wish(1, "1/9", false)));
-        assert_eq!(record(wish(1, "2/9", false)), (true, wish(1, "2/9", false)));
-        assert_eq!(record(wish(1, "9/9", true)), (true, wish(1, "9/9", true)));
+        assert_eq!(record(update(1, "1/9", false)), (true, update(1, "1/9", false)));
+        assert_eq!(record(update(1, "1/9", false)), (false, update(1, "1/9", false)));
+        assert_eq!(record(update(1, "2/9", false)), (true, update(1, "2/9", false)));
+        assert_eq!(record(update(1, "9/9", true)), (true, update(1, "9/9", true)));
         assert_eq!(
-            record(wish(1, "3/9", false)),
-            (false, wish(1, "9/9", true)),
+            record(update(1, "3/9", false)),
+            (false, update(1, "9/9", true)),
             "the end stays"
         );
         assert_eq!(
-            record(wish(2, "3/9", false)),
-            (true, wish(2, "3/9", false)),
+            record(update(2, "3/9", false)),
+            (true, update(2, "3/9", false)),
             "but for a resume"
         );
-        assert_eq!(record(wish(1, "9/9", true)), (false, wish(2, "3/9", false)));
+        assert_eq!(record(update(1, "9/9", true)), (false, update(2, "3/9", false)));
     }
 
     #[test]
     fn an_end_is_written_once() {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
-        ledger.record(table("t"), &a, wish(1, "9/9", true), now);
+        ledger.record(table("t"), &a, update(1, "9/9", true), now);
         assert_eq!(ledger.view(&a), Some(view(1, false, None)));
-        assert!(ledger.report(&a, &wish(1, "9/9", true), Ok(Written::Stored), now));
+        assert!(ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stored), now));
         assert_eq!(ledger.view(&a), Some(view(1, true, None)));
         assert_eq!(ledger.next(&table("t")), None);
-        assert!(!ledger.record(table("t"), &a, wish(1, "9/9", true), now));
+        assert!(!ledger.record(table("t"), &a, update(1, "9/9", true), now));
         ledger.forget(&a);
         assert_eq!(ledger.view(&a), None);
-        assert!(!ledger.report(&a, &wish(1, "9/9", true), Ok(Written::Stored), now));
+        assert!(!ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stored), now));
     }
 
     #[test]
     fn a_row_that_was_replaced_while_it_was_written_leaves_the_newer_one_waiting() {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
-        ledger.record(table("t"), &a, wish(1, "1/9", false), now);
+        ledger.record(table("t"), &a, update(1, "1/9", false), now);
         let (_, first) = ledger.next(&table("t")).unwrap();
-        ledger.record(table("t"), &a, wish(1, "2/9", false), now);
+        ledger.record(table("t"), &a, update(1, "2/9", false), now);
         assert!(!ledger.report(&a, &first, Ok(Written::Stored), now));
-        assert_eq!(ledger.next(&table("t")).unwrap().1, wish(1, "2/9", false));
+        assert_eq!(ledger.next(&table("t")).unwrap().1, update(1, "2/9", false));
     }
 
     #[test]
     fn ends_go_first_then_who_waited_longest_each_table_for_itself() {
         let (mut ledger, now) = (Ledger::default(), Instant::now());
         for (name, end) in [("a", false), ("b", false), ("c", true)] {
-            ledger.record(table("t"), &key(name), wish(1, "1/9", end), now);
+            ledger.record(table("t"), &key(name), update(1, "1/9", end), now);
         }
-        ledger.record(table("u"), &key("d"), wish(1, "1/9", true), now);
-        ledger.record(table("t"), &key("a"), wish(1, "2/9", false), now);
+        ledger.record(table("u"), &key("d"), update(1, "1/9", true), now);
+        ledger.record(table("t"), &key("a"), update(1, "2/9", false), now);
         let mut order = Vec::new();
-        while let Some((key, wish)) = ledger.next(&table("t")) {
-            ledger.report(&key, &wish, Ok(Written::Stored), now);
+        while let Some((key, update)) = ledger.next(&table("t")) {
+            ledger.report(&key, &update, Ok(Written::Stored), now);
             order.push(key.name);
         }
         assert_eq!(order, ["c", "a", "b"]);
@@ -285,21 +295,21 @@ mod tests {
     #[test]
     fn a_failure_of_the_table_lets_the_others_try_and_keeps_the_row() {
         let (mut ledger, now) = (Ledger::default(), Instant::now());
-        ledger.record(table("t"), &key("a"), wish(1, "1/9", false), now);
-        ledger.record(table("t"), &key("b"), wish(1, "1/9", false), now);
-        assert!(ledger.report(&key("a"), &wish(1, "1/9", false), Err(throttled()), now));
+        ledger.record(table("t"), &key("a"), update(1, "1/9", false), now);
+        ledger.record(table("t"), &key("b"), update(1, "1/9", false), now);
+        assert!(ledger.report(&key("a"), &update(1, "1/9", false), Err(throttled()), now));
         assert_eq!(
             ledger.view(&key("a")),
             Some(view(
                 1,
                 false,
-                Some("table t: UpdateItem failed: slow down; it is tried again")
+                Some("table t: UpdateItem failed: slow down; it is retried")
             ))
         );
         assert_eq!(ledger.next(&table("t")).unwrap().0, key("b"));
-        ledger.report(&key("b"), &wish(1, "1/9", false), Ok(Written::Stored), now);
+        ledger.report(&key("b"), &update(1, "1/9", false), Ok(Written::Stored), now);
         assert_eq!(ledger.next(&table("t")).unwrap().0, key("a"));
-        assert!(ledger.report(&key("a"), &wish(1, "1/9", false), Ok(Written::Stored), now));
+        assert!(ledger.report(&key("a"), &update(1, "1/9", false), Ok(Written::Stored), now));
         assert_eq!(ledger.view(&key("a")), Some(view(1, false, None)));
     }
 
@@ -311,24 +321,24 @@ mod tests {
             key: "team_id".into(),
             problem: "is empty: the team is not known".into(),
         };
-        ledger.record(table("t"), &a, wish(1, "1/9", true), now);
-        ledger.report(&a, &wish(1, "1/9", true), Err(refused()), now);
+        ledger.record(table("t"), &a, update(1, "1/9", true), now);
+        ledger.report(&a, &update(1, "1/9", true), Err(refused()), now);
         let told = Some("table t: key team_id is empty: the team is not known");
         assert_eq!(ledger.view(&a), Some(view(1, false, told)));
         assert_eq!(ledger.next(&table("t")), None);
-        assert!(!ledger.record(table("t"), &a, wish(1, "1/9", true), now));
-        assert!(ledger.record(table("t"), &a, wish(1, "2/9", true), now));
-        ledger.report(&a, &wish(1, "2/9", true), Err(refused()), now);
-        assert!(ledger.record(table("t"), &a, wish(1, "2/9", true), now + REFUSED));
+        assert!(!ledger.record(table("t"), &a, update(1, "1/9", true), now));
+        assert!(ledger.record(table("t"), &a, update(1, "2/9", true), now));
+        ledger.report(&a, &update(1, "2/9", true), Err(refused()), now);
+        assert!(ledger.record(table("t"), &a, update(1, "2/9", true), now + REFUSED));
     }
 
     #[test]
-    fn a_stale_end_is_told_and_a_stale_partial_row_is_not() {
+    fn a_stale_end_is_an_error_and_a_stale_partial_row_is_not() {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
-        ledger.record(table("t"), &a, wish(1, "1/9", false), now);
-        assert!(!ledger.report(&a, &wish(1, "1/9", false), Ok(Written::Stale), now));
-        ledger.record(table("t"), &a, wish(1, "9/9", true), now);
-        ledger.report(&a, &wish(1, "9/9", true), Ok(Written::Stale), now);
+        ledger.record(table("t"), &a, update(1, "1/9", false), now);
+        assert!(!ledger.report(&a, &update(1, "1/9", false), Ok(Written::Stale), now));
+        ledger.record(table("t"), &a, update(1, "9/9", true), now);
+        ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stale), now);
         let told = "table t already holds a later attempt or another end of submission 7; the row is left as it is";
         assert_eq!(ledger.view(&a), Some(view(1, false, Some(told))));
     }

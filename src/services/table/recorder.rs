@@ -12,8 +12,9 @@ use futures::future::BoxFuture;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::Instant;
 
-use super::ledger::{Ledger, TableId, View, Wish};
+use super::ledger::{Ledger, RowState, RowUpdate, TableId};
 use super::{Row, Table, TableError, Written};
+use crate::backoff::Backoff;
 use crate::observability::tasks::Tasks;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
@@ -21,8 +22,8 @@ use leaderboard_api as api;
 
 /// Time between the starts of two writes to one table: the stock table has one write unit.
 const SPACING: Duration = Duration::from_secs(2);
-/// Longest pause after failures.
-const LONGEST_PAUSE: Duration = Duration::from_mins(5);
+/// Pauses after failures in a row, half of which is no less than the spacing.
+const RETRY: Backoff = Backoff::new(Duration::from_secs(4), Duration::from_mins(5));
 /// How often a fence that is down is looked at.
 const FENCE_PAUSE: Duration = Duration::from_secs(1);
 
@@ -83,8 +84,8 @@ impl Recorder {
     /// in each pass: what is written or waiting already is not written again.
     pub fn record(&self, table: &api::Table, key: &ObjectKey, row: Row, end: bool) {
         let id = TableId::from(table);
-        let wish = Wish { row: row.into(), end };
-        if !self.shared.ledger().record(id.clone(), key, wish, Instant::now()) {
+        let update = RowUpdate { row: row.into(), end };
+        if !self.shared.ledger().record(id.clone(), key, update, Instant::now()) {
             return;
         }
         let mut tables = lock(&self.shared.tables);
@@ -103,7 +104,7 @@ impl Recorder {
     }
 
     /// What is known of an object's newest row; None if none was handed in.
-    pub fn view(&self, key: &ObjectKey) -> Option<View> {
+    pub fn view(&self, key: &ObjectKey) -> Option<RowState> {
         self.shared.ledger().view(key)
     }
 
@@ -141,11 +142,11 @@ impl Worker {
             let pause = match next {
                 None => None,
                 Some(_) if !(self.shared.may_write)() => Some(Instant::now() + FENCE_PAUSE),
-                Some((key, wish)) => {
+                Some((key, update)) => {
                     let begun = Instant::now();
-                    let is_sick = self.write(key, wish).await;
+                    let is_sick = self.write(key, update).await;
                     failures = if is_sick { failures.saturating_add(1) } else { 0 };
-                    Some(begun + pause(failures, fastrand::f64()))
+                    Some(begun + if failures == 0 { SPACING } else { RETRY.after(failures) })
                 }
             };
             let wait = async {
@@ -162,27 +163,17 @@ impl Worker {
     }
 
     /// Writes one row. True if the table could not be written.
-    async fn write(&self, key: ObjectKey, wish: Wish) -> bool {
-        let result = self.shared.store.write(&self.table, wish.row.clone()).await;
+    async fn write(&self, key: ObjectKey, update: RowUpdate) -> bool {
+        let result = self.shared.store.write(&self.table, update.row.clone()).await;
         let is_sick = result.as_ref().is_err_and(TableError::is_of_the_table);
         if let Err(error) = &result {
             tracing::warn!(submission = %key, %error, "the row is not in the table");
         }
-        if self.shared.ledger().report(&key, &wish, result, Instant::now()) {
+        if self.shared.ledger().report(&key, &update, result, Instant::now()) {
             // Nobody listens any more once the controller has ended.
             let _ = self.shared.wake.send(key);
         }
         is_sick
-    }
-}
-
-/// The spacing; after failures it doubles up to five minutes, between half of it and all.
-fn pause(failures: u32, chance: f64) -> Duration {
-    let whole = SPACING.saturating_mul(1 << failures.min(10)).min(LONGEST_PAUSE);
-    if failures == 0 {
-        SPACING
-    } else {
-        whole.mul_f64(0.5 + chance / 2.0).max(SPACING)
     }
 }
 

@@ -49,11 +49,11 @@ async fn cancels_between_a_list_and_a_write_are_found_by_the_read_of_that_write(
         world.set(pk, Stored::Cancelled);
         let cancelled = Timestamp::now();
         let wish = match index % 3 {
-            0 => Wish::Queued,
-            1 => Wish::Running,
-            _ => Wish::Partial(results(&world.target, 41.0)),
+            0 => DesiredUpdate::Queued,
+            1 => DesiredUpdate::Running,
+            _ => DesiredUpdate::Partial(results(&world.target, 41.0)),
         };
-        world.wish(pk, wish);
+        world.update(pk, wish);
         let view = world.until(pk, |view| {
             view.ended.is_some() || view.progress.is_some() || view.partial_at.is_some()
         });
@@ -82,7 +82,7 @@ async fn cancels_during_partial_traffic_are_lost_only_inside_a_request() {
     for (round, pk) in pks.iter().enumerate() {
         for other in &pks {
             let score = f64::from(u32::try_from(round).unwrap());
-            world.wish(*other, Wish::Partial(results(&world.target, score)));
+            world.update(*other, DesiredUpdate::Partial(results(&world.target, score)));
         }
         // Those that are cancelled get none.
         let wanted = world.sent("PUT").len() + 5.min(pks.len() - round);
@@ -182,7 +182,7 @@ async fn cancel_all(world: &World, pks: &[i64]) -> BTreeMap<i64, Timestamp> {
             round += 1;
             let results = results(&world.target, f64::from(round));
             for pk in pks.iter().filter(|pk| !cancelled.contains_key(*pk)) {
-                world.wish(*pk, Wish::Partial(results.clone()));
+                world.update(*pk, DesiredUpdate::Partial(results.clone()));
             }
         }
         tokio::time::sleep_until(began + moment).await;

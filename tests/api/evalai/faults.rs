@@ -42,7 +42,10 @@ async fn an_unanswered_end_leaves_one_row_on_the_leaderboard() {
         put_delay_ms: 1000,
         ..Knobs::default()
     });
-    world.wish(pk, Wish::Final(Outcome::Finished, results(&world.target, 43.0)));
+    world.update(
+        pk,
+        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
+    );
     let view = world.until(pk, |view| view.unanswered_until.is_some()).await;
     assert!(
         view.last_error
@@ -95,7 +98,7 @@ async fn a_write_that_was_done_without_an_answer_is_settled_by_a_read() {
         let mut world = World::new().await;
         let pk = world.submit();
         world.fail("PUT", "/api/jobs/", answer, When::After);
-        world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+        world.update(pk, DesiredUpdate::Final(Outcome::Failed, results(&world.target, 0.0)));
         world.until(pk, |view| view.unanswered_until.is_some()).await;
         assert_eq!(world.ended(pk).await, Ended::Agreed(Status::Failed));
         assert_eq!(world.sent("PUT").len(), 1);
@@ -108,7 +111,7 @@ async fn a_broken_page_in_place_of_an_end_is_an_answer() {
     let mut world = World::new().await;
     let pk = world.submit();
     world.fail("PUT", "/api/jobs/", Failure::Html500, When::Before);
-    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+    world.update(pk, DesiredUpdate::Final(Outcome::Failed, results(&world.target, 0.0)));
     let view = world.until(pk, |view| view.last_error.is_some()).await;
     assert_eq!((view.unanswered_until, view.end), (None, None));
 }
@@ -120,7 +123,10 @@ async fn a_refused_end_says_why() {
     let mut target = world.target.clone();
     target.labels = ["Bogus".to_owned()].into();
     world.target = target;
-    world.wish(pk, Wish::Final(Outcome::Finished, results(&world.target, 43.0)));
+    world.update(
+        pk,
+        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
+    );
     let Ended::Refused(why) = world.ended(pk).await else {
         panic!("it was not refused")
     };
@@ -136,7 +142,10 @@ async fn the_end_of_the_process_waits_for_what_is_on_its_way() {
         put_delay_ms: 500,
         ..Knobs::default()
     });
-    world.wish(pk, Wish::Final(Outcome::Finished, results(&world.target, 43.0)));
+    world.update(
+        pk,
+        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
+    );
     world
         .server
         .wait_until(|_, log| log.entries().any(|entry| entry.method == "PUT"))
@@ -151,7 +160,10 @@ async fn the_end_of_the_process_waits_for_what_is_on_its_way() {
     let world = World::with(timing(), timeouts).await;
     let pk = world.submit();
     world.fail("PUT", "/api/jobs/", Failure::Hang, When::After);
-    world.wish(pk, Wish::Final(Outcome::Finished, results(&world.target, 43.0)));
+    world.update(
+        pk,
+        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
+    );
     world
         .server
         .wait_until(|_, log| log.entries().any(|entry| entry.method == "PUT"))
@@ -220,7 +232,7 @@ async fn writes_that_wait_for_the_process_before_are_named_and_their_start_wakes
     let opens = Instant::now() + Duration::from_secs(1);
     let mut world = World::opened_at(opens).await;
     let pk = world.submit();
-    world.wish(pk, Wish::Final(Outcome::Failed, results(&world.target, 0.0)));
+    world.update(pk, DesiredUpdate::Final(Outcome::Failed, results(&world.target, 0.0)));
     let from = world.hub.writes_from().unwrap();
     assert!(from > Timestamp::now() && from < Timestamp::now() + SignedDuration::from_secs(2));
     loop {

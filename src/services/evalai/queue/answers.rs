@@ -10,9 +10,10 @@ use jiff::SignedDuration;
 use super::poll::pause;
 use super::sub::{RETRY_END, Sub};
 use super::{Busy, Now, Queue, Ticket};
+use crate::backoff::Backoff;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::payload::digest;
-use crate::services::evalai::request::{Reply, Request, Subject};
+use crate::services::evalai::request::{Reply, Request, SubmissionRef};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Status};
 use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
@@ -20,8 +21,8 @@ use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);
 
-/// Longest wait after a write that EvalAI broke down over: results are to be there two minutes after an outage.
-const OUTAGE_PAUSE: Duration = Duration::from_secs(90);
+/// Waits after a write that EvalAI broke down over: results are to be there two minutes after an outage.
+const OUTAGE: Backoff = Backoff::new(Duration::from_secs(30), Duration::from_secs(90));
 /// So many such waits are well over an hour.
 const OUTAGE_TRIES: u32 = 60;
 
@@ -43,7 +44,7 @@ impl Queue {
     pub fn not_sent(&mut self, ticket: &Ticket) {
         if let Some(lane) = ticket
             .request
-            .subject()
+            .submission()
             .and_then(|subject| self.lanes.get_mut(&subject.pk))
         {
             lane.busy = None;
@@ -70,7 +71,7 @@ impl Queue {
         }
     }
 
-    fn took_row(&mut self, subject: &Subject, requested: Duration, answer: Answer<Row>, now: &Now) {
+    fn took_row(&mut self, subject: &SubmissionRef, requested: Duration, answer: Answer<Row>, now: &Now) {
         let lane = self.lanes.entry(subject.pk).or_default();
         let for_write = lane.busy.take() == Some(Busy::ReadForWrite);
         let row = match answer {
@@ -110,7 +111,7 @@ impl Queue {
         }
     }
 
-    fn took_image(&mut self, subject: &Subject, answer: Answer<ImageAnswer>, now: &Now) {
+    fn took_image(&mut self, subject: &SubmissionRef, answer: Answer<ImageAnswer>, now: &Now) {
         self.lanes.entry(subject.pk).or_default().busy = None;
         self.change(subject, |sub| {
             sub.view.image = Some(match answer {
@@ -127,7 +128,7 @@ impl Queue {
         });
     }
 
-    fn read_failed(&mut self, subject: &Subject, answer: &Answer<Row>, now: &Now) {
+    fn read_failed(&mut self, subject: &SubmissionRef, answer: &Answer<Row>, now: &Now) {
         let everybodys = matches!(answer, Answer::Throttled(_))
             || matches!(answer, Answer::Refused(refusal) if refusal.about == About::Token);
         match answer.error() {
@@ -136,12 +137,12 @@ impl Queue {
         }
     }
 
-    fn went_wrong(&mut self, subject: &Subject, why: String, now: &Now) {
+    fn went_wrong(&mut self, subject: &SubmissionRef, why: String, now: &Now) {
         self.change(subject, |sub| sub.read_failed(why, now));
     }
 
     fn wrote(&mut self, request: &Request, answer: Answer<()>, now: &Now) {
-        let Some(subject) = request.subject() else { return };
+        let Some(subject) = request.submission() else { return };
         self.lanes.entry(subject.pk).or_default().busy = None;
         match answer {
             Answer::Done(()) => self.change(subject, |sub| done(sub, request, now)),
@@ -159,7 +160,7 @@ impl Queue {
         }
     }
 
-    fn refused(&mut self, subject: &Subject, request: &Request, refusal: Refusal, now: &Now) {
+    fn refused(&mut self, subject: &SubmissionRef, request: &Request, refusal: Refusal, now: &Now) {
         self.change(subject, |sub| match (refusal.about, request) {
             (About::Token, _) => {}
             (About::Missing, _) => sub.outdated = true,
@@ -171,7 +172,7 @@ impl Queue {
         });
     }
 
-    fn unanswered(&mut self, subject: &Subject, silence: Silence, now: &Now) {
+    fn unanswered(&mut self, subject: &SubmissionRef, silence: Silence, now: &Now) {
         if !silence.sent {
             return self.change(subject, |sub| {
                 sub.write_failed(silence.why, pause(sub.write_failures), now);
@@ -192,7 +193,7 @@ impl Queue {
     }
 
     /// Changes the object a request was about, if it is still at that attempt.
-    fn change(&mut self, subject: &Subject, change: impl FnOnce(&mut Sub)) {
+    fn change(&mut self, subject: &SubmissionRef, change: impl FnOnce(&mut Sub)) {
         let Some(sub) = self.subs.get_mut(&subject.key) else {
             return;
         };
@@ -209,11 +210,11 @@ impl Queue {
     }
 }
 
-/// The wait before a write that EvalAI broke down over is tried again: short while it may be an outage, whose end nobody
-/// announces; long once it must be this row, which only EvalAI's own people can mend.
+/// The wait before a write that EvalAI broke down over is retried: short while it may be an outage, whose end nobody
+/// announces; long once it must be this row, which only EvalAI's administrators can fix.
 fn broken_pause(failures: u32) -> Duration {
     if failures < OUTAGE_TRIES {
-        (pause(failures) * 6).min(OUTAGE_PAUSE)
+        OUTAGE.bound(failures.saturating_add(1))
     } else {
         RETRY_END
     }

@@ -10,7 +10,7 @@ use jiff::{SignedDuration, Timestamp};
 use super::poll::Challenge;
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
-use crate::services::evalai::request::{Purpose, Request, Subject};
+use crate::services::evalai::request::{Purpose, Request, SubmissionRef};
 use crate::services::evalai::status::{Outcome, Progress, Status};
 use crate::services::evalai::types::Key;
 
@@ -47,7 +47,7 @@ pub(super) enum Priority {
 enum What {
     Sub(Key, Step),
     List(i64, Purpose),
-    Look(i64),
+    Check(i64),
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -280,12 +280,12 @@ impl Queue {
         if challenge.sweep.is_some() {
             offers.extend(list(Priority::Sweep, Purpose::SweepSubmitted));
             offers.extend(list(Priority::Sweep, Purpose::SweepResuming));
-            if !challenge.look.poll.busy {
+            if !challenge.check.poll.busy {
                 offers.push(Offer {
                     priority: Priority::Sweep,
-                    since: challenge.look.poll.due,
-                    ready: challenge.look.poll.due,
-                    what: What::Look(id),
+                    since: challenge.check.poll.due,
+                    ready: challenge.check.poll.due,
+                    what: What::Check(id),
                 });
             }
         }
@@ -305,10 +305,10 @@ impl Queue {
                     after,
                 })
             }
-            What::Look(id) => {
-                let look = &mut self.challenges.get_mut(id)?.look;
-                let request = look.request(*id)?;
-                look.poll.busy = true;
+            What::Check(id) => {
+                let check = &mut self.challenges.get_mut(id)?.check;
+                let request = check.request(*id)?;
+                check.poll.busy = true;
                 Some(request)
             }
         }
@@ -316,7 +316,7 @@ impl Queue {
 
     fn start_sub(&mut self, key: &Key, step: Step) -> Option<Request> {
         let sub = self.subs.get_mut(key)?;
-        let subject = Subject {
+        let subject = SubmissionRef {
             key: key.clone(),
             challenge: sub.challenge,
             pk: sub.pk,

@@ -17,12 +17,12 @@ use leaderboard_api::names;
 
 /// What the sweep has found is not handed out again for so long.
 const SWEPT_FOR: Duration = Duration::from_mins(10);
-/// Before a failed check is tried again.
-const RETRY_LOOK: Duration = Duration::from_mins(1);
+/// Before a failed check is retried.
+const RETRY_CHECK: Duration = Duration::from_mins(1);
 
-/// What a row says that asks to be run. EvalAI makes a re-run's row by copying the old one: it keeps the Jobs of the old one's id,
+/// What kind of run a row asks for. EvalAI makes a re-run's row by copying the old one: it keeps the Jobs of the old one's id,
 /// when that was submitted and when it ended.
-fn says(row: &Row, since: Timestamp) -> Swept {
+fn kind_of(row: &Row, since: Timestamp) -> Swept {
     let own = format!("{}-", names::submission(row.id));
     let has_run = row.jobs.iter().any(|job| job.starts_with(&own));
     let is_ours = !has_run && row.submitted_at.is_some_and(|at| at >= since);
@@ -43,12 +43,14 @@ impl Queue {
                 self.took_list(*challenge, *purpose, requested, answer, now);
             }
             (Request::Phases(id), Reply::Phases(answer)) => {
-                self.looked(*id, answer, now, |look, phases| {
-                    look.phases = Some(phases);
+                self.took_of_check(*id, answer, now, |check, phases| {
+                    check.phases = Some(phases);
                 });
             }
             (Request::Splits(id), Reply::Splits(answer)) => {
-                self.looked(*id, answer, now, |look, splits: Vec<Split>| look.splits = Some(splits));
+                self.took_of_check(*id, answer, now, |check, splits: Vec<Split>| {
+                    check.splits = Some(splits)
+                });
             }
             (Request::DatasetSplit(id, split), Reply::DatasetSplit(answer)) => {
                 // Not every host may read it: the phase's only leaderboard is taken then.
@@ -56,8 +58,8 @@ impl Queue {
                     Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),
                     other => other.and_then(|split| Answer::Done(Some(split.codename))),
                 };
-                self.looked(*id, answer, now, |look, codename| {
-                    look.codenames.insert(*split, codename);
+                self.took_of_check(*id, answer, now, |check, codename| {
+                    check.codenames.insert(*split, codename);
                 });
             }
             _ => {}
@@ -88,7 +90,7 @@ impl Queue {
                 challenge.poll(purpose).failed(now.at, every);
                 if let Answer::Refused(refusal) = other {
                     if is_news && refusal.about == About::Challenge {
-                        challenge.look.hurry(now.at);
+                        challenge.check.hurry(now.at);
                     }
                     self.listed(id, purpose, now.at);
                 }
@@ -105,7 +107,7 @@ impl Queue {
         self.listed(id, purpose, requested);
     }
 
-    /// Whoever is still waiting after a list of new submissions is asked for alone.
+    /// A submission that still waits after a list of new ones is asked for alone.
     fn listed(&mut self, id: i64, purpose: Purpose, requested: Duration) {
         if purpose != Purpose::Accept {
             return;
@@ -145,36 +147,42 @@ impl Queue {
             challenge: id,
             phase,
             submission: row.id,
-            says: says(row, since),
+            kind: kind_of(row, since),
             time,
         });
     }
 
-    fn looked<T>(&mut self, id: i64, answer: Answer<T>, now: &Now, take: impl FnOnce(&mut super::poll::Look, T)) {
+    fn took_of_check<T>(
+        &mut self,
+        id: i64,
+        answer: Answer<T>,
+        now: &Now,
+        take: impl FnOnce(&mut super::poll::ChallengeCheck, T),
+    ) {
         let every = self.timing.check;
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
         };
-        let look = &mut challenge.look;
-        let before = (look.catalog.clone(), look.error.clone());
+        let check = &mut challenge.check;
+        let before = (check.catalog.clone(), check.error.clone());
         match answer {
             Answer::Done(content) => {
-                take(look, content);
-                look.poll.done(now.at, now.at, Duration::ZERO);
-                if look.request(id).is_none() {
-                    look.poll.done(now.at, now.at, every);
-                    look.close(now.wall);
+                take(check, content);
+                check.poll.done(now.at, now.at, Duration::ZERO);
+                if check.request(id).is_none() {
+                    check.poll.done(now.at, now.at, every);
+                    check.close(now.wall);
                 }
             }
-            Answer::Throttled(_) => look.poll.busy = false,
+            Answer::Throttled(_) => check.poll.busy = false,
             other => {
-                look.is_forbidden = matches!(&other, Answer::Refused(refusal) if refusal.about == About::Challenge);
-                look.error = other.error();
-                look.restart();
-                look.poll.failed(now.at, RETRY_LOOK);
+                check.is_forbidden = matches!(&other, Answer::Refused(refusal) if refusal.about == About::Challenge);
+                check.error = other.error();
+                check.restart();
+                check.poll.failed(now.at, RETRY_CHECK);
             }
         }
-        if before != (look.catalog.clone(), look.error.clone()) {
+        if before != (check.catalog.clone(), check.error.clone()) {
             let of = self.served.iter().filter(|(_, target)| target.challenge == id);
             self.changes
                 .extend(of.map(|(key, _)| Changed::Leaderboard(key.clone())));

@@ -1,12 +1,12 @@
 //! What one token is to ask and to write, and in which order: all of it as a state machine without network and clock.
 //!
-//! `hub` puts wishes in, `task` takes requests out ([`Queue::next`]) and brings their answers back ([`Queue::answered`]).
+//! `hub` puts updates in, `task` takes requests out ([`Queue::next`]) and brings their answers back ([`Queue::answered`]).
 //! What holds for every request:
 //!
 //! - the budget of the token, priorities by [`choose`], oldest first within one;
 //! - one request in flight for a submission, whatever it is, and [`MAX_IN_FLIGHT`] in all;
 //! - after a write without an answer nothing for that submission until the server must have given up, then a read;
-//! - each write follows at once a read of its own, judged by [`super::guard`]: the server overwrites whatever it was told in
+//! - each write follows at once a read of its own, judged by [`super::guard`]: the server overwrites whatever it has stored in
 //!   between, a cancel above all.
 
 mod answers;
@@ -15,8 +15,6 @@ mod lists;
 mod poll;
 mod sub;
 
-#[cfg(test)]
-mod simulation;
 #[cfg(test)]
 mod tests;
 
@@ -27,13 +25,13 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use self::poll::Challenge;
-use self::sub::{Asked, Sub, Wanted};
+use self::sub::{Asked, Pending, Sub};
 use super::budget::Budget;
 use super::labels::{Labels, compare};
 use super::payload::{check, digest};
 use super::request::Request;
 use super::status::{Outcome, Progress};
-use super::types::{Changed, Ended, Key, Payload, Run, SweepRow, Target, View, Wish};
+use super::types::{Changed, DesiredUpdate, Ended, Key, Payload, Subject, SubmissionState, SweepRow, Target};
 
 /// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
 const MAX_IN_FLIGHT: usize = 4;
@@ -85,7 +83,7 @@ impl Default for Timing {
 pub enum Next {
     /// Send this, and hand it back with its answer.
     Send(Ticket),
-    /// Nothing before that moment, unless something is wished or answered; none is never.
+    /// Nothing before that moment, unless there is a new update or an answer; none is never.
     Wait(Option<Duration>),
 }
 
@@ -129,7 +127,7 @@ pub struct Queue {
     lanes: BTreeMap<i64, Lane>,
     challenges: BTreeMap<i64, Challenge>,
     served: BTreeMap<Key, Target>,
-    /// What EvalAI said of the token, and until when nothing is asked with it.
+    /// EvalAI's refusal of the token, and until when nothing is asked with it.
     token_refused: Option<(String, Duration)>,
     changes: BTreeSet<Changed>,
     sweep: Vec<SweepRow>,
@@ -165,20 +163,21 @@ impl Queue {
             .or_insert_with(|| Challenge::new(target.period));
         self.arrange(now);
         if let Some(challenge) = self.challenges.get_mut(&target.challenge) {
-            challenge.look.poll.due = now.at;
-            challenge.look.restart();
+            challenge.check.poll.due = now.at;
+            challenge.check.restart();
         }
         true
     }
 
     /// A Leaderboard is gone.
     pub fn retire(&mut self, leaderboard: &Key, now: Now) {
-        if self.served.remove(leaderboard).is_some() {
+        if let Some(target) = self.served.remove(leaderboard) {
+            self.drop_unused(target.challenge);
             self.arrange(now);
         }
     }
 
-    /// The token was renewed: what EvalAI said of the old one is void.
+    /// The token was renewed: the refusal of the old one is void.
     pub fn renew_token(&mut self) {
         self.token_refused = None;
     }
@@ -199,7 +198,13 @@ impl Queue {
 
     /// Whether a write was not answered and the server may still be working on it.
     pub fn is_unsure(&self, now: Now) -> bool {
-        self.lanes.values().any(|lane| lane.hold_until > now.at)
+        self.settled_at(now).is_some()
+    }
+
+    /// When the server must have given up every write that was not answered; none if it has.
+    pub fn settled_at(&self, now: Now) -> Option<Duration> {
+        let holds = self.lanes.values().map(|lane| lane.hold_until);
+        holds.max().filter(|until| *until > now.at)
     }
 
     /// Wakes what waited for the first write, once, when it may be sent.
@@ -214,15 +219,15 @@ impl Queue {
         self.changes.extend(waiting.chain(boards));
     }
 
-    /// Wants to know whether an attempt may run, and its image where the object has none. This and the two below say
-    /// whether they brought anything new.
-    pub fn ask(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, image: bool, now: Now) -> bool {
-        let Some(sub) = self.enter(target, key, pk, run) else {
+    /// Asks whether an attempt may run, and for its image where the object has none. This and the two below return whether
+    /// they brought anything new.
+    pub fn ask(&mut self, subject: &Subject, image: bool, now: Now) -> bool {
+        let Some(sub) = self.enter(subject) else {
             return false;
         };
         let mut news = image && !sub.image;
         sub.image |= image;
-        if sub.view.answered < run.attempt && sub.asked.is_none() {
+        if sub.view.answered < subject.run.attempt && sub.asked.is_none() {
             news = true;
             sub.asked = Some(Asked {
                 since: now.at,
@@ -233,8 +238,8 @@ impl Queue {
     }
 
     /// From now on a cancellation of this attempt is looked for. `submitted_at` is EvalAI's own time.
-    pub fn live(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, submitted_at: Timestamp) -> bool {
-        let Some(sub) = self.enter(target, key, pk, run) else {
+    pub fn live(&mut self, subject: &Subject, submitted_at: Timestamp) -> bool {
+        let Some(sub) = self.enter(subject) else {
             return false;
         };
         let news = !sub.has_end() && sub.live != Some(submitted_at);
@@ -244,25 +249,26 @@ impl Queue {
         news
     }
 
-    /// Wants EvalAI to say something; a newer wish replaces an older one, an end all others.
-    pub fn wish(&mut self, target: &Target, key: &Key, pk: i64, run: &Run, wish: Wish, now: Now) -> bool {
-        let Some(sub) = self.enter(target, key, pk, run) else {
+    /// Requests an update; a newer one replaces an older one, an end all others.
+    pub fn update(&mut self, subject: &Subject, update: DesiredUpdate, now: Now) -> bool {
+        let Some(sub) = self.enter(subject) else {
             return false;
         };
+        let target = &*subject.target;
         let before = sub.view.clone();
-        let news = match wish {
-            Wish::Queued => wish_progress(sub, Progress::Queued, now),
-            Wish::Running => wish_progress(sub, Progress::Running, now),
-            Wish::Partial(payload) => wish_partial(sub, target, payload, now),
-            Wish::Final(outcome, payload) => wish_end(sub, target, outcome, payload, now),
+        let news = match update {
+            DesiredUpdate::Queued => request_progress(sub, Progress::Queued, now),
+            DesiredUpdate::Running => request_progress(sub, Progress::Running, now),
+            DesiredUpdate::Partial(payload) => request_partial(sub, target, payload, now),
+            DesiredUpdate::Final(outcome, payload) => request_end(sub, target, outcome, payload, now),
         };
         if sub.view != before {
-            self.changes.insert(Changed::Submission(key.clone()));
+            self.changes.insert(Changed::Submission(subject.key.clone()));
         }
         news
     }
 
-    /// The object is gone, or nothing more is to be said of it.
+    /// The object is gone, or needs no further update.
     pub fn forget(&mut self, key: &Key, now: Now) {
         let Some(sub) = self.subs.remove(key) else { return };
         if let Some(keys) = self.pks.get_mut(&sub.pk) {
@@ -274,10 +280,19 @@ impl Queue {
         let pks = &self.pks;
         self.lanes
             .retain(|pk, lane| lane.busy.is_some() || lane.hold_until > now.at || pks.contains_key(pk));
+        self.drop_unused(sub.challenge);
+    }
+
+    /// A challenge that no Leaderboard serves and no submission is of needs no memory.
+    fn drop_unused(&mut self, challenge: i64) {
+        let is_served = self.served.values().any(|target| target.challenge == challenge);
+        if !is_served && !self.subs.values().any(|sub| sub.challenge == challenge) {
+            self.challenges.remove(&challenge);
+        }
     }
 
     /// What is known of a submission.
-    pub fn view(&self, key: &Key) -> Option<View> {
+    pub fn view(&self, key: &Key) -> Option<SubmissionState> {
         self.subs.get(key).map(|sub| sub.view.clone())
     }
 
@@ -289,8 +304,8 @@ impl Queue {
         let Some(challenge) = self.challenges.get(&target.challenge) else {
             return (None, None);
         };
-        let labels = challenge.look.catalog.as_ref().map(|catalog| compare(target, catalog));
-        (labels, challenge.look.error.clone())
+        let labels = challenge.check.catalog.as_ref().map(|catalog| compare(target, catalog));
+        (labels, challenge.check.error.clone())
     }
 
     /// Requests of the last minute, and the limit.
@@ -298,7 +313,7 @@ impl Queue {
         (self.budget.used(now.at), self.budget.limit())
     }
 
-    /// Wishes and questions that wait for a request.
+    /// Updates and questions that wait for a request.
     pub fn waiting(&self) -> usize {
         let of = |sub: &Sub| {
             usize::from(sub.asked.is_some())
@@ -309,16 +324,16 @@ impl Queue {
         self.subs.values().map(of).sum()
     }
 
-    /// What EvalAI last said of the token, if it refused it.
+    /// EvalAI's answer to the token, if it refused it.
     pub fn token_refused(&self) -> Option<&str> {
         self.token_refused.as_ref().map(|(why, _)| why.as_str())
     }
 
-    /// What EvalAI last said of the token's rights on the challenge of a Leaderboard, if it has none.
+    /// EvalAI's answer about the token's rights on the challenge of a Leaderboard, if it has none.
     pub fn challenge_refused(&self, leaderboard: &Key) -> Option<&str> {
         let target = self.served.get(leaderboard)?;
-        let look = &self.challenges.get(&target.challenge)?.look;
-        look.error.as_deref().filter(|_| look.is_forbidden)
+        let check = &self.challenges.get(&target.challenge)?.check;
+        check.error.as_deref().filter(|_| check.is_forbidden)
     }
 
     /// Objects to wake.
@@ -332,13 +347,14 @@ impl Queue {
     }
 
     /// The submission's place, at this attempt; none if it is already further.
-    fn enter(&mut self, target: &Target, key: &Key, pk: i64, run: &Run) -> Option<&mut Sub> {
+    fn enter(&mut self, subject: &Subject) -> Option<&mut Sub> {
+        let Subject { target, key, pk, run } = subject;
         self.challenges
             .entry(target.challenge)
             .or_insert_with(|| Challenge::new(target.period));
         let sub = self.subs.entry(key.clone()).or_insert_with(|| {
-            self.pks.entry(pk).or_default().insert(key.clone());
-            Sub::new(pk, target.challenge, run.clone())
+            self.pks.entry(*pk).or_default().insert(key.clone());
+            Sub::new(*pk, target.challenge, run.clone())
         });
         if run.attempt > sub.run.attempt {
             sub.begin(run.clone());
@@ -347,7 +363,7 @@ impl Queue {
             sub.run.has_job |= run.has_job;
         }
         // An object's submission is immutable.
-        (run.attempt == sub.run.attempt && pk == sub.pk).then_some(sub)
+        (run.attempt == sub.run.attempt && *pk == sub.pk).then_some(sub)
     }
 
     /// Computes what depends on all Leaderboards served.
@@ -360,23 +376,23 @@ impl Queue {
             challenge.period = of().map(|target| target.period).min().unwrap_or(challenge.period);
             let since = of().map(|target| target.since).min();
             challenge.sweep = of().map(|target| target.sweep).min().zip(since);
-            challenge.look.wanted = of().flat_map(|target| target.phases.iter().copied()).collect();
+            challenge.check.wanted = of().flat_map(|target| target.phases.iter().copied()).collect();
         }
     }
 }
 
-fn wish_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
+fn request_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
     let further = sub.view.progress >= Some(wanted) || sub.progress.as_ref().is_some_and(|p| p.what >= wanted);
     if further || sub.has_end() {
         return false;
     }
     let since = sub.progress.as_ref().map_or(now.at, |progress| progress.since);
-    sub.progress = Some(Wanted { what: wanted, since });
+    sub.progress = Some(Pending { what: wanted, since });
     sub.settle(&now);
     true
 }
 
-fn wish_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
+fn request_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
     let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == payload);
     if sub.has_end() || pending || sub.partial_sent == Some(digest(&payload)) {
         return false;
@@ -387,11 +403,11 @@ fn wish_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now)
     }
     // The oldest unsent goes first, however often it was replaced.
     let since = sub.partial.as_ref().map_or(now.at, |partial| partial.since);
-    sub.partial = Some(Wanted { what: payload, since });
+    sub.partial = Some(Pending { what: payload, since });
     true
 }
 
-fn wish_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Payload>, now: Now) -> bool {
+fn request_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Payload>, now: Now) -> bool {
     let closed = sub
         .view
         .end
@@ -406,7 +422,7 @@ fn wish_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Paylo
         Outcome::Failed | Outcome::Cancelled => None,
     };
     let since = now.at;
-    sub.end = Some(Wanted { what: want, since });
+    sub.end = Some(Pending { what: want, since });
     (sub.progress, sub.partial, sub.view.end) = (None, None, None);
     sub.retry_at = sub.retry_at.min(now.at);
     true

@@ -7,14 +7,13 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use crate::backoff::Backoff;
 use crate::services::evalai::labels::Catalog;
 use crate::services::evalai::request::{Purpose, Request};
 use crate::services::evalai::row::{Phase, Split};
 
-/// Longest wait after failures.
-const LONGEST_PAUSE: Duration = Duration::from_mins(1);
-/// Wait after the first failure.
-const FIRST_PAUSE: Duration = Duration::from_secs(5);
+/// Waits after failures in a row. Without jitter: one task makes all requests of a token.
+const RETRY: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_mins(1));
 
 /// Something asked again and again, one request at a time.
 #[derive(Clone, Copy, Debug, Default)]
@@ -48,9 +47,9 @@ impl Poll {
     }
 }
 
-/// The wait after the n-th failure in a row.
+/// The wait after a failure that follows so many in a row.
 pub(super) fn pause(failures: u32) -> Duration {
-    (FIRST_PAUSE * 2_u32.saturating_pow(failures.min(10))).min(LONGEST_PAUSE)
+    RETRY.bound(failures.saturating_add(1))
 }
 
 /// A challenge, as far as it is asked about as a whole.
@@ -62,7 +61,7 @@ pub(super) struct Challenge {
     pub sweep: Option<(Duration, Timestamp)>,
     /// When each of its lists is due. One that was never asked for is due at once.
     pub lists: BTreeMap<Purpose, Poll>,
-    pub look: Look,
+    pub check: ChallengeCheck,
     /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when we said so.
     pub swept: BTreeMap<i64, (Timestamp, Duration)>,
 }
@@ -73,7 +72,7 @@ impl Challenge {
             period,
             sweep: None,
             lists: BTreeMap::new(),
-            look: Look::default(),
+            check: ChallengeCheck::default(),
             swept: BTreeMap::new(),
         }
     }
@@ -85,7 +84,7 @@ impl Challenge {
 
 /// Reading what a challenge's leaderboards look like, request by request.
 #[derive(Debug, Default)]
-pub(super) struct Look {
+pub(super) struct ChallengeCheck {
     pub poll: Poll,
     /// Phases whose splits are of interest.
     pub wanted: Vec<i64>,
@@ -100,7 +99,7 @@ pub(super) struct Look {
     pub is_forbidden: bool,
 }
 
-impl Look {
+impl ChallengeCheck {
     /// Starts anew.
     pub fn restart(&mut self) {
         (self.phases, self.splits) = (None, None);

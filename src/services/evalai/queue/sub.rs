@@ -12,16 +12,16 @@ use super::poll::pause;
 use crate::services::evalai::guard::{self, Attempt, End, Start, Verdict};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
-use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, View};
+use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, SubmissionState};
 
 /// Wait before an unknown word of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
 /// Wait before an end is tried again that was refused, or that EvalAI breaks down over again and again.
 pub(super) const RETRY_END: Duration = Duration::from_mins(10);
 
-/// A wish and since when it is wished.
+/// An update that is requested, and since when.
 #[derive(Debug, Clone)]
-pub(super) struct Wanted<T> {
+pub(super) struct Pending<T> {
     pub what: T,
     pub since: Duration,
 }
@@ -51,9 +51,9 @@ pub(super) struct Sub {
     pub live: Option<Timestamp>,
     pub asked: Option<Asked>,
     pub image: bool,
-    pub progress: Option<Wanted<Progress>>,
-    pub partial: Option<Wanted<Arc<Payload>>>,
-    pub end: Option<Wanted<(Outcome, Arc<Payload>)>>,
+    pub progress: Option<Pending<Progress>>,
+    pub partial: Option<Pending<Arc<Payload>>>,
+    pub end: Option<Pending<(Outcome, Arc<Payload>)>>,
     /// Digest of the partial results that were last answered.
     pub partial_sent: Option<u64>,
     /// Why the end's results are not sent, whatever EvalAI says.
@@ -76,14 +76,14 @@ pub(super) struct Sub {
     pub image_failures: u32,
     /// Failed writes in a row: a read that goes well between two of them repairs nothing.
     pub write_failures: u32,
-    pub view: View,
+    pub view: SubmissionState,
 }
 
 impl Sub {
     pub fn new(pk: i64, challenge: i64, run: Run) -> Self {
-        let view = View {
+        let view = SubmissionState {
             attempt: run.attempt,
-            ..View::default()
+            ..SubmissionState::default()
         };
         Self {
             pk,
@@ -111,7 +111,7 @@ impl Sub {
         }
     }
 
-    /// Begins a later attempt: every wish of the earlier one is void, what was read stays.
+    /// Begins a later attempt: every update of the earlier one is void, what was read stays.
     pub fn begin(&mut self, run: Run) {
         let old = std::mem::take(&mut self.view);
         let fresh = Self::new(self.pk, self.challenge, run);
@@ -119,7 +119,7 @@ impl Sub {
             read: self.read,
             outdated: self.outdated,
             wrote_at: self.wrote_at,
-            view: View {
+            view: SubmissionState {
                 row: old.row,
                 read_at: old.read_at,
                 answered: old.answered,
@@ -137,7 +137,7 @@ impl Sub {
         self.end.is_some() || self.view.end.is_some() || self.is_over()
     }
 
-    /// Whether nothing more is to be said of this attempt.
+    /// Whether this attempt needs no further update.
     pub fn is_over(&self) -> bool {
         self.view.ended.is_some()
             || self
@@ -183,19 +183,19 @@ impl Sub {
         self.image && unread && has_file && !self.has_end()
     }
 
-    /// When it was submitted, EvalAI's own word first.
+    /// When it was submitted, by EvalAI's own time if it is known.
     pub fn submitted_at(&self) -> Option<Timestamp> {
         self.view.row.as_ref().and_then(|row| row.submitted_at).or(self.live)
     }
 
-    /// Whether EvalAI had been told of this attempt when a read was made.
-    fn told(&self, row: &Row, requested: Duration) -> bool {
+    /// Whether EvalAI had stored this attempt when a read was made.
+    fn is_known(&self, row: &Row, requested: Duration) -> bool {
         row.names(&self.run.job) || self.known_at.is_some_and(|known| requested > known)
     }
 
     /// Whether the end of an earlier attempt could no longer stand when a read was made.
     fn begun(&self, row: &Row, requested: Duration) -> bool {
-        self.told(row, requested) || self.live_at.is_some_and(|live| requested > live)
+        self.is_known(row, requested) || self.live_at.is_some_and(|live| requested > live)
     }
 
     /// This attempt, as far as it had come when a read was made.
@@ -247,7 +247,7 @@ impl Sub {
         }
         self.settle(now);
         // That it was read again is no news.
-        let before = View {
+        let before = SubmissionState {
             read_at: self.view.read_at,
             ..before
         };
@@ -269,7 +269,7 @@ impl Sub {
         (self.live, self.progress, self.partial) = (None, None, None);
     }
 
-    /// Grants wishes that EvalAI grants already.
+    /// Drops the updates that EvalAI shows already.
     pub fn settle(&mut self, now: &Now) {
         if let Some((Verdict::There, wanted)) = self.progress_verdict().zip(self.progress.clone()) {
             let known = self.read.unwrap_or(now.at);
@@ -298,7 +298,7 @@ impl Sub {
         (self.end, self.live, self.progress, self.partial) = (None, None, None, None);
     }
 
-    /// The end can't be had now. It is tried again from time to time, after a read that finds a later cancel too: so no list
+    /// The end can't be written now. It is retried from time to time, after a read that finds a later cancel too: so no list
     /// of cancelled ones is asked for it.
     pub fn refuse_end(&mut self, why: String, now: &Now) {
         self.view.end = Some(Ended::Refused(why.clone()));
@@ -306,12 +306,12 @@ impl Sub {
         self.write_failed(why, RETRY_END, now);
     }
 
-    /// What becomes of the wish for progress; none without one, or without a row.
+    /// What becomes of the update of progress; none without one, or without a row.
     pub fn progress_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         let wanted = self.progress.as_ref()?.what;
-        let (attempt, told) = (self.attempt(row, read), self.told(row, read));
-        Some(guard::progress(row.status, attempt, told, wanted))
+        let (attempt, is_known) = (self.attempt(row, read), self.is_known(row, read));
+        Some(guard::progress(row.status, attempt, is_known, wanted))
     }
 
     /// What becomes of partial results; none without some, or without a row.
@@ -321,7 +321,7 @@ impl Sub {
         Some(guard::partial(row.status, self.attempt(row, read)))
     }
 
-    /// What becomes of the wish for an end; none without one, or without a read since.
+    /// What becomes of the update to an end; none without one, or without a read since.
     pub fn end_verdict(&self) -> Option<End> {
         let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
         let since = !self.outdated && read >= want.since && read >= self.wrote_at;
@@ -333,14 +333,14 @@ impl Sub {
         self.misfit.clone().or_else(|| self.foreign_phase())
     }
 
-    /// EvalAI would put the results on another phase's leaderboard without a word.
+    /// EvalAI would put the results on another phase's leaderboard without an error.
     fn foreign_phase(&self) -> Option<String> {
         let (outcome, payload) = &self.end.as_ref()?.what;
         let phase = self.view.row.as_ref()?.phase?;
         (*outcome == Outcome::Finished && phase != payload.phase).then(|| {
             let (pk, ours) = (self.pk, payload.phase);
             format!(
-                "EvalAI says that submission {pk} belongs to phase {phase}, not to phase {ours}; set its phase back to {ours} in EvalAI"
+                "EvalAI shows that submission {pk} belongs to phase {phase}, not to phase {ours}; set its phase back to {ours} in EvalAI"
             )
         })
     }
@@ -361,7 +361,7 @@ impl Sub {
         }
     }
 
-    /// A read went wrong: the next one is later each time.
+    /// A read failed: the next one is later each time.
     pub fn read_failed(&mut self, why: String, now: &Now) {
         self.retry_at = now.at + pause(self.failures);
         self.failures = self.failures.saturating_add(1);
@@ -386,7 +386,7 @@ impl Sub {
         self.view.last_error = Some(why);
     }
 
-    /// A write went wrong: the next try is that much later.
+    /// A write failed: the next try is that much later.
     pub fn write_failed(&mut self, why: String, pause: Duration, now: &Now) {
         self.retry_at = now.at + pause;
         self.write_failures = self.write_failures.saturating_add(1);

@@ -6,7 +6,7 @@ use super::*;
 fn a_cancellation_is_found_by_the_next_list() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.wait(10.0);
     bench.list(
         "list of cancelled",
@@ -15,7 +15,7 @@ fn a_cancellation_is_found_by_the_next_list() {
     assert_eq!(bench.view(7).ended, Some(Status::Cancelled));
     bench.wait(30.0);
     bench.expect_nothing();
-    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Cancelled, results(41.0)));
     bench.get(7, row(7, Status::Cancelled));
     bench.expect_nothing();
     assert_eq!(bench.view(7).end, Some(Ended::Agreed(Status::Cancelled)));
@@ -29,7 +29,7 @@ fn a_cancellation_that_a_write_under_way_may_undo_is_told_again() {
     bench.answer(&write, Reply::Written(Answer::Done(())));
     let view = bench.view(7);
     assert_eq!((view.ended, view.overtaken), (Some(Status::Cancelled), true));
-    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Cancelled, results(41.0)));
     bench.get(7, row(7, Status::PartiallyEvaluated));
     bench.write("cancelled 7");
     assert!(matches!(
@@ -66,7 +66,7 @@ fn partial_under_way() -> (Bench, Ticket) {
     bench.running(7);
     bench.wait(10.0);
     bench.list("list of cancelled", vec![]);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.get(7, row(7, Status::Running));
     let write = bench.expect("partial 7");
     (bench, write)
@@ -81,7 +81,7 @@ fn next_list(bench: &mut Bench) -> Ticket {
 fn lists_reach_back_to_the_first_live_submission_only() {
     let mut bench = Bench::new();
     for (pk, submitted) in [(7, -60), (8, -900), (9, -30)] {
-        bench.queue.live(&target(), &key(pk), pk, &run(pk, 1), wall(submitted));
+        bench.queue.live(&of(pk, 1), wall(submitted));
     }
     let ticket = bench.list("list of cancelled", vec![]);
     assert!(matches!(ticket.request, Request::List { after, purpose: Purpose::Cancel, .. } if after == wall(-901)));
@@ -109,7 +109,7 @@ fn an_old_cancellation_does_not_end_a_resumed_attempt() {
     bench.live(7, 2);
     let early = bench.expect("list of cancelled");
     assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, None));
-    bench.wish(7, 2, Wish::Queued);
+    bench.update(7, 2, DesiredUpdate::Queued);
     bench.get(7, old.clone());
     bench.write("queued 7");
     // Requested before EvalAI answered the PATCH: it shows the end of attempt 1.
@@ -134,10 +134,12 @@ fn a_cancel_before_the_first_read_of_an_attempt_that_evalai_has_asked_for_stays(
             ..row(7, Status::Cancelled)
         };
         let now = bench.now();
-        bench.queue.ask(&target(), &key(7), 7, &run, false, now);
+        bench.queue.ask(&subject(&key(7), 7, run), false, now);
         bench.get(7, cancelled.clone());
         assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, ended));
-        bench.queue.wish(&target(), &key(7), 7, &run, Wish::Queued, now);
+        bench
+            .queue
+            .update(&subject(&key(7), 7, run), DesiredUpdate::Queued, now);
         if ended.is_some() {
             bench.expect_nothing();
         } else {
@@ -182,7 +184,7 @@ fn a_cancellation_that_a_write_overtook_still_counts() {
     bench.wait(10.0);
     let early = bench.expect("list of cancelled");
     bench.expect_nothing();
-    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(0.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(0.0)));
     let get = bench.expect("submission 7");
     bench.answer(&get, Reply::Row(Answer::Done(row(7, Status::Running))));
     let mut other = Bench::new();
@@ -238,7 +240,7 @@ fn a_deleted_submission_is_noticed_within_a_minute_and_cancelled_in_evalai() {
     }
     let view = bench.view(7);
     assert_eq!((view.ended, view.overtaken), (Some(Status::Deleted), true));
-    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Cancelled, results(41.0)));
     bench.get(7, row(7, Status::Deleted));
     bench.write("cancelled 7");
     assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
@@ -251,7 +253,7 @@ fn the_end_of_a_deleted_submission_is_cancelled_once_whatever_it_was() {
     for outcome in [Outcome::Finished, Outcome::Failed] {
         let mut bench = Bench::new();
         bench.running(7);
-        bench.wish(7, 1, Wish::Final(outcome, results(43.0)));
+        bench.update(7, 1, DesiredUpdate::Final(outcome, results(43.0)));
         bench.get(7, row(7, Status::Deleted));
         bench.write("cancelled 7");
         assert_eq!(bench.view(7).end, Some(Ended::Otherwise(Status::Deleted)));
@@ -261,7 +263,7 @@ fn the_end_of_a_deleted_submission_is_cancelled_once_whatever_it_was() {
     for outcome in [Outcome::Finished, Outcome::Cancelled] {
         let mut bench = Bench::new();
         bench.running(7);
-        bench.wish(7, 1, Wish::Final(outcome, results(43.0)));
+        bench.update(7, 1, DesiredUpdate::Final(outcome, results(43.0)));
         bench.get(7, row(7, Status::Ignored));
         bench.expect_nothing();
         assert!(
@@ -284,16 +286,16 @@ fn a_deleted_submission_that_waits_is_found_by_the_sweep() {
 #[test]
 fn each_write_follows_at_once_a_read_of_its_own() {
     for (wish, write) in [
-        (Wish::Partial(results(41.0)), "partial 7"),
-        (Wish::Final(Outcome::Cancelled, results(41.0)), "cancelled 7"),
+        (DesiredUpdate::Partial(results(41.0)), "partial 7"),
+        (DesiredUpdate::Final(Outcome::Cancelled, results(41.0)), "cancelled 7"),
     ] {
         let mut bench = Bench::new();
         bench.all_running(&[7, 8]);
-        bench.wish(7, 1, wish);
+        bench.update(7, 1, wish);
         let read = bench.expect("submission 7");
         // Meanwhile there is what would otherwise come first.
         bench.ask(9, 1);
-        bench.wish(8, 1, Wish::Final(Outcome::Finished, results(50.0)));
+        bench.update(8, 1, DesiredUpdate::Final(Outcome::Finished, results(50.0)));
         bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Running))));
         bench.write(write);
     }
@@ -303,7 +305,7 @@ fn each_write_follows_at_once_a_read_of_its_own() {
 fn a_read_that_is_not_followed_at_once_is_made_again() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.get(7, row(7, Status::Running));
     // The lease is away for a moment.
     let now = bench.now();
@@ -320,7 +322,7 @@ const WAY: Duration = Duration::from_millis(5);
 
 /// A cancel so long after a list was answered, and a wish two seconds after that list. How long before the server began with
 /// the write that undid the cancel it had come; none if it stands.
-fn undone(wish: &Wish, offset: Duration) -> Option<Duration> {
+fn undone(wish: &DesiredUpdate, offset: Duration) -> Option<Duration> {
     let mut bench = Bench::new();
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Submitted));
@@ -328,7 +330,7 @@ fn undone(wish: &Wish, offset: Duration) -> Option<Duration> {
     bench.list("list of cancelled", vec![]);
     let cancel = bench.at + offset;
     bench.wait(2.0);
-    bench.wish(7, 1, wish.clone());
+    bench.update(7, 1, wish.clone());
     while let Some((_, ticket)) = bench.next() {
         bench.at += WAY;
         let arrived = bench.at;
@@ -352,7 +354,11 @@ fn undone(wish: &Wish, offset: Duration) -> Option<Duration> {
 fn forty_cancels_aimed_between_a_list_and_a_write_are_undone_only_while_the_server_works_on_it() {
     // The way of the read's answer and of the write; all moments of this clock differ by a little.
     let on_the_way = WAY * 2 + Duration::from_millis(1);
-    for wish in [Wish::Queued, Wish::Running, Wish::Partial(results(41.0))] {
+    for wish in [
+        DesiredUpdate::Queued,
+        DesiredUpdate::Running,
+        DesiredUpdate::Partial(results(41.0)),
+    ] {
         // From the list to the wish in steps of 100 ms, then through read and write in steps of 10 ms.
         let offsets = (0..20)
             .map(|step| step * 100)

@@ -6,7 +6,7 @@ use super::*;
 fn an_unanswered_end_is_read_again_only_when_the_server_must_have_given_up() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.get(7, row(7, Status::Running));
     let put = bench.expect("finished 7");
     bench.wait(65.0);
@@ -15,7 +15,7 @@ fn an_unanswered_end_is_read_again_only_when_the_server_must_have_given_up() {
     assert_eq!(until, now(bench.at).wall + SignedDuration::from_secs(75));
     assert!(bench.is_unsure());
     bench.forget(7);
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.wait(74.9);
     bench.expect_nothing();
     bench.wait(0.1);
@@ -29,7 +29,7 @@ fn an_unanswered_end_is_read_again_only_when_the_server_must_have_given_up() {
 fn an_unanswered_write_is_followed_by_a_read_before_any_other_write() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.get(7, row(7, Status::Running));
     let put = bench.expect("partial 7");
     bench.answer(&put, unanswered());
@@ -46,7 +46,7 @@ fn an_unanswered_write_is_followed_by_a_read_before_any_other_write() {
 #[test]
 fn a_request_that_never_left_is_tried_again_soon() {
     let mut bench = Bench::new();
-    bench.wish(7, 1, Wish::Queued);
+    bench.update(7, 1, DesiredUpdate::Queued);
     bench.get(7, row(7, Status::Submitted));
     let patch = bench.expect("queued 7");
     let silence = Silence {
@@ -79,15 +79,15 @@ fn throttling_stops_everything_for_as_long_as_asked() {
 fn a_refused_end_is_told_tried_again_later_and_at_once_with_other_texts() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.get(7, row(7, Status::Running));
     let put = bench.expect("finished 7");
     bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Request, 400))));
     assert_eq!(bench.view(7).end, Some(Ended::Refused("EvalAI answered 400".into())));
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.wait(10.0);
     bench.expect_nothing();
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(44.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(44.0)));
     assert_eq!(bench.view(7).end, None);
     bench.get(7, row(7, Status::Running));
     let put = bench.expect("finished 7");
@@ -104,7 +104,7 @@ fn a_refused_end_is_told_tried_again_later_and_at_once_with_other_texts() {
 fn refused_here() -> Bench {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.get(7, of_phase_2(Status::Running));
     assert!(matches!(bench.view(7).end, Some(Ended::Refused(why)) if why.contains("phase 2, not to phase 1")));
     bench
@@ -120,7 +120,7 @@ fn of_phase_2(status: Status) -> Row {
 #[test]
 fn a_result_that_was_refused_here_is_tried_again_from_time_to_time() {
     let mut bench = refused_here();
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.wait(599.0);
     bench.expect_nothing();
     bench.wait(1.0);
@@ -178,7 +178,7 @@ fn a_list_that_brings_a_refused_result_does_not_put_off_its_next_try() {
 #[test]
 fn a_broken_server_is_left_alone_longer_each_time() {
     let mut bench = Bench::new();
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     // An outage of an hour is over within two minutes; after that it is the row.
     let waits = [30.0, 60.0].into_iter().chain([90.0; 58]).chain([600.0, 600.0]);
     for wait in waits {
@@ -197,9 +197,9 @@ fn without_the_lease_and_after_a_takeover_only_reads_are_sent() {
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Submitted));
     bench.live(7, 1);
-    bench.wish(7, 1, Wish::Queued);
+    bench.update(7, 1, DesiredUpdate::Queued);
     bench.list("list of cancelled", vec![]);
-    bench.wish(8, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.update(8, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
     bench.expect_nothing();
     bench.wait(15.0);
     let now = bench.now();
@@ -225,7 +225,7 @@ fn what_waits_for_the_first_write_is_woken_once_when_it_may_be_sent() {
     }
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Submitted));
-    bench.wish(8, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.update(8, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
     bench.queue.take_changes();
     let now = bench.now();
     let Next::Wait(Some(until)) = bench.queue.next(now, true) else {

@@ -7,19 +7,19 @@ fn a_whole_life() {
     let mut bench = Bench::new();
     bench.running(7);
     assert_eq!(bench.view(7).progress, Some(Progress::Running));
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.read_and_write(7, "partial");
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.expect_nothing();
     bench.wait(3.0);
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.get(7, row(7, Status::PartiallyEvaluated));
     bench.write("finished 7");
     let at = now(bench.at).wall;
     let outcome = Outcome::Finished;
     assert_eq!(bench.view(7).end, Some(Ended::Published { outcome, at }));
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
-    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(44.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Cancelled, results(44.0)));
     bench.live(7, 1);
     bench.wait(100.0);
     bench.expect_nothing();
@@ -44,18 +44,18 @@ fn every_change_wakes_its_object_once_and_repeats_wake_nobody() {
     bench.get(7, read.clone());
     assert_eq!(bench.queue.take_changes(), [].into(), "a read that says what is known");
     let now = bench.now();
-    assert!(!bench.queue.wish(&target(), &key(7), 7, &run(7, 1), Wish::Running, now));
-    assert!(!bench.queue.live(&target(), &key(7), 7, &run(7, 1), wall(-60)));
+    assert!(!bench.queue.update(&of(7, 1), DesiredUpdate::Running, now));
+    assert!(!bench.queue.live(&of(7, 1), wall(-60)));
 }
 
 #[test]
 fn progress_names_the_job_once() {
     let mut bench = Bench::new();
-    bench.wish(7, 1, Wish::Queued);
+    bench.update(7, 1, DesiredUpdate::Queued);
     bench.get(7, row(7, Status::Submitted));
     let ticket = bench.write("queued 7");
     assert!(matches!(&ticket.request, Request::Progress(_, _, Some(job)) if job == "submission-7-1"));
-    bench.wish(7, 1, Wish::Running);
+    bench.update(7, 1, DesiredUpdate::Running);
     let named = Row {
         jobs: vec!["submission-7-1".into()],
         ..row(7, Status::Queued)
@@ -68,9 +68,9 @@ fn progress_names_the_job_once() {
 #[test]
 fn queued_is_left_out_where_running_is_wanted_already() {
     let mut bench = Bench::new();
-    bench.wish(7, 1, Wish::Queued);
+    bench.update(7, 1, DesiredUpdate::Queued);
     let read = bench.expect("submission 7");
-    bench.wish(7, 1, Wish::Running);
+    bench.update(7, 1, DesiredUpdate::Running);
     bench.answer(&read, Reply::Row(Answer::Done(row(7, Status::Submitted))));
     bench.write("running 7");
     bench.expect_nothing();
@@ -79,7 +79,7 @@ fn queued_is_left_out_where_running_is_wanted_already() {
 #[test]
 fn what_evalai_says_already_is_not_written_again() {
     let mut bench = Bench::new();
-    bench.wish(7, 1, Wish::Running);
+    bench.update(7, 1, DesiredUpdate::Running);
     bench.get(7, row(7, Status::Running));
     bench.expect_nothing();
     assert_eq!(bench.view(7).progress, Some(Progress::Running));
@@ -99,7 +99,7 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
         bench.ask(7, 1);
         bench.get(7, row(7, status));
         assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, Some(status)));
-        bench.wish(7, 1, Wish::Queued);
+        bench.update(7, 1, DesiredUpdate::Queued);
         bench.wait(100.0);
         bench.expect_nothing();
     }
@@ -114,16 +114,16 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
 fn a_participant_who_calls_a_run_finished_neither_ends_it_nor_keeps_its_results() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
     bench.read_and_write(7, "partial");
     bench.wait(70.0);
     bench.list("list of cancelled", vec![]);
     bench.get(7, row(7, Status::Finished));
     assert_eq!(bench.view(7).ended, None);
-    bench.wish(7, 1, Wish::Partial(results(42.0)));
+    bench.update(7, 1, DesiredUpdate::Partial(results(42.0)));
     bench.get(7, row(7, Status::Finished));
     bench.write("partial 7");
-    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(0.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(0.0)));
     bench.get(7, row(7, Status::Finished));
     bench.write("failed 7");
     let failed = Outcome::Failed;
@@ -142,10 +142,12 @@ fn after_a_restart_a_run_with_a_job_is_still_not_finished_by_others() {
         ..row(7, Status::Finished)
     };
     let now = bench.now();
-    bench.queue.ask(&target(), &key(7), 7, &run, false, now);
+    bench.queue.ask(&subject(&key(7), 7, run), false, now);
     bench.get(7, finished.clone());
     assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, None));
-    bench.queue.wish(&target(), &key(7), 7, &run, Wish::Running, now);
+    bench
+        .queue
+        .update(&subject(&key(7), 7, run), DesiredUpdate::Running, now);
     bench.get(7, finished);
     bench.write("running 7");
 }
@@ -185,19 +187,19 @@ fn results_that_cannot_be_right_are_not_sent() {
         result: "[]".into(),
         ..Payload::default()
     });
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, empty.clone()));
     bench.get(7, row(7, Status::Running));
     assert!(matches!(bench.view(7).end, Some(Ended::Refused(_))));
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, empty.clone()));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, empty.clone()));
     bench.expect_nothing();
-    bench.wish(7, 1, Wish::Final(Outcome::Failed, empty));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, empty));
     bench.get(7, row(7, Status::Running));
     bench.write("failed 7");
     let foreign = Arc::new(Payload {
         phase: 2,
         ..Payload::clone(&results(1.0))
     });
-    bench.wish(8, 1, Wish::Final(Outcome::Finished, foreign));
+    bench.update(8, 1, DesiredUpdate::Final(Outcome::Finished, foreign));
     bench.get(8, row(8, Status::Running));
     bench.expect_nothing();
     assert!(matches!(bench.view(8).end, Some(Ended::Refused(why)) if why.contains("phase 1, not to phase 2")));
@@ -208,9 +210,9 @@ fn an_end_waits_for_its_own_read() {
     let mut bench = Bench::new();
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Running));
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.wait(0.1);
-    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(43.0)));
     let get = bench.expect("submission 7");
     bench.answer(&get, Reply::Row(Answer::Done(row(7, Status::Cancelled))));
     bench.expect_nothing();
@@ -220,11 +222,11 @@ fn an_end_waits_for_its_own_read() {
 #[test]
 fn an_end_replaces_what_was_wished_before() {
     let mut bench = Bench::new();
-    bench.wish(7, 1, Wish::Queued);
-    bench.wish(7, 1, Wish::Partial(results(41.0)));
-    bench.wish(7, 1, Wish::Final(Outcome::Finished, results(43.0)));
-    bench.wish(7, 1, Wish::Running);
-    bench.wish(7, 1, Wish::Partial(results(42.0)));
+    bench.update(7, 1, DesiredUpdate::Queued);
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    bench.update(7, 1, DesiredUpdate::Running);
+    bench.update(7, 1, DesiredUpdate::Partial(results(42.0)));
     bench.get(7, row(7, Status::Submitted));
     bench.write("finished 7");
     bench.wait(100.0);
@@ -235,11 +237,11 @@ fn an_end_replaces_what_was_wished_before() {
 fn a_later_attempt_makes_the_wishes_of_the_earlier_one_void() {
     let mut bench = Bench::new();
     bench.running(7);
-    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
     bench.get(7, row(7, Status::Running));
     let put = bench.expect("failed 7");
     bench.ask(7, 2);
-    bench.wish(7, 1, Wish::Final(Outcome::Failed, results(2.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(2.0)));
     bench.expect_nothing();
     bench.answer(&put, Reply::Written(Answer::Done(())));
     assert_eq!((bench.view(7).attempt, bench.view(7).end), (2, None));
@@ -251,7 +253,7 @@ fn a_later_attempt_makes_the_wishes_of_the_earlier_one_void() {
 fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
     let mut bench = Bench::new();
     let now = bench.now();
-    bench.queue.ask(&target(), &key(7), 7, &run(7, 1), true, now);
+    bench.queue.ask(&of(7, 1), true, now);
     let found = Row {
         input_file: Some("http://files/x.json".into()),
         ..row(7, Status::Submitted)
@@ -274,7 +276,7 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
 /// A submission whose image is asked for, up to the download of its file.
 fn image_wanted(bench: &mut Bench, attempt: i64) -> Ticket {
     let now = bench.now();
-    bench.queue.ask(&target(), &key(7), 7, &run(7, attempt), true, now);
+    bench.queue.ask(&of(7, attempt), true, now);
     let found = Row {
         input_file: Some("http://files/x.json".into()),
         ..row(7, Status::Resuming)
@@ -306,7 +308,7 @@ fn the_file_of_a_submission_that_is_over_is_not_fetched() {
     let mut bench = Bench::new();
     let ticket = image_wanted(&mut bench, 1);
     bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
-    bench.wish(7, 1, Wish::Final(Outcome::Cancelled, results(0.0)));
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Cancelled, results(0.0)));
     bench.get(7, row(7, Status::Cancelled));
     for _ in 0..20 {
         bench.wait(60.0);

@@ -1,10 +1,11 @@
-//! The queue, one rule a test: wishes in, requests out, answers in.
+//! The queue, one rule a test: updates in, requests out, answers in.
 
 mod cancels;
 mod faults;
 mod life;
 mod order;
 mod outage;
+mod simulation;
 
 use jiff::SignedDuration;
 
@@ -56,6 +57,20 @@ fn run(pk: i64, attempt: i64) -> Run {
         by_hand: true,
         has_job: false,
     }
+}
+
+fn subject(key: &Key, pk: i64, run: Run) -> Subject {
+    Subject {
+        target: Arc::new(target()),
+        key: key.clone(),
+        pk,
+        run,
+    }
+}
+
+/// The attempt of a submission, as its object asks about it.
+fn of(pk: i64, attempt: i64) -> Subject {
+    subject(&key(pk), pk, run(pk, attempt))
 }
 
 fn row(pk: i64, status: Status) -> Row {
@@ -117,16 +132,16 @@ impl Bench {
 
     fn ask(&mut self, pk: i64, attempt: i64) {
         let now = self.now();
-        self.queue.ask(&target(), &key(pk), pk, &run(pk, attempt), false, now);
+        self.queue.ask(&of(pk, attempt), false, now);
     }
 
     fn live(&mut self, pk: i64, attempt: i64) {
-        self.queue.live(&target(), &key(pk), pk, &run(pk, attempt), wall(-60));
+        self.queue.live(&of(pk, attempt), wall(-60));
     }
 
-    fn wish(&mut self, pk: i64, attempt: i64, wish: Wish) {
+    fn update(&mut self, pk: i64, attempt: i64, update: DesiredUpdate) {
         let now = self.now();
-        self.queue.wish(&target(), &key(pk), pk, &run(pk, attempt), wish, now);
+        self.queue.update(&of(pk, attempt), update, now);
     }
 
     fn forget(&mut self, pk: i64) {
@@ -144,7 +159,7 @@ impl Bench {
         self.queue.is_unsure(now)
     }
 
-    fn view(&self, pk: i64) -> View {
+    fn view(&self, pk: i64) -> SubmissionState {
         self.queue.view(&key(pk)).unwrap()
     }
 
@@ -155,7 +170,7 @@ impl Bench {
             Next::Send(ticket) => {
                 let pk = ticket
                     .request
-                    .subject()
+                    .submission()
                     .map(|subject| format!(" {}", subject.pk))
                     .unwrap_or_default();
                 Some((format!("{}{pk}", ticket.request.name()), ticket))
@@ -213,7 +228,7 @@ impl Bench {
     fn all_running(&mut self, pks: &[i64]) {
         for pk in pks {
             self.live(*pk, 1);
-            self.wish(*pk, 1, Wish::Running);
+            self.wish(*pk, 1, DesiredUpdate::Running);
             self.answer_all(Status::Submitted);
             self.wait(5.0);
         }
@@ -223,7 +238,7 @@ impl Bench {
         }
     }
 
-    /// Answers all that is sent now: nothing was cancelled, every row says this, every write is taken.
+    /// Answers all that is sent now: nothing was cancelled, every row has this status, every write is taken.
     fn answer_all(&mut self, status: Status) {
         while let Some((_, ticket)) = self.next() {
             let reply = match &ticket.request {
@@ -235,16 +250,16 @@ impl Bench {
         }
     }
 
-    /// A submission of attempt 1 that runs in EvalAI's eyes too, after the first list.
+    /// A submission of attempt 1 that EvalAI shows as running, after the first list.
     fn running(&mut self, pk: i64) {
         self.ask(pk, 1);
         self.get(pk, row(pk, Status::Submitted));
         self.live(pk, 1);
         self.list("list of cancelled", vec![]);
-        self.wish(pk, 1, Wish::Queued);
+        self.wish(pk, 1, DesiredUpdate::Queued);
         self.get(pk, row(pk, Status::Submitted));
         self.write(&format!("queued {pk}"));
-        self.wish(pk, 1, Wish::Running);
+        self.wish(pk, 1, DesiredUpdate::Running);
         self.get(pk, row(pk, Status::Queued));
         self.write(&format!("running {pk}"));
         self.expect_nothing();

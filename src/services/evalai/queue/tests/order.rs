@@ -8,11 +8,11 @@ fn priorities() {
     let mut bench = Bench::new();
     bench.all_running(&[1, 2, 3]);
     bench.serve();
-    bench.wish(1, 1, Wish::Partial(results(1.0)));
-    bench.wish(2, 1, Wish::Final(Outcome::Cancelled, results(1.0)));
-    bench.wish(10, 1, Wish::Queued);
+    bench.update(1, 1, DesiredUpdate::Partial(results(1.0)));
+    bench.update(2, 1, DesiredUpdate::Final(Outcome::Cancelled, results(1.0)));
+    bench.update(10, 1, DesiredUpdate::Queued);
     bench.ask(11, 1);
-    bench.wish(3, 1, Wish::Final(Outcome::Failed, results(1.0)));
+    bench.update(3, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
     bench.wait(10.0);
     let mut sent = Vec::new();
     let mut tickets = Vec::new();
@@ -51,7 +51,7 @@ fn one_request_a_submission_and_four_in_all() {
     let mut bench = Bench::new();
     for pk in 1..=5 {
         bench.ask(pk, 1);
-        bench.wish(pk, 1, Wish::Queued);
+        bench.update(pk, 1, DesiredUpdate::Queued);
     }
     let tickets: Vec<_> = std::iter::from_fn(|| bench.next()).collect();
     assert_eq!(tickets.len(), 4, "{tickets:?}");
@@ -68,7 +68,7 @@ fn one_request_a_submission_and_four_in_all() {
         ..key(7)
     };
     let now = bench.now();
-    bench.queue.ask(&target(), &again, 7, &run(7, 1), false, now);
+    bench.queue.ask(&subject(&again, 7, run(7, 1)), false, now);
     bench.expect_nothing();
 }
 
@@ -119,7 +119,7 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         .queue
         .take_sweep()
         .into_iter()
-        .map(|row| (row.server, row.submission, row.says, row.time))
+        .map(|row| (row.server, row.submission, row.kind, row.time))
         .collect();
     let server = target().api_server;
     assert_eq!(
@@ -185,10 +185,10 @@ fn a_swept_row_that_was_run_before_is_told_from_a_lost_rerun() {
     bench.serve();
     bench.list("sweep of submitted", rows);
     let swept = bench.queue.take_sweep();
-    let said: Vec<_> = swept.into_iter().map(|row| (row.submission, row.says)).collect();
+    let kinds: Vec<_> = swept.into_iter().map(|row| (row.submission, row.kind)).collect();
     let (edited, rerun) = (Swept::Edited, Swept::Rerun);
     assert_eq!(
-        said,
+        kinds,
         [
             (1, edited),
             (2, rerun),
@@ -309,7 +309,7 @@ fn many_ends_do_not_keep_the_list_of_cancelled_ones_waiting() {
     let mut bench = Bench::new();
     bench.live(500, 1);
     for pk in 1..=200 {
-        bench.wish(pk, 1, Wish::Final(Outcome::Failed, results(1.0)));
+        bench.update(pk, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
     }
     let (mut lists, mut ends) = (Vec::new(), 0);
     for _ in 0..2400 {

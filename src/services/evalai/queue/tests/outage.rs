@@ -79,7 +79,8 @@ impl Outage {
             self.bench.at = self.bench.at.max(next);
             while let Some((_, pk)) = ends.first().copied().filter(|(at, _)| *at <= self.bench.at) {
                 ends.remove(0);
-                self.bench.wish(pk, 1, Wish::Final(Outcome::Finished, results(43.0)));
+                self.bench
+                    .update(pk, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
             }
             self.deliver();
         }

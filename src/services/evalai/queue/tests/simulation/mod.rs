@@ -1,6 +1,8 @@
 //! Hours of a bad network in milliseconds: a model of the server that reads early and saves late, faults, cancellations,
 //! a lease that comes and goes; and what must hold all the same.
 
+mod server;
+
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 
@@ -283,7 +285,7 @@ impl World {
         if !ticket.request.is_write() {
             return;
         }
-        let pk = ticket.request.subject().unwrap().pk;
+        let pk = ticket.request.submission().unwrap().pk;
         assert!(self.lease, "a write without the lease");
         assert!(at >= Duration::from_secs(75), "a write right after a takeover");
         let working = self.working.entry(pk).or_default();
@@ -331,128 +333,6 @@ impl World {
     }
 
     /// The server gets a request, works on it, answers; or one of the three goes wrong.
-    fn arrive(&mut self, ticket: Ticket) {
-        let fault = if self.at < PEACE { self.rng.u8(0..100) } else { 100 };
-        let silence = |sent| Silence {
-            sent,
-            why: "silence".into(),
-        };
-        let unanswered = |sent| match ticket.request {
-            Request::Get(_) => Reply::Row(Answer::Unanswered(silence(sent))),
-            Request::List { .. } => Reply::Rows(Answer::Unanswered(silence(sent))),
-            _ => Reply::Written(Answer::Unanswered(silence(sent))),
-        };
-        let plain = |answer: Answer<()>| match ticket.request {
-            Request::Get(_) => Reply::Row(answer.and_then(|()| Answer::Throttled(Duration::ZERO))),
-            Request::List { .. } => Reply::Rows(answer.and_then(|()| Answer::Throttled(Duration::ZERO))),
-            _ => Reply::Written(answer),
-        };
-        let written = ticket.request.is_write();
-        let pk = ticket.request.subject().map(|subject| subject.pk);
-        let (reply, after) = match fault {
-            0 => (unanswered(false), Duration::ZERO),
-            1 => (unanswered(true), Duration::from_secs(3)),
-            2 => (plain(Answer::Throttled(Duration::from_secs(20))), WAY),
-            3 => (plain(Answer::Broken("EvalAI answered 500".into())), WAY),
-            _ if written => return self.work(ticket, fault < 10),
-            4..8 => (unanswered(true), Duration::from_secs(30)),
-            _ => (self.read(&ticket), self.random(0.01, READ_SECONDS)),
-        };
-        if let (true, Some(pk)) = (written, pk) {
-            *self.working.get_mut(&pk).unwrap() -= 1;
-        }
-        self.push(self.at + after, Event::Answer(ticket, reply));
-    }
-
-    fn read(&self, ticket: &Ticket) -> Reply {
-        match &ticket.request {
-            Request::Get(subject) => Reply::Row(Answer::Done(row(subject.pk, &self.table[&subject.pk]))),
-            Request::List { purpose, .. } => {
-                let status = if *purpose == Purpose::Cancel {
-                    Status::Cancelled
-                } else {
-                    Status::Submitted
-                };
-                let of = self.table.iter().filter(|(_, record)| record.status == status);
-                Reply::Rows(Answer::Done(of.map(|(pk, record)| row(*pk, record)).collect()))
-            }
-            other => panic!("{other:?} is not of this model"),
-        }
-    }
-
-    /// Reads now, saves later; a lost answer may be worked on for a minute.
-    fn work(&mut self, ticket: Ticket, lost: bool) {
-        let pk = ticket.request.subject().unwrap().pk;
-        let read = self.table[&pk].clone();
-        let mut save = read.clone();
-        save.cancelled_at = None;
-        match &ticket.request {
-            Request::Progress(_, progress, job) => {
-                save.status = progress.status();
-                save.jobs.extend(job.iter().map(|job| job.to_lowercase()));
-            }
-            Request::Partial(..) => save.status = Status::PartiallyEvaluated,
-            Request::Final(_, outcome, _) => save.status = Status::parse(outcome.as_str()),
-            other => panic!("{other:?} is no write"),
-        }
-        if matches!(save.status, Status::Finished | Status::PartiallyEvaluated) && read.rows == 0 {
-            save.rows = 1;
-        }
-        let work = Work {
-            pk,
-            kind: ticket.request.name(),
-            attempt: self.actors[&pk].attempt,
-            began: self.actors[&pk].began.unwrap_or_default(),
-            sent: ticket.requested,
-            checked: self.checked.remove(&pk).unwrap().0,
-            read,
-            save,
-        };
-        let takes = self.random(0.05, if lost { 60.0 } else { 2.0 });
-        self.push(self.at + takes, Event::Save(work));
-        let (reply, after) = if lost {
-            let why = "EvalAI did not answer in time".into();
-            (Answer::Unanswered(Silence { sent: true, why }), Duration::from_secs(65))
-        } else {
-            (Answer::Done(()), takes + WAY)
-        };
-        self.push(self.at + after, Event::Answer(ticket, Reply::Written(reply)));
-    }
-
-    fn save(&mut self, work: &Work) {
-        *self.working.get_mut(&work.pk).unwrap() -= 1;
-        let record = self.table.get_mut(&work.pk).unwrap();
-        if let (Status::Cancelled, Some(at)) = (record.status, record.cancelled_at)
-            && !matches!(work.save.status, Status::Failed | Status::Cancelled)
-            && at > work.began
-            && (work.attempt == 1
-                || record
-                    .jobs
-                    .contains(&format!("submission-{}-{}", work.pk, work.attempt)))
-        {
-            // A cancel while we write, or since the server made our read right before it, is overwritten; no other.
-            assert!(
-                at >= work.checked,
-                "{} at {:?}, read at {:?}, undoes the cancel of {at:?}",
-                work.kind,
-                work.sent,
-                work.checked
-            );
-            if at >= work.sent {
-                self.lost.0 += 1;
-            } else {
-                self.lost.1 += 1;
-            }
-        }
-        let doubled = work.read.rows == 0 && record.rows > 0;
-        assert!(
-            !doubled || work.save.rows == 0,
-            "two rows on the leaderboard for submission {}",
-            work.pk
-        );
-        *record = work.save.clone();
-    }
-
     fn answer(&mut self, ticket: &Ticket, reply: Reply) {
         if let (Request::Get(subject), Reply::Row(Answer::Done(_))) = (&ticket.request, &reply) {
             let made = ticket.requested + WAY;
@@ -469,16 +349,19 @@ impl World {
             return;
         }
         let now = self.now();
-        let target = target();
-        let run = Run {
-            attempt: actor.attempt,
-            job: format!("submission-{pk}-{}", actor.attempt),
-            by_hand: true,
-            has_job: actor.began.is_some(),
+        let subject = Subject {
+            target: Arc::new(target()),
+            key: key(pk),
+            pk,
+            run: Run {
+                attempt: actor.attempt,
+                job: format!("submission-{pk}-{}", actor.attempt),
+                by_hand: true,
+                has_job: actor.began.is_some(),
+            },
         };
-        let key = key(pk);
-        self.queue.ask(&target, &key, pk, &run, false, now);
-        let view = self.queue.view(&key).unwrap();
+        self.queue.ask(&subject, false, now);
+        let view = self.queue.view(&subject.key).unwrap();
         if let Some(end) = view.end {
             return self.settle(pk, &end);
         }
@@ -487,28 +370,28 @@ impl World {
         }
         let Some(began) = actor.began else {
             if view.ended.is_some() && view.overtaken {
-                let cancelled = Wish::Final(Outcome::Cancelled, results(0));
-                self.queue.wish(&target, &key, pk, &run, cancelled, now);
+                let cancelled = DesiredUpdate::Final(Outcome::Cancelled, results(0));
+                self.queue.update(&subject, cancelled, now);
                 return;
             }
             if view.ended.is_some() {
                 return self.settle(pk, &Ended::Otherwise(Status::Cancelled));
             }
-            self.queue.live(&target, &key, pk, &run, submitted_at());
-            self.queue.wish(&target, &key, pk, &run, Wish::Queued, now);
+            self.queue.live(&subject, submitted_at());
+            self.queue.update(&subject, DesiredUpdate::Queued, now);
             self.actors.get_mut(&pk).unwrap().began = Some(self.at);
             return;
         };
         assert_ne!(view.ended, Some(Status::Finished), "no run is finished by others");
         let age = self.at.saturating_sub(began);
-        let wish = match (view.ended, age >= actor.length) {
-            (Some(_), _) => Wish::Final(Outcome::Cancelled, results(0)),
-            (None, true) if pk % 3 == 0 => Wish::Final(Outcome::Failed, results(0)),
-            (None, true) => Wish::Final(Outcome::Finished, results(100)),
-            (None, false) if age < Duration::from_secs(5) => Wish::Running,
-            (None, false) => Wish::Partial(results(age.as_secs() / 10)),
+        let update = match (view.ended, age >= actor.length) {
+            (Some(_), _) => DesiredUpdate::Final(Outcome::Cancelled, results(0)),
+            (None, true) if pk % 3 == 0 => DesiredUpdate::Final(Outcome::Failed, results(0)),
+            (None, true) => DesiredUpdate::Final(Outcome::Finished, results(100)),
+            (None, false) if age < Duration::from_secs(5) => DesiredUpdate::Running,
+            (None, false) => DesiredUpdate::Partial(results(age.as_secs() / 10)),
         };
-        self.queue.wish(&target, &key, pk, &run, wish, now);
+        self.queue.update(&subject, update, now);
     }
 
     fn settle(&mut self, pk: i64, end: &Ended) {
