@@ -7,7 +7,7 @@
 mod read;
 mod write;
 
-pub use read::Limit;
+pub use read::{FileLimits, Limit};
 pub(crate) use read::{ReadError, read};
 pub(crate) use write::{KeyOrder, Node, write};
 
