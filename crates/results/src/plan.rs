@@ -103,7 +103,7 @@ impl Plan {
         }
     }
 
-    /// Whether the plan says which pairs and routes there are, and is to be believed more than the files.
+    /// Whether the plan has the pairs and routes, and decides where the files differ.
     pub(crate) fn decides(&self) -> bool {
         !self.pairs.is_empty() && !self.as_original
     }

@@ -1,4 +1,4 @@
-//! Why a checkpoint or a merge is refused, in words a participant understands. Every room returns these; none of them
+//! Why a checkpoint or a merge is refused, for the participant. Every module returns these; none of them
 //! repeats a text the agent wrote, so they may be published.
 
 use std::fmt;
@@ -68,10 +68,10 @@ pub enum Refusal {
         /// What the plan says.
         expected: u32,
     },
-    /// A sensor nobody knows.
+    /// A sensor of no known kind.
     #[error("{}sensor {sensor} is not one of the known kinds", .pair.map_or(String::new(), |pair| format!("pair {}: ", ordinal(pair))))]
     Sensor {
-        /// Whose file, when it was seen there.
+        /// Whose file, when it was found there.
         pair: Option<usize>,
         /// Which sensor of the list, from 1.
         sensor: usize,

@@ -32,8 +32,8 @@ pub struct Checkpoint {
 impl Checkpoint {
     /// How many routes the worker has finished.
     ///
-    /// In a pod, a route in which the simulation crashed is not finished: whoever starts the evaluator again lets it
-    /// repeat that route.
+    /// In a pod, a route in which the simulation crashed is not finished: the evaluator repeats it when it
+    /// is started again.
     pub fn done(&self) -> u32 {
         let records = u32::try_from(self.records.len()).unwrap_or(u32::MAX);
         records.saturating_sub(u32::from(self.repeats))
@@ -45,7 +45,7 @@ impl Checkpoint {
         self.counted
     }
 
-    /// How many the file says it will finish.
+    /// How many the file promises.
     pub fn total(&self) -> u32 {
         self.total
     }
@@ -104,7 +104,7 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
     }))
 }
 
-/// The parts of the JSON that are looked at, taken out of it.
+/// The parts of the JSON that are used, taken out of it.
 struct File {
     records: Vec<Value>,
     progress: Vec<Value>,

@@ -103,7 +103,7 @@ struct Events<'a> {
 }
 
 impl<'a> Events<'a> {
-    /// The messages an evaluator can have written: plain ASCII. Others are somebody's additions and cost nothing.
+    /// The messages an evaluator can have written: plain ASCII. Others are additions of a fork and cost nothing.
     fn messages(&self, infraction: &str) -> impl Iterator<Item = &'a str> {
         let all = self.record.object.get("infractions").and_then(Value::as_object);
         let list = all

@@ -69,7 +69,7 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// What Python's `not value` says.
+    /// What Python's `not value` is.
     pub(crate) fn is_falsy(&self) -> bool {
         match self {
             Self::Null => true,
