@@ -10,6 +10,7 @@ use fastrand::Rng;
 use leaderboard_api::ResultsFormat;
 use leaderboard_operator::pod::gather::results_plan;
 use leaderboard_operator::pod::report::Report;
+use leaderboard_operator::pod::run::STATUS_FOLDER;
 use serde_json::json;
 
 use super::kubelet::Kubelet;
@@ -21,7 +22,7 @@ const PAIRS: usize = 16;
 const MEMORY: u64 = 512 << 20;
 const LIMIT: Duration = Duration::from_mins(3);
 
-/// A whole checkpoint of a pair with one route, filled up to `bytes`.
+/// The checkpoint of a pair that has finished one of its two routes, filled up to `bytes`.
 fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
     let infractions = [
         "collisions_pedestrian",
@@ -44,7 +45,7 @@ fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
     let file = |texts: &[String]| {
         let record = json!({
             "index": 0,
-            "route_id": format!("RouteScenario_{pair}_rep0"),
+            "route_id": format!("RouteScenario_{}_rep0", 2 * pair),
             "status": "Completed",
             "num_infractions": 0,
             "infractions": infractions,
@@ -52,12 +53,11 @@ fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
             "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
             "texts": texts,
         });
-        let global = json!({"index": -1, "status": "Completed"});
-        let checkpoint = json!({"global_record": global, "progress": [1, 1], "records": [record]});
+        let checkpoint = json!({"global_record": {}, "progress": [1, 2], "records": [record]});
         json!({
             "_checkpoint": checkpoint,
-            "entry_status": "Finished",
-            "eligible": true,
+            "entry_status": "Started",
+            "eligible": false,
             "sensors": ["carla_camera"],
             "values": [],
             "labels": [],
@@ -76,8 +76,9 @@ fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
 fn put(logs: &Path, pair: usize, text: &str) {
     let folder = logs.join(format!("agent/agent{}", pair + 1));
     fs::create_dir_all(&folder).unwrap();
-    fs::write(folder.join("next"), text).unwrap();
-    fs::rename(folder.join("next"), folder.join("agent_results.json")).unwrap();
+    let next = logs.join("next");
+    fs::write(&next, text).unwrap();
+    fs::rename(next, folder.join("agent_results.json")).unwrap();
 }
 
 /// Waits for a report that says so, while logcopy stays below its memory.
@@ -99,13 +100,16 @@ async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) {
 async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys_memory() {
     let (sink, endpoint, serving) = serve().await;
     let mut submission = Submission::on(&endpoint, "bucket", ResultsFormat::V2, &mut Rng::new()).await;
-    submission.run.plan.slices = (0..PAIRS).map(|pair| format!("{pair}-{pair}")).collect();
-    submission.run.plan.routes = i32::try_from(PAIRS).unwrap();
+    submission.run.plan.slices = (0..PAIRS)
+        .map(|pair| format!("{}-{}", 2 * pair, 2 * pair + 1))
+        .collect();
+    submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
     let most = results_plan(&submission.run).unwrap().limits_of(0).bytes;
     let kubelet = Kubelet::new(&submission);
     let root = kubelet.folder().join("pod-1");
     make_volumes(&root);
     let logs = root.join("logs");
+    fs::create_dir_all(logs.join(STATUS_FOLDER)).unwrap();
     let mut logcopy = submission
         .own("logcopy", &root, "pod-1")
         .kill_on_drop(true)
