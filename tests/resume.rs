@@ -18,6 +18,7 @@ mod ministack;
 mod resume {
     mod kills;
     mod kubelet;
+    mod largest;
     mod measure;
     mod process;
     mod results;

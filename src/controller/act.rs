@@ -21,7 +21,7 @@ use super::job_spec::{self, JobInput};
 use super::observe::{is_pod_of, uid_of};
 use super::significance::{Change, change, patience};
 use super::view::View;
-use crate::pod::report::OWNER_KEY;
+use crate::pod::report::{OWNER_KEY, Owner};
 use leaderboard_api::client_errors;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
@@ -334,7 +334,7 @@ impl Actor<'_> {
             "controller-{}",
             status.times.stopping.as_ref().map_or(0, |t| t.0.as_second())
         );
-        let write = archive.put(OWNER_KEY, mark.into_bytes());
+        let write = archive.put(OWNER_KEY, Owner::new(mark).to_json());
         let written = self.context.buckets.call(&plan.storage, CALL_TIMEOUT, write).await;
         written.map(|_| ()).map_err(|source| ActError::Fence {
             object: self.name(),

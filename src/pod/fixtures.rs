@@ -1,16 +1,17 @@
-//! A run and its checkpoints, for the tests of this room.
+//! A run and its checkpoints, for the tests of this module.
 
 use std::fs;
 use std::path::Path;
 
 use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
 
-use super::run::{Run, STATUS_FOLDER};
+use super::run::{Run, SCHEMA, STATUS_FOLDER};
 use leaderboard_api::{ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
 
 /// Two pairs of two routes each, once.
 pub(crate) fn run() -> Run {
     Run {
+        schema: SCHEMA,
         namespace: "default".to_owned(),
         submission: "submission-77".to_owned(),
         uid: "uid-1".to_owned(),

@@ -1,8 +1,8 @@
 //! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
 //!
-//! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes the merged file and EvalAI's texts
-//! there; knows no S3. A checkpoint that is torn, gone or refused leaves the last good one in place. What is to be stored is
-//! handed out from memory, so that no torn file and no full disk comes between the results and S3.
+//! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes nothing; knows no S3. A checkpoint that
+//! is torn, gone or refused leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
+//! file and no full disk comes between the results and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -10,20 +10,20 @@ use std::sync::Arc;
 
 use leaderboard_results::{Checkpoint, Files, Format, Merged, Plan, Refusal, Slice, Strictness};
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Progress, Side};
-use sha2::{Digest, Sha256};
 
 use super::report::{ReportPair, StoredFile};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Stamp, Tree, TreeError};
-use super::upload::hex;
+use super::upload::Object;
 use leaderboard_api::{LeaderboardVersion, Verify, effective};
 
-/// Largest checkpoint that is read, in bytes.
-const CHECKPOINT_LIMIT: u64 = 64 << 20;
-/// The merged file, below the volume's root.
+/// Key of the merged file.
 pub const MERGED: &str = "agent/agent_results.json";
-
-/// The same text under EvalAI's name.
+/// Before the keys of EvalAI's texts.
+pub const EVALAI: &str = "evalai/";
+/// Before the key of a refused checkpoint: no agent can put a file of its own there.
+pub const REFUSED: &str = "logcopy/refused/";
+/// The merged file under EvalAI's name.
 const METADATA: &str = "evalai/metadata.json";
 
 /// The plan of the results, from the plan of the run.
@@ -70,7 +70,7 @@ fn kept_path(pair: usize) -> String {
     format!("{STATUS_FOLDER}/{}-{pair}/{KEPT_CHECKPOINT}", Side::Agent)
 }
 
-/// The pairs and the round their status files are in.
+/// One pair, as its status files show it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PairSeen {
     /// From its agent's folder.
@@ -110,14 +110,14 @@ impl PairSeen {
 struct Worker {
     good: Option<Checkpoint>,
     seen: Option<Stamp>,
-    /// The runner's copy as it was looked at last.
+    /// The runner's copy as it was read last.
     kept: Option<Stamp>,
     refused: Option<String>,
 }
 
-/// What a look at a checkpoint gave.
+/// What reading a checkpoint gave.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Look {
+enum ReadOutcome {
     /// Another good one.
     New,
     /// Nothing that was not known.
@@ -127,14 +127,14 @@ enum Look {
 }
 
 /// Results by their keys below the run's prefix.
-pub type Objects = BTreeMap<String, Arc<[u8]>>;
+pub type Objects = BTreeMap<String, Object>;
 
 /// What one round found.
 #[derive(Clone, Debug)]
 pub struct Gathered {
     /// The last good merge, without its text; `None` before the first checkpoint.
     pub merged: Option<Arc<Merged>>,
-    /// EvalAI's texts, of the same merge.
+    /// EvalAI's short texts, of the same merge; `metadata.json` is only in `objects`.
     pub files: Arc<Files>,
     /// The last good checkpoints, the merged file and EvalAI's texts, as they are to be stored.
     pub objects: Objects,
@@ -155,7 +155,7 @@ impl Gathered {
         first.filter(|_| !self.is_complete()).cloned()
     }
 
-    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents say.
+    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.
     pub fn is_complete(&self) -> bool {
         self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_final)
     }
@@ -169,33 +169,26 @@ impl Gathered {
 
     /// Digests of EvalAI's texts, by key.
     pub fn digests(&self) -> BTreeMap<String, StoredFile> {
-        let of = |(key, text): (&'static str, &str)| {
-            let stored = StoredFile {
-                size: text.len() as u64,
-                sha256: hex(&Sha256::digest(text)),
-            };
-            (key.to_owned(), stored)
-        };
-        texts(&self.files).into_iter().map(of).collect()
+        let texts = self.objects.iter().filter(|(key, _)| key.starts_with(EVALAI));
+        texts
+            .map(|(key, object)| (key.clone(), object.digest.clone()))
+            .collect()
     }
 }
 
-/// EvalAI's texts by their keys, which are also their paths.
-pub fn texts(files: &Files) -> Vec<(&'static str, &str)> {
-    let mut texts = vec![
-        ("evalai/results.json", files.results_json.as_str()),
-        ("evalai/stdout.txt", files.stdout_txt.as_str()),
+/// Takes in EvalAI's texts. The merged file can be large, so it is moved: it is in memory once, under both of its keys.
+fn take_texts(objects: &mut Objects, files: &mut Files) {
+    let texts = [
+        ("evalai/results.json", &files.results_json),
+        ("evalai/stdout.txt", &files.stdout_txt),
     ];
-    texts.extend(files.metadata_json.as_deref().map(|text| (METADATA, text)));
-    texts
-}
-
-fn take_texts(objects: &mut Objects, files: &Files) {
-    for (key, text) in texts(files) {
-        objects.insert(key.to_owned(), text.as_bytes().into());
+    for (key, text) in texts {
+        objects.insert(key.to_owned(), Object::new(text.clone()));
     }
-    if let Some(metadata) = objects.get(METADATA).cloned() {
-        objects.insert(MERGED.to_owned(), metadata);
+    if let Some(metadata) = files.metadata_json.take() {
+        let merged = Object::new(metadata);
+        objects.insert(MERGED.to_owned(), merged.clone());
+        objects.insert(METADATA.to_owned(), merged);
     }
 }
 
@@ -210,28 +203,23 @@ pub struct Gatherer {
     files: Arc<Files>,
     objects: Objects,
     unmerged: Option<String>,
-    written: BTreeMap<&'static str, Arc<Files>>,
-    /// That something can't be written was said.
-    complained: bool,
 }
 
 impl Gatherer {
     /// For a plan that holds.
     pub fn new(plan: Plan, tree: Arc<Tree>) -> Result<Self, Refusal> {
-        let files = Arc::new(leaderboard_results::render(&plan, None)?);
+        let mut files = leaderboard_results::render(&plan, None)?;
         let mut objects = Objects::new();
-        take_texts(&mut objects, &files);
+        take_texts(&mut objects, &mut files);
         Ok(Self {
             status: tree.path().join(STATUS_FOLDER),
             workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
             plan,
             tree,
             merged: None,
-            files,
+            files: Arc::new(files),
             objects,
             unmerged: None,
-            written: BTreeMap::new(),
-            complained: false,
         })
     }
 
@@ -240,32 +228,22 @@ impl Gatherer {
         self.plan.routes.saturating_mul(self.plan.repetitions)
     }
 
-    /// Looks at everything once and writes what follows from it. Blocks: not for an asynchronous thread.
+    /// Reads everything once. Blocks: not for an asynchronous thread.
     pub fn round(&mut self) -> Gathered {
-        // The agents' word is read before their results: who is done has written everything.
+        // The status files are read before the results: an agent that is done has written everything.
         let seen: Vec<PairSeen> = (1..=self.workers.len())
             .map(|number| PairSeen::read(&self.status, number))
             .collect();
         let mut changed = false;
         for index in 0..self.workers.len() {
             changed |= match self.read(index) {
-                Look::New => true,
-                Look::Same => false,
-                Look::Unusable => self.read_kept(index),
+                ReadOutcome::New => true,
+                ReadOutcome::Same => false,
+                ReadOutcome::Unusable => self.read_kept(index),
             };
         }
         if changed {
             self.merge();
-        }
-        match self.write() {
-            Ok(()) => self.complained = false,
-            Err(error) if !self.complained => {
-                self.complained = true;
-                tracing::warn!(
-                    "the merged results can't be written to the logs volume, S3 gets them all the same: {error}"
-                );
-            }
-            Err(_) => {}
         }
         let pairs = self.pairs(&seen);
         Gathered {
@@ -280,52 +258,61 @@ impl Gatherer {
     }
 
     /// Reads one worker's checkpoint, if it is not the one of the last round.
-    fn read(&mut self, index: usize) -> Look {
-        let path = checkpoint_path(index + 1);
-        let worker = &mut self.workers[index];
+    fn read(&mut self, index: usize) -> ReadOutcome {
+        let path = checkpoint_path(index.saturating_add(1));
+        let limit = self.plan.limits_of(index).bytes as u64;
+        let Some(worker) = self.workers.get_mut(index) else {
+            return ReadOutcome::Unusable;
+        };
         let (file, stamp) = match self.tree.file(&path) {
             Ok(Some(found)) => found,
-            Ok(None) => return Look::Unusable,
+            Ok(None) => return ReadOutcome::Unusable,
             Err(error) => return worker.refuse(index, &error),
         };
         if worker.seen == Some(stamp) {
-            return Look::Same;
+            return ReadOutcome::Same;
         }
         drop(file);
-        let (bytes, stamp) = match self.tree.read(&path, CHECKPOINT_LIMIT) {
+        let (bytes, stamp) = match self.tree.read(&path, limit) {
             Ok(Some(read)) => read,
             // The next round finds it whole.
-            Ok(None) | Err(TreeError::Changed) => return Look::Unusable,
+            Ok(None) | Err(TreeError::Changed) => return ReadOutcome::Unusable,
             Err(error) => return worker.refuse(index, &error),
         };
         match leaderboard_results::read_worker(&self.plan, index, &bytes) {
-            Ok(None) => Look::Unusable,
+            Ok(None) => ReadOutcome::Unusable,
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
                 worker.good = Some(checkpoint);
-                self.objects.insert(path, bytes.into());
+                self.objects.insert(path, Object::new(bytes));
                 if let Some(why) = worker.refused.take() {
-                    tracing::info!(pair = index + 1, "the checkpoint is good again; before: {why}");
+                    tracing::info!(
+                        pair = index.saturating_add(1),
+                        "the checkpoint is good again; before: {why}"
+                    );
                 }
-                Look::New
+                ReadOutcome::New
             }
             Err(refusal) => {
                 worker.seen = Some(stamp);
-                worker.refuse_with(words(&refusal))
+                worker.refuse_with(reason(&refusal))
             }
         }
     }
 
     /// Reads what the agent's runner has kept, when the file itself is being written: that is further than what this logcopy has
-    /// seen, if it looks seldom, or has begun just now.
+    /// read, if its rounds are rare, or it has begun just now.
     fn read_kept(&mut self, index: usize) -> bool {
-        let path = kept_path(index + 1);
-        let worker = &mut self.workers[index];
+        let path = kept_path(index.saturating_add(1));
+        let limit = self.plan.limits_of(index).bytes as u64;
+        let Some(worker) = self.workers.get_mut(index) else {
+            return false;
+        };
         match self.tree.file(&path) {
             Ok(Some((_, stamp))) if worker.kept != Some(stamp) => {}
             _ => return false,
         }
-        let Ok(Some((bytes, stamp))) = self.tree.read(&path, CHECKPOINT_LIMIT) else {
+        let Ok(Some((bytes, stamp))) = self.tree.read(&path, limit) else {
             return false;
         };
         worker.kept = Some(stamp);
@@ -338,7 +325,8 @@ impl Gatherer {
             return false;
         }
         worker.good = Some(kept);
-        self.objects.insert(checkpoint_path(index + 1), bytes.into());
+        self.objects
+            .insert(checkpoint_path(index.saturating_add(1)), Object::new(bytes));
         true
     }
 
@@ -352,47 +340,20 @@ impl Gatherer {
             Ok((merged, files))
         });
         match merged {
-            Ok((merged, files)) => {
-                take_texts(&mut self.objects, &files);
+            Ok((mut merged, mut files)) => {
+                take_texts(&mut self.objects, &mut files);
+                // The same text as `metadata.json`.
+                merged.text = String::new();
                 self.merged = Some(Arc::new(merged));
                 self.files = Arc::new(files);
                 self.unmerged = None;
             }
             Err(refusal) => {
-                let words = words(&refusal);
-                tracing::warn!("the checkpoints are not merged: {words}");
-                self.unmerged = Some(words);
+                let reason = reason(&refusal);
+                tracing::warn!("the checkpoints are not merged: {reason}");
+                self.unmerged = Some(reason);
             }
         }
-    }
-
-    /// Writes what differs from what was written before.
-    fn write(&mut self) -> Result<(), TreeError> {
-        let files = Arc::clone(&self.files);
-        for (path, text) in texts(&files) {
-            self.write_one(path, text, &files)?;
-        }
-        if let Some(text) = &files.metadata_json {
-            self.write_one(MERGED, text, &files)?;
-        }
-        Ok(())
-    }
-
-    fn write_one(&mut self, path: &'static str, text: &str, files: &Arc<Files>) -> Result<(), TreeError> {
-        if self
-            .written
-            .get(path)
-            .is_some_and(|written| Arc::ptr_eq(written, files))
-        {
-            return Ok(());
-        }
-        // Restored from an earlier Pod, or the same as in the last round.
-        let there = self.tree.read(path, 2 * CHECKPOINT_LIMIT).ok().flatten();
-        if there.is_none_or(|(bytes, _)| bytes != text.as_bytes()) {
-            self.tree.write(path, text.as_bytes())?;
-        }
-        self.written.insert(path, Arc::clone(files));
-        Ok(())
     }
 
     fn pairs(&self, seen: &[PairSeen]) -> Vec<ReportPair> {
@@ -415,24 +376,23 @@ impl Gatherer {
 }
 
 impl Worker {
-    fn refuse(&mut self, index: usize, error: &TreeError) -> Look {
-        let words = format!(
-            "pair {}: the checkpoint can't be read: {error}. Leave it to the evaluator.",
-            index + 1
-        );
-        self.refuse_with(words)
+    fn refuse(&mut self, index: usize, error: &TreeError) -> ReadOutcome {
+        let pair = index.saturating_add(1);
+        self.refuse_with(format!(
+            "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
+        ))
     }
 
-    fn refuse_with(&mut self, words: String) -> Look {
-        if self.refused.as_ref() != Some(&words) {
-            tracing::warn!("a checkpoint is refused, the last good one stays: {words}");
+    fn refuse_with(&mut self, reason: String) -> ReadOutcome {
+        if self.refused.as_ref() != Some(&reason) {
+            tracing::warn!("a checkpoint is refused, the last good one stays: {reason}");
         }
-        self.refused = Some(words);
-        Look::Same
+        self.refused = Some(reason);
+        ReadOutcome::Same
     }
 }
 
 /// Which checkpoint, why, and what to do.
-fn words(refusal: &Refusal) -> String {
+fn reason(refusal: &Refusal) -> String {
     format!("{refusal}. {}", refusal.next_step())
 }

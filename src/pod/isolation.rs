@@ -13,7 +13,7 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use tokio::net::TcpStream;
-use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tokio::time::{Instant, sleep, timeout};
 
 use super::run::Isolation;
 use leaderboard_api::ranges;
@@ -155,9 +155,9 @@ async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Mea
             sleep(PAUSE).await;
             continue;
         };
-        failures += 1;
+        failures = u32::saturating_add(failures, 1);
         // An error that comes at once counts for no more than a silence.
-        sleep_until(tried + TRY).await;
+        sleep(TRY.saturating_sub(tried.elapsed())).await;
         if failures == FAILURES {
             return Measured::Blocked(how);
         }

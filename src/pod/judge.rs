@@ -1,4 +1,4 @@
-//! Whether a run goes on, is wound down, or has ended: a pure function of what a round saw, and the little memory it needs
+//! Whether a run goes on, is wound down, or has ended: a pure function of what a round found, and the little memory it needs
 //! to say for how long.
 //!
 //! Called by `logcopy`. Knows no clock but the one handed in, no file and no S3.
@@ -16,7 +16,7 @@ pub enum Ending {
     Complete,
     /// It was stopped from outside; the results are what there is.
     Stopped(Stop),
-    /// A pair has come to its end with results that can't be used: why, in words for the participant.
+    /// A pair has come to its end with results that can't be used: why, for the participant.
     Invalid(String),
 }
 
@@ -35,24 +35,24 @@ impl std::fmt::Display for Ending {
 pub enum Step {
     /// Nothing out of the ordinary.
     GoOn,
-    /// Ask everybody to stop, and look again soon.
+    /// Ask all containers to stop, and have another round soon.
     Cancel,
     /// Store the final report.
     Finish(Ending),
 }
 
-/// What one round saw, with the times since when.
+/// What one round found, with the times since when.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Situation {
     /// No route is missing.
     pub whole: bool,
     /// No route is missing and every evaluator has come to its regular end, for this long.
     pub complete: Option<Duration>,
-    /// All agents say that they are done.
+    /// All agents report that they are done.
     pub all_done: bool,
     /// Some container has begun.
     pub any_started: bool,
-    /// A stop is wished.
+    /// A stop is requested.
     pub stop: Option<Stop>,
     /// A pair has ended badly: why, and for how long.
     pub spoiled: Option<(String, Duration)>,
@@ -82,7 +82,7 @@ pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
         return Step::Cancel;
     };
     // The other half of the time is for storing.
-    let longest = pace.grace.min(cancel / 2);
+    let longest = pace.grace.min(cancel.checked_div(2).unwrap_or_default());
     let is_still = cancelled.min(seen.quiet) >= pace.quiet.min(longest);
     if !seen.any_started || is_still || cancelled >= longest {
         Step::Finish(ending)
@@ -104,7 +104,7 @@ pub struct Judge {
 /// What a round hands to [`Judge::see`] besides the results.
 #[derive(Clone, Copy, Debug)]
 pub struct Outside {
-    /// A stop is wished.
+    /// A stop is requested.
     pub stop: Option<Stop>,
     /// `simulation.cancel` is there.
     pub cancelled: bool,
@@ -146,7 +146,7 @@ impl Judge {
     }
 }
 
-/// A pair that says it is done without having complete results will not get them any more. An agent's word alone ends
+/// A pair that reports it is done without complete results will not get them any more. An agent's report alone ends
 /// nothing well: it can only end its own run badly.
 fn spoiled(gathered: &Gathered) -> Option<String> {
     if gathered.is_complete() {

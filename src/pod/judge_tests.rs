@@ -127,7 +127,7 @@ mod seen_on_a_volume {
 
     use super::super::*;
     use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
-    use crate::pod::gather::{Gatherer, MERGED, results_plan};
+    use crate::pod::gather::{EVALAI, Gatherer, MERGED, results_plan};
     use crate::pod::tree::Tree;
 
     struct Volume {
@@ -161,10 +161,10 @@ mod seen_on_a_volume {
             let seen = self.judge.see(&gathered, outside);
             (gathered, seen)
         }
+    }
 
-        fn text(&self, path: &str) -> String {
-            fs::read_to_string(self.folder.path().join(path)).unwrap()
-        }
+    fn text<'a>(gathered: &'a Gathered, key: &str) -> &'a str {
+        std::str::from_utf8(&gathered.objects[key].bytes).unwrap()
     }
 
     #[test]
@@ -172,8 +172,8 @@ mod seen_on_a_volume {
         let mut volume = Volume::new();
         let (gathered, seen) = volume.round();
         assert!(gathered.merged.is_none() && seen.complete.is_none() && !seen.any_started);
-        assert!(volume.text("evalai/stdout.txt").starts_with("Initializing"));
-        assert!(!volume.folder.path().join(MERGED).exists());
+        assert!(text(&gathered, "evalai/stdout.txt").starts_with("Initializing"));
+        assert!(!gathered.objects.contains_key(MERGED));
 
         put_status(volume.folder.path(), Side::Simulator, 1, Mark::Start(0));
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
@@ -187,18 +187,16 @@ mod seen_on_a_volume {
             (0, "Waiting")
         );
         assert!(seen.any_started && seen.complete.is_none());
-        assert!(
-            volume
-                .text("evalai/stdout.txt")
-                .contains("Completed 1 out of the 4 routes")
-        );
+        assert!(text(&gathered, "evalai/stdout.txt").contains("Completed 1 out of the 4 routes"));
 
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
         assert_eq!((seen.complete, seen.all_done), (Some(Duration::ZERO), false));
-        assert_eq!(gathered.merged.unwrap().score, Some(100.0));
-        assert_eq!(volume.text("evalai/metadata.json"), volume.text(MERGED));
+        assert_eq!(gathered.merged.as_ref().unwrap().score, Some(100.0));
+        assert_eq!(text(&gathered, "evalai/metadata.json"), text(&gathered, MERGED));
+        assert!(gathered.digests().keys().all(|key| key.starts_with(EVALAI)));
+        assert_eq!(gathered.digests().len(), 3);
         let (_, seen) = volume.round();
         assert_eq!(seen.complete, Some(Duration::from_secs(10)));
     }
@@ -225,7 +223,7 @@ mod seen_on_a_volume {
         volume.round();
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2)[..100]);
         let (gathered, _) = volume.round();
-        assert_eq!(&*gathered.objects["agent/agent1/agent_results.json"], good.as_bytes());
+        assert_eq!(text(&gathered, "agent/agent1/agent_results.json"), good);
         let stored: Vec<&str> = gathered.objects.keys().map(String::as_str).collect();
         let expected = [
             "agent/agent1/agent_results.json",
@@ -266,11 +264,11 @@ mod seen_on_a_volume {
         let uncounted = counted.replacen("\"progress\":[1,2]", "\"progress\":[0,2]", 1);
         assert_ne!(uncounted, counted);
         put_checkpoint(volume.folder.path(), 1, &uncounted);
-        let stored = |gathered: &Gathered| gathered.objects["agent/agent1/agent_results.json"].to_vec();
-        assert_eq!(stored(&volume.round().0), uncounted.as_bytes());
+        let stored = |gathered: &Gathered| text(gathered, "agent/agent1/agent_results.json").to_owned();
+        assert_eq!(stored(&volume.round().0), uncounted);
         put_checkpoint(volume.folder.path(), 1, "");
         fs::write(kept.join("checkpoint.json"), &counted).unwrap();
-        assert_eq!(stored(&volume.round().0), counted.as_bytes());
+        assert_eq!(stored(&volume.round().0), counted);
     }
 
     #[test]
@@ -297,14 +295,43 @@ mod seen_on_a_volume {
     }
 
     #[test]
-    fn a_volume_that_takes_nothing_keeps_no_result_back() {
+    fn a_round_writes_nothing_to_the_volume() {
         let mut volume = Volume::new();
-        // A file where a folder is needed, as good as a full disk for who writes.
-        fs::write(volume.folder.path().join("evalai"), "").unwrap();
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        let tree = Tree::open(volume.folder.path()).unwrap();
+        let before = tree.walk("agent", 100);
         let (gathered, _) = volume.round();
-        assert_eq!(gathered.pairs[0].done, 2);
-        assert!(gathered.objects["evalai/stdout.txt"].starts_with(b"Here is a summary"));
+        assert!(text(&gathered, "evalai/stdout.txt").starts_with("Here is a summary"));
+        assert_eq!(tree.walk("agent", 100), before);
+        assert_eq!(fs::read_dir(volume.folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn the_checkpoints_of_all_pairs_share_one_bound() {
+        for pairs in [1_u32, 4, 16] {
+            let mut run = run();
+            run.plan.slices = (0..pairs).map(|pair| format!("{pair}-{pair}")).collect();
+            let plan = results_plan(&run).unwrap();
+            let bytes: usize = (0..plan.pairs.len()).map(|pair| plan.limits_of(pair).bytes).sum();
+            assert!(bytes <= 48 << 20, "{pairs} pairs may hold {bytes} bytes");
+        }
+    }
+
+    #[test]
+    fn a_checkpoint_beyond_its_pairs_share_is_not_even_read() {
+        let mut volume = Volume::new();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
+        volume.round();
+        let limit = results_plan(&run()).unwrap().limits_of(0).bytes;
+        put_checkpoint(volume.folder.path(), 1, &(checkpoint(0, 2, 2) + &" ".repeat(limit)));
+        let (gathered, _) = volume.round();
+        let why = gathered.why().unwrap();
+        assert!(why.contains(&format!("more than the {limit} that are read")), "{why}");
+        assert_eq!(gathered.pairs[0].done, 1);
+        assert_eq!(
+            gathered.objects["agent/agent1/agent_results.json"].bytes,
+            checkpoint(0, 1, 2)
+        );
     }
 
     #[test]

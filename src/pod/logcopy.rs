@@ -38,9 +38,9 @@ const LAST_FLUSH: Duration = Duration::from_mins(5);
 /// What a round under way has to land after SIGTERM. A request that is dropped may still be served, and then replace the newer
 /// results that the last flush has stored meanwhile.
 const LANDING: Duration = Duration::from_secs(3);
-/// How often the stop file is read where inotify says nothing.
+/// How often the stop file is read where inotify reports nothing.
 const STOP_POLL: Duration = Duration::from_secs(2);
-/// Time between two passes over the logs for CloudWatch.
+/// Time between two rounds over the logs for CloudWatch.
 const SHIP_PERIOD: Duration = Duration::from_secs(5);
 
 /// What logcopy can't work without.
@@ -99,7 +99,7 @@ pub async fn work(
 
     end.send_replace(true);
     stop_watch.abort();
-    // The task has its own bound on its last pass; nothing to do about one that fails.
+    // The task has its own bound on its last round; nothing to do about one that fails.
     let _ = shipped.send(true);
     if let Some(shipping) = shipping {
         let _ = shipping.await;
@@ -127,7 +127,7 @@ fn ship(
 }
 
 /// Obeys the stop annotation at once, whatever a round is waiting for: a task reads the downward API's file, writes
-/// `simulation.cancel`, and tells the rounds.
+/// `simulation.cancel`, and notifies the rounds.
 fn watch_stop(places: Places, tasks: &Tasks) -> (watch::Receiver<Option<Stop>>, JoinHandle<Option<()>>) {
     let (sender, receiver) = watch::channel(None);
     let task = tasks.stay("watch of the stop annotation", async move {
@@ -152,14 +152,14 @@ fn watch_stop(places: Places, tasks: &Tasks) -> (watch::Receiver<Option<Stop>>, 
                     None => std::future::pending().await,
                 }
             };
-            // Either is a reason to look again.
+            // Either is a reason to read it again.
             let _ = tokio::time::timeout(STOP_POLL, wake).await;
         }
     });
     (receiver, task)
 }
 
-/// Creates one of logcopy's own status files: what everybody else waits for. Returns whether it is there.
+/// Creates one of logcopy's own status files, for which the other containers wait. Returns whether it is there.
 async fn create(file: StatusFile, status: &Path) -> bool {
     let folder = status.to_owned();
     let created = blocking(move || file.create(&folder)).await.flatten();
@@ -210,7 +210,7 @@ async fn unless_stopped<T>(round: impl Future<Output = T>, shutdown: impl Future
     tokio::select! {
         biased;
         () = shutdown => {
-            // Whatever it comes to, the last flush looks at everything once more.
+            // Whatever it comes to, the last flush reads everything once more.
             let _ = tokio::time::timeout(LANDING, &mut round).await;
             None
         }
@@ -255,7 +255,7 @@ mod tests {
     use crate::pod::upload::Haste;
     use crate::pod::upload::send::Wanted;
 
-    /// Longer than a stop takes to be seen, and still an end of a test that would hang.
+    /// Longer than a stop takes to be noticed, and still an end of a test that would hang.
     const PATIENCE: Duration = Duration::from_secs(20);
 
     async fn round_of(seconds: u64) -> u64 {
@@ -295,7 +295,7 @@ mod tests {
         fs::write(places.logs.join("agent/agent1/log"), "a line\n").unwrap();
         let tree = Arc::new(Tree::open(&places.logs).unwrap());
         let stamp = tree.file("agent/agent1/log").unwrap().unwrap().1;
-        // Nobody stores anything here, what is tried is only how the file is read.
+        // Nothing is stored here, only how the file is read is tested.
         let nowhere = "http://127.0.0.1:9";
         let s3 = fixtures::aws(nowhere).await.s3(None, Some(nowhere));
         let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), 1 << 20);
@@ -321,9 +321,9 @@ mod tests {
         let (_, ()) = tokio::join!(uploader.sync(&files, None), asked);
         assert!(
             disk.join().unwrap(),
-            "the stop was seen only when the disk answered again"
+            "the stop was noticed only when the disk answered again"
         );
-        // Without the watch no stop would be seen any more, so logcopy ends and starts anew.
+        // Without the watch no stop would be noticed any more, so logcopy ends and starts anew.
         watching.abort();
         assert_eq!(tasks.failed().await.task, "watch of the stop annotation");
     }

@@ -1,7 +1,8 @@
 //! Programs that run inside a submission's Pod, and the two documents they share with the controller.
 //!
-//! `run` is what the controller tells the Pod, `report` what the Pod tells the controller. The programs know S3 and the
-//! Pod's volumes; they know no Kubernetes API, no EvalAI and no DynamoDB.
+//! `run` is what the controller gives to the Pod, `report` what the Pod reports to the controller, `schema` which versions of both
+//! are read. The programs know S3 and the Pod's volumes; they know no Kubernetes API, no EvalAI and no DynamoDB.
+#![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
 #[cfg(test)]
 pub(crate) mod fixtures;
@@ -14,6 +15,7 @@ pub mod ownlog;
 pub mod places;
 pub mod report;
 pub mod run;
+pub mod schema;
 pub mod ship;
 pub mod tree;
 pub mod upload;

@@ -15,7 +15,7 @@ use tracing_subscriber::fmt::writer::MakeWriterExt;
 pub const OWN_LOG: &str = "logcopy/logcopy.log";
 /// Bytes it may have.
 const LIMIT: u64 = 16 << 20;
-/// Says that there is more than this file holds.
+/// The last line: there is more than this file holds.
 const LAST_LINE: &[u8] =
     b"{\"level\":\"WARN\",\"message\":\"this file has reached its limit; standard output goes on\"}\n";
 
@@ -23,7 +23,8 @@ const LAST_LINE: &[u8] =
 #[derive(Debug)]
 pub struct Limited {
     file: File,
-    room: u64,
+    /// Bytes that still fit.
+    left: u64,
 }
 
 impl Limited {
@@ -33,23 +34,22 @@ impl Limited {
             std::fs::create_dir_all(folder)?;
         }
         let file = OpenOptions::new().append(true).create(true).open(path)?;
-        let room = limit.saturating_sub(file.metadata()?.len());
-        Ok(Self { file, room })
+        let left = limit.saturating_sub(file.metadata()?.len());
+        Ok(Self { file, left })
     }
 }
 
 impl Write for Limited {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let len = bytes.len() as u64;
-        if self.room == 0 {
+        if self.left == 0 {
             return Ok(bytes.len());
         }
-        if len > self.room {
-            self.room = 0;
-            self.file.write_all(LAST_LINE)?;
-        } else {
-            self.room -= len;
+        if let Some(left) = self.left.checked_sub(bytes.len() as u64) {
+            self.left = left;
             self.file.write_all(bytes)?;
+        } else {
+            self.left = 0;
+            self.file.write_all(LAST_LINE)?;
         }
         Ok(bytes.len())
     }
@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_file_ends_with_a_word_at_its_limit() {
+    fn the_file_ends_with_a_note_at_its_limit() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("logcopy/logcopy.log");
         let mut log = Limited::open(&path, 10).unwrap();

@@ -8,8 +8,9 @@ use std::time::Duration;
 
 use super::run::{
     ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, RUNNER, RUNNER_IN_IMAGE, Run,
-    STATUS_FOLDER, STOP_FILE, TOOLS,
+    SCHEMA, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
+use super::schema::is_read;
 
 /// Files and folders.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,14 +59,14 @@ impl Places {
     }
 }
 
-/// How long the programs wait for what cannot be seen.
+/// How long the programs wait for what they cannot observe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Pace {
-    /// From complete results to the end, when an agent does not say that it is done.
+    /// From complete results to the end, when an agent does not report that it is done.
     pub settle: Duration,
     /// Without a change in the agents' folders, they count as stopped.
     pub quiet: Duration,
-    /// From a cancel to the last look, when they are never quiet: the runner's grace and a margin.
+    /// From a cancel to the last round, when they are never quiet: the runner's grace and a margin.
     pub grace: Duration,
     /// Smallest time between two rounds.
     pub least: Duration,
@@ -92,14 +93,14 @@ impl Pace {
     /// All times divided: for runs that take seconds.
     #[must_use]
     pub fn faster(self, times: u32) -> Self {
-        let times = times.max(1);
+        let part = |whole: Duration| whole.checked_div(times).unwrap_or(whole);
         Self {
-            settle: self.settle / times,
-            quiet: self.quiet / times,
-            grace: self.grace / times,
-            least: self.least / times,
-            backoff: self.backoff / times,
-            enforced_within: self.enforced_within / times,
+            settle: part(self.settle),
+            quiet: part(self.quiet),
+            grace: part(self.grace),
+            least: part(self.least),
+            backoff: part(self.backoff),
+            enforced_within: part(self.enforced_within),
         }
     }
 }
@@ -130,6 +131,12 @@ pub enum SettingError {
     /// Not what the controller writes.
     #[error("{ENV_RUN} is not the description of a run: {0}. Operator and Pod must be of the same version")]
     Malformed(#[from] serde_json::Error),
+    /// Of a version that this program does not know.
+    #[error(
+        "{ENV_RUN} has schema {0}, and this program reads {SCHEMA} and the one before. Operator and Pod must be of the \
+         same version"
+    )]
+    Schema(u32),
 }
 
 impl Setting {
@@ -137,7 +144,7 @@ impl Setting {
     pub fn read(places: Places, pace: Pace) -> Result<Self, SettingError> {
         let variable = |name| std::env::var(name).map_err(|_| SettingError::Missing(name));
         Ok(Self {
-            run: serde_json::from_str(&variable(ENV_RUN)?)?,
+            run: read_run(&variable(ENV_RUN)?)?,
             pod_uid: variable(ENV_POD_UID)?,
             api_server: api_server(),
             role_arn: std::env::var(ENV_ROLE_ARN).ok().filter(|arn| !arn.is_empty()),
@@ -145,6 +152,14 @@ impl Setting {
             pace,
         })
     }
+}
+
+fn read_run(json: &str) -> Result<Run, SettingError> {
+    let run: Run = serde_json::from_str(json)?;
+    if !is_read(run.schema, SCHEMA) {
+        return Err(SettingError::Schema(run.schema));
+    }
+    Ok(run)
 }
 
 fn api_server() -> Option<SocketAddr> {

@@ -1,19 +1,60 @@
-//! What a Pod tells the controller: `logcopy/report.json`, written last in each round.
+//! What a Pod reports to the controller: `logcopy/report.json`, written last in each round; and the mark of the prefix's owner.
 //!
-//! Written by `logcopy`, read by the controller as hostile text: bounded in size, checked in every number. Pure.
+//! The report is written by `logcopy` and read by the controller as hostile text: bounded in size, checked in every number. Pure.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::schema::is_read;
+
 /// Key of the report below the run's prefix.
 pub const REPORT_KEY: &str = "logcopy/report.json";
-/// Key of the file that names the Pod whose writes count.
+/// Key of the [`Owner`], which names the Pod whose writes count.
 pub const OWNER_KEY: &str = "logcopy/owner";
 /// Largest report that is read or written, in bytes.
 pub const MAX_BYTES: usize = 1 << 20;
-/// Version of the document.
+/// Version of the report.
 pub const SCHEMA: u32 = 1;
+/// Version of the owner's mark.
+pub const OWNER_SCHEMA: u32 = 1;
+
+/// Whose writes below the prefix count.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct Owner {
+    /// [`OWNER_SCHEMA`].
+    pub schema: u32,
+    /// UID of the Pod; the controller's own mark while it holds the prefix.
+    pub owner: String,
+}
+
+impl Owner {
+    /// The mark of a Pod, or of the controller.
+    pub fn new(owner: impl Into<String>) -> Self {
+        Self {
+            schema: OWNER_SCHEMA,
+            owner: owner.into(),
+        }
+    }
+
+    /// What is stored.
+    pub fn to_json(&self) -> Vec<u8> {
+        serde_json::to_vec(self).unwrap_or_default()
+    }
+
+    /// Reads a stored mark; `None` for one of an unknown version, which no Pod of this version wrote. Version 0 was the bare
+    /// text.
+    pub fn parse(bytes: &[u8]) -> Option<Self> {
+        let bytes = bytes.trim_ascii();
+        if !bytes.starts_with(b"{") {
+            let owner = std::str::from_utf8(bytes).ok()?.to_owned();
+            return Some(Self { schema: 0, owner }).filter(|owner| is_read(owner.schema, OWNER_SCHEMA));
+        }
+        let owner: Self = serde_json::from_slice(bytes).ok()?;
+        is_read(owner.schema, OWNER_SCHEMA).then_some(owner)
+    }
+}
 
 /// One round of logcopy.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
@@ -48,7 +89,7 @@ pub struct Report {
     /// Which stop was obeyed, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stopped: Option<super::run::Stop>,
-    /// Why a checkpoint was refused, in words a participant understands.
+    /// Why a checkpoint was refused, for the participant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub why: Option<String>,
     /// What `verify` noticed.
@@ -98,6 +139,9 @@ pub enum ReportError {
     /// Not a report.
     #[error("the report is not one of ours: {0}")]
     Malformed(String),
+    /// Of a version that is not read.
+    #[error("the report has schema {0}, and {SCHEMA} and the one before are read")]
+    Schema(u32),
     /// A number that no run can have.
     #[error("the report is implausible: {0}")]
     Implausible(String),
@@ -116,11 +160,8 @@ impl Report {
 
     fn check(&self) -> Result<(), ReportError> {
         let implausible = |what: &str| Err(ReportError::Implausible(what.into()));
-        if self.schema != SCHEMA {
-            return Err(ReportError::Malformed(format!(
-                "schema {} is not {SCHEMA}",
-                self.schema
-            )));
+        if !is_read(self.schema, SCHEMA) {
+            return Err(ReportError::Schema(self.schema));
         }
         if self.done > self.total {
             return implausible("more routes done than there are");
@@ -137,7 +178,7 @@ impl Report {
         Ok(())
     }
 
-    /// Whether it speaks of this attempt of this object.
+    /// Whether it is of this attempt of this object.
     pub fn belongs_to(&self, uid: &str, attempt: i64) -> bool {
         self.submission_uid == uid && self.attempt == attempt
     }

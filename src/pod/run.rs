@@ -1,4 +1,4 @@
-//! What the controller tells a Pod: one JSON document without secrets, and the paths inside the Pod.
+//! What the controller gives to a Pod: one JSON document without secrets, and the paths inside the Pod.
 //!
 //! Written by `controller::job_spec`, read by `workspace` and `logcopy`. Pure.
 
@@ -9,6 +9,8 @@ use leaderboard_api::{Enforcement, LogGroup, RunPlan, Verify};
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";
+/// Version of [`Run`].
+pub const SCHEMA: u32 = 1;
 /// Environment variable with the Pod's UID, from the downward API.
 pub const ENV_POD_UID: &str = "POD_UID";
 /// The whole `logs` volume, in `workspace` and `logcopy`.
@@ -46,11 +48,14 @@ pub fn console(pair: impl Display) -> String {
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct Run {
+    /// [`SCHEMA`]; what had no number yet is version 0.
+    #[serde(default)]
+    pub schema: u32,
     /// Namespace of the Submission.
     pub namespace: String,
     /// Name of the Submission.
     pub submission: String,
-    /// UID of the Submission: a report of another one counts for nobody.
+    /// UID of the Submission: a report of another one does not count.
     pub uid: String,
     /// Attempt.
     pub attempt: i64,

@@ -1,7 +1,7 @@
 //! Sends the containers' logs to CloudWatch: each file once, in order, line by line.
 //!
 //! A task of `logcopy` with a pace of its own, so that neither waits for the other. Streams are `<run id>/<container>`. What
-//! was sent is noted beside the files, so that a restarted logcopy goes on where the last one was.
+//! was sent is noted next to the files, so that a restarted logcopy goes on where the last one was.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::FileExt;
@@ -20,14 +20,14 @@ use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, cut
 
 /// Bytes read of one file at once.
 const CHUNK: u64 = 256 << 10;
-/// Batches of one file in one pass.
+/// Batches of one file in one round.
 const BATCHES: usize = 64;
 /// Where the note lies on the `logs` volume.
 const NOTE: &str = "logcopy/.shipped.json";
 /// Largest note that is read, in bytes.
 const NOTE_LIMIT: u64 = 1 << 20;
-/// Time the last pass may take.
-const LAST_PASS: Duration = Duration::from_secs(20);
+/// Time the last round may take.
+const LAST_ROUND: Duration = Duration::from_secs(20);
 
 /// How far a file was sent.
 #[derive(Serialize, Deserialize, Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -91,7 +91,7 @@ impl Shipper {
         }
     }
 
-    /// Passes every `period` until `done` is true, and then once more.
+    /// Sends every `period` until `done` is true, and then once more.
     pub async fn run(mut self, period: Duration, mut done: watch::Receiver<bool>) {
         let mut complained = false;
         while !*done.borrow_and_update() {
@@ -108,7 +108,7 @@ impl Shipper {
                 break;
             }
         }
-        match tokio::time::timeout(LAST_PASS, self.pass(true)).await {
+        match tokio::time::timeout(LAST_ROUND, self.pass(true)).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::warn!("{error}"),
             Err(_) => tracing::warn!("the last lines are not in CloudWatch Logs: it took too long"),
@@ -146,7 +146,7 @@ impl Shipper {
             return Ok(false);
         }
         let after = Mark {
-            offset: mark.offset + consumed as u64,
+            offset: mark.offset.saturating_add(consumed as u64),
             ..mark
         };
         let sent = Instant::now();
@@ -222,7 +222,7 @@ fn next(tree: &Tree, path: &str, mark: Mark) -> Result<Option<(Vec<u8>, Mark)>, 
     };
     let goes_on = stamp.inode == mark.inode && stamp.size >= mark.offset;
     let offset = if goes_on { mark.offset } else { 0 };
-    let len = (stamp.size - offset).min(CHUNK);
+    let len = stamp.size.saturating_sub(offset).min(CHUNK);
     let mut bytes = vec![0; usize::try_from(len).unwrap_or(0)];
     file.read_exact_at(&mut bytes, offset)?;
     let inode = stamp.inode;

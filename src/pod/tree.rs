@@ -53,7 +53,7 @@ pub enum TreeError {
     /// A path that leads elsewhere.
     #[error("its path is not a plain one below the folder")]
     Path,
-    /// The system's own words.
+    /// The system's own text.
     #[error("{0}")]
     Io(#[from] io::Error),
 }
@@ -75,6 +75,12 @@ pub struct Walk {
     pub files: BTreeMap<String, Stamp>,
     /// Entries with impossible names, or beyond the limits.
     pub left_out: usize,
+}
+
+impl Walk {
+    fn leave_out(&mut self) {
+        self.left_out = self.left_out.saturating_add(1);
+    }
 }
 
 /// The folder.
@@ -138,7 +144,7 @@ impl Tree {
         }
         let mut bytes = Vec::with_capacity(usize::try_from(size).unwrap_or(0));
         // One byte more, so that a file that grows meanwhile is noticed.
-        (&file).take(size + 1).read_to_end(&mut bytes)?;
+        (&file).take(size.saturating_add(1)).read_to_end(&mut bytes)?;
         if bytes.len() as u64 != size || Stamp::of(&file.metadata()?) != stamp {
             return Err(TreeError::Changed);
         }
@@ -148,8 +154,8 @@ impl Tree {
     /// The regular files below `folder`, looking at no more than `limit` entries. A missing folder is empty.
     pub fn walk(&self, folder: &str, limit: usize) -> Walk {
         let mut walk = Walk::default();
-        let mut looked_at = 0;
-        let mut folders = vec![(folder.to_owned(), 0)];
+        let mut looked_at: usize = 0;
+        let mut folders = vec![(folder.to_owned(), 0_usize)];
         while let Some((folder, depth)) = folders.pop() {
             let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY;
             let Ok(mut dir) = self.at(&folder, flags).and_then(|fd| Ok(Dir::from_fd(fd)?)) else {
@@ -160,20 +166,20 @@ impl Tree {
                 .map_while(Result::ok)
                 .map(|entry| entry.file_name().to_owned())
                 .filter(|name| !matches!(name.to_bytes(), b"." | b".."))
-                .take((limit - looked_at).saturating_add(1))
+                .take(limit.saturating_sub(looked_at).saturating_add(1))
                 .collect();
             for name in names {
-                looked_at += 1;
+                looked_at = looked_at.saturating_add(1);
                 let path = name.to_str().map(|name| format!("{folder}/{name}")).ok();
                 let Some(path) = path.filter(|path| looked_at <= limit && is_plain(path)) else {
-                    walk.left_out += 1;
+                    walk.leave_out();
                     continue;
                 };
                 let Ok(stat) = fstatat(&dir, name.as_c_str(), AtFlags::AT_SYMLINK_NOFOLLOW) else {
                     continue;
                 };
                 match SFlag::from_bits_truncate(stat.st_mode & SFlag::S_IFMT.bits()) {
-                    SFlag::S_IFDIR if depth < MAX_DEPTH => folders.push((path, depth + 1)),
+                    SFlag::S_IFDIR if depth < MAX_DEPTH => folders.push((path, depth.saturating_add(1))),
                     SFlag::S_IFREG => {
                         let stamp = Stamp {
                             size: u64::try_from(stat.st_size).unwrap_or(0),
@@ -182,7 +188,7 @@ impl Tree {
                         };
                         walk.files.insert(path, stamp);
                     }
-                    _ => walk.left_out += 1,
+                    _ => walk.leave_out(),
                 }
             }
             if looked_at > limit {
@@ -232,7 +238,7 @@ impl Tree {
         Ok(file.into())
     }
 
-    /// Writes one of our own files under another name first, so that nobody reads half of it.
+    /// Writes one of our own files under another name first, so that no reader gets half of it.
     pub fn write(&self, relative: &str, bytes: &[u8]) -> Result<(), TreeError> {
         use std::io::Write;
         let (folder, name) = relative.rsplit_once('/').ok_or(TreeError::Path)?;

@@ -1,7 +1,7 @@
 //! When which file is stored: the rules, and the memory of what is stored already.
 //!
 //! `decide_upload` is pure. [`send::Uploader`] carries it out; `logcopy` calls that each round, `workspace` fills the memory
-//! with what it restored. Nothing here lists the bucket: what is stored is remembered beside the files, so that a restarted
+//! with what it restored. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
 //! logcopy does not send everything again.
 
 pub mod send;
@@ -12,9 +12,11 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::time::Duration;
 
+use hyper::body::Bytes;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::report::StoredFile;
 use super::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::MIN_PART;
 
@@ -22,7 +24,7 @@ use crate::services::archive::MIN_PART;
 pub const AT_LEAST_EVERY: Duration = Duration::from_mins(1);
 /// Growth of a large file that is worth the four requests of an append.
 const WORTH_APPENDING: u64 = 1 << 20;
-/// Bytes looked at on each end of a large file to see that it only grew.
+/// Bytes read at each end of a large file to check that it only grew.
 const WINDOW: u64 = 64 << 10;
 /// Where the memory lies on the `logs` volume.
 const MEMORY: &str = "logcopy/.stored.json";
@@ -43,6 +45,27 @@ pub struct Stored {
     pub at: Duration,
 }
 
+/// A result that is stored from memory. Its content is shared, never copied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Object {
+    /// Its content.
+    pub bytes: Bytes,
+    /// Size and digest of it.
+    pub digest: StoredFile,
+}
+
+impl Object {
+    /// With its digest.
+    pub fn new(bytes: impl Into<Bytes>) -> Self {
+        let bytes = bytes.into();
+        let digest = StoredFile {
+            size: bytes.len() as u64,
+            sha256: hex(&Sha256::digest(&bytes)),
+        };
+        Self { bytes, digest }
+    }
+}
+
 /// What is done with a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
@@ -60,7 +83,7 @@ pub enum Decision {
 /// How soon a changed file is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Haste {
-    /// In the round in which it is seen: results, and everything at the end.
+    /// In the round in which it is found: results, and everything at the end.
     Now,
     /// When it has grown enough, or a minute after the last time: logs.
     Soon,
@@ -78,7 +101,7 @@ pub fn decide_upload(found: &Stamp, stored: Option<&Stored>, now: Duration, hast
     let is_due = haste == Haste::Now || now.saturating_sub(stored.at) >= AT_LEAST_EVERY;
     let may_append = found.inode == before.inode && before.size >= MIN_PART && stored.etag.is_some();
     if may_append && found.size > before.size {
-        return if is_due || found.size - before.size >= WORTH_APPENDING {
+        return if is_due || found.size.saturating_sub(before.size) >= WORTH_APPENDING {
             Decision::Append { from: before.size }
         } else {
             Decision::Keep
@@ -92,7 +115,7 @@ pub fn decide_upload(found: &Stamp, stored: Option<&Stored>, now: Duration, hast
     }
 }
 
-/// Tells whether the first `len` bytes of a file are what they were: a digest of all of them, or of both ends where that
+/// Shows whether the first `len` bytes of a file are what they were: a digest of all of them, or of both ends where that
 /// would be too much to read each round.
 pub fn fingerprint(file: &File, len: u64) -> io::Result<String> {
     let mut digest = Sha256::new();
@@ -100,7 +123,7 @@ pub fn fingerprint(file: &File, len: u64) -> io::Result<String> {
         hash_range(&mut digest, file, 0, len)?;
     } else {
         hash_range(&mut digest, file, 0, WINDOW)?;
-        hash_range(&mut digest, file, len - WINDOW, WINDOW)?;
+        hash_range(&mut digest, file, len.saturating_sub(WINDOW), WINDOW)?;
     }
     Ok(hex(&digest.finalize()))
 }
@@ -115,13 +138,14 @@ fn hash_range(digest: &mut Sha256, file: &File, from: u64, len: u64) -> io::Resu
 /// Hexadecimal digits, as in [`super::report::StoredFile`].
 pub fn hex(bytes: &[u8]) -> String {
     use std::fmt::Write;
-    bytes
-        .iter()
-        .fold(String::with_capacity(bytes.len() * 2), |mut text, byte| {
+    bytes.iter().fold(
+        String::with_capacity(bytes.len().saturating_mul(2)),
+        |mut text, byte| {
             // Writing to a String can't fail.
             let _ = write!(text, "{byte:02x}");
             text
-        })
+        },
+    )
 }
 
 /// What is stored, by key.
@@ -144,7 +168,8 @@ impl Memory {
 
     /// Bytes that are stored.
     pub fn bytes(&self) -> u64 {
-        self.0.values().map(|stored| stored.stamp.size).sum()
+        let sizes = self.0.values().map(|stored| stored.stamp.size);
+        sizes.fold(0, u64::saturating_add)
     }
 }
 

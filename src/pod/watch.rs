@@ -1,6 +1,6 @@
 //! Says that something in a few folders may have changed, so that a round need not wait for its period.
 //!
-//! Called by `logcopy`. It never says what changed: who is woken looks again. Where inotify does not work (some sandboxed
+//! Called by `logcopy`. It never reports what changed: who is woken reads everything again. Where inotify does not work (some sandboxed
 //! runtimes do not carry it between containers), the period is all there is.
 
 use std::ffi::OsStr;

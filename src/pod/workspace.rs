@@ -20,7 +20,7 @@ use super::gather::results_plan;
 use super::identity;
 use super::isolation::{self, Finding};
 use super::places::{Places, Setting};
-use super::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report, ReportPair, SCHEMA};
+use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, ReportPair, SCHEMA};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError};
@@ -28,7 +28,7 @@ use leaderboard_api::Enforcement;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 
 /// Folders that no mount makes. The others are the kubelet's.
-const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "evalai", "logcopy"];
+const FOLDERS: [&str; 3] = ["agent", STATUS_FOLDER, "logcopy"];
 /// Names the Pod whose volume this is, once it is prepared.
 const PREPARED: &str = "logcopy/.prepared";
 /// Tries while S3 does not answer, before the kubelet is left to start this again.
@@ -59,7 +59,7 @@ pub enum WorkspaceReason {
     NotMeasured,
 }
 
-/// What the container says in its termination message.
+/// The container's termination message.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
 pub struct WorkspaceVerdict {
     /// For the controller.
@@ -77,12 +77,13 @@ impl WorkspaceVerdict {
             if json.len() <= VERDICT_BYTES || verdict.message.is_empty() {
                 return json;
             }
-            let keep = verdict.message.chars().count() * 3 / 4;
+            let characters = verdict.message.chars().count();
+            let keep = characters.saturating_sub(characters.div_ceil(4));
             verdict.message = verdict.message.chars().take(keep).collect();
         }
     }
 
-    /// What a Pod that goes on says of its isolation.
+    /// What a Pod that goes on reports of its isolation.
     fn of(finding: &Finding) -> Self {
         Self {
             reason: match finding {
@@ -103,7 +104,7 @@ impl WorkspaceVerdict {
 /// Why the workspace could not be prepared.
 #[derive(thiserror::Error, Debug)]
 pub enum WorkspaceError {
-    /// Somebody else's results are there.
+    /// The results of another submission are there.
     #[error(
         "s3://{0} already holds results of something else. Apply the submission with attempt: 2 to take them up, or \
          empty the prefix."
@@ -123,7 +124,7 @@ pub enum WorkspaceError {
     Volume {
         /// Which.
         path: String,
-        /// The system's own words.
+        /// The system's own text.
         error: TreeError,
     },
     /// The runner.
@@ -131,7 +132,7 @@ pub enum WorkspaceError {
     Runner {
         /// Where to.
         path: String,
-        /// The system's own words.
+        /// The system's own text.
         error: io::Error,
     },
 }
@@ -208,7 +209,7 @@ pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), Workspa
             other => return other,
         }
         tokio::time::sleep(pause.min(setting.pace.backoff)).await;
-        pause *= 2;
+        pause = pause.saturating_mul(2);
     }
     take(setting, archive, &tree).await
 }
@@ -216,17 +217,17 @@ pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), Workspa
 /// Takes the prefix for this Pod.
 async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
     let run = &setting.run;
-    let owner = setting.pod_uid.clone().into_bytes();
+    let owner = Owner::new(setting.pod_uid.clone()).to_json();
     match claim(run, archive).await? {
         Claim::Fresh => {
-            // Says whose prefix it is before anything else is in it, so that a Pod that is lost early can be replaced.
+            // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
             let report = first_report(run, &setting.pod_uid)?;
             let bytes = serde_json::to_vec(&report).unwrap_or_default();
             archive.put(REPORT_KEY, bytes).await?;
             archive.put(OWNER_KEY, owner).await?;
         }
         Claim::TakeUp => {
-            // The fence first: what a Pod before this one still stores, it stores before its next look at the fence, and what is
+            // The fence first: what a Pod before this one still stores, it stores before it next reads the fence, and what is
             // restored is then the last of it.
             archive.put(OWNER_KEY, owner).await?;
             let restored = restore::restore(run, archive, tree).await?;
@@ -254,7 +255,7 @@ fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
 enum Claim {
     /// There is nothing.
     Fresh,
-    /// It is ours, or we are told to go on with it.
+    /// It is ours, or the run goes on with it.
     TakeUp,
 }
 
@@ -267,9 +268,9 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     if stored.is_some_and(|report| report.submission_uid == run.uid) {
         return Ok(Claim::TakeUp);
     }
-    // The controller may have taken the fence from a Pod that never came this far, and told why it failed.
+    // The controller may have taken the fence from a Pod that never came this far, and stored why it failed.
     let controllers = [OWNER_KEY, FAILURE_LOG_KEY];
-    let there = archive.list("", controllers.len() + 1).await?.objects;
+    let there = archive.list("", controllers.len().saturating_add(1)).await?.objects;
     if there.iter().all(|object| controllers.contains(&object.key.as_str())) {
         return Ok(Claim::Fresh);
     }

@@ -211,9 +211,9 @@ impl Archive {
     }
 
     /// Stores an object that fits into memory. Returns its entity tag.
-    pub async fn put(&self, key: &str, bytes: Vec<u8>) -> Result<Option<String>, ArchiveError> {
+    pub async fn put(&self, key: &str, bytes: impl Into<ByteStream>) -> Result<Option<String>, ArchiveError> {
         let request = self.client.put_object().bucket(&self.bucket).key(self.full(key));
-        let request = request.body(ByteStream::from(bytes)).send();
+        let request = request.body(bytes.into()).send();
         let output = self.meter.aws("s3", "PutObject", request).await;
         Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
     }

@@ -23,7 +23,7 @@ use leaderboard_operator::controller::leader::{self, Identity};
 use leaderboard_operator::controller::run::{self, Clients};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::pod::report::OWNER_KEY;
+use leaderboard_operator::pod::report::{OWNER_KEY, Owner};
 use leaderboard_operator::services::archive::Archive;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
@@ -439,8 +439,9 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
     let gone = world.api::<Pod>().get_opt(&pod).await.unwrap();
     assert_eq!(gone, None, "removed by force");
     let mark = world.archive(pk).get(OWNER_KEY, 1024).await.unwrap().unwrap();
+    let mark = Owner::parse(&mark.bytes).unwrap();
     assert!(
-        mark.bytes.starts_with(b"controller-"),
+        mark.owner.starts_with("controller-"),
         "what it may still write counts for nobody"
     );
     world.pod(&next, &running()).await;

@@ -24,11 +24,11 @@ use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{LeaderboardVersion, LogGroup, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::logcopy::{self, LogcopyError};
 use leaderboard_operator::pod::places::{Pace, Places, Setting};
-use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY, Report};
-use leaderboard_operator::pod::run::{Run, STATUS_FOLDER, Stop};
+use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
+use leaderboard_operator::pod::run::{Run, SCHEMA, STATUS_FOLDER, Stop};
 use leaderboard_operator::pod::tree::Tree;
-use leaderboard_operator::pod::upload::Haste;
 use leaderboard_operator::pod::upload::send::{Sent, Uploader, Wanted};
+use leaderboard_operator::pod::upload::{Haste, Object};
 use leaderboard_operator::pod::workspace::{self, WorkspaceError, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_operator::pod::{identity, ship};
 use leaderboard_operator::services::archive::{Archive, Cause, Fetched};
@@ -144,6 +144,11 @@ impl Pod {
         self.archive.get(key, LIMIT).await.unwrap().map(|object| object.bytes)
     }
 
+    /// Whose writes count.
+    async fn owner(&self) -> String {
+        Owner::parse(&self.stored(OWNER_KEY).await.unwrap()).unwrap().owner
+    }
+
     async fn report(&self) -> Option<Report> {
         let bytes = self.archive.get(REPORT_KEY, MAX_BYTES as u64).await.ok()??.bytes;
         Some(Report::parse(&bytes).unwrap())
@@ -226,6 +231,7 @@ async fn until_true(what: impl Fn() -> bool) {
 /// Two pairs of two routes each.
 fn run(bucket: &str) -> Run {
     Run {
+        schema: SCHEMA,
         namespace: "default".to_owned(),
         submission: "submission-77".to_owned(),
         uid: "uid-1".to_owned(),

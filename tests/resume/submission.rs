@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use leaderboard_api::{ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::places::Places;
-use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run};
+use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
 use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Side};
 use tokio::process::Command;
@@ -205,6 +205,7 @@ pub fn make_volumes(root: &Path) {
 
 fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Run {
     Run {
+        schema: SCHEMA,
         namespace: "default".to_owned(),
         submission: id.to_owned(),
         uid: format!("uid of {id}"),

@@ -17,6 +17,8 @@
 //! # Ok::<(), leaderboard_results::Refusal>(())
 //! ```
 
+#![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
+
 mod checkpoint;
 mod json;
 mod merge;
@@ -27,10 +29,9 @@ mod refusal;
 mod render;
 mod statistics;
 mod verdict;
-mod verify;
 
 pub use checkpoint::{Checkpoint, read_worker};
-pub use json::Limit;
+pub use json::{FileLimits, Limit};
 pub use merge::{Merged, PairProgress, merge};
 pub use names::{Metric, Score, Source, metrics};
 pub use number::number_text;

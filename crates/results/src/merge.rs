@@ -238,10 +238,10 @@ fn check_gaps(sorted: &[&Record]) -> Result<(), Refusal> {
     for record in sorted {
         let (route, repetition) = record.key;
         if repetition < last_repetition {
-            repetitions = last_repetition + 1;
+            repetitions = i64::saturating_add(last_repetition, 1);
         }
-        let place = route * repetitions + repetition;
-        if place - last_place > 1 {
+        let place = route.saturating_mul(repetitions).saturating_add(repetition);
+        if place.saturating_sub(last_place) > 1 {
             return Err(Refusal::Gap {
                 before,
                 after: record.name.clone(),
@@ -357,7 +357,7 @@ const V2_KEYS: [&str; 6] = ["route_id", "status", "num_infractions", "infraction
 /// The record as it was read, with its index in the merged file. V2 also fills in what is missing and puts the known keys
 /// first.
 fn record_node(format: Format, index: u32, object: &Object) -> Node<'_> {
-    let mut entries = Vec::with_capacity(object.len() + 1);
+    let mut entries = Vec::with_capacity(object.len().saturating_add(1));
     entries.push(("index".as_bytes(), Node::int(index)));
     if format == Format::V2 {
         let value = |key| object.get(key).map_or_else(|| v2_default(key), Node::Value);

@@ -1,5 +1,5 @@
 //! The fixed names of both formats: infractions, metrics, statuses, sensors. Tables only; everything that writes or
-//! judges a name looks it up here.
+//! judges a name takes it from here.
 
 use crate::Format;
 
@@ -200,9 +200,9 @@ pub fn metrics(format: Format) -> &'static [Metric] {
 pub(crate) const CRASHED: &str = "Crashed";
 /// The entry status of a run whose agent asked for sensors it may not have.
 pub(crate) const REJECTED: &str = "Rejected";
-/// Part of a status that tells a crashed simulator.
+/// Part of the status of a route with a crashed simulator.
 pub(crate) const SIMULATION_CRASHED: &str = "Simulation crashed";
-/// Part of a status that tells forbidden sensors.
+/// Part of the status of a route with forbidden sensors.
 pub(crate) const SENSORS_INVALID: &str = "Agent's sensors were invalid";
 /// The status of a record that was never computed.
 pub(crate) const STARTED: &str = "Started";

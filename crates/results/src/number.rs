@@ -126,8 +126,11 @@ fn decimal(text: &str) -> (String, i32) {
     let (whole, fraction) = mantissa.split_once('.').unwrap_or((mantissa, ""));
     let all = format!("{whole}{fraction}");
     let digits = all.trim_start_matches('0');
-    let leading = i32::try_from(all.len() - digits.len()).unwrap_or(0);
-    let point = i32::try_from(whole.len()).unwrap_or(0) - leading + exponent.parse::<i32>().unwrap_or(0);
+    let leading = i32::try_from(all.len().saturating_sub(digits.len())).unwrap_or(0);
+    let whole = i32::try_from(whole.len()).unwrap_or(0);
+    let point = whole
+        .saturating_sub(leading)
+        .saturating_add(exponent.parse().unwrap_or(0));
     (digits.trim_end_matches('0').to_owned(), point)
 }
 
@@ -135,7 +138,7 @@ fn decimal(text: &str) -> (String, i32) {
 fn layout(digits: &str, point: i32) -> String {
     let (first, rest) = digits.split_at_checked(1).unwrap_or(("0", ""));
     let dot = if rest.is_empty() { "" } else { "." };
-    let exponent = point - 1;
+    let exponent = point.saturating_sub(1);
     let sign = if exponent < 0 { '-' } else { '+' };
     format!("{first}{dot}{rest}e{sign}{:02}", exponent.unsigned_abs())
 }

@@ -4,6 +4,18 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Refusal;
+use crate::json::FileLimits;
+
+/// What the checkpoints of all pairs may hold together in a Pod. Real ones hold a few kilobytes a route run.
+const SHARED: FileLimits = FileLimits {
+    bytes: 32 << 20,
+    values: 500_000,
+};
+/// What each pair may have besides its share.
+const LEAST: FileLimits = FileLimits {
+    bytes: 1 << 20,
+    values: 10_000,
+};
 
 /// The checkpoint format: Leaderboard 1.0, or 2.0 and everything after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -47,11 +59,9 @@ pub struct Slice {
 impl Slice {
     /// How many routes the slice holds; 0 for one written backwards.
     pub fn routes(self) -> u32 {
-        if self.last < self.first {
-            0
-        } else {
-            (self.last - self.first).saturating_add(1)
-        }
+        self.last
+            .checked_sub(self.first)
+            .map_or(0, |more| more.saturating_add(1))
     }
 
     pub(crate) fn contains(self, id: i64) -> bool {
@@ -93,7 +103,7 @@ impl Plan {
         }
     }
 
-    /// Whether the plan says which pairs and routes there are, and is to be believed more than the files.
+    /// Whether the plan has the pairs and routes, and decides where the files differ.
     pub(crate) fn decides(&self) -> bool {
         !self.pairs.is_empty() && !self.as_original
     }
@@ -107,6 +117,26 @@ impl Plan {
         self.pairs
             .get(pair)
             .map(|slice| slice.routes().saturating_mul(self.repetitions))
+    }
+
+    /// How large the pair's checkpoint may be. In a Pod the pairs share one bound in proportion to their route runs, so that
+    /// the memory that reading and merging takes does not grow with the number of pairs.
+    pub fn limits_of(&self, pair: usize) -> FileLimits {
+        let (Some(slice), true) = (self.pairs.get(pair), self.is_pod()) else {
+            return FileLimits::LARGEST;
+        };
+        let routes = self.pairs.iter().map(|slice| u64::from(slice.routes()));
+        let all = routes.fold(0, u64::saturating_add);
+        let share = |least: usize, shared: usize| {
+            let part = (shared as u64)
+                .saturating_mul(u64::from(slice.routes()))
+                .checked_div(all);
+            least.saturating_add(part.and_then(|part| usize::try_from(part).ok()).unwrap_or(0))
+        };
+        FileLimits {
+            bytes: share(LEAST.bytes, SHARED.bytes),
+            values: share(LEAST.values, SHARED.values),
+        }
     }
 
     /// How many records the whole run ends with; `None` when the plan does not know.

@@ -1,4 +1,4 @@
-//! Why a checkpoint or a merge is refused, in words a participant understands. Every room returns these; none of them
+//! Why a checkpoint or a merge is refused, for the participant. Every module returns these; none of them
 //! repeats a text the agent wrote, so they may be published.
 
 use std::fmt;
@@ -19,7 +19,7 @@ pub enum Refusal {
         problem: String,
     },
     /// The file, or what would be written from it, is too large in some way.
-    #[error("pair {}: the checkpoint {limit}", pair + 1)]
+    #[error("pair {}: the checkpoint {limit}", ordinal(*pair))]
     Limit {
         /// Whose file.
         pair: usize,
@@ -33,13 +33,13 @@ pub enum Refusal {
         limit: Limit,
     },
     /// The bytes are no text.
-    #[error("pair {}: the checkpoint is not UTF-8 text", pair + 1)]
+    #[error("pair {}: the checkpoint is not UTF-8 text", ordinal(*pair))]
     NotUtf8 {
         /// Whose file.
         pair: usize,
     },
     /// The JSON has not the shape of a checkpoint.
-    #[error("pair {}: `{place}` in the checkpoint is not {wanted}", pair + 1)]
+    #[error("pair {}: `{place}` in the checkpoint is not {wanted}", ordinal(*pair))]
     Shape {
         /// Whose file.
         pair: usize,
@@ -49,7 +49,7 @@ pub enum Refusal {
         wanted: &'static str,
     },
     /// The file was written for other routes or repetitions.
-    #[error("pair {}: the checkpoint is for {found} route runs, but this pair has {expected}", pair + 1)]
+    #[error("pair {}: the checkpoint is for {found} route runs, but this pair has {expected}", ordinal(*pair))]
     Total {
         /// Whose file.
         pair: usize,
@@ -59,7 +59,7 @@ pub enum Refusal {
         expected: u32,
     },
     /// More records than route runs.
-    #[error("pair {}: the checkpoint has {found} records for {expected} route runs", pair + 1)]
+    #[error("pair {}: the checkpoint has {found} records for {expected} route runs", ordinal(*pair))]
     TooManyRecords {
         /// Whose file.
         pair: usize,
@@ -68,16 +68,16 @@ pub enum Refusal {
         /// What the plan says.
         expected: u32,
     },
-    /// A sensor nobody knows.
-    #[error("{}sensor {sensor} is not one of the known kinds", .pair.map_or(String::new(), |pair| format!("pair {}: ", pair + 1)))]
+    /// A sensor of no known kind.
+    #[error("{}sensor {sensor} is not one of the known kinds", .pair.map_or(String::new(), |pair| format!("pair {}: ", ordinal(pair))))]
     Sensor {
-        /// Whose file, when it was seen there.
+        /// Whose file, when it was found there.
         pair: Option<usize>,
         /// Which sensor of the list, from 1.
         sensor: usize,
     },
     /// Two workers ran different sensors.
-    #[error("pairs {} and {} have different sensor configurations", first + 1, second + 1)]
+    #[error("pairs {} and {} have different sensor configurations", ordinal(*first), ordinal(*second))]
     SensorsDiffer {
         /// One worker.
         first: usize,
@@ -85,7 +85,7 @@ pub enum Refusal {
         second: usize,
     },
     /// A record is wrong.
-    #[error("pair {}, {record}: {problem}", pair + 1)]
+    #[error("pair {}, {record}: {problem}", ordinal(*pair))]
     Record {
         /// Whose file.
         pair: usize,
@@ -122,6 +122,11 @@ pub enum Refusal {
         /// Its name on EvalAI.
         metric: &'static str,
     },
+}
+
+/// People count from 1.
+fn ordinal(index: usize) -> usize {
+    index.saturating_add(1)
 }
 
 impl Refusal {

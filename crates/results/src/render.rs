@@ -130,10 +130,10 @@ fn sensors(merged: &Merged) -> Result<Vec<(&'static str, usize)>, Refusal> {
     for (i, sensor) in merged.view.sensors.iter().enumerate() {
         let name = sensor.as_str().and_then(sensor_name).ok_or(Refusal::Sensor {
             pair: None,
-            sensor: i + 1,
+            sensor: i.saturating_add(1),
         })?;
         match counted.iter_mut().find(|(known, _)| *known == name) {
-            Some((_, count)) => *count += 1,
+            Some((_, count)) => *count = count.saturating_add(1),
             None => counted.push((name, 1)),
         }
     }
@@ -162,7 +162,7 @@ fn whole_ratio(routes: &[Line]) -> Number {
 
 fn frames(ratio: Number) -> Number {
     match ratio {
-        Number::Int(i) => Number::Int(i * 20),
+        Number::Int(i) => Number::Int(i.saturating_mul(20)),
         Number::Float(f) => Number::Float(FRAMES * f).rounded(RATIO_DIGITS),
     }
 }

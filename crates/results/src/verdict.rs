@@ -33,7 +33,7 @@ impl Outcome {
     }
 }
 
-/// What the merged file says of the whole run.
+/// The outcome of the whole run, as the merged file has it.
 pub(crate) struct Verdict {
     pub(crate) entry_status: &'static str,
     pub(crate) eligible: bool,
@@ -93,7 +93,7 @@ impl Verdict {
     }
 }
 
-/// The last route that tells of a crash or of wrong sensors decides, as in the original.
+/// The last route whose status names a crash or wrong sensors decides, as in the original.
 fn telling(sorted: &[&Record]) -> Option<Outcome> {
     sorted.iter().rev().find_map(|record| {
         if record.status.contains(SIMULATION_CRASHED) {

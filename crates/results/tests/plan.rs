@@ -335,10 +335,13 @@ fn limits_are_refusals() {
         .to_string();
     assert_eq!(refusal, "pair 1: the checkpoint is nested deeper than 64 levels");
     let large = vec![b' '; (64 << 20) + 1];
-    let refusal = leaderboard_results::read_worker(&plan, 0, &large)
-        .unwrap_err()
-        .to_string();
-    assert_eq!(refusal, "pair 1: the checkpoint is larger than 64 MiB");
+    for (plan, most) in [(&plan, "33 MiB"), (&Plan::lenient(V2), "64 MiB")] {
+        let refusal = leaderboard_results::read_worker(plan, 0, &large).unwrap_err();
+        assert_eq!(
+            refusal.to_string(),
+            format!("pair 1: the checkpoint is larger than {most}")
+        );
+    }
     let refusal = leaderboard_results::read_worker(&plan, 1, b"{\"\xff\":1}")
         .unwrap_err()
         .to_string();

@@ -27,7 +27,7 @@ use kube::api::{DynamicObject, TypeMeta};
 use serde_json::{Value, json};
 
 use super::pod_overlay;
-use crate::pod::run::{Isolation, Run};
+use crate::pod::run::{Isolation, Run, SCHEMA};
 use leaderboard_api::{
     Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions, names,
     reasons,
@@ -139,6 +139,7 @@ pub fn run_document(input: &JobInput<'_>) -> Run {
     let unsigned = |seconds: i64| u64::try_from(seconds).unwrap_or_default();
     let (spec, meta) = (input.spec(), &input.submission.metadata);
     Run {
+        schema: SCHEMA,
         namespace: meta.namespace.clone().unwrap_or_default(),
         submission: input.submission_name().to_owned(),
         uid: meta.uid.clone().unwrap_or_default(),

@@ -1,4 +1,4 @@
-//! What a round's report says. Pure.
+//! The content of a round's report. Pure.
 
 use std::collections::BTreeMap;
 

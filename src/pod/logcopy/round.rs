@@ -1,6 +1,6 @@
-//! One round: look, judge, check the fence, store, report.
+//! One round: read, judge, check the fence, store, report.
 //!
-//! Called by the loop of the parent module. What a report says is in [`super::describe`].
+//! Called by the loop of the parent module. The content of a report is in [`super::describe`].
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
@@ -9,30 +9,29 @@ use std::hash::{Hash, Hasher};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use hyper::body::Bytes;
 use leaderboard_runner::protocol::{self, Side, StatusFile};
 use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
 use super::{LogcopyError, create};
 use crate::pod::blocking;
-use crate::pod::gather::{Gathered, Gatherer, checkpoint_path};
+use crate::pod::gather::{Gathered, Gatherer, REFUSED, checkpoint_path};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
 use crate::pod::ownlog::OWN_LOG;
 use crate::pod::places::Setting;
-use crate::pod::report::{OWNER_KEY, REPORT_KEY, Report};
+use crate::pod::report::{OWNER_KEY, Owner, REPORT_KEY, Report};
 use crate::pod::run::{STATUS_FOLDER, Stop};
 use crate::pod::tree::{Stamp, Tree};
-use crate::pod::upload::Haste;
 use crate::pod::upload::send::{Uploader, Wanted};
+use crate::pod::upload::{Haste, Object};
 use crate::pod::watch::Watch;
 use crate::services::archive::{Archive, ArchiveError, Fetched};
 
-/// Entries looked at in one agent's folder.
+/// Entries read in one agent's folder.
 const AGENT_ENTRIES: usize = 5_000;
-/// Entries looked at in the simulators' folder.
+/// Entries read in the simulators' folder.
 const SIMULATOR_ENTRIES: usize = 20_000;
-/// Ends the key of a refused checkpoint.
-const REFUSED: &str = ".refused";
 /// Bytes of the owner that are read.
 const OWNER_BYTES: u64 = 1024;
 /// Shortest time that logs get in a round of a running run.
@@ -47,9 +46,9 @@ pub(super) enum Why {
     Shutdown,
 }
 
-/// What has been seen on the volume.
+/// What is on the volume.
 #[derive(Debug)]
-struct Look {
+struct Found {
     gathered: Gathered,
     logs: Vec<Wanted>,
     statuses: Vec<StatusFile>,
@@ -123,7 +122,8 @@ impl Rounds {
     /// The pause after this many failures in a row.
     pub(super) fn after_failures(&self, failures: u32) -> Duration {
         let factor = 1 << failures.saturating_sub(1).min(8);
-        (self.setting.pace.least * factor).min(self.setting.pace.backoff)
+        let pause = self.setting.pace.least.saturating_mul(factor);
+        pause.min(self.setting.pace.backoff)
     }
 
     /// Waits for the next round: its time, a stop, or a change that can't wait. There is none after the end.
@@ -173,67 +173,67 @@ impl Rounds {
         if self.fenced || (self.finished && why == Why::Period) {
             return Ok(self.period());
         }
-        let look = self.look().await?;
-        let pause = self.judge(&look).await;
+        let found = self.read().await?;
+        let pause = self.judge(&found).await;
         if !self.owns_prefix().await? {
             self.give_up().await;
             return Ok(self.period());
         }
         if self.finished {
-            // Only what has come since: the others' last status files and our own last lines.
-            self.store_statuses(&look.statuses).await?;
-            self.store_logs(look.logs, true).await?;
+            // Only what has come since: the last status files and our own last lines.
+            self.store_statuses(&found.statuses).await?;
+            self.store_logs(found.logs, true).await?;
             return Ok(self.period());
         }
         let at_end = self.ending.is_some() || why == Why::Shutdown;
-        self.uploader.put(&look.gathered.objects).await?;
-        self.store_statuses(&look.statuses).await?;
+        self.uploader.put(&found.gathered.objects).await?;
+        self.store_statuses(&found.statuses).await?;
         if at_end {
-            self.store_logs(look.logs, true).await?;
+            self.store_logs(found.logs, true).await?;
             // Storing logs can take minutes, in which another Pod may have come.
             if !self.owns_prefix().await? {
                 self.give_up().await;
                 return Ok(self.period());
             }
-            self.report(&look.gathered).await?;
+            self.report(&found.gathered).await?;
         } else {
             // A long upload of logs must not keep the progress back.
-            self.report(&look.gathered).await?;
-            self.store_logs(look.logs, false).await?;
+            self.report(&found.gathered).await?;
+            self.store_logs(found.logs, false).await?;
         }
         if self.ending.is_some() {
-            self.finish(&look.gathered).await?;
+            self.finish(&found.gathered).await?;
         }
         Ok(pause)
     }
 
     /// Reads the volume, on a thread that may block.
-    async fn look(&self) -> Result<Look, LogcopyError> {
+    async fn read(&self) -> Result<Found, LogcopyError> {
         let (tree, reader) = (Arc::clone(&self.tree), Arc::clone(&self.gatherer));
         let status = self.setting.places.status();
         let pairs = self.pairs();
-        let look = move || {
+        let read = move || {
             let gathered = reader.lock().unwrap_or_else(PoisonError::into_inner).round();
             let (files, activity) = logs(&tree, pairs);
-            Look {
+            Found {
                 logs: wanted(&files, &gathered),
                 gathered,
                 statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX)),
                 activity,
             }
         };
-        Ok(blocking(look).await?)
+        Ok(blocking(read).await?)
     }
 
-    /// Draws the consequences of what was seen. Returns how long the next look may wait.
-    async fn judge(&mut self, look: &Look) -> Duration {
+    /// Draws the consequences of what was read. Returns how long the next round may wait.
+    async fn judge(&mut self, found: &Found) -> Duration {
         let outside = Outside {
             stop: *self.stop.borrow_and_update(),
-            cancelled: look.statuses.contains(&StatusFile::Cancel),
-            activity: look.activity,
+            cancelled: found.statuses.contains(&StatusFile::Cancel),
+            activity: found.activity,
             now: self.epoch.elapsed(),
         };
-        let seen = self.judge.see(&look.gathered, outside);
+        let seen = self.judge.see(&found.gathered, outside);
         if self.ending.is_some() {
             return self.setting.pace.least;
         }
@@ -263,13 +263,15 @@ impl Rounds {
         match self.archive.get_if_none_match(OWNER_KEY, known, OWNER_BYTES).await? {
             Fetched::NotModified => Ok(true),
             Fetched::Found(object) => {
-                let ours = object.bytes.trim_ascii() == self.setting.pod_uid.as_bytes();
+                let ours = Owner::parse(&object.bytes).is_some_and(|owner| owner.owner == self.setting.pod_uid);
                 self.owner_etag = object.etag.filter(|_| ours);
                 Ok(ours)
             }
             Fetched::Absent => {
                 if !std::mem::replace(&mut self.owner_missed, true) {
-                    tracing::warn!("{OWNER_KEY} is gone from the prefix; nobody else has taken it, so this goes on");
+                    tracing::warn!(
+                        "{OWNER_KEY} is gone from the prefix; no other Pod has taken it, so this one goes on"
+                    );
                 }
                 Ok(true)
             }
@@ -286,24 +288,13 @@ impl Rounds {
         create(StatusFile::Stored, &status).await;
     }
 
-    /// The status files, flat, as they have always been stored.
+    /// The status files, flat, as they have always been stored. Only their names mean something, so they are stored empty:
+    /// what an agent puts into its own is never read.
     async fn store_statuses(&mut self, statuses: &[StatusFile]) -> Result<(), ArchiveError> {
-        let files: Vec<Wanted> = statuses
-            .iter()
-            .map(|file| {
-                let (folder, name) = (file.folder(), file.name());
-                Wanted {
-                    key: format!("{STATUS_FOLDER}/{name}"),
-                    path: format!("{STATUS_FOLDER}/{folder}/{name}"),
-                    // Their name is all they say.
-                    stamp: Stamp::default(),
-                    haste: Haste::Soon,
-                    essential: true,
-                }
-            })
-            .filter(|file| !self.uploader.memory().0.contains_key(&file.key))
-            .collect();
-        self.uploader.sync(&files, None).await.map(drop)
+        let empty = Object::new(Bytes::new());
+        let keys = statuses.iter().map(|file| format!("{STATUS_FOLDER}/{}", file.name()));
+        let objects: BTreeMap<String, Object> = keys.map(|key| (key, empty.clone())).collect();
+        self.uploader.put(&objects).await.map(drop)
     }
 
     /// The logs: all of them at the end, else what is due, and no longer than a period.
@@ -313,25 +304,25 @@ impl Rounds {
                 file.haste = Haste::Now;
             }
         }
-        let until = (!all).then(|| Instant::now() + self.period().max(LOG_TIME));
-        self.uploader.sync(&files, until).await.map(drop)
+        let until = Instant::now().checked_add(self.period().max(LOG_TIME));
+        self.uploader.sync(&files, until.filter(|_| !all)).await.map(drop)
     }
 
-    /// Stores the report, if it says something new.
+    /// Stores the report, if it differs from the last one.
     async fn report(&mut self, gathered: &Gathered) -> Result<(), ArchiveError> {
         let mut report = describe(&self.setting, gathered, self.ending.as_ref());
         report.round = self.round;
         if self.reported.as_ref() == Some(&report) {
             return Ok(());
         }
-        report.round += 1;
+        report.round = report.round.saturating_add(1);
         self.archive.put(REPORT_KEY, to_bytes(&report)).await?;
         self.round = report.round;
         self.reported = Some(report);
         Ok(())
     }
 
-    /// The final report is stored: says so to the Pod, and ends whoever is still at it.
+    /// The final report is stored: announces that in the Pod, and ends the agents that still run.
     async fn finish(&mut self, gathered: &Gathered) -> Result<(), LogcopyError> {
         let status = self.setting.places.status();
         let folder = status.clone();
@@ -342,7 +333,7 @@ impl Rounds {
             tracing::warn!("logcopy.done is not stored: {error}");
         }
         if gathered.seen.iter().any(|pair| !pair.agent.done) {
-            // Nobody needs to run for results that are complete.
+            // Complete results need no running agent.
             create(StatusFile::Cancel, &status).await;
         }
         Ok(())
@@ -376,7 +367,7 @@ fn wanted(files: &BTreeMap<String, Stamp>, gathered: &Gathered) -> Vec<Wanted> {
         match of_pair.get(path) {
             None => Some(wanted),
             Some(true) => Some(Wanted {
-                key: format!("{path}{REFUSED}"),
+                key: format!("{REFUSED}{path}"),
                 ..wanted
             }),
             Some(false) => None,
@@ -385,7 +376,7 @@ fn wanted(files: &BTreeMap<String, Stamp>, gathered: &Gathered) -> Vec<Wanted> {
     wanted.collect()
 }
 
-/// What can't wait for the period: a container that tells something, or its new folder. A checkpoint can wait: an agent that
+/// What can't wait for the period: a container's new status file, or its new folder. A checkpoint can wait: an agent that
 /// writes all the time must not set the pace.
 fn is_news(name: &OsStr) -> bool {
     let Some(name) = name.to_str() else { return false };

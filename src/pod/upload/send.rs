@@ -10,9 +10,7 @@ use std::time::{Duration, Instant};
 
 use futures::StreamExt;
 
-use sha2::{Digest, Sha256};
-
-use super::{Decision, Haste, Memory, Stored, decide_upload, fingerprint, hex};
+use super::{Decision, Haste, Memory, Object, Stored, decide_upload, fingerprint};
 use crate::pod::blocking;
 use crate::pod::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};
@@ -31,8 +29,6 @@ pub struct Wanted {
     pub stamp: Stamp,
     /// How soon.
     pub haste: Haste,
-    /// Stored even beyond the limit: what a run is about is bounded in other ways.
-    pub essential: bool,
 }
 
 impl Wanted {
@@ -43,16 +39,6 @@ impl Wanted {
             path: path.to_owned(),
             stamp,
             haste,
-            essential: false,
-        }
-    }
-
-    /// The same, stored even beyond the limit.
-    #[must_use]
-    pub fn essential(self) -> Self {
-        Self {
-            essential: true,
-            ..self
         }
     }
 }
@@ -77,12 +63,10 @@ pub struct Uploader {
     limit: u64,
     epoch: Instant,
     complained: BTreeSet<String>,
-    /// The objects of memory that are stored, to see at a glance that they are still the same.
-    known: BTreeMap<String, Arc<[u8]>>,
 }
 
-/// One file's end.
-enum Fate {
+/// What became of one file.
+enum Outcome {
     Stored(Box<Stored>, bool),
     LeftOut(String),
     Failed(ArchiveError),
@@ -99,7 +83,6 @@ impl Uploader {
             limit,
             epoch: Instant::now(),
             complained: BTreeSet::new(),
-            known: BTreeMap::new(),
         }
     }
 
@@ -108,30 +91,30 @@ impl Uploader {
         &self.memory
     }
 
-    /// Stores results that are in memory, each that is not what is stored already. They are stored even beyond the limit.
-    pub async fn put(&mut self, objects: &BTreeMap<String, Arc<[u8]>>) -> Result<Sent, ArchiveError> {
+    /// Stores results that are in memory, each that is not what is stored already. They are stored even beyond the limit: what
+    /// is in memory is bounded.
+    pub async fn put(&mut self, objects: &BTreeMap<String, Object>) -> Result<Sent, ArchiveError> {
         let now = self.epoch.elapsed();
-        let changed = objects.iter().filter(|(key, bytes)| {
-            let known = self.known.get(*key);
-            !known.is_some_and(|known| Arc::ptr_eq(known, bytes)) || !self.memory.0.contains_key(*key)
-        });
-        let jobs: Vec<Put> = changed
-            .map(|(key, bytes)| Put {
+        let is_stored = |key: &String, object: &Object| {
+            let known = self.memory.0.get(key);
+            known.is_some_and(|known| {
+                known.stamp.size == object.digest.size && known.fingerprint == object.digest.sha256
+            })
+        };
+        let jobs: Vec<Put> = objects
+            .iter()
+            .filter(|(key, object)| !is_stored(key, object))
+            .map(|(key, object)| Put {
                 archive: self.archive.clone(),
                 key: key.clone(),
-                bytes: Arc::clone(bytes),
-                known: self.memory.0.get(key).cloned(),
+                object: object.clone(),
                 now,
             })
             .collect();
         let work = jobs.into_iter().map(Put::store);
-        let fates: Vec<(String, Fate)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
-        for (key, fate) in &fates {
-            let bytes = objects.get(key).filter(|_| matches!(fate, Fate::Stored(..)));
-            self.known.extend(bytes.map(|bytes| (key.clone(), Arc::clone(bytes))));
-        }
+        let outcomes = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
         let mut sent = Sent::default();
-        let failed = self.settle(fates, &mut sent);
+        let failed = self.settle(outcomes, &mut sent);
         if sent.objects > 0 || failed.is_some() {
             self.remember().await;
         }
@@ -153,17 +136,17 @@ impl Uploader {
             let broken = Arc::clone(&broken);
             async move {
                 if broken.load(Ordering::Relaxed) || until.is_some_and(|until| Instant::now() >= until) {
-                    return (job.wanted.key, Fate::Late);
+                    return (job.wanted.key, Outcome::Late);
                 }
-                let fate = job.store().await;
-                if matches!(fate, Fate::Failed(_)) {
+                let outcome = job.store().await;
+                if matches!(outcome, Outcome::Failed(_)) {
                     broken.store(true, Ordering::Relaxed);
                 }
-                (job.wanted.key, fate)
+                (job.wanted.key, outcome)
             }
         });
-        let fates: Vec<(String, Fate)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
-        let failed = self.settle(fates, &mut sent);
+        let outcomes = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        let failed = self.settle(outcomes, &mut sent);
         if sent.objects > 0 || failed.is_some() {
             self.remember().await;
         }
@@ -171,22 +154,22 @@ impl Uploader {
     }
 
     /// Takes in what became of the files. Returns S3's failure, if there was one.
-    fn settle(&mut self, fates: Vec<(String, Fate)>, sent: &mut Sent) -> Option<ArchiveError> {
+    fn settle(&mut self, outcomes: Vec<(String, Outcome)>, sent: &mut Sent) -> Option<ArchiveError> {
         let (mut complaints, mut failed) = (BTreeMap::new(), None);
-        for (key, fate) in fates {
-            match fate {
-                Fate::Stored(stored, written) => {
-                    sent.objects += usize::from(written);
+        for (key, outcome) in outcomes {
+            match outcome {
+                Outcome::Stored(stored, written) => {
+                    sent.objects = sent.objects.saturating_add(usize::from(written));
                     self.memory.0.insert(key, *stored);
                 }
-                Fate::LeftOut(why) => {
-                    sent.left_out += 1;
+                Outcome::LeftOut(why) => {
+                    sent.left_out = sent.left_out.saturating_add(1);
                     complaints.insert(key, why);
                 }
-                Fate::Late => sent.late += 1,
-                Fate::Failed(error) => {
+                Outcome::Late => sent.late = sent.late.saturating_add(1),
+                Outcome::Failed(error) => {
                     if matches!(error.cause, Cause::Changed) {
-                        // Somebody else's object: it is written whole the next time.
+                        // Another writer's object: it is written whole the next time.
                         self.memory.0.remove(&key);
                     }
                     failed = Some(error);
@@ -201,15 +184,21 @@ impl Uploader {
     fn due(&self, files: &[Wanted]) -> (Vec<Job>, BTreeMap<String, String>) {
         let now = self.epoch.elapsed();
         let mut used = self.memory.bytes();
-        let (mut jobs, mut left_out) = (Vec::new(), BTreeMap::new());
+        let (mut jobs, mut left_out, mut keys) = (Vec::new(), BTreeMap::new(), BTreeSet::new());
         for file in files {
+            // Two files under one key would overwrite each other in any order.
+            if !keys.insert(file.key.as_str()) {
+                left_out.insert(file.key.clone(), "another file has the same key".to_owned());
+                continue;
+            }
             let known = self.memory.0.get(&file.key);
             let decision = decide_upload(&file.stamp, known, now, file.haste);
             if decision == Decision::Keep {
                 continue;
             }
-            let after = used - known.map_or(0, |known| known.stamp.size) + file.stamp.size;
-            if after > self.limit && after > used && !file.essential {
+            let before = known.map_or(0, |known| known.stamp.size);
+            let after = used.saturating_sub(before).saturating_add(file.stamp.size);
+            if after > self.limit && after > used {
                 let why = format!("storage.sizeLimit of {} bytes is reached", self.limit);
                 left_out.insert(file.key.clone(), why);
                 continue;
@@ -227,7 +216,7 @@ impl Uploader {
         (jobs, left_out)
     }
 
-    /// Says once per file why it is left out.
+    /// Logs once per file why it is left out.
     fn complain(&mut self, left_out: &BTreeMap<String, String>) {
         for (key, why) in left_out {
             if self.complained.len() < 1000 && self.complained.insert(key.clone()) {
@@ -249,33 +238,30 @@ impl Uploader {
 struct Put {
     archive: Archive,
     key: String,
-    bytes: Arc<[u8]>,
-    known: Option<Stored>,
+    object: Object,
     now: Duration,
 }
 
 impl Put {
-    async fn store(self) -> (String, Fate) {
-        let size = self.bytes.len() as u64;
-        let stored = Stored {
-            stamp: Stamp {
-                size,
-                ..Stamp::default()
-            },
-            etag: None,
-            fingerprint: hex(&Sha256::digest(&self.bytes)),
-            at: self.now,
+    async fn store(self) -> (String, Outcome) {
+        let Object { bytes, digest } = self.object;
+        let outcome = match self.archive.put(&self.key, bytes).await {
+            Ok(etag) => {
+                let stamp = Stamp {
+                    size: digest.size,
+                    ..Stamp::default()
+                };
+                let stored = Stored {
+                    stamp,
+                    etag,
+                    fingerprint: digest.sha256,
+                    at: self.now,
+                };
+                Outcome::Stored(Box::new(stored), true)
+            }
+            Err(error) => Outcome::Failed(error),
         };
-        let known = self.known.filter(|known| known.stamp.size == size);
-        if let Some(known) = known.filter(|known| known.fingerprint == stored.fingerprint) {
-            let etag = known.etag;
-            return (self.key, Fate::Stored(Box::new(Stored { etag, ..stored }), false));
-        }
-        let fate = match self.archive.put(&self.key, self.bytes.to_vec()).await {
-            Ok(etag) => Fate::Stored(Box::new(Stored { etag, ..stored }), true),
-            Err(error) => Fate::Failed(error),
-        };
-        (self.key, fate)
+        (self.key, outcome)
     }
 }
 
@@ -289,7 +275,7 @@ struct Job {
     now: Duration,
 }
 
-/// A file that is open, and what its beginning looked like.
+/// A file that is open, and the fingerprint of its beginning.
 struct Opened {
     file: Arc<File>,
     stamp: Stamp,
@@ -299,10 +285,15 @@ struct Opened {
 }
 
 impl Opened {
-    /// None if there is no such file.
-    fn open(tree: &Tree, path: &str, known_size: u64) -> Result<Option<Self>, TreeError> {
-        let Some((file, stamp)) = tree.file(path)? else {
+    /// None if there is no such file. Of one that has grown since it was counted, no more than the counted bytes are there: the
+    /// next round counts and sends the others.
+    fn open(tree: &Tree, path: &str, known_size: u64, counted: u64) -> Result<Option<Self>, TreeError> {
+        let Some((file, found)) = tree.file(path)? else {
             return Ok(None);
+        };
+        let stamp = Stamp {
+            size: found.size.min(counted),
+            ..found
         };
         Ok(Some(Self {
             of_known: fingerprint(&file, known_size.min(stamp.size))?,
@@ -337,25 +328,26 @@ impl From<ArchiveError> for Problem {
 }
 
 impl Job {
-    async fn store(&self) -> Fate {
+    async fn store(&self) -> Outcome {
         match self.send().await {
             Ok(fate) => fate,
-            Err(Problem::Local(error)) => Fate::LeftOut(error.to_string()),
+            Err(Problem::Local(error)) => Outcome::LeftOut(error.to_string()),
             Err(Problem::Archive(error)) => match error.cause {
-                // The file shrank under our hands; the next round sees what it became.
-                Cause::Local(_) | Cause::Parts(_) => Fate::LeftOut(error.cause.to_string()),
-                _ => Fate::Failed(error),
+                // The file shrank meanwhile; the next round finds what it became.
+                Cause::Local(_) | Cause::Parts(_) => Outcome::LeftOut(error.cause.to_string()),
+                _ => Outcome::Failed(error),
             },
         }
     }
 
-    /// Sends the first bytes of the file, as many as it had when it was opened.
-    async fn send(&self) -> Result<Fate, Problem> {
+    /// Sends the first bytes of the file, as many as it had when it was opened, and no more than were counted.
+    async fn send(&self) -> Result<Outcome, Problem> {
         let known_size = self.known.as_ref().map_or(0, |known| known.stamp.size);
         let (tree, path) = (Arc::clone(&self.tree), self.wanted.path.clone());
-        let opened = blocking(move || Opened::open(&tree, &path, known_size)).await??;
+        let counted = self.wanted.stamp.size;
+        let opened = blocking(move || Opened::open(&tree, &path, known_size, counted)).await??;
         let Some(opened) = opened else {
-            return Ok(Fate::LeftOut("it is gone".to_owned()));
+            return Ok(Outcome::LeftOut("it is gone".to_owned()));
         };
         let Opened {
             file,
@@ -375,7 +367,7 @@ impl Job {
         let prefix = prefix.filter(|known| known_size <= stamp.size && known.fingerprint == of_known);
         if let Some(known) = prefix.filter(|_| known_size == stamp.size && stamp.size < MIN_PART) {
             // Touched, or written again with the same content.
-            return Ok(Fate::Stored(stored(known.etag.clone()), false));
+            return Ok(Outcome::Stored(stored(known.etag.clone()), false));
         }
         let etag = prefix.and_then(|known| known.etag.as_deref());
         let kept = match self.decision {
@@ -389,6 +381,6 @@ impl Job {
         } else {
             self.archive.upload(key, &file, kept, stamp.size).await?
         };
-        Ok(Fate::Stored(stored(etag), true))
+        Ok(Outcome::Stored(stored(etag), true))
     }
 }

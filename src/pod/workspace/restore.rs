@@ -9,6 +9,8 @@ use std::sync::Arc;
 use futures::{StreamExt, TryStreamExt};
 
 use super::WorkspaceError;
+use crate::pod::blocking;
+use crate::pod::gather::{EVALAI, MERGED, REFUSED};
 use crate::pod::report::{OWNER_KEY, REPORT_KEY};
 use crate::pod::run::{Run, STATUS_FOLDER};
 use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
@@ -73,30 +75,30 @@ struct Chosen {
 
 /// What is restored: the smallest first, so that a huge log never keeps a checkpoint out.
 fn choose(mut objects: Vec<Listed>, pairs: usize, limit: u64) -> Chosen {
-    let ours = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
+    let ours = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY, MERGED];
+    // What logcopy makes from the checkpoints it makes again, and evidence is for people.
+    let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];
     objects.retain(|object| {
-        !ours.contains(&object.key.as_str())
-            && !object.key.starts_with(&format!("{STATUS_FOLDER}/"))
-            && !object.key.starts_with("logcopy/.")
-            && !is_foreign_agent(&object.key, pairs)
+        let key = object.key.as_str();
+        !ours.contains(&key) && !unread.iter().any(|folder| key.starts_with(folder)) && !is_foreign_agent(key, pairs)
     });
     let all = objects.len();
     objects.retain(|object| object.key.contains('/') && is_plain(&object.key));
     drop_shadowed(&mut objects);
     objects.sort_by(|a, b| (a.size, &a.key).cmp(&(b.size, &b.key)));
-    let mut room = limit;
+    let mut left = limit;
     objects.retain(|object| {
-        let fits = object.size <= room;
-        room -= if fits { object.size } else { 0 };
-        fits
+        let after = left.checked_sub(object.size);
+        left = after.unwrap_or(left);
+        after.is_some()
     });
     Chosen {
-        left_out: all - objects.len(),
+        left_out: all.saturating_sub(objects.len()),
         objects,
     }
 }
 
-/// S3 can hold `a` beside `a/b`; a volume can't.
+/// S3 can hold `a` next to `a/b`; a volume can't.
 fn drop_shadowed(objects: &mut Vec<Listed>) {
     let keys: BTreeSet<String> = objects.iter().map(|object| object.key.clone()).collect();
     objects.retain(|object| {
@@ -114,28 +116,43 @@ fn is_foreign_agent(key: &str, pairs: usize) -> bool {
     number.is_some_and(|(number, _)| !(1..=pairs).any(|pair| pair.to_string() == number))
 }
 
-async fn download(archive: &Archive, tree: &Tree, object: Listed) -> Result<Option<(String, Stored)>, WorkspaceError> {
-    let file = tree.create(&object.key).map_err(|error| volume(&object.key, error))?;
-    let mut file = tokio::fs::File::from_std(file);
-    // A little more than the list said, for an object that was replaced since.
+async fn download(
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    object: Listed,
+) -> Result<Option<(String, Stored)>, WorkspaceError> {
+    let local = |error: TreeError| volume(&object.key, error);
+    let (creating, key) = (Arc::clone(tree), object.key.clone());
+    let created = blocking(move || creating.create(&key)).await;
+    let created = created.map_err(TreeError::from).flatten().map_err(local)?;
+    let mut file = tokio::fs::File::from_std(created);
+    // A little more than the list showed, for an object that was replaced since.
     let limit = object.size.saturating_mul(2).max(1 << 20);
     let Some(size) = archive.download(&object.key, &mut file, limit).await? else {
         return Ok(None);
     };
     drop(file);
-    let local = |error: std::io::Error| volume(&object.key, error.into());
-    let Some((file, stamp)) = tree.file(&object.key).map_err(|error| volume(&object.key, error))? else {
+    let (reading, key) = (Arc::clone(tree), object.key.clone());
+    let read = blocking(move || fingerprint_of(&reading, &key)).await;
+    let Some((fingerprint, stamp)) = read.map_err(TreeError::from).flatten().map_err(local)? else {
         return Ok(None);
     };
-    // Known as stored only if it is what the list told the tag of.
+    // Known as stored only if it is what the list showed the tag of.
     let etag = object.etag.filter(|_| size == object.size);
     let stored = Stored {
-        fingerprint: fingerprint(&file, stamp.size).map_err(local)?,
+        fingerprint,
         stamp: Stamp { size, ..stamp },
         etag,
         at: std::time::Duration::ZERO,
     };
     Ok(Some((object.key, stored)))
+}
+
+fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, TreeError> {
+    let Some((file, stamp)) = tree.file(path)? else {
+        return Ok(None);
+    };
+    Ok(Some((fingerprint(&file, stamp.size)?, stamp)))
 }
 
 fn volume(path: &str, error: TreeError) -> WorkspaceError {
@@ -174,6 +191,8 @@ mod tests {
             listed("logcopy/report.json", 5),
             listed("logcopy/owner", 5),
             listed("evalai/environment_log.txt", 5),
+            listed("evalai/metadata.json", 30),
+            listed("logcopy/refused/agent/agent1/agent_results.json", 5),
             listed("logcopy/.stored.json", 5),
             listed("logcopy/logcopy.log", 40),
         ];
@@ -181,7 +200,6 @@ mod tests {
         let expected = [
             "agent/agent1/agent_results.json",
             "agent/agent2/leaderboard.log",
-            "agent/agent_results.json",
             "logcopy/logcopy.log",
         ];
         assert_eq!((keys(&chosen), chosen.left_out), (expected.to_vec(), 0));

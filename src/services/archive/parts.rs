@@ -9,6 +9,8 @@ pub const MIN_PART: u64 = 5 << 20;
 const MAX_PARTS: u64 = 10_000;
 /// Bytes of an ordinary part, which is also what is held in memory of one file.
 pub const PART: u64 = 8 << 20;
+/// Most bytes of a part: several are in memory at once, and a stranger's sparse file can have any size.
+const MAX_PART: u64 = 64 << 20;
 /// Bytes copied by one request. S3 takes 5 GiB, but answers only when it is done.
 const COPY: u64 = 1 << 30;
 
@@ -53,6 +55,9 @@ pub enum PartsError {
     /// There are too many.
     #[error("it would need {0} parts, and S3 takes {MAX_PARTS}")]
     TooMany(usize),
+    /// Its parts would be larger than what may be in memory.
+    #[error("it has {0} bytes, and its parts would have more than {MAX_PART}")]
+    TooLarge(u64),
     /// More is kept than the file has.
     #[error("the file is shorter than what is stored of it")]
     Shrunk,
@@ -70,6 +75,9 @@ pub fn plan(kept: u64, size: u64) -> Result<Vec<Part>, PartsError> {
     }
     let room = MAX_PARTS.saturating_sub(pieces).max(1);
     let step = PART.max(new.div_ceil(room).next_multiple_of(1 << 20));
+    if step > MAX_PART {
+        return Err(PartsError::TooLarge(size));
+    }
     let mut from = kept;
     while from < size {
         let len = step.min(size - from);
@@ -136,6 +144,15 @@ mod tests {
             }
             assert_eq!(at, size);
             assert!(parts.len() as u64 <= MAX_PARTS);
+        }
+    }
+
+    #[test]
+    fn no_part_is_larger_than_what_may_be_in_memory() {
+        let most = MAX_PART * MAX_PARTS;
+        assert!(plan(0, most).is_ok_and(|parts| parts.iter().all(|part| part.len() <= MAX_PART)));
+        for size in [most + 1, 4 << 40, u64::MAX / 2] {
+            assert_eq!(plan(0, size), Err(PartsError::TooLarge(size)));
         }
     }
 

@@ -39,7 +39,7 @@ async fn objects_and_lines_go_where_the_leaderboard_says() {
 
     let prepared = program("workspace").status().await.unwrap();
     assert!(prepared.success(), "{}", said("workspace"));
-    assert_eq!(pod.stored(OWNER_KEY).await.as_deref(), Some(&b"pod-1"[..]));
+    assert_eq!(pod.owner().await, "pod-1");
     let agent = at(LOGS).join("agent/agent1");
     fs::create_dir_all(&agent).unwrap();
     fs::write(agent.join("leaderboard.log"), "a line\n").unwrap();

@@ -42,7 +42,7 @@ async fn whatever_is_in_the_place_of_a_checkpoint_the_last_good_one_stays_and_th
         ("folder", "not a regular file"),
         ("pipe", "not a regular file"),
         ("device", "not a regular file"),
-        ("sparse file", "more than the 67108864 that are read"),
+        ("sparse file", "more than the 17825792 that are read"),
         ("nonsense", "pair 2"),
         ("deep", "pair 2"),
     ];
@@ -54,6 +54,7 @@ async fn whatever_is_in_the_place_of_a_checkpoint_the_last_good_one_stays_and_th
         pod.mark(Side::Agent, 1, Mark::Done);
         let logcopy = pod.logcopy();
         pod.reported(|report| report.done == 3).await;
+        pod.put(&format!("{CHECKPOINT}.refused"), b"an agent's own");
         if !put(&pod, what) {
             println!("left out, as only root makes one: {what}");
             logcopy.end().await;
@@ -70,10 +71,38 @@ async fn whatever_is_in_the_place_of_a_checkpoint_the_last_good_one_stays_and_th
         assert!(report.is_final && !report.eligible, "{what}");
         let stored = pod.stored(CHECKPOINT).await.unwrap();
         assert_eq!(stored, checkpoint(2, 1, 2).as_bytes(), "{what}: the last good one");
-        let evidence = pod.stored(&format!("{CHECKPOINT}.refused")).await;
-        assert_eq!(evidence.is_some(), matches!(what, "nonsense" | "deep"), "{what}");
+        let evidence = pod.stored(&format!("logcopy/refused/{CHECKPOINT}")).await;
+        let refused = matches!(what, "nonsense" | "deep").then(|| fs::read(pod.path(CHECKPOINT)).unwrap());
+        assert!(evidence == refused, "{what}: the evidence is the refused file");
+        let own = pod.stored(&format!("{CHECKPOINT}.refused")).await;
+        assert_eq!(own.as_deref(), Some(&b"an agent's own"[..]), "{what}");
         logcopy.end().await;
     }
+}
+
+#[tokio::test]
+async fn a_status_file_with_content_is_stored_empty_and_holds_nothing_up() {
+    let mut pod = Pod::new().await;
+    pod.setting.run.plan.storage.limit = 16 << 20;
+    pod.prepare().await.unwrap();
+    pod.append("agent/agent1/leaderboard.log", b"a line\n");
+    let content = noise(MIB, 1);
+    pod.put("containers-status/agent-1/agent-1.start0", &content);
+    let logcopy = pod.logcopy();
+    let key = "containers-status/agent-1.start0";
+    let stored = until(|| async { pod.stored(key).await }).await;
+    assert!(stored.is_empty(), "{} bytes of an agent's status file", stored.len());
+    // More than any bucket takes, and than logcopy has memory for the parts of.
+    pod.put("containers-status/agent-2/agent-2.start0", b"");
+    let sparse = OpenOptions::new()
+        .write(true)
+        .open(pod.path("containers-status/agent-2/agent-2.start0"));
+    sparse.unwrap().set_len(4 << 40).unwrap();
+    pod.checkpoint(1, 1);
+    pod.reported(|report| report.done == 1).await;
+    logcopy.end().await;
+    assert_eq!(pod.stored("containers-status/agent-2.start0").await.unwrap(), b"");
+    assert_eq!(pod.stored("agent/agent1/leaderboard.log").await.unwrap(), b"a line\n");
 }
 
 #[tokio::test]

@@ -16,10 +16,10 @@ async fn a_fresh_prefix_is_taken_and_everybody_gets_the_runner() {
     let runner = fs::metadata(pod.setting.places.runner_for_all()).unwrap();
     assert_eq!(runner.permissions().mode() & 0o7777, 0o755);
     assert_eq!(pod.keys().await, [OWNER_KEY, REPORT_KEY]);
-    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
+    assert_eq!(pod.owner().await, "pod-1");
     let report = pod.report().await.unwrap();
     assert!(report.belongs_to("uid-1", 1) && !report.is_final && report.done == 0);
-    for folder in ["agent", STATUS_FOLDER, "evalai", "logcopy"] {
+    for folder in ["agent", STATUS_FOLDER, "logcopy"] {
         assert_eq!(
             fs::metadata(pod.path(folder)).unwrap().mode() & 0o7777,
             0o777,
@@ -38,7 +38,7 @@ async fn somebody_elses_prefix_is_left_alone() {
     assert_eq!(verdict.reason, WorkspaceReason::PrefixInUse);
     assert!(verdict.message.contains("attempt: 2"), "{}", verdict.message);
     assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
-    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
+    assert_eq!(pod.owner().await, "pod-1");
 
     let foreign = Pod::new().await;
     foreign
@@ -57,7 +57,7 @@ async fn a_fence_taken_before_the_first_pod_came_is_no_foreign_prefix() {
     let told = pod.archive.put(FAILURE_LOG_KEY, b"why it failed".to_vec()).await;
     told.unwrap();
     pod.prepare().await.unwrap();
-    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-1");
+    assert_eq!(pod.owner().await, "pod-1");
 }
 
 #[tokio::test]
@@ -76,7 +76,7 @@ async fn a_replaced_pod_goes_on_where_the_lost_one_was() {
     }
     let next = lost.replaced("pod-2").await;
     next.prepare().await.unwrap();
-    assert_eq!(next.stored(OWNER_KEY).await.unwrap(), b"pod-2");
+    assert_eq!(next.owner().await, "pod-2");
     assert_eq!(
         fs::read(next.path("agent/agent1/leaderboard.log")).unwrap(),
         noise(6 * MIB, 3)
@@ -121,7 +121,7 @@ async fn a_restarted_node_finds_its_volume_as_it_was_and_takes_no_fence_back() {
         fs::read_to_string(pod.path("agent/agent1/agent_results.json")).unwrap(),
         checkpoint(0, 1, 2)
     );
-    assert_eq!(pod.stored(OWNER_KEY).await.unwrap(), b"pod-2");
+    assert_eq!(pod.owner().await, "pod-2");
 }
 
 #[tokio::test]
@@ -213,5 +213,5 @@ async fn connections_that_are_cut_in_mid_transfer_are_made_anew() {
     "pod-2".clone_into(&mut next.setting.pod_uid);
     next.prepare().await.unwrap();
     assert_eq!(fs::read(next.path(log)).unwrap(), noise(6 * MIB, 3));
-    assert_eq!(lost.stored(OWNER_KEY).await.unwrap(), b"pod-2");
+    assert_eq!(lost.owner().await, "pod-2");
 }

@@ -90,8 +90,54 @@ async fn the_limit_leaves_files_out_and_keeps_the_rest() {
     let sent = uploader.sync(&wanted, None).await.unwrap();
     assert_eq!((sent.objects, sent.left_out), (1, 1));
     assert_eq!(pod.keys().await, ["simulator/small"]);
-    let essential = wanted[1].clone().essential();
-    assert_eq!(uploader.sync(&[essential], None).await.unwrap().objects, 1);
+}
+
+#[tokio::test]
+async fn a_file_that_grows_after_it_was_counted_is_sent_as_far_as_it_was_counted() {
+    let pod = Pod::new().await;
+    let tree = Arc::new(Tree::open(pod.logs()).unwrap());
+    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), 100);
+    let path = "agent/agent1/x.log";
+    pod.put(path, b"0123456789");
+    let counted = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
+    pod.append(path, &[b'x'; 1000]);
+    assert_eq!(uploader.sync(&[counted], None).await.unwrap().objects, 1);
+    assert_eq!(pod.stored(path).await.unwrap(), b"0123456789");
+    assert_eq!(uploader.memory().bytes(), 10);
+    // The next round counts what it has become.
+    let grown = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
+    let sent = uploader.sync(&[grown], None).await.unwrap();
+    assert_eq!((sent.objects, sent.left_out), (0, 1));
+    pod.put(path, b"0123456789ab");
+    let shrunk = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
+    assert_eq!(uploader.sync(&[shrunk], None).await.unwrap().objects, 1);
+    assert_eq!(pod.stored(path).await.unwrap(), b"0123456789ab");
+}
+
+#[tokio::test]
+async fn two_files_under_one_key_are_stored_once_and_counted_once() {
+    let pod = Pod::new().await;
+    let tree = Arc::new(Tree::open(pod.logs()).unwrap());
+    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), 100);
+    let both = |first: &[u8], second: &[u8]| {
+        pod.put("agent/agent1/first", first);
+        pod.put("agent/agent1/second", second);
+        let wanted = ["first", "second"].map(|name| {
+            let path = format!("agent/agent1/{name}");
+            let stamp = tree.file(&path).unwrap().unwrap().1;
+            Wanted {
+                key: "agent/agent1/key".to_owned(),
+                ..Wanted::new(&path, stamp, Haste::Now)
+            }
+        });
+        wanted.to_vec()
+    };
+    for (first, second) in [(&[b'1'; 90][..], &b"2"[..]), (b"1", b"22")] {
+        let sent = uploader.sync(&both(first, second), None).await.unwrap();
+        assert_eq!((sent.objects, sent.left_out), (1, 1));
+        assert_eq!(pod.stored("agent/agent1/key").await.unwrap(), first);
+    }
+    assert_eq!(uploader.memory().bytes(), 1);
 }
 
 #[tokio::test]
@@ -111,7 +157,12 @@ async fn results_from_memory_are_sent_when_they_change_and_not_again_after_a_res
     let bucket = server().await.bucket().await;
     let proxy = server().await.proxy().await;
     let pod = Pod::on(&proxy.endpoint(), &bucket, run(&bucket)).await;
-    let object = |text: &str| BTreeMap::from([("agent/agent1/agent_results.json".to_owned(), text.as_bytes().into())]);
+    let object = |text: &str| {
+        BTreeMap::from([(
+            "agent/agent1/agent_results.json".to_owned(),
+            Object::new(text.to_owned()),
+        )])
+    };
     let first = object("first");
     let mut uploader = pod.uploader();
     assert_eq!(uploader.put(&first).await.unwrap().objects, 1);

@@ -3,13 +3,14 @@
 
 mod plausible;
 mod record;
+mod verify;
 
 pub(crate) use record::Record;
 
 use crate::json::{self, Limit, ReadError, Text, Value};
 use crate::names::CRASHED;
 use crate::plan::Verify;
-use crate::{Plan, Refusal, verify};
+use crate::{Plan, Refusal};
 
 const MAX_RECORDS: usize = 10_000;
 const MAX_SENSORS: usize = 1_000;
@@ -31,8 +32,8 @@ pub struct Checkpoint {
 impl Checkpoint {
     /// How many routes the worker has finished.
     ///
-    /// In a pod, a route in which the simulation crashed is not finished: whoever starts the evaluator again lets it
-    /// repeat that route.
+    /// In a pod, a route in which the simulation crashed is not finished: the evaluator repeats it when it
+    /// is started again.
     pub fn done(&self) -> u32 {
         let records = u32::try_from(self.records.len()).unwrap_or(u32::MAX);
         records.saturating_sub(u32::from(self.repeats))
@@ -44,7 +45,7 @@ impl Checkpoint {
         self.counted
     }
 
-    /// How many the file says it will finish.
+    /// How many the file promises.
     pub fn total(&self) -> u32 {
         self.total
     }
@@ -65,7 +66,7 @@ impl Checkpoint {
 ///
 /// `Ok(None)`: there is nothing yet; the file is empty, half-written or not JSON, and another round will find it whole.
 pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Checkpoint>, Refusal> {
-    let value = match json::read(bytes) {
+    let value = match json::read(bytes, plan.limits_of(pair)) {
         Ok(value) => value,
         Err(ReadError::NotJson) => return Ok(None),
         Err(ReadError::NotUtf8) => return Err(Refusal::NotUtf8 { pair }),
@@ -103,7 +104,7 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
     }))
 }
 
-/// The parts of the JSON that are looked at, taken out of it.
+/// The parts of the JSON that are used, taken out of it.
 struct File {
     records: Vec<Value>,
     progress: Vec<Value>,
@@ -162,7 +163,7 @@ fn sensors(plan: &Plan, pair: usize, value: &Value) -> Result<Vec<Text>, Refusal
         if plan.is_pod() && text.as_str().and_then(crate::names::sensor_name).is_none() {
             return Err(Refusal::Sensor {
                 pair: Some(pair),
-                sensor: i + 1,
+                sensor: i.saturating_add(1),
             });
         }
         sensors.push(text.clone());
@@ -194,8 +195,8 @@ fn records(plan: &Plan, pair: usize, values: Vec<Value>) -> Result<Vec<Record>, 
         });
     }
     let mut records = Vec::with_capacity(values.len());
-    for (i, value) in values.into_iter().enumerate() {
-        let record = Record::of(plan.format, i + 1, value).map_err(|(record, problem)| Refusal::Record {
+    for (place, value) in (1..).zip(values) {
+        let record = Record::of(plan.format, place, value).map_err(|(record, problem)| Refusal::Record {
             pair,
             record,
             problem,

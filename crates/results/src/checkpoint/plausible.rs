@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use super::Record;
+use super::record::Record;
 use crate::names::{self, MIN_SPEED};
 use crate::plan::{Format, Plan};
 use crate::{RecordName, RecordProblem, Refusal};
@@ -46,7 +46,7 @@ pub(super) fn check_file(plan: &Plan, pair: usize, total: u32, records: &[Record
         };
         check(plan, pair, record).map_err(refuse)?;
         let times = runs.entry(record.key).or_default();
-        *times += 1;
+        *times = times.saturating_add(1);
         if *times > allowed {
             return Err(refuse(RecordProblem::Repeated));
         }

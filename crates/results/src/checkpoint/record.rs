@@ -1,12 +1,12 @@
-//! One route record: its JSON kept whole, and beside it, typed, what the statistics need. Built by the checkpoint reader
-//! only, so whoever holds a record holds numbers and counts.
+//! One route record: its JSON kept whole, and next to it, typed, what the statistics need. Built by the checkpoint reader
+//! only, so anyone who holds a record holds numbers and counts.
 
 use crate::json::{Object, Value};
 use crate::names::{self, OFF_ROAD, Score};
 use crate::number::Number;
 use crate::{Format, RecordName, RecordProblem};
 
-/// Ids and repetitions beyond this are nobody's.
+/// No evaluator has ids or repetitions beyond this.
 const MAX_ID: i64 = 1_000_000_000;
 
 /// The three scores of a record.
@@ -47,7 +47,7 @@ pub(crate) struct Record {
     pub(crate) status: String,
     /// How many of each infraction, in the order of [`names::infractions`].
     pub(crate) counts: Vec<usize>,
-    /// Meters off the road; only V2 looks at it.
+    /// Meters off the road; only V2 uses it.
     pub(crate) off_road: f64,
     pub(crate) scores: Scores,
     pub(crate) meta: Meta,

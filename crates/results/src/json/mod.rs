@@ -7,7 +7,7 @@
 mod read;
 mod write;
 
-pub use read::Limit;
+pub use read::{FileLimits, Limit};
 pub(crate) use read::{ReadError, read};
 pub(crate) use write::{KeyOrder, Node, write};
 
@@ -69,7 +69,7 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// What Python's `not value` says.
+    /// What Python's `not value` is.
     pub(crate) fn is_falsy(&self) -> bool {
         match self {
             Self::Null => true,

@@ -5,15 +5,15 @@ use super::{Object, Text, Value};
 /// A bound a hostile file ran into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Limit {
-    /// Size of the whole file.
-    #[error("is larger than 64 MiB")]
-    Size,
+    /// Size of the whole file: more bytes than these.
+    #[error("is larger than {}", size_text(*.0))]
+    Size(usize),
     /// Lists and objects inside each other.
     #[error("is nested deeper than 64 levels")]
     Depth,
-    /// Values of any kind.
-    #[error("holds more than 500,000 values")]
-    Values,
+    /// Values of any kind: more than so many.
+    #[error("holds more than {} values", grouped(*.0))]
+    Values(usize),
     /// Length of one text.
     #[error("holds a text longer than 1 MiB")]
     Text,
@@ -31,10 +31,24 @@ pub enum Limit {
     Output,
 }
 
-/// The largest file that is read, in bytes.
-const MAX_SIZE: usize = 64 << 20;
+/// How large one file may be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FileLimits {
+    /// Bytes.
+    pub bytes: usize,
+    /// Values of any kind.
+    pub values: usize,
+}
+
+impl FileLimits {
+    /// Of any file, whatever it is for.
+    pub(crate) const LARGEST: Self = Self {
+        bytes: 64 << 20,
+        values: 500_000,
+    };
+}
+
 const MAX_DEPTH: usize = 64;
-const MAX_VALUES: usize = 500_000;
 const MAX_TEXT: usize = 1 << 20;
 const MAX_NUMBER: usize = 4096;
 
@@ -47,9 +61,9 @@ pub(crate) enum ReadError {
 }
 
 /// Reads one value. A file that ends inside a multi-byte character is half-written, so not JSON.
-pub(crate) fn read(bytes: &[u8]) -> Result<Value, ReadError> {
-    if bytes.len() > MAX_SIZE {
-        return Err(ReadError::Limit(Limit::Size));
+pub(crate) fn read(bytes: &[u8], limits: FileLimits) -> Result<Value, ReadError> {
+    if bytes.len() > limits.bytes {
+        return Err(ReadError::Limit(Limit::Size(limits.bytes)));
     }
     if let Err(error) = std::str::from_utf8(bytes) {
         return Err(if error.error_len().is_none() {
@@ -61,7 +75,8 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Value, ReadError> {
     let mut reader = Reader {
         bytes,
         at: 0,
-        values: 0,
+        values: limits.values,
+        limits,
     };
     reader.space();
     let value = reader.value(0)?;
@@ -76,7 +91,9 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Value, ReadError> {
 struct Reader<'a> {
     bytes: &'a [u8],
     at: usize,
+    /// How many more there may be.
     values: usize,
+    limits: FileLimits,
 }
 
 type Read<T> = Result<T, ReadError>;
@@ -86,9 +103,14 @@ impl<'a> Reader<'a> {
         self.bytes.get(self.at).copied()
     }
 
+    /// Steps over bytes that are there, so never beyond the end.
+    fn step(&mut self, bytes: usize) {
+        self.at = self.at.saturating_add(bytes);
+    }
+
     fn next(&mut self) -> Read<u8> {
         let byte = self.peek().ok_or(ReadError::NotJson)?;
-        self.at += 1;
+        self.step(1);
         Ok(byte)
     }
 
@@ -96,22 +118,20 @@ impl<'a> Reader<'a> {
     fn take(&mut self, token: &[u8]) -> bool {
         let here = self.bytes.get(self.at..).is_some_and(|rest| rest.starts_with(token));
         if here {
-            self.at += token.len();
+            self.step(token.len());
         }
         here
     }
 
     fn space(&mut self) {
         while matches!(self.peek(), Some(b' ' | b'\t' | b'\n' | b'\r')) {
-            self.at += 1;
+            self.step(1);
         }
     }
 
     fn value(&mut self, depth: usize) -> Read<Value> {
-        self.values += 1;
-        if self.values > MAX_VALUES {
-            return Err(ReadError::Limit(Limit::Values));
-        }
+        let too_many = ReadError::Limit(Limit::Values(self.limits.values));
+        self.values = self.values.checked_sub(1).ok_or(too_many)?;
         if depth > MAX_DEPTH {
             return Err(ReadError::Limit(Limit::Depth));
         }
@@ -119,7 +139,7 @@ impl<'a> Reader<'a> {
             b'{' => self.object(depth),
             b'[' => self.list(depth),
             b'"' => {
-                self.at += 1;
+                self.step(1);
                 self.text().map(Value::Text)
             }
             b'-' | b'0'..=b'9' => self.number(),
@@ -143,7 +163,7 @@ impl<'a> Reader<'a> {
     }
 
     fn list(&mut self, depth: usize) -> Read<Value> {
-        self.at += 1;
+        self.step(1);
         let mut items = Vec::new();
         self.space();
         if self.take(b"]") {
@@ -151,7 +171,7 @@ impl<'a> Reader<'a> {
         }
         loop {
             self.space();
-            items.push(self.value(depth + 1)?);
+            items.push(self.value(depth.saturating_add(1))?);
             self.space();
             match self.next()? {
                 b',' => {}
@@ -162,7 +182,7 @@ impl<'a> Reader<'a> {
     }
 
     fn object(&mut self, depth: usize) -> Read<Value> {
-        self.at += 1;
+        self.step(1);
         let mut entries = Vec::new();
         self.space();
         if self.take(b"}") {
@@ -179,7 +199,7 @@ impl<'a> Reader<'a> {
                 return Err(ReadError::NotJson);
             }
             self.space();
-            entries.push((key, self.value(depth + 1)?));
+            entries.push((key, self.value(depth.saturating_add(1))?));
             self.space();
             match self.next()? {
                 b',' => {}
@@ -217,7 +237,7 @@ impl<'a> Reader<'a> {
         if length > MAX_TEXT {
             return Err(ReadError::Limit(Limit::Text));
         }
-        self.at += length;
+        self.step(length);
         Ok(rest.get(..length).unwrap_or_default())
     }
 
@@ -249,7 +269,7 @@ impl<'a> Reader<'a> {
         if self.take(b"\\u")
             && let Ok(low @ 0xdc00..=0xdfff) = self.hex4()
         {
-            return Ok(0x1_0000 + ((unit - 0xd800) << 10) + (low - 0xdc00));
+            return Ok(u32::saturating_add(0x1_0000, (unit & 0x3ff) << 10 | low & 0x3ff));
         }
         self.at = after;
         Ok(unit)
@@ -287,7 +307,7 @@ impl<'a> Reader<'a> {
                 return Err(ReadError::NotJson);
             }
         }
-        if self.at - from > MAX_NUMBER {
+        if self.at.saturating_sub(from) > MAX_NUMBER {
             return Err(ReadError::Limit(Limit::Number));
         }
         let text = self
@@ -304,10 +324,31 @@ impl<'a> Reader<'a> {
     fn digits(&mut self) -> usize {
         let from = self.at;
         while self.peek().is_some_and(|byte| byte.is_ascii_digit()) {
-            self.at += 1;
+            self.step(1);
         }
-        self.at - from
+        self.at.saturating_sub(from)
     }
+}
+
+/// In MiB where that is a whole number, else in KiB.
+fn size_text(bytes: usize) -> String {
+    if bytes.is_multiple_of(1 << 20) {
+        format!("{} MiB", bytes >> 20)
+    } else {
+        format!("{} KiB", bytes >> 10)
+    }
+}
+
+/// With a comma between the thousands.
+fn grouped(number: usize) -> String {
+    let digits = number.to_string();
+    let groups: Vec<&str> = digits
+        .as_bytes()
+        .rchunks(3)
+        .rev()
+        .filter_map(|group| std::str::from_utf8(group).ok())
+        .collect();
+    groups.join(",")
 }
 
 fn push_code_point(text: &mut Vec<u8>, code: u32) {
@@ -379,6 +420,10 @@ fn without_repeats(mut entries: Vec<(Text, Value)>) -> Vec<(Text, Value)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn read(bytes: &[u8]) -> Result<Value, ReadError> {
+        super::read(bytes, FileLimits::LARGEST)
+    }
 
     fn ok(text: &str) -> Value {
         read(text.as_bytes()).unwrap()
@@ -460,10 +505,24 @@ mod tests {
         );
         let long = format!("\"{}\"", "x".repeat(MAX_TEXT + 1));
         assert_eq!(read(long.as_bytes()), Err(ReadError::Limit(Limit::Text)));
-        let many = format!("[{}1]", "1,".repeat(MAX_VALUES));
-        assert_eq!(read(many.as_bytes()), Err(ReadError::Limit(Limit::Values)));
+        let many = format!("[{}1]", "1,".repeat(FileLimits::LARGEST.values));
+        assert_eq!(read(many.as_bytes()), Err(ReadError::Limit(Limit::Values(500_000))));
         assert_eq!(read("1".repeat(5000).as_bytes()), Err(ReadError::Limit(Limit::Number)));
-        assert_eq!(read(&vec![b' '; MAX_SIZE + 1]), Err(ReadError::Limit(Limit::Size)));
+        let large = vec![b' '; FileLimits::LARGEST.bytes + 1];
+        assert_eq!(read(&large), Err(ReadError::Limit(Limit::Size(64 << 20))));
+        let few = FileLimits { bytes: 5, values: 3 };
+        assert!(super::read(b"[1,2]", few).is_ok());
+        assert_eq!(super::read(b"[1,22]", few), Err(ReadError::Limit(Limit::Size(5))));
+        let few = FileLimits { bytes: 9, ..few };
+        assert_eq!(super::read(b"[1,2,3]", few), Err(ReadError::Limit(Limit::Values(3))));
+    }
+
+    #[test]
+    fn limits_are_shown_in_units_and_groups() {
+        assert_eq!(Limit::Size(64 << 20).to_string(), "is larger than 64 MiB");
+        assert_eq!(Limit::Size(2600 << 10).to_string(), "is larger than 2600 KiB");
+        assert_eq!(Limit::Values(500_000).to_string(), "holds more than 500,000 values");
+        assert_eq!(Limit::Values(41_250).to_string(), "holds more than 41,250 values");
     }
 
     #[test]

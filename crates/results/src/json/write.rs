@@ -103,8 +103,8 @@ impl Writer {
         }
         self.out.push('[');
         for (i, item) in items.iter().enumerate() {
-            self.line(i > 0, depth + 1)?;
-            each(self, item, depth + 1)?;
+            self.line(i > 0, depth.saturating_add(1))?;
+            each(self, item, depth.saturating_add(1))?;
         }
         self.line(false, depth)?;
         self.out.push(']');
@@ -134,11 +134,11 @@ impl Writer {
         self.out.push('{');
         let mut is_empty = true;
         for (key, value) in entries {
-            self.line(!is_empty, depth + 1)?;
+            self.line(!is_empty, depth.saturating_add(1))?;
             is_empty = false;
             self.text(key);
             self.out.push_str(": ");
-            each(self, value, depth + 1)?;
+            each(self, value, depth.saturating_add(1))?;
         }
         if !is_empty {
             self.line(false, depth)?;
@@ -195,8 +195,9 @@ impl Writer {
             0x08 => self.out.push_str("\\b"),
             0x0c => self.out.push_str("\\f"),
             0x1_0000.. => {
-                self.unit(0xd800 + ((code - 0x1_0000) >> 10));
-                self.unit(0xdc00 + ((code - 0x1_0000) & 0x3ff));
+                let beyond = code.saturating_sub(0x1_0000);
+                self.unit(0xd800 | beyond >> 10);
+                self.unit(0xdc00 | beyond & 0x3ff);
             }
             _ => self.unit(code),
         }
@@ -229,11 +230,15 @@ fn next_code_point(bytes: &[u8]) -> Option<(u32, &[u8])> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::read;
+    use super::super::{FileLimits, read};
     use super::*;
 
     fn again(text: &str, order: KeyOrder) -> String {
-        write(&Node::Value(&read(text.as_bytes()).unwrap()), order).unwrap()
+        write(
+            &Node::Value(&read(text.as_bytes(), FileLimits::LARGEST).unwrap()),
+            order,
+        )
+        .unwrap()
     }
 
     #[test]

@@ -2,9 +2,9 @@
 //! this is the cheap answer to an edited file; it does not see an infraction that was removed together with its penalty.
 //! Pure; called by the checkpoint reader.
 //!
-//! Told is only what makes a score better than it can be. A lower penalty is nobody's gain, and forks have more to punish.
+//! Only what makes a score better than it can be is reported. A lower penalty is nobody's gain, and forks have more to punish.
 
-use crate::checkpoint::Record;
+use super::record::Record;
 use crate::json::Value;
 use crate::names::MIN_SPEED;
 use crate::number::{Number, count, round};
@@ -14,7 +14,7 @@ use crate::{Format, RecordProblem};
 const PRODUCT_ERROR: f64 = 1e-4;
 
 /// Refuses a record whose driving score or penalty does not follow from the rest of it.
-pub(crate) fn check(format: Format, record: &Record) -> Result<(), RecordProblem> {
+pub(super) fn check(format: Format, record: &Record) -> Result<(), RecordProblem> {
     let [route, penalty, composed] =
         [record.scores.route, record.scores.penalty, record.scores.composed].map(Number::as_f64);
     // A route that failed before it began has zeros everywhere.
@@ -103,7 +103,7 @@ struct Events<'a> {
 }
 
 impl<'a> Events<'a> {
-    /// The messages an evaluator can have written: plain ASCII. Others are somebody's additions and cost nothing.
+    /// The messages an evaluator can have written: plain ASCII. Others are additions of a fork and cost nothing.
     fn messages(&self, infraction: &str) -> impl Iterator<Item = &'a str> {
         let all = self.record.object.get("infractions").and_then(Value::as_object);
         let list = all

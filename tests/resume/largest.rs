@@ -1,0 +1,146 @@
+//! Checkpoints as large as they may be, of as many pairs as there may be, and larger ones: logcopy reads, merges and stores them
+//! far below the memory it is given.
+
+use std::fs;
+use std::path::Path;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use fastrand::Rng;
+use leaderboard_api::ResultsFormat;
+use leaderboard_operator::pod::gather::results_plan;
+use leaderboard_operator::pod::report::Report;
+use leaderboard_operator::pod::run::STATUS_FOLDER;
+use serde_json::json;
+
+use super::kubelet::Kubelet;
+use super::measure::{Sink, most_memory, serve};
+use super::submission::{Submission, make_volumes};
+
+const PAIRS: usize = 16;
+/// Half of what the Pod gives to logcopy.
+const MEMORY: u64 = 512 << 20;
+const LIMIT: Duration = Duration::from_mins(3);
+
+/// The checkpoint of a pair that has finished one of its two routes, filled up to `bytes`.
+fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
+    let infractions = [
+        "collisions_pedestrian",
+        "collisions_vehicle",
+        "collisions_layout",
+        "red_light",
+        "stop_infraction",
+        "outside_route_lanes",
+        "min_speed_infractions",
+        "yield_emergency_vehicle_infractions",
+        "scenario_timeouts",
+        "route_dev",
+        "vehicle_blocked",
+        "route_timeout",
+    ];
+    let infractions: serde_json::Map<_, _> = infractions
+        .map(|name| (name.to_owned(), json!([])))
+        .into_iter()
+        .collect();
+    let file = |texts: &[String]| {
+        let record = json!({
+            "index": 0,
+            "route_id": format!("RouteScenario_{}_rep0", 2 * pair),
+            "status": "Completed",
+            "num_infractions": 0,
+            "infractions": infractions,
+            "scores": {"score_route": 100.0, "score_penalty": 1.0, "score_composed": 100.0},
+            "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
+            "texts": texts,
+        });
+        let checkpoint = json!({"global_record": {}, "progress": [1, 2], "records": [record]});
+        json!({
+            "_checkpoint": checkpoint,
+            "entry_status": "Started",
+            "eligible": false,
+            "sensors": ["carla_camera"],
+            "values": [],
+            "labels": [],
+        })
+        .to_string()
+    };
+    let mut left = bytes - file(&[]).len();
+    let mut texts = Vec::new();
+    while left > 3 {
+        texts.push(fill.repeat((left - 3).min(1 << 20)));
+        left -= texts.last().map_or(0, String::len) + 3;
+    }
+    file(&texts)
+}
+
+fn put(logs: &Path, pair: usize, text: &str) {
+    let folder = logs.join(format!("agent/agent{}", pair + 1));
+    fs::create_dir_all(&folder).unwrap();
+    let next = logs.join("next");
+    fs::write(&next, text).unwrap();
+    fs::rename(next, folder.join("agent_results.json")).unwrap();
+}
+
+/// Waits for a report that says so, while logcopy stays below its memory.
+async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) {
+    let began = Instant::now();
+    loop {
+        let memory = most_memory(pid);
+        assert!(memory < MEMORY, "{} MiB", memory >> 20);
+        let report = Report::parse(&sink.report.lock().unwrap());
+        if report.as_ref().is_ok_and(&what) {
+            return;
+        }
+        assert!(began.elapsed() < LIMIT, "{report:?}");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys_memory() {
+    let (sink, endpoint, serving) = serve().await;
+    let mut submission = Submission::on(&endpoint, "bucket", ResultsFormat::V2, &mut Rng::new()).await;
+    submission.run.plan.slices = (0..PAIRS)
+        .map(|pair| format!("{}-{}", 2 * pair, 2 * pair + 1))
+        .collect();
+    submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
+    let most = results_plan(&submission.run).unwrap().limits_of(0).bytes;
+    let kubelet = Kubelet::new(&submission);
+    let root = kubelet.folder().join("pod-1");
+    make_volumes(&root);
+    let logs = root.join("logs");
+    fs::create_dir_all(logs.join(STATUS_FOLDER)).unwrap();
+    let mut logcopy = submission
+        .own("logcopy", &root, "pod-1")
+        .kill_on_drop(true)
+        .spawn()
+        .unwrap();
+    let pid = logcopy.id().unwrap();
+
+    for pair in 0..PAIRS {
+        put(&logs, pair, &checkpoint(pair, most, "x"));
+    }
+    reported(&sink, pid, |report| report.done == 16).await;
+    let before = sink.bytes.load(Ordering::Relaxed);
+    for pair in 0..PAIRS {
+        put(&logs, pair, &checkpoint(pair, most, "y"));
+    }
+    reported(&sink, pid, |_| {
+        sink.bytes.load(Ordering::Relaxed) > before + (PAIRS * most) as u64
+    })
+    .await;
+    for pair in 0..4 {
+        put(&logs, pair, &checkpoint(pair, 63 << 20, "z"));
+    }
+    reported(&sink, pid, |report| {
+        report.why.as_ref().is_some_and(|why| why.contains("that are read"))
+    })
+    .await;
+    println!(
+        "{} pairs of {most} bytes: {} MiB of memory",
+        PAIRS,
+        most_memory(pid) >> 20
+    );
+    logcopy.kill().await.unwrap();
+    serving.abort();
+}
