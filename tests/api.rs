@@ -29,6 +29,7 @@ mod api {
     mod rule_cases;
     mod rules;
     mod scale;
+    mod slots;
     mod table;
     mod token;
     mod watches;

@@ -128,6 +128,10 @@ impl Actor<'_> {
                 failure_log::keep(self.context, self.view, status, places).await;
                 Ok(())
             }
+            Action::JoinLine(place) => {
+                self.context.slots.join(self.submission(), place.clone());
+                Ok(())
+            }
             Action::AskEvalai => {
                 self.context.sync.ask(self.view);
                 Ok(())
@@ -180,26 +184,25 @@ impl Actor<'_> {
     }
 
     async fn write_status(&self, status: &SubmissionStatus) -> Result<Option<Duration>, ActError> {
-        if let Some(old) = &self.submission().status {
-            match change(old, status) {
-                Change::Nothing => return Ok(None),
-                Change::Place => {
-                    let position = status.waiting.as_ref().map_or(0, |w| w.position);
-                    let now = tokio::time::Instant::now();
-                    let waits = self.context.memory.place_waits(self.submission(), position, now);
-                    if waits.is_some() {
-                        return Ok(waits);
-                    }
+        let old = self.submission().status.clone().unwrap_or_default();
+        match change(&old, status) {
+            Change::Nothing => return Ok(None),
+            Change::Place => {
+                let position = status.waiting.as_ref().map_or(0, |w| w.position);
+                let now = tokio::time::Instant::now();
+                let waits = self.context.memory.place_waits(self.submission(), position, now);
+                if waits.is_some() {
+                    return Ok(waits);
                 }
-                Change::Progress => {
-                    let patience = patience(self.view.leaderboard.as_ref().map(|l| &l.spec));
-                    let since = self.context.memory.since_write(self.submission());
-                    if let Some(left) = since.and_then(|since| patience.checked_sub(since)) {
-                        return Ok(Some(left));
-                    }
-                }
-                Change::Real => {}
             }
+            Change::Progress => {
+                let patience = patience(self.view.leaderboard.as_ref().map(|l| &l.spec));
+                let since = self.context.memory.since_write(self.submission());
+                if let Some(left) = since.and_then(|since| patience.checked_sub(since)) {
+                    return Ok(Some(left));
+                }
+            }
+            Change::Real => {}
         }
         let patch = json!({
             "apiVersion": Submission::api_version(&()),

@@ -17,11 +17,11 @@ use super::failure_log::FailureLogs;
 use super::leaderboards::Desk;
 use super::memory::Memory;
 use super::network_policy;
-use super::observe::board::Board;
 use super::observe::node::Nodes;
 use super::observe::report::Reports;
 use super::observe::{is_pod_of, uid_of};
 use super::reruns::Reruns;
+use super::slots::SlotAllocator;
 use super::sync::Sync;
 use crate::kubernetes::Synced;
 use crate::services::archive::Archive;
@@ -47,6 +47,15 @@ impl Stores {
     pub fn newest_pod(&self, job: &Job) -> Option<Arc<Pod>> {
         let pods = self.pods.state().into_iter().filter(|pod| is_pod_of(pod, job));
         pods.max_by_key(|pod| (pod.metadata.creation_timestamp.clone().map(|t| t.0), pod.name_any()))
+    }
+
+    /// Takes all that is there into the lines for slots.
+    pub fn fill(&self, slots: &SlotAllocator) {
+        slots.start(
+            &self.leaderboards.state(),
+            &self.jobs.state(),
+            &self.submissions.state(),
+        );
     }
 
     /// Whether the policy that a Leaderboard's present spec asks for is seen to be there.
@@ -88,7 +97,7 @@ pub struct Settings {
     pub concurrency: u16,
 }
 
-/// Tells the queue of a Leaderboard.
+/// Wakes a Leaderboard.
 pub type Wake = Box<dyn Fn(ObjectRef<Leaderboard>) + Send + std::marker::Sync>;
 
 /// Shared by all passes.
@@ -99,7 +108,7 @@ pub struct Context {
     pub memory: Memory,
     pub reports: Reports,
     pub reruns: Reruns,
-    pub board: Board,
+    pub slots: Arc<SlotAllocator>,
     pub failure_logs: FailureLogs,
     pub desk: Desk,
     pub sync: Sync,
@@ -107,8 +116,7 @@ pub struct Context {
     pub buckets: Buckets,
     pub nodes: Nodes,
     pub recorder: Recorder,
-    /// Looks at a Leaderboard again, and at those that wait for it.
-    pub wake: Wake,
+    wake: Wake,
     archives: Mutex<HashMap<String, Archive>>,
 }
 
@@ -129,7 +137,7 @@ impl Context {
             memory: Memory::default(),
             reports: Reports::default(),
             reruns: Reruns::default(),
-            board: Board::default(),
+            slots: Arc::default(),
             failure_logs: FailureLogs::default(),
             desk: Desk::default(),
             sync,
@@ -154,6 +162,12 @@ impl Context {
             .entry(bucket::id(storage))
             .or_insert_with(|| Archive::of_run(&self.aws, storage, run_id));
         shared.at_prefix(leaderboard_api::effective::key_prefix(storage, run_id))
+    }
+
+    /// Reconciles a Leaderboard again, and those that wait for it.
+    pub fn wake(&self, board: ObjectRef<Leaderboard>) {
+        self.slots.wake_pending(&board);
+        (self.wake)(board);
     }
 
     /// Half the period of a submission's Leaderboard, in seconds.
@@ -192,6 +206,5 @@ impl Context {
         self.memory.forget(uid);
         self.reports.forget(uid);
         self.failure_logs.forget(uid);
-        self.board.release(uid);
     }
 }

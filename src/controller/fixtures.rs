@@ -8,6 +8,7 @@ use aws_credential_types::Credentials;
 use http::{Method, Request, Response};
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
 use kube::client::Body;
@@ -41,6 +42,7 @@ pub struct Cluster {
     pub leaderboards: Vec<Leaderboard>,
     pub submissions: Vec<Submission>,
     pub jobs: Vec<Job>,
+    pub pods: Vec<Pod>,
     pub policies: Vec<NetworkPolicy>,
 }
 
@@ -106,7 +108,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         leaderboards: store(cluster.leaderboards),
         submissions: store(cluster.submissions),
         jobs: store(cluster.jobs),
-        pods: store(Vec::new()),
+        pods: store(cluster.pods),
         policies: store(cluster.policies),
         policies_synced,
     };
@@ -126,8 +128,10 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let wake = Box::new(move |board: ObjectRef<Leaderboard>| {
         let _ = woken_by.send(board.name);
     });
+    let context = Context::new(client, settings, stores, sync, aws, events, wake);
+    context.stores.fill(&context.slots);
     Surroundings {
-        context: Context::new(client, settings, stores, sync, aws, events, wake),
+        context,
         requests,
         woken,
         _stop: stop,

@@ -10,7 +10,7 @@ use kube::ResourceExt;
 use tokio::time::Instant;
 
 use super::observe::uid_of;
-use leaderboard_api::{Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Submission, SubmissionStatus};
 
 /// Places in line that are written without waiting for their turn.
 const FIRST_PLACES: i32 = 20;
@@ -102,13 +102,6 @@ impl Memory {
         Some(at - now)
     }
 
-    /// Whether our last status, too, is of a submission that still waits: it has no Job, or may have none before the policy.
-    pub fn is_waiting(&self, submission: &Submission) -> bool {
-        let entries = self.lock();
-        let written = entries.get(&uid_of(submission)).and_then(|e| e.written.as_ref());
-        written.is_none_or(|w| waits_for_leaderboard(&w.status) && w.status.times.finished.is_none())
-    }
-
     /// Routes of the last partial result of the present attempt.
     pub fn partial_told(&self, submission: &Submission) -> Option<u32> {
         let (attempt, done) = self.lock().get(&uid_of(submission))?.partial?;
@@ -150,11 +143,6 @@ impl Memory {
     fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
         self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// Whether a change of its Leaderboard may let it start: it has no Job, or the one that it asked for may not be made.
-pub fn waits_for_leaderboard(status: &SubmissionStatus) -> bool {
-    status.job_name.is_none() || status.reason.as_deref() == Some(reasons::NOT_ISOLATED)
 }
 
 /// Resource versions of one kind grow; the API promises that they can be compared as numbers.
@@ -212,21 +200,5 @@ mod tests {
         assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("new"));
         let seen = memory.with_own_status(Arc::new(object("13", "newer")));
         assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("newer"));
-    }
-
-    #[test]
-    fn who_may_have_no_job_before_the_policy_waits_for_the_leaderboard() {
-        let memory = Memory::default();
-        for (job, reason, expected) in [
-            (None, "WaitingForSlot", true),
-            (Some("s-1"), reasons::RUNNING, false),
-            (Some("s-1"), reasons::NOT_ISOLATED, true),
-        ] {
-            let mut object = object("1", reason);
-            object.status.as_mut().unwrap().job_name = job.map(str::to_owned);
-            memory.wrote(&object);
-            assert_eq!(memory.is_waiting(&object), expected, "{reason}");
-            assert_eq!(waits_for_leaderboard(&object.status.unwrap()), expected, "{reason}");
-        }
     }
 }

@@ -24,6 +24,7 @@ pub mod reruns;
 mod result_texts;
 pub mod run;
 pub mod significance;
+pub mod slots;
 pub mod sync;
 pub mod turns;
 pub mod view;

@@ -1,6 +1,6 @@
 //! Whose turn it is: which waiting submissions start now, the place of the others, and how long they may have to wait.
 //!
-//! Pure; called by `observe` through `Board`. Fair between teams: each pick goes to the team that has the least running
+//! Pure; called by `slots`. Fair between teams: each pick goes to the team that has the least running
 //! and picked so far, and among these to the one whose last run began longest ago. So a team with a hundred submissions
 //! does not hold up another's first, even where only one runs at a time. Within a team the higher priority goes first,
 //! then the older.
@@ -9,13 +9,36 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 
 use jiff::Timestamp;
 
-use super::view::Turn;
-
 #[cfg(test)]
 mod day;
 
 /// Runs of a track that its waiting times are estimated from.
 pub const RUNS: usize = 20;
+
+/// Whether a submission may start.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Turn {
+    /// It waits for no slot yet, as far as is known.
+    NotInLine,
+    Go,
+    Wait {
+        position: i32,
+        eta: Option<String>,
+    },
+    Paused {
+        position: i32,
+    },
+}
+
+impl Turn {
+    /// Its place in line; 0 for one that has none.
+    pub fn position(&self) -> i32 {
+        match self {
+            Self::Wait { position, .. } | Self::Paused { position } => *position,
+            Self::NotInLine | Self::Go => 0,
+        }
+    }
+}
 
 /// A submission that waits for a slot.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -50,25 +73,25 @@ pub struct Past {
 type Rank<'a> = (usize, usize, Option<Timestamp>, Timestamp, &'a str);
 
 /// The teams in line.
-struct Teams {
-    waiting: BTreeMap<String, VecDeque<InLine>>,
-    load: HashMap<String, usize>,
-    picked: HashMap<String, usize>,
+struct Teams<'a> {
+    waiting: BTreeMap<&'a str, VecDeque<&'a InLine>>,
+    load: HashMap<&'a str, usize>,
+    picked: HashMap<&'a str, usize>,
     picks: usize,
-    served: HashMap<String, Timestamp>,
+    served: &'a HashMap<String, Timestamp>,
 }
 
 /// The turn of everyone in line.
-pub fn turns(line: Vec<InLine>, past: Past, limits: Limits) -> HashMap<String, Turn> {
+pub fn turns<'a>(line: impl IntoIterator<Item = &'a InLine>, past: &'a Past, limits: Limits) -> HashMap<String, Turn> {
     let mut free = limits
         .total
         .map_or(usize::MAX, |total| total.saturating_sub(past.occupied.len()));
-    let quartiles: HashMap<String, Quartiles> = past
+    let quartiles: HashMap<&str, Quartiles> = past
         .runs
-        .into_iter()
-        .filter_map(|(track, runs)| Some((track, Quartiles::of(runs)?)))
+        .iter()
+        .filter_map(|(track, runs)| Some((track.as_str(), Quartiles::of(runs.clone())?)))
         .collect();
-    let mut teams = Teams::new(line, &past.occupied, past.served);
+    let mut teams = Teams::new(line, past);
     let mut result = HashMap::new();
     let mut position = 0;
     while let Some((pick, running)) = teams.pick() {
@@ -82,64 +105,64 @@ pub fn turns(line: Vec<InLine>, past: Past, limits: Limits) -> HashMap<String, T
                 Turn::Paused { position }
             } else {
                 let slots = limits.total.and_then(|n| i64::try_from(n).ok());
-                let known = quartiles.get(&pick.track);
+                let known = quartiles.get(pick.track.as_str());
                 let eta = known.zip(slots).map(|(known, slots)| known.band(position, slots));
                 Turn::Wait { position, eta }
             }
         };
-        result.insert(pick.uid, turn);
+        result.insert(pick.uid.clone(), turn);
     }
     result
 }
 
-impl Teams {
-    fn new(mut line: Vec<InLine>, occupied: &[String], served: HashMap<String, Timestamp>) -> Self {
+impl<'a> Teams<'a> {
+    fn new(line: impl IntoIterator<Item = &'a InLine>, past: &'a Past) -> Self {
+        let mut line: Vec<&InLine> = line.into_iter().collect();
         line.sort_by(|a, b| {
             b.priority
                 .cmp(&a.priority)
                 .then(a.submitted.cmp(&b.submitted))
                 .then(a.uid.cmp(&b.uid))
         });
-        let mut load: HashMap<String, usize> = HashMap::new();
-        for team in occupied {
-            *load.entry(team.clone()).or_default() += 1;
+        let mut load: HashMap<&str, usize> = HashMap::new();
+        for team in &past.occupied {
+            *load.entry(team).or_default() += 1;
         }
-        let mut waiting: BTreeMap<String, VecDeque<InLine>> = BTreeMap::new();
+        let mut waiting: BTreeMap<&str, VecDeque<&InLine>> = BTreeMap::new();
         for each in line {
-            waiting.entry(each.team.clone()).or_default().push_back(each);
+            waiting.entry(&each.team).or_default().push_back(each);
         }
         Self {
             waiting,
             load,
             picked: HashMap::new(),
             picks: 0,
-            served,
+            served: &past.served,
         }
     }
 
     /// The next one, and how many of its team run or were picked before it.
-    fn pick(&mut self) -> Option<(InLine, usize)> {
+    fn pick(&mut self) -> Option<(&'a InLine, usize)> {
         // A set ordered by rank would save the scan; the number of teams in line is small.
         let (.., team) = self
             .waiting
             .iter()
             .filter_map(|(team, line)| self.rank(team, line))
             .min()?;
-        let team = team.to_owned();
-        let line = self.waiting.get_mut(&team)?;
+        let line = self.waiting.get_mut(team)?;
         let pick = line.pop_front()?;
         if line.is_empty() {
-            self.waiting.remove(&team);
+            self.waiting.remove(team);
         }
         self.picks += 1;
-        self.picked.insert(team.clone(), self.picks);
+        self.picked.insert(team, self.picks);
         let load = self.load.entry(team).or_default();
         let running = *load;
         *load += 1;
         Some((pick, running))
     }
 
-    fn rank<'a>(&self, team: &'a str, line: &VecDeque<InLine>) -> Option<Rank<'a>> {
+    fn rank(&self, team: &'a str, line: &VecDeque<&InLine>) -> Option<Rank<'a>> {
         let load = self.load.get(team).copied().unwrap_or(0);
         let picked = self.picked.get(team).copied().unwrap_or(0);
         Some((
@@ -240,8 +263,8 @@ mod tests {
     #[test]
     fn without_limits_everyone_goes() {
         let all = turns(
-            vec![waiting("a", "x", 1), waiting("b", "x", 2)],
-            occupied(&[]),
+            &[waiting("a", "x", 1), waiting("b", "x", 2)],
+            &occupied(&[]),
             Limits::default(),
         );
         assert!(all.values().all(|t| *t == Turn::Go));
@@ -252,7 +275,7 @@ mod tests {
     fn a_flood_of_one_team_does_not_hold_up_anothers_first() {
         let mut line: Vec<_> = (0..100).map(|n| waiting(&format!("x{n:03}"), "x", n)).collect();
         line.push(waiting("y", "y", 1000));
-        let all = turns(line, occupied(&["x"]), limits(2));
+        let all = turns(&line, &occupied(&["x"]), limits(2));
         assert_eq!(all["y"], Turn::Go);
         assert_eq!(all["x000"], wait(1));
         assert_eq!(all["x099"], wait(100));
@@ -263,8 +286,8 @@ mod tests {
         let mut urgent = waiting("late", "x", 9);
         urgent.priority = 5;
         let all = turns(
-            vec![waiting("early", "x", 1), urgent, waiting("other", "y", 2)],
-            occupied(&[]),
+            &[waiting("early", "x", 1), urgent, waiting("other", "y", 2)],
+            &occupied(&[]),
             limits(2),
         );
         assert_eq!(all["late"], Turn::Go);
@@ -279,11 +302,7 @@ mod tests {
             per_team: Some(1),
             paused: false,
         };
-        let all = turns(
-            vec![waiting("a", "x", 1), waiting("b", "y", 2)],
-            occupied(&["x"]),
-            limits,
-        );
+        let all = turns(&[waiting("a", "x", 1), waiting("b", "y", 2)], &occupied(&["x"]), limits);
         assert_eq!(all["a"], wait(1));
         assert_eq!(all["b"], Turn::Go);
     }
@@ -294,14 +313,14 @@ mod tests {
             paused: true,
             ..Limits::default()
         };
-        let all = turns(vec![waiting("a", "x", 1), waiting("b", "y", 2)], occupied(&[]), limits);
+        let all = turns(&[waiting("a", "x", 1), waiting("b", "y", 2)], &occupied(&[]), limits);
         assert_eq!(all["a"], Turn::Paused { position: 1 });
         assert_eq!(all["b"], Turn::Paused { position: 2 });
     }
 
     #[test]
     fn a_full_leaderboard_starts_nobody() {
-        let all = turns(vec![waiting("a", "x", 1)], occupied(&["y", "z"]), limits(2));
+        let all = turns(&[waiting("a", "x", 1)], &occupied(&["y", "z"]), limits(2));
         assert_eq!(all["a"], wait(1));
     }
 
@@ -311,17 +330,17 @@ mod tests {
         line.push(waiting("y", "y", 1000));
         let mut past = occupied(&[]);
         past.served.insert("x".into(), Timestamp::from_second(2000).unwrap());
-        let all = turns(line.clone(), past.clone(), limits(1));
+        let all = turns(&line, &past, limits(1));
         assert_eq!((&all["y"], &all["x000"]), (&Turn::Go, &wait(1)));
         // While y runs, and when it has ended and pushed again.
         past.occupied = vec!["y".into()];
         past.served.insert("y".into(), Timestamp::from_second(3000).unwrap());
         line.pop();
         line.push(waiting("y2", "y", 4000));
-        let all = turns(line.clone(), past.clone(), limits(1));
+        let all = turns(&line, &past, limits(1));
         assert_eq!((&all["x000"], &all["y2"], &all["x001"]), (&wait(1), &wait(2), &wait(3)));
         past.occupied.clear();
-        assert_eq!(turns(line, past, limits(1))["x000"], Turn::Go);
+        assert_eq!(turns(&line, &past, limits(1))["x000"], Turn::Go);
     }
 
     #[test]
@@ -331,10 +350,10 @@ mod tests {
             (track.to_owned(), ended.zip(seconds.iter().copied()).collect::<Vec<_>>())
         };
         let eta = |seconds: &[i64], place: i64, slots: usize| {
-            let line = (1..=place).map(|n| waiting(&n.to_string(), "x", n)).collect();
+            let line: Vec<_> = (1..=place).map(|n| waiting(&n.to_string(), "x", n)).collect();
             let mut past = occupied(&["y"].repeat(slots));
             past.runs = [runs("sensors", seconds), runs("map", &[1])].into();
-            match turns(line, past, limits(slots)).remove(&place.to_string()) {
+            match turns(&line, &past, limits(slots)).remove(&place.to_string()) {
                 Some(Turn::Wait { eta, .. }) => eta,
                 other => panic!("{other:?}"),
             }
@@ -373,6 +392,6 @@ mod tests {
         };
         let mut past = occupied(&["x"]);
         past.runs = [("sensors".to_owned(), vec![(Timestamp::UNIX_EPOCH, 60)])].into();
-        assert_eq!(turns(vec![waiting("a", "x", 1)], past, limits)["a"], wait(1));
+        assert_eq!(turns(&[waiting("a", "x", 1)], &past, limits)["a"], wait(1));
     }
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use jiff::Timestamp;
 
+pub use super::turns::Turn;
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::{Leaderboard, Rerun, Submission};
@@ -16,7 +17,7 @@ pub struct View {
     pub leaderboard: Option<Arc<Leaderboard>>,
     /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place.
     pub is_policy_in_place: bool,
-    /// Whether it may start now; only meaningful while it has no Job.
+    /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: JobSight,
     pub pod: Option<PodView>,
@@ -166,14 +167,6 @@ impl ReportSight {
             _ => None,
         }
     }
-}
-
-/// Whether a submission may start.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Turn {
-    Go,
-    Wait { position: i32, eta: Option<String> },
-    Paused { position: i32 },
 }
 
 /// What is known of the submission in EvalAI.

@@ -260,6 +260,12 @@ impl<'a> Draft<'a> {
             .map(|c| c.last_transition_time.0)
     }
 
+    /// Shows nothing new: the status stays as it was observed, and nothing is published.
+    pub(super) fn keeps_status(&mut self) {
+        self.status = self.submission().status.clone().unwrap_or_default();
+        self.events.clear();
+    }
+
     /// Marks a failure that ends the attempt; the first one stands.
     pub(super) fn fail(&mut self, failure: Failure) {
         if self.status.failure.is_none() {

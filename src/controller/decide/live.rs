@@ -5,12 +5,12 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 
 use super::draft::{Draft, after};
-use super::{Action, Tell, accept, end, failure, isolation, job_name, start, stop};
-use crate::controller::view::{JobSight, JobView, PodView, Standing, Turn};
+use super::{Action, Tell, accept, end, failure, isolation, job_name, line, start, stop};
+use crate::controller::view::{JobSight, JobView, PodView, Standing};
 use crate::pod::report::Report;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{PairStatus, Progress, State, Waiting, reasons};
+use leaderboard_api::{PairStatus, Progress, State, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
@@ -83,25 +83,11 @@ fn in_line(draft: &mut Draft<'_>) {
     if waits_for_next_try(draft) {
         return;
     }
-    let (position, eta, reason, message) = match draft.view.turn.clone() {
-        Turn::Go => return start_job(draft),
-        Turn::Wait { position, eta } => (
-            position,
-            known_eta(draft, position).or(eta),
-            reasons::WAITING_FOR_SLOT,
-            "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
-        ),
-        Turn::Paused { position } => (
-            position,
-            None,
-            reasons::PAUSED,
-            "The Leaderboard is paused; it starts again with paused: false.",
-        ),
-    };
-    draft.status.waiting = Some(Waiting { position, eta });
-    draft.moves();
-    draft.say(State::Pending, reason, message);
-    tell(draft);
+    match line::decide(draft) {
+        line::Step::Start => return start_job(draft),
+        line::Step::Join => {}
+        line::Step::Wait => tell(draft),
+    }
     draft.requeue_in(BACKSTOP);
 }
 
@@ -111,12 +97,6 @@ fn note_original(draft: &mut Draft<'_>) {
     if draft.status.rerun_of.is_none() {
         draft.status.rerun_of = info.and_then(|info| info.rerun_of.clone());
     }
-}
-
-/// What was said of this place. A wait that is only estimated anew is not worth a write; it follows the place.
-fn known_eta(draft: &Draft<'_>, position: i32) -> Option<String> {
-    let known = draft.status.waiting.as_ref().filter(|known| known.position == position);
-    known.and_then(|known| known.eta.clone())
 }
 
 fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {

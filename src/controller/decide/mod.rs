@@ -1,7 +1,7 @@
 //! What is to be done for one submission: a pure function from a `View` to a `Plan`.
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
-//! one in the view, and no `async`. One file a stage of life: `accept`, `live`, `start`, `stop`, `end`, `after`; `failure`
+//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `failure`
 //! names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
@@ -10,6 +10,7 @@ mod draft;
 mod end;
 mod failure;
 mod isolation;
+mod line;
 mod live;
 mod log;
 mod next_steps;
@@ -21,6 +22,7 @@ mod trouble;
 
 use std::time::Duration;
 
+use super::turns::InLine;
 use super::view::View;
 use crate::pod::run::Stop;
 pub use after::previous_controller;
@@ -45,6 +47,8 @@ pub enum Action {
     AddFinalizer,
     /// Take our finalizer off the object.
     ReleaseFinalizer,
+    /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
+    JoinLine(InLine),
     /// Create the Job of this attempt and retry.
     CreateJob { attempt: i64, retry: i32 },
     /// Delete a Job and its Pods with this grace period.

@@ -25,6 +25,8 @@ pub struct LeaderboardView {
     pub counts: Counts,
     /// Submissions that are live or not yet published and recorded.
     pub in_use: usize,
+    /// Its Pods that have not ended, counted while it is being deleted.
+    pub pods: usize,
     /// How the NetworkPolicy of its Pods stands.
     pub policy: Policy,
     /// What the last of its Pods has found of its isolation.
@@ -80,11 +82,9 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
         conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
     }
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
-    if deleting && view.in_use > 0 {
-        let message = format!(
-            "{} submissions are live or unpublished; it goes when they are done.",
-            view.in_use
-        );
+    let is_in_use = view.in_use > 0 || view.pods > 0;
+    if deleting && is_in_use {
+        let message = in_use(view);
         conditions::set(
             &mut status.conditions,
             conditions::TERMINATING,
@@ -101,10 +101,22 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
         .any(|f| f == names::FINALIZER_LEADERBOARD);
     let finalizer = match (deleting, held) {
         (false, false) => Some(true),
-        (true, true) if view.in_use == 0 => Some(false),
+        (true, true) if !is_in_use => Some(false),
         _ => None,
     };
     LeaderboardPlan { status, finalizer }
+}
+
+/// What keeps a Leaderboard that is being deleted. With it goes its NetworkPolicy, which has to outlive the last Pod.
+fn in_use(view: &LeaderboardView) -> String {
+    match (view.in_use, view.pods) {
+        (0, pods) => {
+            format!("{pods} Pods still run; the Leaderboard and its NetworkPolicy are removed when they have ended.")
+        }
+        (submissions, _) => {
+            format!("{submissions} submissions are live or unpublished; the Leaderboard is removed when they are done.")
+        }
+    }
 }
 
 /// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong.
@@ -274,6 +286,7 @@ mod tests {
             all: all.to_vec(),
             counts: Counts::default(),
             in_use: 0,
+            pods: 0,
             policy: Policy::InPlace,
             measured: None,
             invalid_pod: None,
@@ -326,7 +339,12 @@ mod tests {
         let plan = decide(&seen);
         assert_eq!(plan.finalizer, None);
         assert!(conditions::is_true(&plan.status.conditions, conditions::TERMINATING));
-        seen.in_use = 0;
+        (seen.in_use, seen.pods) = (0, 1);
+        let plan = decide(&seen);
+        assert_eq!(plan.finalizer, None, "its policy goes with it");
+        let shown = conditions::get(&plan.status.conditions, conditions::TERMINATING).unwrap();
+        assert!(shown.message.starts_with("1 Pods still run"), "{}", shown.message);
+        seen.pods = 0;
         assert_eq!(decide(&seen).finalizer, Some(false));
     }
 

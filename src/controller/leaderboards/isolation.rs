@@ -107,7 +107,7 @@ pub(super) async fn keep(context: &Context, leaderboard: &Leaderboard, now: Time
     context.desk.note_applied(&uid, applied);
     if policy == Policy::InPlace && last.is_some_and(|last| last.has_failed()) {
         // An apply that changes nothing is no event.
-        (context.wake)(ObjectRef::from_obj(leaderboard));
+        context.wake(ObjectRef::from_obj(leaderboard));
     }
     policy
 }
@@ -279,6 +279,21 @@ fn by_pods(stores: &Stores, leaderboard: &Leaderboard) -> Option<WorkspaceVerdic
     let pods = stores.pods.state();
     let found = pods.iter().filter(|pod| is_ours(pod)).filter_map(|pod| finding(pod));
     found.max_by_key(|(at, _)| *at).map(|(_, verdict)| verdict)
+}
+
+/// Pods of a Leaderboard that have not ended, counted only once it is being deleted: the policy goes with it.
+pub(super) fn pods_left(stores: &Stores, leaderboard: &Leaderboard) -> usize {
+    if leaderboard.metadata.deletion_timestamp.is_none() {
+        return 0;
+    }
+    let (name, namespace) = (leaderboard.name_any(), leaderboard.namespace());
+    let is_left = |pod: &Arc<Pod>| {
+        let phase = pod.status.as_ref().and_then(|status| status.phase.as_deref());
+        pod.namespace() == namespace
+            && pod.labels().get(names::LABEL_LEADERBOARD) == Some(&name)
+            && !matches!(phase, Some("Succeeded" | "Failed"))
+    };
+    stores.pods.state().iter().filter(|pod| is_left(pod)).count()
 }
 
 /// What a Pod has found of its isolation, and when.

@@ -276,3 +276,39 @@ async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missi
     let policy = keep(&around.context, &board, began).await;
     assert!(matches!(policy, Policy::NotApplied(_)), "never listed: said at once");
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_leaderboard_and_with_it_the_policy_stays_while_a_pod_of_it_runs() {
+    let pod = |leaderboard: &str, phase: &str| -> Pod {
+        let metadata =
+            json!({"name": "p", "namespace": fixtures::NAMESPACE, "labels": {names::LABEL_LEADERBOARD: leaderboard}});
+        serde_json::from_value(json!({"metadata": metadata, "status": {"phase": phase}})).unwrap()
+    };
+    for (left, stays) in [
+        (Some(pod("carla", "Running")), true),
+        (Some(pod("carla", "Pending")), true),
+        (Some(pod("carla", "Unknown")), true),
+        (Some(pod("carla", "Succeeded")), false),
+        (Some(pod("carla", "Failed")), false),
+        (Some(pod("other", "Running")), false),
+        (None, false),
+    ] {
+        let mut board = fixtures::leaderboard("carla", "http://127.0.0.1:1");
+        board.metadata.finalizers = Some(vec![names::FINALIZER_LEADERBOARD.into()]);
+        board.metadata.deletion_timestamp = Some(Time(Timestamp::now()));
+        let cluster = Cluster {
+            policies: vec![network_policy(&board)],
+            pods: left.iter().cloned().collect(),
+            ..Cluster::default()
+        };
+        let mut around = surroundings(cluster, "http://127.0.0.1:1").await;
+        let context = Arc::new(around.context);
+        // The mock's answer to a finalizer is no Leaderboard.
+        let _ = crate::controller::leaderboards::reconcile(Arc::new(board), context).await;
+        let sent = std::iter::from_fn(|| around.requests.try_recv().ok());
+        let is_released = sent
+            .into_iter()
+            .any(|request| request.path.ends_with("/leaderboards/carla"));
+        assert_eq!(!is_released, stays, "{left:?}");
+    }
+}

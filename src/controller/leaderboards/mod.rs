@@ -25,8 +25,7 @@ use crate::services::ObjectKey;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::{Applied, Measured, Policy};
 use leaderboard_api::client_errors;
-use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{Leaderboard, State, Submission, conditions, names};
+use leaderboard_api::{Leaderboard, names};
 use probe::Probe;
 
 /// A status whose counts alone have changed is written at most this often.
@@ -133,7 +132,7 @@ fn observe(
     probe: &Probe,
     now: Timestamp,
 ) -> LeaderboardView {
-    let (counts, in_use) = census(context, leaderboard);
+    let (counts, in_use) = context.slots.census(leaderboard);
     let key = key_of(leaderboard);
     LeaderboardView {
         now,
@@ -141,6 +140,7 @@ fn observe(
         all: context.stores.leaderboards.state(),
         counts,
         in_use,
+        pods: isolation::pods_left(&context.stores, leaderboard),
         policy,
         measured: isolation::measured(context, leaderboard),
         invalid_pod: probe.invalid_pod(),
@@ -149,42 +149,6 @@ fn observe(
         evalai_writes_from: context.sync.hub.writes_from(),
         budget: context.sync.hub.budget_used(&key),
     }
-}
-
-fn census(context: &Context, leaderboard: &Leaderboard) -> (Counts, usize) {
-    let mut counts = Counts::default();
-    let mut in_use = 0;
-    let mine =
-        |s: &Submission| s.spec.leaderboard_name == leaderboard.name_any() && s.namespace() == leaderboard.namespace();
-    for submission in context.stores.submissions.state().into_iter().filter(|s| mine(s)) {
-        match submission.status.as_ref().and_then(|s| s.state) {
-            None | Some(State::Pending) => counts.pending += 1,
-            Some(State::Running | State::Resumed) => counts.running += 1,
-            Some(State::Finished) => counts.finished += 1,
-            Some(State::Failed) => counts.failed += 1,
-            Some(State::Cancelled) => counts.cancelled += 1,
-        }
-        if needs_leaderboard(&submission) {
-            in_use += 1;
-        }
-    }
-    (counts, in_use)
-}
-
-/// Live, or its end is not everywhere yet.
-fn needs_leaderboard(submission: &Submission) -> bool {
-    let conditions = submission
-        .status
-        .as_ref()
-        .map(|s| s.conditions.as_slice())
-        .unwrap_or_default();
-    let waits = |type_: &str| {
-        conditions::get(conditions, type_)
-            .is_some_and(|c| c.status != "True" && c.reason != leaderboard_api::reasons::NOT_REQUIRED)
-    };
-    !conditions::is_true(conditions, conditions::FINISHED)
-        || waits(conditions::PUBLISHED)
-        || waits(conditions::RECORDED)
 }
 
 async fn set_finalizer(

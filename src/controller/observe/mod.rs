@@ -1,6 +1,5 @@
 //! Reads the world of one submission into a `View`: caches, memory and one short read from S3. Decides nothing.
 
-pub mod board;
 pub mod job;
 pub mod node;
 pub mod pod;
@@ -47,9 +46,7 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         .and_then(|l| context.sync.record_view(l, &submission));
     let known = |name: &str| context.stores.submissions.get(&ObjectRef::new(name).within(&namespace));
     let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission, known);
-    let is_asked = evalai.as_ref().is_none_or(|e| e.info.is_some());
-    let all = || context.stores.submissions.state();
-    let turn = context.board.turn(all, &submission, leaderboard.as_deref(), is_asked);
+    let turn = context.slots.turn(&submission, leaderboard.as_deref());
     let partial_told = context.memory.partial_told(&submission);
     let unread = context.memory.unread(&submission);
     let rerun_as = context.reruns.of(&submission);

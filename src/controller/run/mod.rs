@@ -1,39 +1,38 @@
-//! Wires the controller: watches, lease, services, passes. Called by the command line; decides nothing.
+//! Wires the controller: watches, lease, services, reconciles. Called by the command line; decides nothing.
 //!
 //! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error, and so does one
 //! that has lost one of its tasks: the kubelet starts it again with empty hands.
 
 mod counts;
 mod events;
-mod marks;
 mod needs;
-mod passes;
+mod reconciles;
 mod sweep;
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures::StreamExt;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
-use kube::runtime::reflector::{ObjectRef, Store};
+use kube::runtime::reflector::Store;
 use kube::runtime::watcher::Config;
 use kube::{Client, ResourceExt};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
+use super::backoff::BackoffMap;
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
 use super::leaderboards::isolation;
 use super::observe::children_selector;
 use super::sync::Sync;
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
-use crate::kubernetes::{Watch, WatchEvent, WatchEvents, Watchable, guarded, spawn_watch};
+use crate::kubernetes::{Watch, guarded, spawn_watch};
 use crate::observability::Observability;
-use crate::observability::tasks::{TaskFailed, Tasks};
+use crate::observability::tasks::TaskFailed;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
@@ -41,7 +40,7 @@ use crate::services::meter::Meter;
 use crate::services::table::Recorder;
 use leaderboard_api::{Leaderboard, Submission};
 
-/// Passes in hand may take this long to end after a stop.
+/// Reconciles under way may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
 
 /// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
@@ -56,13 +55,21 @@ pub enum RunError {
     TaskFailed(#[from] TaskFailed),
 }
 
-/// Something has changed for an object.
-#[derive(Clone, Debug)]
-pub(super) enum Touched {
-    Submission(ObjectRef<Submission>),
-    Leaderboard(ObjectRef<Leaderboard>),
-    /// An object is gone for good.
-    Gone(ObjectKey),
+/// What all reconciles share.
+pub(super) struct Shared {
+    context: Arc<Context>,
+    backoff: BackoffMap,
+    seen: Observability,
+}
+
+impl Shared {
+    /// Drops everything that is remembered of an object that is gone.
+    fn forget(&self, key: &ObjectKey) {
+        self.context.forget(&key.uid);
+        self.context.desk.forget(&key.uid);
+        self.context.sync.gone(key);
+        self.backoff.dropped(&key.uid);
+    }
 }
 
 /// Runs until told to stop, or until it no longer leads.
@@ -166,29 +173,6 @@ impl Watches {
         let _ = self.pods.store.wait_until_ready().await;
         let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
     }
-
-    /// Tells everything that is there now, then everything that is touched.
-    fn feed(&self, touched: &mpsc::UnboundedSender<Touched>, context: &Arc<Context>, tasks: &Tasks) {
-        forward(tasks, self.leaderboards.subscribe(), touched, events::of_leaderboards());
-        let of_submissions = events::of_submissions(Arc::clone(context));
-        forward(tasks, self.submissions.subscribe(), touched, of_submissions);
-        forward(tasks, self.jobs.subscribe(), touched, |touch: WatchEvent<Job>| {
-            owner(touch.object.as_ref())
-        });
-        forward(tasks, self.pods.subscribe(), touched, events::of_pods());
-        let restored = isolation::restore(
-            self.policies.subscribe(),
-            self.leaderboards.subscribe(),
-            Arc::clone(context),
-        );
-        tasks.stay("policies", restored);
-        forward(
-            tasks,
-            self.policies.subscribe(),
-            touched,
-            |touch: WatchEvent<NetworkPolicy>| board(touch.object.as_ref()).into_iter().collect(),
-        );
-    }
 }
 
 /// Of a Job, decisions read metadata and status.
@@ -212,37 +196,12 @@ pub(super) fn trim_pod(pod: &mut Pod) {
     }
 }
 
-fn owner(child: &impl ResourceExt) -> Vec<Touched> {
-    Stores::owner_of(child).map(Touched::Submission).into_iter().collect()
-}
-
-fn board(child: &impl ResourceExt) -> Option<Touched> {
-    Stores::leaderboard_of(child).map(Touched::Leaderboard)
-}
-
 fn key(object: &impl ResourceExt) -> ObjectKey {
     ObjectKey {
         namespace: object.namespace().unwrap_or_default(),
         name: object.name_any(),
         uid: object.uid().unwrap_or_default(),
     }
-}
-
-fn forward<K: Watchable>(
-    tasks: &Tasks,
-    mut touches: WatchEvents<K>,
-    touched: &mpsc::UnboundedSender<Touched>,
-    mut map: impl FnMut(WatchEvent<K>) -> Vec<Touched> + Send + 'static,
-) {
-    let touched = touched.clone();
-    tasks.stay(format!("events of {}", K::plural(&())), async move {
-        while let Some(touch) = touches.next().await {
-            for each in map(touch) {
-                // Without a receiver the process is ending.
-                let _ = touched.send(each);
-            }
-        }
-    });
 }
 
 /// What one process is made of.
@@ -260,44 +219,65 @@ impl Parts {
             return Ok(());
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.seen.stop.wait() => return Ok(()) }
-        let (touched, inbox) = mpsc::unbounded_channel();
+        let (boards, woken_boards) = mpsc::unbounded_channel();
+        let (changed_rows, rows) = mpsc::unbounded_channel();
+        let (changed, evalai) = mpsc::unbounded_channel();
         let fence = leader.fence();
         let hub = hub(
             &fence,
-            &touched,
+            changed,
             &self.client,
             &self.watches.leaderboards.store,
             &self.seen,
         );
-        let recorder = recorder(&fence, &touched, self.aws.clone(), &self.seen.tasks);
-        let instance = std::env::var("POD_NAME").ok();
-        let reporter = Reporter {
-            controller: "leaderboard.carla.org/controller".into(),
-            instance,
-        };
-        let events = EventRecorder::new(self.client.clone(), reporter);
+        let may_write = fence.clone();
+        let tasks = self.seen.tasks.clone();
+        let recorder = Recorder::new(self.aws.clone(), move || may_write.may_write(), changed_rows, tasks);
         let sync = Sync::new(hub.clone(), recorder);
         let gauges = counts::keep(hub.clone(), self.watches.submissions.store.clone(), self.seen.clone());
         self.seen.tasks.stay("gauges", gauges);
-        let stores = self.watches.stores();
-        let to_queue = touched.clone();
+        let watches = self.watches;
+        let to_queue = boards.clone();
         let wake = Box::new(move |board| {
-            let _ = to_queue.send(Touched::Leaderboard(board));
+            // Without a receiver the process is ending.
+            let _ = to_queue.send(board);
         });
-        let context = Context::new(self.client, self.settings, stores, sync, self.aws, events, wake);
-        let context = Arc::new(context);
-        self.watches.feed(&touched, &context, &self.seen.tasks);
+        let events = events(&self.client);
+        let context = Context::new(
+            self.client,
+            self.settings,
+            watches.stores(),
+            sync,
+            self.aws,
+            events,
+            wake,
+        );
+        let shared = Arc::new(Shared {
+            context: Arc::new(context),
+            backoff: BackoffMap::default(),
+            seen: self.seen.clone(),
+        });
+        shared.context.stores.fill(&shared.context.slots);
+        let restored = isolation::restore(
+            watches.policies.subscribe(),
+            watches.leaderboards.subscribe(),
+            Arc::clone(&shared.context),
+        );
+        self.seen.tasks.stay("policies", restored);
+        let reports = events::Reports { rows, evalai };
+        let of_submissions = events::of_submissions(&watches, reports, &boards, &shared);
+        let of_leaderboards = events::of_leaderboards(&watches, woken_boards, &shared);
         let mut leadership = leader.leadership();
-        let passes = passes::run(context, inbox, self.seen.clone());
-        let passes = self.seen.tasks.stay("reconciles", passes);
+        let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
+        let reconciles = self.seen.tasks.stay("reconciles", reconciles);
         tokio::select! {
             () = self.seen.stop.wait() => {}
             why = lost(&mut leadership) => {
-                passes.abort();
+                reconciles.abort();
                 return Err(RunError::LostLease(why));
             }
         }
-        finish(passes).await;
+        finish(reconciles).await;
         if hub.drain().await {
             leader.drained();
         }
@@ -306,22 +286,18 @@ impl Parts {
 }
 
 /// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.
-async fn finish<T>(mut passes: JoinHandle<T>) {
-    if tokio::time::timeout(DRAIN, &mut passes).await.is_err() {
-        passes.abort();
+async fn finish<T>(mut reconciles: JoinHandle<T>) {
+    if tokio::time::timeout(DRAIN, &mut reconciles).await.is_err() {
+        reconciles.abort();
     }
 }
 
-fn recorder(fence: &leader::Fence, touched: &mpsc::UnboundedSender<Touched>, aws: Aws, tasks: &Tasks) -> Recorder {
-    let (changed, mut rows) = mpsc::unbounded_channel::<ObjectKey>();
-    let touched = touched.clone();
-    tasks.stay("changes of rows", async move {
-        while let Some(key) = rows.recv().await {
-            let _ = touched.send(Touched::Submission(ObjectRef::new(&key.name).within(&key.namespace)));
-        }
-    });
-    let fence = fence.clone();
-    Recorder::new(aws, move || fence.may_write(), changed, tasks.clone())
+fn events(client: &Client) -> EventRecorder {
+    let reporter = Reporter {
+        controller: "leaderboard.carla.org/controller".into(),
+        instance: std::env::var("POD_NAME").ok(),
+    };
+    EventRecorder::new(client.clone(), reporter)
 }
 
 /// Waits to become the leader. False if told to stop before.
@@ -358,22 +334,12 @@ async fn lost(leadership: &mut tokio::sync::watch::Receiver<Leadership>) -> Stri
 
 fn hub(
     fence: &leader::Fence,
-    touched: &mpsc::UnboundedSender<Touched>,
+    changed: mpsc::UnboundedSender<Changed>,
     client: &Client,
     leaderboards: &Store<Leaderboard>,
     seen: &Observability,
 ) -> Hub {
-    let (changed, mut changes) = mpsc::unbounded_channel::<Changed>();
     let (sweep, rows) = mpsc::unbounded_channel::<SweepRow>();
-    let forward = touched.clone();
-    seen.tasks.stay("changes of EvalAI", async move {
-        while let Some(change) = changes.recv().await {
-            let _ = forward.send(match change {
-                Changed::Submission(key) => Touched::Submission(ObjectRef::new(&key.name).within(&key.namespace)),
-                Changed::Leaderboard(key) => Touched::Leaderboard(ObjectRef::new(&key.name).within(&key.namespace)),
-            });
-        }
-    });
     let sweeping = sweep::into_cluster(client.clone(), leaderboards.clone(), rows);
     let stop = seen.stop.clone();
     seen.tasks.stay("sweep", async move {

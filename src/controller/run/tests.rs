@@ -13,14 +13,7 @@ use crate::controller::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 18] = [
-    "changes of EvalAI",
-    "changes of rows",
-    "events of jobs",
-    "events of leaderboards",
-    "events of networkpolicies",
-    "events of pods",
-    "events of submissions",
+const TASKS: [&str; 11] = [
     "gauges",
     "lease",
     "permissions",

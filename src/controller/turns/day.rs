@@ -5,8 +5,7 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 
 use super::tests::{limits, waiting};
-use super::{InLine, Past, turns};
-use crate::controller::view::Turn;
+use super::{InLine, Past, Turn, turns};
 
 /// A day of a Leaderboard: teams that push again as soon as they can, each keeping so many in line.
 struct Day {
@@ -43,7 +42,7 @@ impl Day {
     /// Starts whoever may, then goes on to the next end. Hands back the team that ended.
     fn step(&mut self) -> String {
         self.past.occupied = self.running.iter().map(|(_, team)| team.clone()).collect();
-        let turns = turns(self.line.clone(), self.past.clone(), limits(self.slots));
+        let turns = turns(&self.line, &self.past, limits(self.slots));
         let (start, wait): (Vec<_>, Vec<_>) = self.line.drain(..).partition(|each| turns[&each.uid] == Turn::Go);
         self.line = wait;
         for each in start {

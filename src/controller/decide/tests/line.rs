@@ -1,10 +1,11 @@
 //! In line: slots, pauses, and the Leaderboard's changes before the first Job.
 
 use super::builders::*;
-use crate::controller::decide::Tell;
-use crate::controller::view::{JobSight, Turn};
+use crate::controller::decide::{Action, Tell};
+use crate::controller::turns::{InLine, Turn};
+use crate::controller::view::JobSight;
 use leaderboard_api::State::{Cancelled, Pending};
-use leaderboard_api::{Waiting, reasons};
+use leaderboard_api::{SubmissionStatus, Waiting, reasons};
 
 #[test]
 fn who_waits_sees_place_and_time() {
@@ -44,6 +45,67 @@ fn who_waits_sees_place_and_time() {
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert!(creates(&plan));
     assert_eq!(plan.status.waiting, None);
+}
+
+#[test]
+fn joining_the_line_shows_nothing_and_starts_nothing() {
+    for mut world in [World::local(), World::evalai()] {
+        world.view.turn = Turn::NotInLine;
+        let created = world.view.submission.metadata.creation_timestamp.clone().unwrap().0;
+        let is_evalais = world.view.submission.spec.evalai.is_some();
+        let plan = world.pass();
+        assert_eq!(
+            plan.status,
+            SubmissionStatus::default(),
+            "its first place is worth a write, joining is not"
+        );
+        assert!(plan.events.is_empty() && !creates(&plan) && tells(&plan).is_empty());
+        let place = InLine {
+            uid: UID.into(),
+            team: if is_evalais { "42" } else { "t1" }.into(),
+            track: "sensors".into(),
+            priority: 0,
+            submitted: if is_evalais { at(-60) } else { created },
+        };
+        assert_eq!(plan.actions, [Action::JoinLine(place.clone())]);
+
+        world.view.turn = Turn::Wait { position: 1, eta: None };
+        let plan = world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+        assert!(
+            plan.actions.contains(&Action::JoinLine(place.clone())),
+            "it stays in line"
+        );
+        world.submission().spec.priority = 5;
+        assert!(
+            world
+                .pass()
+                .actions
+                .contains(&Action::JoinLine(InLine { priority: 5, ..place }))
+        );
+
+        // After a takeover it joins anew, and keeps what it showed.
+        let before = world.status();
+        world.view.turn = Turn::NotInLine;
+        assert_eq!(world.pass().status, before);
+        world.view.turn = Turn::Go;
+        assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    }
+}
+
+#[test]
+fn who_waits_for_something_else_does_not_join() {
+    let refused: [fn(&mut World); 4] = [
+        |world| world.view.leaderboard = None,
+        |world| world.view.is_policy_in_place = false,
+        |world| world.in_evalai().info = None,
+        |world| world.submission().spec.cancel = true,
+    ];
+    for refuse in refused {
+        let mut world = World::evalai();
+        world.view.turn = Turn::NotInLine;
+        refuse(&mut world);
+        assert!(!has(&world.pass(), |action| matches!(action, Action::JoinLine(_))));
+    }
 }
 
 #[test]

@@ -232,6 +232,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
 
 fn change() -> impl Strategy<Value = Change> {
     let turns = vec![
+        Turn::NotInLine,
         Turn::Go,
         Turn::Wait { position: 2, eta: None },
         Turn::Paused { position: 1 },

@@ -1,15 +1,19 @@
-//! Passes against caches of the test's own, under a paused clock.
+//! Reconciles against caches of the test's own, under a paused clock.
 
+use futures::stream;
 use http::Method;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use tokio::sync::mpsc;
 
 use super::*;
+use crate::controller::backoff::BackoffMap;
 use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
 use crate::controller::observe::report::READ_TIMEOUT;
+use crate::observability::Observability;
 use crate::observability::shutdown::Stop;
 
-/// Passes that run into a bucket which takes connections and never answers.
+/// Reconciles that run into a bucket which takes connections and never answers.
 const BEHIND: usize = 300;
 /// Cancels of others. The queue takes who waits in no order, so that one of them may be lucky.
 const CANCELS: usize = 6;
@@ -35,15 +39,21 @@ async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
     }
     cluster.leaderboards = vec![hanging, other];
 
-    let (touched, inbox) = mpsc::unbounded_channel();
-    let touch = |submission: &ObjectRef<Submission>| touched.send(Touched::Submission(submission.clone())).unwrap();
+    let (queue, mut queued) = mpsc::unbounded_channel();
+    let touch = |submission: &ObjectRef<Submission>| queue.send(submission.clone()).unwrap();
     let mut all: Vec<_> = cluster.submissions.iter().map(ObjectRef::from_obj).collect();
     let cancelled = all.split_off(BEHIND);
     let mut around = surroundings(cluster, &endpoint).await;
     let (_stop, signal) = Stop::new();
-    let passes = tokio::spawn(run(Arc::new(around.context), inbox, Observability::new(signal)));
+    let shared = Arc::new(Shared {
+        context: Arc::new(around.context),
+        backoff: BackoffMap::default(),
+        seen: Observability::new(signal),
+    });
+    let of_submissions = stream::poll_fn(move |cx| queued.poll_recv(cx)).boxed();
+    let reconciles = tokio::spawn(run(of_submissions, stream::pending().boxed(), shared));
     all.iter().for_each(touch);
-    // As many passes as there may be at once have begun, and the others wait.
+    // As many reconciles as there may be at once have begun, and the others wait.
     tokio::time::sleep(Duration::from_secs(1)).await;
     let began = tokio::time::Instant::now();
     cancelled.iter().for_each(touch);
@@ -54,7 +64,7 @@ async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
             stopped.push(request.at - began);
         }
     }
-    passes.abort();
+    reconciles.abort();
     let limit = READ_TIMEOUT * 2 + Duration::from_secs(1);
     assert!(
         stopped.iter().all(|took| *took <= limit),

@@ -1,0 +1,109 @@
+//! What of a Submission, as the watch shows it, counts for the others of its Leaderboard: all of it, and nothing else. Pure.
+
+use jiff::Timestamp;
+
+use leaderboard_api::{State, Submission, SubmissionStatus, conditions, names, reasons};
+
+pub(super) struct Member {
+    pub(super) name: String,
+    pub(super) team: String,
+    pub(super) track: String,
+    /// The attempt that runs or is to run next.
+    pub(super) attempt: i64,
+    /// The Job of that attempt, as it is or will be called.
+    pub(super) job: String,
+    pub(super) stand: Stand,
+    /// It starts nothing any more.
+    pub(super) is_leaving: bool,
+    /// A change of its Leaderboard may let it start.
+    pub(super) is_pending: bool,
+    /// When its present or last run began.
+    pub(super) began: Option<Timestamp>,
+    /// When a run ended that has begun.
+    pub(super) ended: Option<Timestamp>,
+    pub(super) state: State,
+    /// It is live, or its end is not yet published and recorded.
+    pub(super) needs_leaderboard: bool,
+}
+
+/// What its status says of it.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Stand {
+    /// It has no slot, and may want one.
+    Idle,
+    HasSlot,
+    /// It has come to its end, and no other attempt is requested.
+    Over,
+}
+
+impl Member {
+    pub(super) fn of(submission: &Submission) -> Self {
+        let spec = &submission.spec;
+        let none = SubmissionStatus::default();
+        let status = submission.status.as_ref().unwrap_or(&none);
+        let name = submission.metadata.name.clone().unwrap_or_default();
+        let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
+        let known = status.attempt.unwrap_or(spec.attempt);
+        let is_over = is_finished && spec.attempt <= known;
+        let (attempt, retry) = if is_finished && !is_over {
+            (spec.attempt, 0)
+        } else {
+            (known, status.retry)
+        };
+        let times = &status.times;
+        let began = times.scheduled.as_ref().or(times.started.as_ref());
+        // What never ran says nothing of how long a run takes.
+        let ended = times.started.as_ref().and(times.finished.as_ref());
+        let team = status.team.as_ref().or(spec.team.as_ref());
+        let team = team.and_then(|team| team.id.as_deref().or(team.name.as_deref()));
+        let is_deleting = submission.metadata.deletion_timestamp.is_some();
+        Self {
+            team: team.unwrap_or_default().to_owned(),
+            track: status.track.clone().or(spec.track.clone()).unwrap_or_default(),
+            attempt,
+            job: names::job(&name, attempt, retry),
+            name,
+            stand: match status {
+                _ if is_over => Stand::Over,
+                // Between two tries it keeps its slot: it lost its Job to the infrastructure and is about to get another.
+                status if !is_finished && (status.job_name.is_some() || status.retry > 0) => Stand::HasSlot,
+                _ => Stand::Idle,
+            },
+            is_leaving: is_over || spec.cancel || is_deleting,
+            is_pending: !is_over && waits_for_leaderboard(status),
+            began: began.map(|time| time.0),
+            ended: ended.map(|time| time.0),
+            state: status.state.unwrap_or(State::Pending),
+            needs_leaderboard: needs_leaderboard(status),
+        }
+    }
+
+    /// Whether what is known of past runs stays right by adding what is new here.
+    pub(super) fn adds_to(&self, old: &Self) -> bool {
+        let same_run = |new: Option<Timestamp>, old: Option<Timestamp>| old.is_none() || old == new;
+        old.began.is_none()
+            || (self.team == old.team
+                && self.track == old.track
+                && same_run(self.began, old.began)
+                && same_run(self.ended, old.ended))
+    }
+
+    pub(super) fn ran_as(&self, old: &Self) -> bool {
+        (&self.team, &self.track, self.began, self.ended) == (&old.team, &old.track, old.began, old.ended)
+    }
+}
+
+fn needs_leaderboard(status: &SubmissionStatus) -> bool {
+    let waits = |type_: &str| {
+        let condition = conditions::get(&status.conditions, type_);
+        condition.is_some_and(|c| c.status != "True" && c.reason != reasons::NOT_REQUIRED)
+    };
+    !conditions::is_true(&status.conditions, conditions::FINISHED)
+        || waits(conditions::PUBLISHED)
+        || waits(conditions::RECORDED)
+}
+
+/// Whether a change of its Leaderboard may let it start: it has no Job, or the one that it asked for may not be made.
+fn waits_for_leaderboard(status: &SubmissionStatus) -> bool {
+    status.job_name.is_none() || status.reason.as_deref() == Some(reasons::NOT_ISOLATED)
+}

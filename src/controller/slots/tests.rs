@@ -1,0 +1,431 @@
+use futures::FutureExt;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
+use serde_json::{Value, json};
+
+use super::*;
+use leaderboard_api::LeaderboardSpec;
+
+fn leaderboard(running: &Value, paused: bool) -> Leaderboard {
+    let spec = json!({
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2", "contents": {"image": "c"},
+        "simulator": {"image": "s"}, "storage": {"bucket": "b"}, "concurrency": running, "paused": paused,
+    });
+    let mut object = Leaderboard::new("lb", serde_json::from_value(spec).unwrap());
+    object.metadata.namespace = Some("ns".into());
+    object
+}
+
+fn one() -> Leaderboard {
+    leaderboard(&json!({"total": 1}), false)
+}
+
+fn time(second: i64) -> Time {
+    Time(jiff::Timestamp::from_second(second).unwrap())
+}
+
+/// A submission of a team; `status` is what the watch shows of it.
+fn submission(name: &str, team: &str, second: i64, status: Value) -> Submission {
+    let spec = json!({"leaderboardName": "lb", "image": "i", "track": "sensors", "team": {"id": team}});
+    let mut object = Submission::new(name, serde_json::from_value(spec).unwrap());
+    object.metadata.namespace = Some("ns".into());
+    object.metadata.uid = Some(name.into());
+    object.metadata.creation_timestamp = Some(time(second));
+    object.status = serde_json::from_value(status).unwrap();
+    object
+}
+
+fn condition(type_: &str, status: &str) -> Value {
+    json!({"type": type_, "status": status, "reason": "R", "message": "", "lastTransitionTime": "2026-01-01T00:00:00Z"})
+}
+
+fn ended(attempt: i64) -> Value {
+    json!({"attempt": attempt, "jobName": "j", "track": "sensors", "conditions": [condition("Finished", "True")],
+           "times": {"scheduled": time(0), "started": time(100), "finished": time(1500)}})
+}
+
+/// An allocator, and what its Leaderboard's reconciles and watches do with it.
+struct World {
+    slots: Arc<SlotAllocator>,
+    leaderboard: Leaderboard,
+}
+
+impl World {
+    fn new(leaderboard: Leaderboard, all: &[&Submission]) -> Self {
+        let slots = Arc::new(SlotAllocator::default());
+        let all: Vec<_> = all.iter().map(|&object| Arc::new(object.clone())).collect();
+        slots.start(&[Arc::new(leaderboard.clone())], &[], &all);
+        Self { slots, leaderboard }
+    }
+
+    /// The watch shows another state of a submission.
+    fn shows(&self, submission: &Submission) {
+        self.slots.submission(submission, false);
+    }
+
+    fn becomes(&mut self, leaderboard: Leaderboard) {
+        self.slots.leaderboard(&leaderboard, false);
+        self.leaderboard = leaderboard;
+    }
+
+    fn turn(&self, submission: &Submission) -> Turn {
+        self.slots.turn(submission, Some(&self.leaderboard))
+    }
+
+    /// All but the slot is settled.
+    fn joins(&self, submission: &Submission) {
+        let created = submission.metadata.creation_timestamp.as_ref().unwrap();
+        let place = InLine {
+            uid: uid_of(submission),
+            team: submission.spec.team.as_ref().unwrap().id.clone().unwrap(),
+            track: "sensors".into(),
+            priority: submission.spec.priority,
+            submitted: created.0,
+        };
+        self.slots.join(submission, place);
+    }
+
+    /// Joins the line, and the turn that follows.
+    fn asks(&self, submission: &Submission) -> Turn {
+        self.joins(submission);
+        self.slots.allocate();
+        self.turn(submission)
+    }
+
+    fn woken(&self) -> Vec<String> {
+        let mut names: Vec<_> = self.slots.allocate().into_iter().map(|object| object.name).collect();
+        names.sort();
+        names
+    }
+}
+
+fn wait(position: i32) -> Turn {
+    Turn::Wait { position, eta: None }
+}
+
+#[test]
+fn a_slot_is_granted_once_and_given_back_at_the_end() {
+    let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
+    let world = World::new(one(), &[&a, &b]);
+    assert_eq!(world.asks(&a), Turn::Go);
+    assert_eq!(world.asks(&b), wait(1));
+    world.slots.starts(&a);
+    assert_eq!(world.asks(&b), wait(1), "the watch does not show the Job yet");
+    world.shows(&submission("a", "x", 1, json!({"attempt": 1, "jobName": "a-1"})));
+    assert_eq!(world.asks(&b), wait(1));
+    world.shows(&submission("a", "x", 1, ended(1)));
+    assert_eq!(world.woken(), ["b"]);
+    assert_eq!(world.turn(&b), Turn::Go);
+
+    // The first one's later attempt is not let past.
+    let mut resumed = submission("a", "x", 1, ended(1));
+    resumed.spec.attempt = 2;
+    world.shows(&resumed);
+    assert!(matches!(world.asks(&resumed), Turn::Wait { position: 1, .. }));
+}
+
+#[test]
+fn who_did_not_start_holds_no_slot() {
+    let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
+    let world = World::new(one(), &[&a, &b]);
+    assert_eq!((world.asks(&a), world.asks(&b)), (Turn::Go, wait(1)));
+    // Its reconcile found that the Leaderboard is no longer ready.
+    world.slots.leaves(&a);
+    assert_eq!(world.woken(), ["b"]);
+    assert_eq!((world.turn(&a), world.turn(&b)), (Turn::NotInLine, Turn::Go));
+}
+
+#[test]
+fn who_is_cancelled_or_deleted_holds_no_slot_and_no_place() {
+    for cancel in [true, false] {
+        let all: Vec<_> = (1..=3).map(|n| submission(&n.to_string(), "x", n, json!({}))).collect();
+        let world = World::new(one(), &[&all[0], &all[1], &all[2]]);
+        let turns: Vec<_> = all.iter().map(|object| world.asks(object)).collect();
+        assert_eq!(turns, [Turn::Go, wait(1), wait(2)]);
+        for object in &all[..2] {
+            let mut gone = object.clone();
+            gone.spec.cancel = cancel;
+            gone.metadata.deletion_timestamp = (!cancel).then(|| time(9));
+            world.shows(&gone);
+        }
+        assert_eq!(world.woken(), ["3"]);
+        assert_eq!(world.turn(&all[2]), Turn::Go);
+    }
+}
+
+#[test]
+fn one_that_is_gone_before_it_joins_holds_nothing() {
+    let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
+    let world = World::new(one(), &[&a, &b]);
+    // Its last reconcile was under way.
+    world.slots.submission(&a, true);
+    assert_eq!(world.asks(&a), Turn::NotInLine);
+    assert_eq!(world.asks(&b), Turn::Go);
+    world.slots.submission(&b, true);
+    world.slots.leaderboard(&world.leaderboard, true);
+    assert!(
+        world.slots.lock().by_board.is_empty(),
+        "nothing is kept of what is gone"
+    );
+}
+
+#[test]
+fn nobody_waits_for_one_that_evalai_is_still_asked_about() {
+    let asking = json!({"conditions": [condition("Accepted", "Unknown")]});
+    let (a, b) = (submission("a", "x", 1, asking), submission("b", "y", 2, json!({})));
+    let world = World::new(one(), &[&a, &b]);
+    assert_eq!(world.turn(&a), Turn::NotInLine, "it has not joined");
+    assert_eq!(world.asks(&b), Turn::Go);
+    assert_eq!(world.asks(&a), wait(1));
+}
+
+#[test]
+fn between_two_tries_the_slot_is_kept_also_by_another_leader() {
+    let replacing = json!({"attempt": 1, "retry": 1, "times": {"started": time(5)}});
+    let (a, b) = (submission("a", "x", 9, replacing), submission("b", "y", 2, json!({})));
+    let mut world = World::new(one(), &[&a, &b]);
+    assert_eq!(world.asks(&b), wait(1));
+    assert_eq!(world.turn(&a), Turn::Go);
+    world.becomes(leaderboard(&json!({"total": 1}), true));
+    let turn = world.asks(&a);
+    assert!(
+        matches!(turn, Turn::Paused { .. }),
+        "a paused Leaderboard makes no Job: {turn:?}"
+    );
+    world.woken();
+    world.becomes(one());
+    assert!(world.woken().contains(&"a".to_owned()));
+    assert_eq!((world.turn(&a), world.turn(&b)), (Turn::Go, wait(1)));
+}
+
+#[test]
+fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
+    let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
+    let slots = Arc::new(SlotAllocator::default());
+    let mut job = Job::default();
+    job.metadata.name = Some("a-1".into());
+    job.metadata.namespace = Some("ns".into());
+    job.metadata.labels = Some([(names::LABEL_LEADERBOARD.to_owned(), "lb".to_owned())].into());
+    let owner = OwnerReference {
+        uid: "a".into(),
+        ..OwnerReference::default()
+    };
+    job.metadata.owner_references = Some(vec![owner]);
+    let job = Arc::new(job);
+    let all = [Arc::new(a.clone()), Arc::new(b.clone())];
+    slots.start(&[Arc::new(one())], &[Arc::clone(&job)], &all);
+    let mut world = World {
+        slots,
+        leaderboard: one(),
+    };
+    assert_eq!(world.asks(&b), wait(1));
+    world.slots.job(&job, true);
+    assert_eq!(world.woken(), ["b"]);
+    // One of an earlier attempt that has ended has none.
+    let mut resumed = submission("c", "x", 3, ended(1));
+    resumed.spec.attempt = 2;
+    let mut job = Job::clone(&job);
+    job.metadata.name = Some("c-1".into());
+    job.metadata.owner_references.as_mut().unwrap()[0].uid = "c".into();
+    world.slots.job(&job, false);
+    world.shows(&resumed);
+    world.becomes(leaderboard(&json!({"total": 2}), false));
+    world.slots.allocate();
+    assert_eq!(world.asks(&resumed), Turn::Go);
+}
+
+#[test]
+fn no_slot_is_granted_before_the_caches_are_there() {
+    let slots = Arc::new(SlotAllocator::default());
+    let world = World {
+        slots,
+        leaderboard: one(),
+    };
+    let (a, b) = (
+        submission("a", "x", 1, json!({})),
+        submission("b", "y", 2, json!({"jobName": "b-1"})),
+    );
+    world.slots.leaderboard(&one(), false);
+    world.shows(&a);
+    assert_eq!(world.asks(&a), Turn::NotInLine);
+    let all = [Arc::new(a.clone()), Arc::new(b)];
+    world.slots.start(&[Arc::new(one())], &[], &all);
+    assert_eq!(world.woken(), ["a"]);
+    assert_eq!(world.turn(&a), wait(1));
+}
+
+#[test]
+fn without_limits_a_slot_costs_no_hop() {
+    let a = submission("a", "x", 1, json!({}));
+    let mut world = World::new(leaderboard(&json!({}), false), &[&a]);
+    assert_eq!(world.turn(&a), Turn::Go);
+    world.becomes(leaderboard(&json!({}), true));
+    assert_eq!(world.turn(&a), Turn::NotInLine);
+    assert_eq!(world.asks(&a), Turn::Paused { position: 1 });
+}
+
+#[test]
+fn a_pause_or_a_lower_limit_takes_back_what_was_not_used() {
+    let two = || leaderboard(&json!({"total": 2}), false);
+    let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
+    let mut world = World::new(two(), &[&a, &b]);
+    assert_eq!((world.asks(&a), world.asks(&b)), (Turn::Go, Turn::Go));
+    // Its Job is being created when the pause comes.
+    world.slots.starts(&a);
+    world.becomes(leaderboard(&json!({"total": 2}), true));
+    assert_eq!((world.turn(&a), world.turn(&b)), (Turn::Go, Turn::NotInLine));
+    assert_eq!(world.woken(), ["b"]);
+    assert_eq!(world.turn(&b), Turn::Paused { position: 1 });
+    world.becomes(one());
+    assert_eq!(world.woken(), ["b"]);
+    assert_eq!(world.turn(&b), wait(1));
+    world.becomes(two());
+    assert_eq!(world.woken(), ["b"]);
+    assert_eq!(world.turn(&b), Turn::Go);
+    // One that could not be created is taken back as well.
+    world.slots.did_not_start(&a);
+    world.becomes(leaderboard(&json!({"total": 2}), true));
+    assert_eq!(world.woken(), ["a", "b"]);
+    assert!(matches!(world.turn(&a), Turn::Paused { .. }));
+}
+
+#[test]
+fn the_line_knows_who_was_served_and_how_long_runs_take() {
+    let running = json!({"attempt": 1, "jobName": "j", "times": {"scheduled": time(2000)}});
+    let all = [
+        submission("x-old", "x", 1, ended(1)),
+        submission("x-now", "x", 2, running),
+        submission("x-next", "x", 3, json!({})),
+        submission("y-next", "y", 4, json!({})),
+    ];
+    let world = World::new(one(), &[&all[0], &all[1], &all[2], &all[3]]);
+    let expected = |position, eta: &str| Turn::Wait {
+        position,
+        eta: Some(eta.into()),
+    };
+    world.joins(&all[2]);
+    world.joins(&all[3]);
+    assert_eq!(world.woken(), ["x-next", "y-next"]);
+    assert_eq!(world.turn(&all[3]), expected(1, "20-30 min"));
+    assert_eq!(world.turn(&all[2]), expected(2, "40-60 min"));
+    // With the one that has ended goes what was known of runs.
+    world.slots.submission(&all[0], true);
+    world.slots.allocate();
+    assert_eq!(world.turn(&all[3]), wait(1));
+}
+
+#[test]
+fn only_those_whose_turn_has_changed_are_woken() {
+    let all: Vec<_> = (0..300)
+        .map(|n| submission(&format!("{n:03}"), "x", n, json!({})))
+        .collect();
+    let world = World::new(one(), &all.iter().collect::<Vec<_>>());
+    for object in &all {
+        world.joins(object);
+    }
+    assert_eq!(world.woken().len(), 300, "each has to know its place");
+    let turn = |n: usize| world.turn(&all[n]);
+    assert_eq!((turn(0), turn(299)), (Turn::Go, wait(299)));
+    for object in &all {
+        world.joins(object);
+    }
+    assert_eq!(world.woken(), [""; 0], "nothing is new");
+    world.slots.starts(&all[0]);
+    world.shows(&submission(
+        "000",
+        "x",
+        0,
+        json!({"jobName": "j", "progress": {"done": 1, "total": 4, "text": "1/4"}}),
+    ));
+    assert_eq!(world.woken(), [""; 0], "nobody moves by it");
+    world.shows(&submission("000", "x", 0, ended(1)));
+    let woken = world.woken();
+    assert_eq!(
+        (turn(1), turn(2), turn(299)),
+        (
+            Turn::Go,
+            Turn::Wait {
+                position: 1,
+                eta: Some("20-30 min".into())
+            },
+            turn(299)
+        )
+    );
+    let first: Vec<String> = (1..=20).map(|n| format!("{n:03}")).collect();
+    assert_eq!(woken, first, "a step is news in the first places only");
+    // Each learns of its place before it is there.
+    let mut last = all[0].clone();
+    let mut woken = Vec::new();
+    for object in &all[1..250] {
+        world.slots.leaves(object);
+        woken.extend(world.woken().into_iter().filter(|name| name == "299"));
+        last = object.clone();
+    }
+    assert_eq!(last.name_any(), "249");
+    assert!((10..60).contains(&woken.len()), "{}", woken.len());
+    assert_eq!(turn(299).position(), 49);
+}
+
+#[tokio::test]
+async fn a_burst_is_worked_out_together() {
+    let all: Vec<_> = (0..50)
+        .map(|n| submission(&format!("{n:02}"), "x", n, json!({})))
+        .collect();
+    let world = World::new(one(), &all.iter().collect::<Vec<_>>());
+    let mut woken = world.slots.woken().boxed();
+    assert_eq!(woken.next().now_or_never(), None, "nobody waits");
+    for object in &all {
+        world.joins(object);
+    }
+    let mut names = Vec::new();
+    for _ in &all {
+        names.push(woken.next().await.unwrap().name);
+    }
+    names.sort();
+    names.dedup();
+    assert_eq!(names.len(), 50, "each is woken once");
+    assert_eq!(woken.next().now_or_never(), None);
+}
+
+#[test]
+fn a_change_of_the_leaderboard_wakes_those_without_a_job() {
+    let refused = json!({"jobName": "d-1", "reason": leaderboard_api::reasons::NOT_ISOLATED});
+    let running = json!({"jobName": "b-1", "reason": "Running"});
+    let all = [
+        submission("a", "x", 1, json!({"reason": "LeaderboardNotReady"})),
+        submission("b", "x", 2, running),
+        submission("c", "x", 3, ended(1)),
+        submission("d", "x", 4, refused),
+    ];
+    let world = World::new(leaderboard(&json!({}), false), &[&all[0], &all[1], &all[2], &all[3]]);
+    let reference = ObjectRef::from_obj(&world.leaderboard);
+    world.slots.wake_pending(&reference);
+    assert_eq!(world.woken(), ["a", "d"]);
+    world.slots.wake_pending(&ObjectRef::new("other").within("ns"));
+    assert_eq!(world.woken(), [""; 0]);
+}
+
+#[test]
+fn counts_follow_each_change() {
+    let mut a = submission("a", "x", 1, json!({"state": "Pending"}));
+    let world = World::new(one(), &[&a, &submission("b", "y", 1, json!({"state": "Running"}))]);
+    let counts = |world: &World| {
+        let (counts, in_use) = world.slots.census(&world.leaderboard);
+        (counts.pending, counts.running, counts.finished, in_use)
+    };
+    assert_eq!(counts(&world), (1, 1, 0, 2));
+    assert!(!world.slots.submission(&a, false), "nothing has changed");
+    a.status = serde_json::from_value(json!({
+        "state": "Finished", "conditions": [condition("Finished", "True"), condition("Published", "False")],
+    }))
+    .unwrap();
+    assert!(world.slots.submission(&a, false));
+    assert_eq!(counts(&world), (0, 1, 1, 2), "its end is not published yet");
+    let status = a.status.as_mut().unwrap();
+    status.conditions[1].status = "True".into();
+    assert!(world.slots.submission(&a, false));
+    assert_eq!(counts(&world), (0, 1, 1, 1));
+    assert!(world.slots.submission(&a, true));
+    assert_eq!(counts(&world), (0, 1, 0, 1));
+    let other = Leaderboard::new("other", LeaderboardSpec::clone(&world.leaderboard.spec));
+    assert_eq!(world.slots.census(&other).1, 0);
+}

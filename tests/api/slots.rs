@@ -1,0 +1,103 @@
+//! Slots of a Leaderboard as the whole controller grants them: no more Jobs than slots, places in line, and a new leader that
+//! counts what the old one started.
+
+use k8s_openapi::api::batch::v1::Job;
+use kube::api::{Api, Patch, PatchParams};
+use kube::runtime::wait::await_condition;
+use leaderboard_api::{Leaderboard, Submission, reasons};
+use serde_json::json;
+use tokio::time::timeout;
+
+use super::bridge::{LIMIT, StandIn};
+use super::objects::{Kind, create};
+use super::operator::Operator;
+use crate::support::apiserver::server;
+
+const NAME: &str = "carla";
+
+struct World {
+    aws: StandIn,
+    namespace: String,
+}
+
+impl World {
+    /// A Leaderboard with one slot.
+    async fn new() -> Self {
+        let world = Self {
+            aws: StandIn::start().await,
+            namespace: server().await.namespace("slots").await,
+        };
+        let storage = json!({"bucket": world.aws.name("bucket"), "endpoint": world.aws.endpoint});
+        let patch = json!({"spec": {"storage": storage, "running": {"total": 1}}});
+        let api = Kind::Leaderboard.api(&server().await.client(), &world.namespace);
+        create(&api, Kind::Leaderboard.object(NAME, &[&patch]), false)
+            .await
+            .unwrap();
+        world
+    }
+
+    async fn operator(&self) -> Operator {
+        Operator::start(&self.namespace, self.aws.aws.clone()).await
+    }
+
+    async fn submit(&self, name: &str) {
+        let api = Kind::Submission.api(&server().await.client(), &self.namespace);
+        let patch = json!({"spec": {"leaderboard": NAME}});
+        create(&api, Kind::Submission.object(name, &[&patch]), false)
+            .await
+            .unwrap();
+    }
+
+    async fn edit(&self, spec: serde_json::Value) {
+        let api: Api<Leaderboard> = Api::namespaced(server().await.client(), &self.namespace);
+        let patch = Patch::Merge(json!({ "spec": spec }));
+        api.patch(NAME, &PatchParams::default(), &patch).await.unwrap();
+    }
+
+    async fn has_job(&self, submission: &str) {
+        let jobs: Api<Job> = Api::namespaced(server().await.client(), &self.namespace);
+        let name = format!("{submission}-1");
+        let made = await_condition(jobs, &name, |job: Option<&Job>| job.is_some());
+        timeout(LIMIT, made).await.expect("a Job is made").unwrap();
+    }
+
+    /// Waits until a submission shows this reason and place.
+    async fn shows(&self, name: &str, reason: &str, position: i32) {
+        let api: Api<Submission> = Api::namespaced(server().await.client(), &self.namespace);
+        let found = |object: Option<&Submission>| {
+            let status = object.and_then(|object| object.status.as_ref());
+            status.is_some_and(|status| {
+                let place = status.waiting.as_ref().map(|waiting| waiting.position);
+                status.reason.as_deref() == Some(reason) && place == Some(position) && status.job.is_none()
+            })
+        };
+        if timeout(LIMIT, await_condition(api.clone(), name, found)).await.is_err() {
+            let status = api.get(name).await.unwrap().status;
+            panic!("{name} is not at {position} ({reason}): {status:?}");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_slot_is_one_job_also_after_a_takeover() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    world.submit("one").await;
+    world.has_job("one").await;
+    world.submit("two").await;
+    world.shows("two", reasons::WAITING_FOR_SLOT, 1).await;
+    operator.end().await;
+
+    let operator = world.operator().await;
+    world.submit("three").await;
+    world.shows("three", reasons::WAITING_FOR_SLOT, 2).await;
+    world.edit(json!({"paused": true})).await;
+    world.shows("two", reasons::PAUSED, 1).await;
+    world.shows("three", reasons::PAUSED, 2).await;
+    world.edit(json!({"paused": false, "running": {"total": 2}})).await;
+    world.has_job("two").await;
+    world.shows("three", reasons::WAITING_FOR_SLOT, 1).await;
+    world.edit(json!({"running": null})).await;
+    world.has_job("three").await;
+    operator.end().await;
+}
