@@ -120,7 +120,7 @@ fn has_slot(object: &Submission) -> bool {
 
 fn may_start(object: &Submission) -> bool {
     let is_leaving = object.spec.cancel || object.metadata.deletion_timestamp.is_some();
-    !is_leaving && !is_finished(object) && object.status.as_ref().unwrap().job.is_none()
+    !is_leaving && !is_finished(object) && object.status.as_ref().unwrap().job_name.is_none()
 }
 
 impl World {
@@ -217,7 +217,7 @@ impl World {
         let Some(known) = self.all.get(n) else { return };
         let object = known.real.clone();
         if !may_start(&object) {
-            if object.status.as_ref().unwrap().job.is_none() {
+            if object.status.as_ref().unwrap().job_name.is_none() {
                 self.line.leaves(uid(&object));
             }
             return;
