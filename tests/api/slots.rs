@@ -28,7 +28,7 @@ impl World {
             namespace: server().await.namespace("slots").await,
         };
         let storage = json!({"bucket": world.aws.name("bucket"), "endpoint": world.aws.endpoint});
-        let patch = json!({"spec": {"storage": storage, "running": {"total": 1}}});
+        let patch = json!({"spec": {"storage": storage, "concurrency": {"total": 1}}});
         let api = Kind::Leaderboard.api(&server().await.client(), &world.namespace);
         create(&api, Kind::Leaderboard.object(NAME, &[&patch]), false)
             .await
@@ -42,7 +42,7 @@ impl World {
 
     async fn submit(&self, name: &str) {
         let api = Kind::Submission.api(&server().await.client(), &self.namespace);
-        let patch = json!({"spec": {"leaderboard": NAME}});
+        let patch = json!({"spec": {"leaderboardName": NAME}});
         create(&api, Kind::Submission.object(name, &[&patch]), false)
             .await
             .unwrap();
@@ -68,7 +68,7 @@ impl World {
             let status = object.and_then(|object| object.status.as_ref());
             status.is_some_and(|status| {
                 let place = status.waiting.as_ref().map(|waiting| waiting.position);
-                status.reason.as_deref() == Some(reason) && place == Some(position) && status.job.is_none()
+                status.reason.as_deref() == Some(reason) && place == Some(position) && status.job_name.is_none()
             })
         };
         if timeout(LIMIT, await_condition(api.clone(), name, found)).await.is_err() {
@@ -94,10 +94,10 @@ async fn one_slot_is_one_job_also_after_a_takeover() {
     world.edit(json!({"paused": true})).await;
     world.shows("two", reasons::PAUSED, 1).await;
     world.shows("three", reasons::PAUSED, 2).await;
-    world.edit(json!({"paused": false, "running": {"total": 2}})).await;
+    world.edit(json!({"paused": false, "concurrency": {"total": 2}})).await;
     world.has_job("two").await;
     world.shows("three", reasons::WAITING_FOR_SLOT, 1).await;
-    world.edit(json!({"running": null})).await;
+    world.edit(json!({"concurrency": null})).await;
     world.has_job("three").await;
     operator.end().await;
 }
