@@ -2,7 +2,7 @@
 //! for what its sweep of EvalAI finds.
 //!
 //! `decide_ingest` is pure and holds all policy; `apply` carries it out and is safe twice: names are deterministic,
-//! a bump carries the resourceVersion it was decided on. Knows no queue, and of EvalAI only what a swept row says.
+//! a bump carries the resourceVersion it was decided on. Knows no queue, and of EvalAI only what a swept row shows.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -23,19 +23,19 @@ pub const SWEEP_AGE_MS: i64 = 120_000;
 
 /// Longest time one request to the API server may take.
 const CALL_LIMIT: Duration = Duration::from_secs(8);
-/// How often a lost race is looked at again before the caller has to come back later.
+/// How often a lost race is run again before the caller has to come back later.
 const ROUNDS: usize = 6;
 /// So many attempts begin without a message after one that came. EvalAI lets only hosts resume, but lets participants write their
-/// row's status and times: more would be runs that nobody has granted. One is enough for a resume whose message was lost; a person
+/// row's status and times: more would be runs without a grant. One is enough for a resume whose message was lost; a person
 /// who wants another one raises `spec.attempt`.
 const MOST_WITHOUT_MESSAGE: usize = 1;
 
-/// Who says that a submission wants to run.
+/// Where a submission that is to run comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// A message, by its id.
     Message(String),
-    /// The sweep of EvalAI's lists, whose row says this.
+    /// The sweep of EvalAI's lists, whose row shows this.
     Sweep(Swept),
 }
 
@@ -59,7 +59,7 @@ pub struct Incoming {
     pub submission: i64,
     /// The participant's image, if it is known.
     pub image: Option<String>,
-    /// Who says so.
+    /// Where it comes from.
     pub source: Source,
     /// When, in milliseconds since 1970: SQS's SentTimestamp, or for the sweep the row's `rerun_resumed_at`, else its
     /// `submitted_at`.
@@ -110,7 +110,7 @@ pub enum Outcome {
     Repeat,
     /// The old one is being deleted: come back when it is gone.
     Deleting,
-    /// The name belongs to another leaderboard, challenge or phase; the text says to which.
+    /// The name belongs to another leaderboard, challenge or phase; the text names them.
     IdTaken(String),
 }
 
@@ -132,20 +132,20 @@ impl std::fmt::Display for Outcome {
 #[derive(Debug, Error)]
 pub enum IngestError {
     /// The API server did not answer in time.
-    #[error("the API server did not answer within {} s while Submission {name} was to be {verb}; it is tried again", CALL_LIMIT.as_secs())]
+    #[error("the API server did not answer within {} s while Submission {name} was to be {verb}; it is retried", CALL_LIMIT.as_secs())]
     Timeout { name: String, verb: &'static str },
     /// The API server will not take this object.
     #[error("the API server refuses Submission {name}: {text}")]
     Refused { name: String, text: String },
     /// The API server answered with an error that may pass.
-    #[error("Submission {name} could not be {verb}: {text}; it is tried again")]
+    #[error("Submission {name} could not be {verb}: {text}; it is retried")]
     Failed {
         name: String,
         verb: &'static str,
         text: String,
     },
     /// Others changed the object each time.
-    #[error("Submission {name} changed {ROUNDS} times while it was to be bumped; it is tried again")]
+    #[error("Submission {name} changed {ROUNDS} times while it was to be bumped; it is retried")]
     Contended { name: String },
 }
 
@@ -199,7 +199,7 @@ fn is_ended(existing: &Submission) -> bool {
     existing.status.as_ref().is_some_and(|status| {
         conditions::is_true(&status.conditions, conditions::FINISHED)
             && matches!(status.state, Some(State::Failed | State::Cancelled))
-            // A raised attempt that the controller has not looked at yet still shows the end of the one before.
+            // A raised attempt that the controller has not read yet still shows the end of the one before.
             && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
     })
 }
@@ -214,7 +214,7 @@ fn is_resumable(existing: &Submission) -> bool {
 /// True if this was sent after what made or bumped the object.
 fn is_newer(existing: &Submission, incoming: &Incoming) -> bool {
     let Some(recorded) = Ingested::of(existing) else {
-        // Made by hand: only what was sent after it was made is a wish to resume it.
+        // Made by hand: only what was sent after it was made is a request to resume it.
         let created = existing.metadata.creation_timestamp.as_ref();
         return created.is_some_and(|time| incoming.sent_ms >= time.0.as_millisecond() + 1000);
     };
@@ -367,7 +367,7 @@ async fn note(
     unless_lost(&[404, 409], name, "bumped", api.patch(name, &params, &patch)).await
 }
 
-/// True if the request was carried out, false if it lost a race, which these statuses tell.
+/// True if the request was carried out, false if it lost a race, which these statuses show.
 async fn unless_lost<T>(
     lost: &[u16],
     name: &str,

@@ -62,7 +62,7 @@ async fn a_refusal_for_good_is_told_from_a_passing_failure() {
     let text = failed.unwrap_err().to_string();
     assert_eq!(
         text,
-        "Submission submission-3 could not be created: Forbidden indeed; it is tried again"
+        "Submission submission-3 could not be created: Forbidden indeed; it is retried"
     );
 }
 

@@ -61,7 +61,7 @@ fn with_state(mut made: Submission, state: State) -> Submission {
     made
 }
 
-/// The object after a bump was carried out and the controller has not looked yet.
+/// The object after a bump was carried out and the controller has not read it yet.
 fn bumped(mut made: Submission, by: &Incoming) -> Submission {
     made.spec.attempt += 1;
     let (key, text) = annotation(&record(Some(&made), by, made.spec.attempt));
@@ -145,16 +145,16 @@ fn a_resume_bumps_what_has_failed_or_was_cancelled() {
     check("pending", &in_state(State::Pending), &resume, &REPEAT);
     check("running", &in_state(State::Running), &resume, &REPEAT);
     check("resumed", &in_state(State::Resumed), &resume, &REPEAT);
-    check("not looked at by the controller", &made_by(&first), &resume, &REPEAT);
+    check("not read by the controller", &made_by(&first), &resume, &REPEAT);
     let fresh = bumped(in_state(State::Failed), &resume);
     check(
-        "the resume again, before the controller looked",
+        "the resume again, before the controller read it",
         &fresh,
         &resume,
         &REPEAT,
     );
     check(
-        "the next one, before the controller looked",
+        "the next one, before the controller read it",
         &fresh,
         &message("c", 300_000),
         &REPEAT,
@@ -291,7 +291,7 @@ fn a_resume_without_a_message_counts_also_where_its_object_is_gone() {
 
 #[test]
 fn a_row_that_was_run_before_makes_no_object_without_a_message() {
-    let swept = |says| incoming(Source::Sweep(says), 300_000);
+    let swept = |kind| incoming(Source::Sweep(kind), 300_000);
     assert_eq!(decide_ingest(BOARD, None, &swept(Swept::Edited)), Ingest::NotNew);
     assert!(matches!(
         decide_ingest(BOARD, None, &message("a", 300_000)),

@@ -25,7 +25,7 @@ pub(super) struct Connection {
     endpoint: Option<String>,
 }
 
-/// The queues that Leaderboards name, each reached as the oldest of them says.
+/// The queues that Leaderboards name, each reached by the connection of the oldest of them.
 pub(super) fn desired(leaderboards: &[Arc<Leaderboard>]) -> BTreeMap<String, Connection> {
     let urls: BTreeSet<&String> = leaderboards
         .iter()

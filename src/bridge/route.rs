@@ -20,7 +20,7 @@ const SHORT_WAIT: i32 = 60;
 /// A message as the policy sees it.
 #[derive(Clone, Debug)]
 pub struct Envelope {
-    /// What it says.
+    /// What it holds.
     pub content: Result<Message, Malformed>,
     /// When it was sent.
     pub sent_ms: i64,

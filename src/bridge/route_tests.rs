@@ -96,7 +96,7 @@ fn a_known_message_goes_to_its_leaderboard() {
         &to("a"),
     );
     check(
-        "nobody reads the queue any more",
+        "no Leaderboard reads the queue any more",
         &envelope(1, 2, 0),
         &[],
         true,
@@ -193,7 +193,7 @@ fn of_two_that_claim_a_phase_the_older_serves_it() {
     assert_eq!(
         names(vec![queue(board("b", 10)), queue(board("a", 10))]),
         ["a", "b"],
-        "then the name tells"
+        "then the name decides"
     );
     let older_leaves = with(queue(board("b", 10)), |lb| {
         lb.metadata.deletion_timestamp = lb.metadata.creation_timestamp.clone();

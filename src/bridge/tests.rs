@@ -119,7 +119,7 @@ async fn the_end_of_a_task_ends_the_bridge_by_its_name() {
         }
         telemetry.tasks.end(name);
         let ended = tokio::time::timeout(Duration::from_mins(1), bridge).await;
-        let result = ended.unwrap_or_else(|_| panic!("the bridge goes on without {name}"));
+        let result = ended.unwrap_or_else(|_| panic!("the bridge continues without {name}"));
         assert_eq!(result.unwrap().unwrap_err().task, name);
     }
 }

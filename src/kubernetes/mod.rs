@@ -66,7 +66,7 @@ fn client_with(mut config: kube::Config, read_timeout: Duration) -> Result<Clien
     Client::try_from(config)
 }
 
-/// The API of a kind, in one namespace or in all. A malformed object is an item that says so, and fails no list.
+/// The API of a kind, in one namespace or in all. A malformed object is an item of its own kind, and fails no list.
 pub fn guarded<K>(client: Client, namespace: Option<&str>) -> Api<DeserializeGuard<K>>
 where
     K: Watchable + Resource<Scope = NamespaceResourceScope>,

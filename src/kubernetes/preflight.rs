@@ -93,7 +93,7 @@ async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
     let version = GroupVersion::gv(GROUP, VERSION);
     let served = match timeout(CALL_TIMEOUT, discovery::pinned_group(client, &version)).await {
         Ok(Ok(group)) => group.versioned_resources(VERSION),
-        // For an unknown group the server answers plain text, so that only the code says what it means.
+        // For an unknown group the server answers plain text, so that only the code is used.
         Ok(Err(kube::Error::Api(status))) if status.code == 404 => Vec::new(),
         // For a group without kinds discovery has an error of its own.
         Ok(Err(kube::Error::Discovery(_))) => Vec::new(),

@@ -99,7 +99,7 @@ impl<K: Watchable> Watch<K> {
     }
 }
 
-/// Starts to watch a kind until the process stops. `trim` drops what nobody reads, before it is cached; managed fields go
+/// Starts to watch a kind until the process stops. `trim` drops what is never read, before it is cached; managed fields go
 /// anyway. Until the first list is complete, the process is not ready.
 pub fn spawn_watch<K: Watchable>(
     api: Api<DeserializeGuard<K>>,

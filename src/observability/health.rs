@@ -35,22 +35,22 @@ pub struct HealthServer {
 }
 
 impl HealthServer {
-    /// Listens on an address; port 0 takes a free one. It serves on while the process stops, so that a probe is told.
+    /// Listens on an address; port 0 takes a free one. It serves on while the process stops, so that a probe gets an answer.
     ///
     /// # Errors
     /// If the address cannot be bound.
-    pub async fn start(address: SocketAddr, seen: Observability) -> Result<Self, HealthError> {
+    pub async fn start(address: SocketAddr, telemetry: Observability) -> Result<Self, HealthError> {
         let bind = |source| HealthError::Bind { address, source };
         let listener = TcpListener::bind(address).await.map_err(bind)?;
         let address = listener.local_addr().map_err(bind)?;
         let (close, closed) = oneshot::channel();
-        let tasks = seen.tasks.clone();
+        let tasks = telemetry.tasks.clone();
         let task = tasks.may_end("health server", async move {
-            let served = axum::serve(listener, router(seen)).with_graceful_shutdown(async {
+            let served = axum::serve(listener, router(telemetry)).with_graceful_shutdown(async {
                 // Closed and dropped are the same to the server.
                 let _ = closed.await;
             });
-            // It ends when it is closed, and by no error: one that can't accept a connection waits and goes on.
+            // It ends when it is closed, and by no error: one that can't accept a connection waits and continues.
             let _ = served.await;
         });
         tracing::info!(%address, "serving /livez, /readyz and /metrics");
@@ -71,28 +71,28 @@ impl HealthServer {
 }
 
 /// The three pages.
-pub fn router(seen: Observability) -> Router {
+pub fn router(telemetry: Observability) -> Router {
     Router::new()
         .route("/livez", get(livez))
         .route("/readyz", get(readyz))
         .route("/metrics", get(metrics_page))
-        .with_state(seen)
+        .with_state(telemetry)
 }
 
-async fn livez(State(seen): State<Observability>) -> Response {
-    page(&seen.liveness.problems())
+async fn livez(State(telemetry): State<Observability>) -> Response {
+    page(&telemetry.liveness.problems())
 }
 
-async fn readyz(State(seen): State<Observability>) -> Response {
-    let mut missing = seen.readiness.missing();
-    if seen.stop.is_set() {
+async fn readyz(State(telemetry): State<Observability>) -> Response {
+    let mut missing = telemetry.readiness.missing();
+    if telemetry.stop.is_set() {
         missing.insert(0, "running: the process is stopping".to_owned());
     }
     page(&missing)
 }
 
-async fn metrics_page(State(seen): State<Observability>) -> Response {
-    match seen.metrics.text() {
+async fn metrics_page(State(telemetry): State<Observability>) -> Response {
+    match telemetry.metrics.text() {
         Ok(text) => ([(CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),
         Err(error) => (
             StatusCode::INTERNAL_SERVER_ERROR,
@@ -133,8 +133,8 @@ mod tests {
     #[tokio::test]
     async fn readyz_names_what_is_missing_and_turns_when_the_process_stops() {
         let (sender, stop) = Stop::new();
-        let seen = Observability::new(stop);
-        let server = HealthServer::start(([127, 0, 0, 1], 0).into(), seen.clone())
+        let telemetry = Observability::new(stop);
+        let server = HealthServer::start(([127, 0, 0, 1], 0).into(), telemetry.clone())
             .await
             .unwrap();
         let (code, answer) = get(server.address(), "/readyz").await;
@@ -142,15 +142,16 @@ mod tests {
             (code, body(&answer)),
             (503, "process: starting; not all checks are registered\n")
         );
-        seen.readiness
+        telemetry
+            .readiness
             .set("submissions synced", Err("the list has not come yet".into()));
-        seen.readiness.registered();
+        telemetry.readiness.registered();
         let (code, answer) = get(server.address(), "/readyz").await;
         assert_eq!(
             (code, body(&answer)),
             (503, "submissions synced: the list has not come yet\n")
         );
-        seen.readiness.set("submissions synced", Ok(()));
+        telemetry.readiness.set("submissions synced", Ok(()));
         let (code, answer) = get(server.address(), "/readyz").await;
         assert_eq!((code, body(&answer)), (200, "ok\n"));
         sender.send(true).unwrap();
@@ -164,8 +165,8 @@ mod tests {
     #[tokio::test]
     async fn a_fresh_process_is_alive_and_its_metrics_are_openmetrics() {
         let (_sender, stop) = Stop::new();
-        let seen = Observability::new(stop);
-        let server = HealthServer::start(([127, 0, 0, 1], 0).into(), seen.clone())
+        let telemetry = Observability::new(stop);
+        let server = HealthServer::start(([127, 0, 0, 1], 0).into(), telemetry.clone())
             .await
             .unwrap();
         let (code, answer) = get(server.address(), "/livez").await;
@@ -179,11 +180,11 @@ mod tests {
     #[tokio::test]
     async fn a_taken_address_is_an_error_that_names_it() {
         let (_sender, stop) = Stop::new();
-        let seen = Observability::new(stop);
-        let server = HealthServer::start(([127, 0, 0, 1], 0).into(), seen.clone())
+        let telemetry = Observability::new(stop);
+        let server = HealthServer::start(([127, 0, 0, 1], 0).into(), telemetry.clone())
             .await
             .unwrap();
-        let error = HealthServer::start(server.address(), seen)
+        let error = HealthServer::start(server.address(), telemetry)
             .await
             .unwrap_err()
             .to_string();

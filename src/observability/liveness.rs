@@ -1,7 +1,7 @@
 //! Whether a restart would help: watches that stay broken while the API server answers.
 //!
 //! Kept by the watches themselves, read by the health server. An outage of the API server is no reason to restart, so a
-//! stuck watch counts only while somebody else gets answers. A task that ends needs no probe: it ends the process (`tasks`).
+//! stuck watch counts only while other calls are answered. A task that ends needs no probe: it ends the process (`tasks`).
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,12 +9,12 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// A watch that is broken for so long is not going to mend itself.
+/// A watch that is broken for so long does not recover by itself.
 const STUCK_AFTER: Duration = Duration::from_mins(10);
 /// The API server counts as answering for so long after an answer.
 const ANSWERED_LATELY: Duration = Duration::from_mins(1);
 /// A watch that has failed to start tries again within this time (back-off, and the longest that one try may hang).
-/// Without another failure by then it runs, though it may have nothing to say.
+/// Without another failure by then it runs, though it may have no news.
 const FAILS_AGAIN_WITHIN: Duration = Duration::from_mins(7);
 
 /// Clones are the same registry.
@@ -63,7 +63,7 @@ impl Liveness {
         }
     }
 
-    /// What a restart would cure, one sentence each. Empty: alive.
+    /// What a restart would fix, one sentence each. Empty: alive.
     pub fn problems(&self) -> Vec<String> {
         let (state, now) = (self.lock(), Instant::now());
         if state.answered.is_none_or(|at| now - at >= ANSWERED_LATELY) {
@@ -82,7 +82,7 @@ impl Liveness {
     }
 }
 
-/// How a watch tells what it meets.
+/// How a watch reports what happens to it.
 #[derive(Debug)]
 pub struct WatchProbe {
     liveness: Liveness,
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn failing_to_start_for_ten_minutes_is_stuck_and_an_event_mends_it() {
+    async fn failing_to_start_for_ten_minutes_is_stuck_and_an_event_clears_it() {
         let liveness = Liveness::default();
         let watch = liveness.watch("pods");
         watch.listed();

@@ -10,10 +10,10 @@ use tracing_subscriber::filter::ParseError;
 use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::util::SubscriberInitExt;
 
-/// What is logged when nothing else is wished. The libraries' own warnings are repeated by us as sentences.
+/// What is logged by default. The libraries' own warnings are repeated by us as sentences.
 pub const DEFAULT_FILTER: &str = "info,kube_client=warn,kube_runtime=error,aws_config=warn,aws_smithy_runtime=warn,hyper=warn,hyper_util=warn,tower=warn,rustls=warn";
 
-/// How lines look.
+/// The format of a line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Format {
     /// Text on a terminal, else JSON.
@@ -111,7 +111,7 @@ pub(crate) mod tests {
         let writer = lines.clone();
         let subscriber = subscriber(format, filter, move || writer.clone(), is_terminal).unwrap();
         tracing::subscriber::with_default(subscriber, || {
-            let _span = tracing::info_span!("pass", submission = "submission-7").entered();
+            let _span = tracing::info_span!("reconcile", submission = "submission-7").entered();
             tracing::info!(attempt = 2, "started");
             tracing::debug!("a detail");
         });
@@ -212,7 +212,7 @@ pub(crate) mod tests {
         for fine in ["%error, \"why?\"", "a = b.c()?, \"x\"", "\"{error}\""] {
             assert!(!has_dump(fine), "{fine}");
         }
-        // In pieces, since this source is looked through too.
+        // In pieces, since this source is searched too.
         let source = r#"tracing:: info!(a = f(b), "smile ;)"); tracing:: warn!("{c:?}");"#.replace(":: ", "::");
         assert_eq!(macros(&source), [r#"a = f(b), "smile ;)""#, r#""{c:?}""#]);
     }

@@ -1,7 +1,7 @@
-//! What must be seen of a running process, and how it is told to stop: metrics, health, logs, the stop signal.
+//! What a running process shows, and how it is stopped: metrics, health, logs, the stop signal.
 //!
-//! Called by every program that stays: `controller` and `bridge`. Knows no Kubernetes object and no policy; parts tell
-//! it what they do and what they miss.
+//! Called by every program that stays: `controller` and `bridge`. Knows no Kubernetes object and no policy; parts report
+//! what they do and what they miss.
 
 pub mod health;
 pub mod liveness;
@@ -19,7 +19,7 @@ use readiness::Readiness;
 use shutdown::Stop;
 use tasks::Tasks;
 
-/// What every part of a process is handed: where it counts, where it says what it misses, and when it has to end.
+/// What every part of a process is handed: where it counts, where it reports what it misses, and when it has to end.
 #[derive(Clone, Debug)]
 pub struct Observability {
     pub metrics: Arc<Metrics>,

@@ -24,7 +24,7 @@ impl Default for Readiness {
 }
 
 impl Readiness {
-    /// Says how a named check stands: fine, or the sentence that says what is missing. A check that was never set is
+    /// Sets a named check: fine, or a sentence about what is missing. A check that was never set is
     /// not asked for, so each part sets its own to an error before it begins.
     pub fn set(&self, name: &str, state: Result<(), String>) {
         let mut checks = self.0.lock().unwrap_or_else(PoisonError::into_inner);

@@ -1,4 +1,4 @@
-//! The process's one stop signal: SIGTERM or SIGINT, seen by every part.
+//! The process's one stop signal: SIGTERM or SIGINT, for every part.
 //!
 //! Made once by `main`, cloned to all parts. What a part does about it is the part's own.
 
@@ -7,7 +7,7 @@ use std::io;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
 
-/// Exit code of a process that was told twice by Ctrl-C, as shells know it.
+/// Exit code after a second Ctrl-C, as shells know it.
 const INTERRUPTED: i32 = 130;
 
 /// Becomes true once and stays so.
@@ -29,7 +29,7 @@ impl Stop {
     /// Returns when the process has to end. Safe to drop and to call again.
     pub async fn wait(&self) {
         let mut receiver = self.0.clone();
-        // An error means that the sender is gone, hence that nobody is left who would want more work.
+        // An error means that the sender is gone, hence that no more work is wanted.
         let _ = receiver.wait_for(|stop| *stop).await;
     }
 
@@ -56,7 +56,7 @@ async fn listen(sender: watch::Sender<bool>, mut terminate: Signal, mut interrup
         _ = interrupt.recv() => "SIGINT",
     };
     tracing::info!(signal = name, "stopping; a second Ctrl-C ends the process at once");
-    // Without a receiver there is no part left to be told.
+    // Without a receiver no part is left.
     let _ = sender.send(true);
     interrupt.recv().await;
     std::process::exit(INTERRUPTED);

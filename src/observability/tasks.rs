@@ -1,7 +1,7 @@
 //! The tasks that a process lives by: one that ends or panics before the stop ends the process, which names it.
 //!
 //! Tasks are started here, by every part; the program's `run` waits for [`Tasks::failed`] next to its work. A process that
-//! goes on without one of its tasks looks alive and does half of its work; the kubelet starts a new one with empty hands.
+//! continues without one of its tasks is alive and does half of its work; the kubelet starts a new one.
 
 use std::any::Any;
 use std::fmt;
@@ -57,7 +57,7 @@ impl Tasks {
         self.start(name.into(), true, work)
     }
 
-    /// Starts a task that may end at any time: it has come to its end, or says in another way why it did not. Only a panic
+    /// Starts a task that may end at any time: it has come to its end, or reports in another way why it did not. Only a panic
     /// of it ends the process.
     pub fn may_end<T: Send + 'static>(
         &self,

@@ -38,7 +38,7 @@ pub struct LogEvent {
 /// What CloudWatch did not take.
 #[derive(thiserror::Error, Debug)]
 pub enum LogsError {
-    /// It said no.
+    /// It refused them.
     #[error("{op} {group}/{stream} in CloudWatch Logs: {why}. {HINT}")]
     Refused {
         /// What was done.
@@ -47,12 +47,12 @@ pub enum LogsError {
         group: String,
         /// The stream.
         stream: String,
-        /// Its words.
+        /// Its message.
         why: String,
         /// Whether the stream does not exist.
         missing: bool,
     },
-    /// It did not say anything: the events may be there or not.
+    /// It did not answer: the events may be there or not.
     #[error("{op} {group}/{stream} in CloudWatch Logs: no answer ({why}). {HINT}")]
     Unanswered {
         /// What was done.
@@ -61,7 +61,7 @@ pub enum LogsError {
         group: String,
         /// The stream.
         stream: String,
-        /// The client's words.
+        /// The client's message.
         why: String,
     },
 }

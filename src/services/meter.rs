@@ -1,6 +1,6 @@
 //! Counts what is asked of the services around the cluster: which service, what, with which outcome, how long it took.
 //!
-//! Every client here tells its calls; who listens is the process's business. All words are fixed, so that neither a secret
+//! Every client here reports its calls to one; what becomes of them is up to the process. All labels are fixed, so that neither a secret
 //! nor the name of an object can get into a metric.
 
 use std::fmt;
@@ -21,7 +21,7 @@ pub struct Call {
     pub service: &'static str,
     /// What was asked, as the service calls it.
     pub op: &'static str,
-    /// `ok`, the word of a failure, or `abandoned`.
+    /// `ok`, the kind of a failure, or `abandoned`.
     pub outcome: &'static str,
     /// From the first byte sent, retries included.
     pub took: Duration,
@@ -29,7 +29,7 @@ pub struct Call {
 
 type Listener = dyn Fn(&Call) + Send + Sync;
 
-/// Whoever listens. Clones tell the same listener; the default has none.
+/// A listener to calls. Clones have the same one; the default has none.
 #[derive(Clone, Default)]
 pub struct Meter(Option<Arc<Listener>>);
 
@@ -40,7 +40,7 @@ impl fmt::Debug for Meter {
 }
 
 impl Meter {
-    /// Tells `listener` of every call.
+    /// Reports every call to `listener`.
     pub fn new(listener: impl Fn(&Call) + Send + Sync + 'static) -> Self {
         Self(Some(Arc::new(listener)))
     }
@@ -134,14 +134,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_call_is_told_once_also_one_that_was_given_up() {
-        let told = Arc::new(Mutex::new(Vec::new()));
-        let listener = Arc::clone(&told);
+    fn every_call_is_reported_once_also_one_that_was_abandoned() {
+        let reported = Arc::new(Mutex::new(Vec::new()));
+        let listener = Arc::clone(&reported);
         let meter = Meter::new(move |call| listener.lock().unwrap().push((call.service, call.op, call.outcome)));
         meter.begin("s3", "GetObject").end("ok");
         drop(meter.clone().begin("evalai", "get_submission"));
         Meter::default().begin("s3", "GetObject").end("ok");
         let all = [("s3", "GetObject", "ok"), ("evalai", "get_submission", "abandoned")];
-        assert_eq!(*told.lock().unwrap(), all);
+        assert_eq!(*reported.lock().unwrap(), all);
     }
 }

@@ -12,6 +12,7 @@ use aws_sdk_dynamodb::Client;
 use aws_sdk_dynamodb::config::http::HttpResponse;
 use aws_sdk_dynamodb::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_dynamodb::operation::update_item::UpdateItemError;
+use aws_sdk_dynamodb::operation::update_item::builders::UpdateItemFluentBuilder;
 use aws_sdk_dynamodb::types::{
     AttributeValue, KeyType, ReturnValuesOnConditionCheckFailure, ScalarAttributeType, TableDescription,
 };
@@ -219,6 +220,22 @@ impl Table {
 
     /// Writes a row, unless the table holds a later one. Safe twice.
     pub async fn write(&self, row: &Row) -> Result<Written, TableError> {
+        let columns = self.columns(row);
+        let request = set_columns(self.request(row)?, row, &columns).send();
+        match self.meter.aws("dynamodb", "UpdateItem", request).await {
+            Ok(_) => Ok(Written::Stored),
+            Err(error) => match error.as_service_error() {
+                Some(UpdateItemError::ConditionalCheckFailedException(lost)) => {
+                    let same = lost.item().is_some_and(|old| is_same(old, row.attempt, &columns));
+                    Ok(if same { Written::Stored } else { Written::Stale })
+                }
+                _ => Err(failed(&self.name, "UpdateItem", &error)),
+            },
+        }
+    }
+
+    /// The update of a row, under its condition, without columns.
+    fn request(&self, row: &Row) -> Result<UpdateItemFluentBuilder, TableError> {
         let mut request = self
             .client
             .update_item()
@@ -236,42 +253,7 @@ impl Table {
         for (index, end) in ENDS.into_iter().enumerate() {
             request = request.expression_attribute_values(format!(":end{index}"), AttributeValue::S(end.into()));
         }
-        let columns = self.columns(row);
-        let (mut set, mut remove) = (vec!["#attempt = :attempt".to_owned()], Vec::new());
-        for (index, (column, value)) in columns.iter().enumerate() {
-            // A name may have one placeholder only, and the status has one already.
-            let name = match *column {
-                STATUS => "#status".to_owned(),
-                RERUN => "#rerun".to_owned(),
-                _ => format!("#c{index}"),
-            };
-            request = request.expression_attribute_names(&name, *column);
-            if let Some(value) = value {
-                set.push(format!("{name} = :v{index}"));
-                request = request.expression_attribute_values(format!(":v{index}"), AttributeValue::S((*value).into()));
-            } else {
-                remove.push(name);
-            }
-        }
-        if !row.rerun_as.is_empty() {
-            let status = AttributeValue::S(row.submission_status.clone());
-            request = request.expression_attribute_values(":status", status);
-        }
-        let mut update = format!("SET {}", set.join(", "));
-        if !remove.is_empty() {
-            update = format!("{update} REMOVE {}", remove.join(", "));
-        }
-        let request = request.update_expression(update).send();
-        match self.meter.aws("dynamodb", "UpdateItem", request).await {
-            Ok(_) => Ok(Written::Stored),
-            Err(error) => match error.as_service_error() {
-                Some(UpdateItemError::ConditionalCheckFailedException(lost)) => {
-                    let same = lost.item().is_some_and(|old| is_same(old, row.attempt, &columns));
-                    Ok(if same { Written::Stored } else { Written::Stale })
-                }
-                _ => Err(failed(&self.name, "UpdateItem", &error)),
-            },
-        }
+        Ok(request)
     }
 
     /// Keys can't be set; a table may have given one the name of a column.
@@ -298,6 +280,35 @@ impl Table {
             problem,
         })
     }
+}
+
+/// Sets the columns that have a value, and removes the others.
+fn set_columns(mut request: UpdateItemFluentBuilder, row: &Row, columns: &Columns<'_>) -> UpdateItemFluentBuilder {
+    let (mut set, mut remove) = (vec!["#attempt = :attempt".to_owned()], Vec::new());
+    for (index, (column, value)) in columns.iter().enumerate() {
+        // A name may have one placeholder only, and the status has one already.
+        let name = match *column {
+            STATUS => "#status".to_owned(),
+            RERUN => "#rerun".to_owned(),
+            _ => format!("#c{index}"),
+        };
+        request = request.expression_attribute_names(&name, *column);
+        if let Some(value) = value {
+            set.push(format!("{name} = :v{index}"));
+            request = request.expression_attribute_values(format!(":v{index}"), AttributeValue::S((*value).into()));
+        } else {
+            remove.push(name);
+        }
+    }
+    if !row.rerun_as.is_empty() {
+        let status = AttributeValue::S(row.submission_status.clone());
+        request = request.expression_attribute_values(":status", status);
+    }
+    let mut update = format!("SET {}", set.join(", "));
+    if !remove.is_empty() {
+        update = format!("{update} REMOVE {}", remove.join(", "));
+    }
+    request.update_expression(update)
 }
 
 /// True if the stored item holds what we were about to write.

@@ -30,7 +30,7 @@ pub enum TokenSource {
     },
 }
 
-/// Which word stands before the token in the `Authorization` header.
+/// The scheme before the token in the `Authorization` header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scheme {
     /// A JWT refresh token, as EvalAI's profile page gives it.
@@ -103,7 +103,7 @@ impl fmt::Debug for TokenSource {
     }
 }
 
-/// The service's own words where it gave some: its answers hold no secret, unlike a `Debug` of the whole.
+/// The service's own message where it gave one: its answers hold no secret, unlike a `Debug` of the whole.
 fn reason<R>(
     error: &aws_sdk_secretsmanager::error::SdkError<
         aws_sdk_secretsmanager::operation::get_secret_value::GetSecretValueError,
@@ -129,7 +129,7 @@ fn entry(id: &str, key: &str, text: &str) -> Result<String, TokenError> {
 }
 
 impl Token {
-    /// Reads a token as people store it: with or without the scheme's word and white space around it.
+    /// Reads a token as people store it: with or without the scheme and white space around it.
     pub fn parse(text: &str) -> Result<Self, TokenError> {
         let text = text.trim();
         let value = match text.split_once(char::is_whitespace) {
@@ -164,7 +164,7 @@ impl Token {
         })
     }
 
-    /// Which word stands before it.
+    /// The scheme before it.
     pub fn scheme(&self) -> Scheme {
         self.scheme
     }
@@ -177,7 +177,7 @@ impl Token {
         }
     }
 
-    /// When it ends, if it says so.
+    /// When it ends, if it holds that.
     pub fn expires(&self) -> Option<Timestamp> {
         self.expires
     }
@@ -208,7 +208,7 @@ impl fmt::Debug for Token {
     }
 }
 
-/// The claims of a JWT, unverified: only EvalAI can tell whether they are true.
+/// The claims of a JWT, unverified: only EvalAI can verify them.
 fn claims(value: &str) -> Option<Map<String, Value>> {
     let mut parts = value.split('.');
     let (_, claims, _, None) = (parts.next()?, parts.next()?, parts.next()?, parts.next()) else {

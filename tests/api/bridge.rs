@@ -305,7 +305,7 @@ async fn a_resume_bumps_once_and_undoes_a_cancel() {
     world.stand_in.send(&url, &body(2, 7)).await;
     world.submission("submission-7", |_| true).await;
     world.stand_in.send(&url, &body(2, 7)).await;
-    eventually("the repeat is seen", async || bridge.count("repeat") == 1).await;
+    eventually("the repeat is counted", async || bridge.count("repeat") == 1).await;
     let cancel = Patch::Merge(json!({"spec": {"cancel": true}}));
     world
         .submissions()
@@ -451,7 +451,7 @@ async fn one_bad_queue_among_several_is_named_and_the_others_are_read() {
     })
     .await;
     delete("bad").await;
-    eventually("a queue that nobody names is forgotten", async || {
+    eventually("a queue that no Leaderboard names is forgotten", async || {
         bridge.missing().is_empty()
     })
     .await;

@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use serde_json::{Map, Value};
 
-/// EvalAI's words to a user who is no host, whatever is asked for.
+/// EvalAI's answer to a user who is no host, whatever is asked for.
 const NOT_AUTHORIZED: &str = "you are not authorized to";
 /// Longest text taken over from an answer, in characters.
 const LONGEST: usize = 400;
 /// Taken when the server throttles without saying for how long.
-const UNSAID_WAIT: Duration = Duration::from_mins(1);
+const DEFAULT_WAIT: Duration = Duration::from_mins(1);
 /// Longest wait taken from the server.
 const LONGEST_WAIT: Duration = Duration::from_mins(5);
 
@@ -26,7 +26,7 @@ pub enum Answer<T> {
     Broken(String),
     /// 429: nothing was done, and nothing may be asked for that long.
     Throttled(Duration),
-    /// No answer that says what happened: the server may still be working on it.
+    /// No answer that shows what happened: the server may still be working on it.
     Unanswered(Silence),
 }
 
@@ -64,8 +64,8 @@ pub struct Silence {
 }
 
 impl<T> Answer<T> {
-    /// A word for metrics.
-    pub fn word(&self) -> &'static str {
+    /// The value of a metric's label.
+    pub fn as_str(&self) -> &'static str {
         match self {
             Self::Done(_) => "ok",
             Self::Refused(_) => "refused",
@@ -99,7 +99,7 @@ impl<T> Answer<T> {
     }
 
     /// The same answer to a request that every host of a challenge may make, and that is about nothing else: EvalAI refuses
-    /// others in words of its own, with status 400 or 401. Of one submission the same words may mean another challenge's.
+    /// others with another text, with status 400 or 401. Of one submission the same text may mean another challenge's.
     pub(super) fn of_hosts(self) -> Self {
         match self {
             Self::Refused(refusal) if refusal.about == About::Request && refusal.message.contains(NOT_AUTHORIZED) => {
@@ -129,32 +129,34 @@ pub fn classify(status: u16, retry_after: Option<&str>, body: &[u8]) -> Answer<(
         200..=299 => Answer::Done(()),
         429 => Answer::Throttled(wait(retry_after)),
         300..=399 => Answer::unusable(status, "a redirect"),
-        // A web server's or proxy's own page says nothing of the program behind it.
-        500 if !text.contains("<center>nginx") => Answer::Broken(sentence(status, &Said::read(&text))),
+        // A web server's or proxy's own page shows nothing of the program behind it.
+        500 if !text.contains("<center>nginx") => Answer::Broken(sentence(status, &Body::read(&text))),
         400..=499 => {
-            let said = Said::read(&text);
+            let body = Body::read(&text);
             Answer::Refused(Refusal {
-                about: said.about(status),
+                about: body.about(status),
                 status,
-                message: sentence(status, &said),
+                message: sentence(status, &body),
             })
         }
         _ => Answer::Unanswered(Silence {
             sent: true,
-            why: sentence(status, &Said::read(&text)),
+            why: sentence(status, &Body::read(&text)),
         }),
     }
 }
 
 fn wait(retry_after: Option<&str>) -> Duration {
-    let said = retry_after
+    let asked = retry_after
         .and_then(|text| text.trim().parse().ok())
         .map(Duration::from_secs);
-    said.unwrap_or(UNSAID_WAIT).clamp(Duration::from_secs(1), LONGEST_WAIT)
+    asked
+        .unwrap_or(DEFAULT_WAIT)
+        .clamp(Duration::from_secs(1), LONGEST_WAIT)
 }
 
 /// Where the text of an error stood: EvalAI has four ways.
-enum Said {
+enum Body {
     /// `{"error": …}`, by EvalAI's views.
     Error(String),
     /// `{"detail": …}`, by the framework under them.
@@ -165,7 +167,7 @@ enum Said {
     Page(String),
 }
 
-impl Said {
+impl Body {
     fn read(body: &str) -> Self {
         match serde_json::from_str::<Value>(body) {
             Ok(Value::Object(fields)) => Self::read_fields(&fields),
@@ -200,7 +202,7 @@ impl Said {
     fn about(&self, status: u16) -> About {
         match (status, self) {
             (401 | 403, Self::Detail(_)) => About::Token,
-            // A page that says 404 is a wrong address, not a missing submission.
+            // A page with status 404 is a wrong address, not a missing submission.
             (404, Self::Error(_) | Self::Detail(_)) => About::Missing,
             _ => About::Request,
         }
@@ -208,23 +210,23 @@ impl Said {
 }
 
 /// One sentence without line breaks.
-fn sentence(status: u16, said: &Said) -> String {
-    let words = said.text().split_whitespace().collect::<Vec<_>>().join(" ");
-    let mut text: String = words.chars().take(LONGEST).collect();
-    if text.len() < words.len() {
+fn sentence(status: u16, body: &Body) -> String {
+    let whole = body.text().split_whitespace().collect::<Vec<_>>().join(" ");
+    let mut text: String = whole.chars().take(LONGEST).collect();
+    if text.len() < whole.len() {
         text.push('…');
     }
     let text = if text.is_empty() { "nothing".to_owned() } else { text };
-    let next = next_step(status, said)
+    let next = next_step(status, body)
         .map(|step| format!(" ({step})"))
         .unwrap_or_default();
     format!("EvalAI answered {status}: {text}{next}")
 }
 
-/// What helps, where EvalAI's own words mislead or say nothing.
-fn next_step(status: u16, said: &Said) -> Option<&'static str> {
-    let has = |part: &str| said.text().contains(part);
-    match said.about(status) {
+/// What helps, where EvalAI's own text misleads or is empty.
+fn next_step(status: u16, body: &Body) -> Option<&'static str> {
+    let has = |part: &str| body.text().contains(part);
+    match body.about(status) {
         About::Token if has("verify your email") => Some("the token's user has to confirm the e-mail address"),
         About::Token => Some("store a valid refresh token of a host of the challenge"),
         _ if has("metrics are missing in theleaderboard data") => {
@@ -234,14 +236,14 @@ fn next_step(status: u16, said: &Said) -> Option<&'static str> {
         _ if has("not authorized to access this submission") => Some("the token's user is no host of its challenge"),
         _ if has(NOT_AUTHORIZED) => Some(
             "the token's user is no host of this challenge, or there is no such challenge: check evalai.challenge, and \
-             store a host's token where evalai.token says",
+             store a host's token where evalai.token points",
         ),
-        _ if status == 404 && matches!(said, Said::Page(_)) => Some("check evalai.apiServer"),
+        _ if status == 404 && matches!(body, Body::Page(_)) => Some("check evalai.apiServer"),
         _ => None,
     }
 }
 
-/// JSON as words: values only of lists, names and values of objects.
+/// JSON as plain text: values only of lists, names and values of objects.
 fn flat(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),

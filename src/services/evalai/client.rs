@@ -1,6 +1,6 @@
 //! EvalAI over HTTP: one method a request, every answer classified.
 //!
-//! Called by `task` only. Knows no policy: it sends what it is told, once, and follows no redirect of the API (the server
+//! Called by `task` only. Knows no policy: it sends each request once, and follows no redirect of the API (the server
 //! drops the body of a redirected write).
 
 use std::time::Duration;
@@ -115,7 +115,7 @@ impl Client {
     pub async fn send(&self, token: &Token, request: &Request) -> Reply {
         let running = self.meter.begin("evalai", request.op());
         let reply = self.exchange(token, request).await;
-        running.end(reply.answer().word());
+        running.end(reply.answer().as_str());
         reply
     }
 
@@ -222,7 +222,7 @@ impl Client {
 enum Need {
     /// A read is nothing without its body.
     Body,
-    /// The status line says that a write was done, whatever becomes of the rest.
+    /// The status line shows that a write was done, also without the rest.
     Status,
 }
 

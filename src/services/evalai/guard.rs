@@ -1,15 +1,15 @@
-//! What may be started, written or ended, given what EvalAI says: the server itself enforces nothing.
+//! What may be started, written or ended, given what EvalAI shows: the server itself enforces nothing.
 //!
-//! Called by `queue` with each read. Pure: words in, words out.
+//! Called by `queue` with each read. Pure: a status in, a verdict out.
 //!
 //! An [`Attempt`] has `begun` when the end of an earlier one no longer stands: its Job is in the row's `job_name`, or the read
 //! was requested after EvalAI had answered its `queued`, or after another read had shown the submission as live. Only then does
-//! `failed` speak of this attempt. So does `cancelled`, but EvalAI resumes only what has failed: before an attempt that it has
+//! `failed` are about this attempt. So does `cancelled`, but EvalAI resumes only what has failed: before an attempt that it has
 //! asked for has begun, `cancelled` is a new cancel. Only an attempt that a person has begun here follows a cancelled one.
 
 use super::status::{Outcome, Progress, Status};
 
-/// The attempt that a status may speak of.
+/// The attempt that a status may be about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Attempt {
     /// From 1.
@@ -29,16 +29,16 @@ pub enum Start {
     Run,
     /// EvalAI has ended it: nothing runs, nothing is written.
     Drop(Status),
-    /// EvalAI's word is not known: neither start nor end on it.
+    /// EvalAI's status is unknown: neither start nor end because of it.
     Unclear,
 }
 
-/// What becomes of a wish to write `queued`, `running` or partial results.
+/// What becomes of an update to `queued`, `running` or partial results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
     /// Write.
     Send,
-    /// EvalAI says so already: a repeated PATCH would reset the execution time.
+    /// EvalAI shows it already: a repeated PATCH would reset the execution time.
     There,
     /// Not now.
     Wait,
@@ -46,18 +46,18 @@ pub enum Verdict {
     Ended(Status),
 }
 
-/// What becomes of a wish to write the end.
+/// What becomes of an update to the end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
     /// Write.
     Put,
-    /// EvalAI says so already.
+    /// EvalAI shows it already.
     Done(Status),
     /// EvalAI has ended it otherwise: the outcome becomes Cancelled, nothing is written.
     Amend(Status),
     /// It was deleted there before its end: `cancelled` is written in place of the outcome, which becomes Cancelled.
     Cancel,
-    /// EvalAI's word is not known: read again later.
+    /// EvalAI's status is unknown: read again later.
     Wait,
 }
 
@@ -72,13 +72,13 @@ pub fn start(status: Status, attempt: Attempt) -> Start {
     }
 }
 
-/// Whether `queued` or `running` is written. `told` says that EvalAI has been told of this attempt: before, a later attempt
-/// writes even over `running`, which is an earlier one's word.
-pub fn progress(status: Status, attempt: Attempt, told: bool, wanted: Progress) -> Verdict {
+/// Whether `queued` or `running` is written. `is_known`: EvalAI has stored this attempt. Before that, a later attempt writes even over
+/// `running`, which an earlier one has written.
+pub fn progress(status: Status, attempt: Attempt, is_known: bool, wanted: Progress) -> Verdict {
     match start(status, attempt) {
         Start::Drop(status) => Verdict::Ended(status),
         Start::Unclear => Verdict::Wait,
-        Start::Run if (attempt.number == 1 || told) && reached(status, wanted) => Verdict::There,
+        Start::Run if (attempt.number == 1 || is_known) && reached(status, wanted) => Verdict::There,
         Start::Run => Verdict::Send,
     }
 }
@@ -107,7 +107,7 @@ pub fn end(status: Status, attempt: Attempt, wanted: Outcome) -> End {
     }
 }
 
-/// The status as it speaks of this attempt: the end of an earlier attempt is a beginning.
+/// The status as it is about this attempt: the end of an earlier attempt is a beginning.
 fn standing(status: Status, attempt: Attempt) -> Status {
     match status {
         Status::Failed if attempt.number > 1 && !attempt.begun => Status::Resuming,
@@ -181,9 +181,9 @@ mod tests {
                 ..of(number, begun)
             };
             assert_eq!(start(S::Finished, under_way), Start::Run);
-            for told in [false, true] {
-                let sent = progress(S::Finished, under_way, told, Progress::Running);
-                assert_eq!(sent, Verdict::Send, "{number} {begun} {told}");
+            for is_known in [false, true] {
+                let sent = progress(S::Finished, under_way, is_known, Progress::Running);
+                assert_eq!(sent, Verdict::Send, "{number} {begun} {is_known}");
             }
             assert_eq!(partial(S::Finished, under_way), Verdict::Send);
             for wanted in [Outcome::Finished, Outcome::Failed, Outcome::Cancelled] {

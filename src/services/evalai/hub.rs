@@ -149,7 +149,7 @@ impl Hub {
         self.with_subject(subject, |queue, now| queue.ask(subject, image, now))
     }
 
-    /// From now on, until its end or [`Hub::forget`], a cancellation of this attempt is looked for each period.
+    /// From now on, until its end or [`Hub::forget`], a cancellation of this attempt is checked for each period.
     /// `submitted_at` is EvalAI's own time of the submission.
     pub fn live(&self, subject: &Subject, submitted_at: Timestamp) -> Result<(), ClientError> {
         self.with_subject(subject, |queue, _| queue.live(subject, submitted_at))
@@ -352,14 +352,12 @@ mod tests {
     use super::*;
     use crate::observability::shutdown::Stop;
     use crate::services::token::Token;
+    use futures::FutureExt;
+    use std::time::Duration;
 
-    #[tokio::test(start_paused = true)]
-    async fn the_task_of_each_token_is_one_of_the_process() {
-        let (_stop, signal) = Stop::new();
-        let tasks = Tasks::new(signal);
-        let hub = Hub::new(Options {
-            // Nothing is sent anywhere: the guard's panic stands for any of the task's own.
-            write_guard: Arc::new(|| -> bool { panic!("on purpose") }),
+    fn hub(tasks: &Tasks, write_guard: impl WriteGuard) -> Hub {
+        Hub::new(Options {
+            write_guard: Arc::new(write_guard),
             not_before: Instant::now(),
             changed: mpsc::unbounded_channel().0,
             sweep: mpsc::unbounded_channel().0,
@@ -367,31 +365,73 @@ mod tests {
             timeouts: Timeouts::default(),
             meter: Meter::default(),
             tasks: tasks.clone(),
-        });
-        let target = Target {
+        })
+    }
+
+    fn target(token: &str) -> Target {
+        Target {
             api_server: "http://127.0.0.1:9".into(),
             challenge: 1,
             split: "leaderboard".into(),
-            token: Arc::new(Token::parse("x").unwrap()),
+            token: Arc::new(Token::parse(token).unwrap()),
             requests_per_minute: 54,
-            sweep: std::time::Duration::from_mins(1),
-            period: std::time::Duration::from_secs(10),
+            sweep: Duration::from_mins(1),
+            period: Duration::from_secs(10),
             phases: [1].into(),
             labels: [].into(),
             since: Timestamp::UNIX_EPOCH,
-        };
-        let key = Key {
+        }
+    }
+
+    fn key(name: &str) -> Key {
+        Key {
             namespace: "ns".into(),
-            name: "board".into(),
-            uid: "u".into(),
-        };
-        hub.serve(&key, &target).unwrap();
-        let failed = tokio::time::timeout(std::time::Duration::from_mins(1), tasks.failed()).await;
+            name: name.into(),
+            uid: name.into(),
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_task_of_each_token_is_one_of_the_process() {
+        let (_stop, signal) = Stop::new();
+        let tasks = Tasks::new(signal);
+        // Nothing is sent anywhere: the guard's panic stands for any of the task's own.
+        let hub = hub(&tasks, || -> bool { panic!("on purpose") });
+        hub.serve(&key("board"), &target("x")).unwrap();
+        let failed = tokio::time::timeout(Duration::from_mins(1), tasks.failed()).await;
         let failed = failed.unwrap().to_string();
         assert!(
             failed.starts_with("task EvalAI requests of token-") && failed.contains("has panicked: on purpose"),
             "{failed}"
         );
         assert!(!hub.drain().await, "a write of it may have no answer");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_task_of_a_token_ends_when_nothing_uses_it_and_comes_back_with_the_next_use() {
+        let (_stop, signal) = Stop::new();
+        let tasks = Tasks::new(signal);
+        let hub = hub(&tasks, || true);
+        let running = || tasks.names().len();
+        let settled = async || tokio::time::sleep(Duration::from_mins(2)).await;
+        hub.serve(&key("one"), &target("x")).unwrap();
+        hub.serve(&key("two"), &target("x")).unwrap();
+        hub.serve(&key("three"), &target("y")).unwrap();
+        assert_eq!(running(), 2);
+        hub.retire(&key("one"));
+        hub.retire(&key("three"));
+        settled().await;
+        assert_eq!(running(), 1, "the one that a Leaderboard still uses");
+        assert_eq!(hub.state().tokens.len(), 1);
+        hub.serve(&key("two"), &target("y")).unwrap();
+        settled().await;
+        assert_eq!(running(), 1, "the renewed token's");
+        hub.retire(&key("two"));
+        settled().await;
+        assert_eq!((running(), hub.state().places.len()), (0, 0));
+        hub.serve(&key("two"), &target("x")).unwrap();
+        assert_eq!(running(), 1);
+        assert!(tasks.failed().now_or_never().is_none());
+        assert!(hub.drain().await);
     }
 }

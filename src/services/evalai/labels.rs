@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use super::row::{Phase, Split};
 use super::types::Target;
 
-/// What EvalAI said of a challenge.
+/// What EvalAI shows of a challenge.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Catalog {
     /// When it was read.
@@ -18,7 +18,7 @@ pub struct Catalog {
     pub phases: Vec<Phase>,
     /// Its leaderboards.
     pub splits: Vec<Split>,
-    /// Codenames of dataset splits; none where EvalAI does not tell.
+    /// Codenames of dataset splits; none where EvalAI does not show them.
     pub codenames: BTreeMap<i64, Option<String>>,
 }
 
@@ -52,7 +52,7 @@ pub enum Misfit {
     /// The leaderboard lacks metrics: EvalAI would refuse every result.
     #[error("the leaderboard of phase {phase} has no {}; add these labels to its schema", .labels.join(", "))]
     Unknown { phase: i64, labels: Vec<String> },
-    /// The leaderboard has metrics that nobody sends: EvalAI shows them as `#`.
+    /// The leaderboard has metrics that are never sent: EvalAI shows them as `#`.
     #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion", .labels.join(", "))]
     Unsent { phase: i64, labels: Vec<String> },
 }
@@ -108,7 +108,7 @@ fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> 
     unknown.into_iter().chain(unsent).collect()
 }
 
-/// The phase's leaderboard of a split. Where EvalAI does not tell a codename, a phase's only leaderboard is taken.
+/// The phase's leaderboard of a split. Where EvalAI does not show a codename, a phase's only leaderboard is taken.
 fn split_of<'a>(catalog: &'a Catalog, phase: i64, codename: &str) -> Option<&'a Split> {
     let of_phase = || catalog.splits.iter().filter(|split| split.phase == phase);
     let name = |split: &Split| catalog.codenames.get(&split.dataset_split).cloned().flatten();

@@ -22,7 +22,7 @@ pub fn check(payload: &Payload, split: &str, labels: &[String]) -> Result<(), St
     let entries: Vec<Entry> = serde_json::from_str(&payload.result)
         .map_err(|error| format!("the results are not EvalAI's list of splits ({error})"))?;
     let [entry] = entries.as_slice() else {
-        return Err(format!("the results speak of {} splits, not of one", entries.len()));
+        return Err(format!("the results are for {} splits, not for one", entries.len()));
     };
     if entry.split != split {
         return Err(format!("the results are for the split {}, not {split}", entry.split));

@@ -1,4 +1,4 @@
-//! Every request this room can make, and the form of its answer. `queue` chooses them, `client` sends them.
+//! Every request of this module, and the form of its answer. `queue` chooses them, `client` sends them.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! What EvalAI tells of a submission, a phase and a split, parsed at the edge.
+//! What EvalAI shows of a submission, a phase and a split, parsed at the edge.
 //!
 //! Called by `client`. Pure. Only an id and a status are required: a field that changes its form must not blind us to
 //! a cancellation.

@@ -1,6 +1,6 @@
-//! EvalAI's words for where a submission stands, and ours for what we want it to say.
+//! The status of a submission in EvalAI, and the updates that we request.
 //!
-//! Pure. Used by every module of this room and by the controller.
+//! Pure. Used by every module of `evalai` and by the controller.
 
 use std::fmt;
 
@@ -24,7 +24,7 @@ pub enum Status {
     Ignored,
     /// EvalAI has no such submission.
     Missing,
-    /// A word this program does not know.
+    /// A status that this program does not know.
     Unknown,
 }
 
@@ -47,13 +47,13 @@ impl Status {
         Self::Unknown,
     ];
 
-    /// Reads EvalAI's word.
-    pub fn parse(word: &str) -> Self {
-        let word = word.to_ascii_lowercase();
+    /// Reads EvalAI's name of a status.
+    pub fn parse(name: &str) -> Self {
+        let name = name.to_ascii_lowercase();
         let ours = |status: &Self| matches!(status, Self::Deleted | Self::Ignored | Self::Missing | Self::Unknown);
         let found = Self::ALL
             .into_iter()
-            .find(|status| !ours(status) && status.as_str() == word);
+            .find(|status| !ours(status) && status.as_str() == name);
         found.unwrap_or(Self::Unknown)
     }
 
@@ -70,7 +70,7 @@ impl Status {
         )
     }
 
-    /// The word, EvalAI's where it has one.
+    /// Its name, EvalAI's where it has one.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Submitted => "submitted",
@@ -97,7 +97,7 @@ impl fmt::Display for Status {
     }
 }
 
-/// How far a run is said to be.
+/// How far a run is, as EvalAI shows it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Progress {
     Queued,
@@ -105,7 +105,7 @@ pub enum Progress {
 }
 
 impl Progress {
-    /// EvalAI's word.
+    /// EvalAI's name of it.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Queued => "queued",
@@ -114,7 +114,7 @@ impl Progress {
     }
 }
 
-/// How a run is said to have ended.
+/// How a run has ended, as EvalAI shows it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Outcome {
     Finished,
@@ -123,7 +123,7 @@ pub enum Outcome {
 }
 
 impl Outcome {
-    /// EvalAI's word.
+    /// EvalAI's name of it.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Finished => "finished",
@@ -138,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn evalais_words_are_read_and_ours_are_not() {
+    fn evalais_names_are_read_and_ours_are_not() {
         for status in Status::ALL {
             let ours = matches!(
                 status,

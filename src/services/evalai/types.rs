@@ -115,7 +115,7 @@ pub struct SubmissionState {
     pub answered: i64,
     /// What the uploaded file names as the image; none before it was asked for and answered.
     pub image: Option<ImageAnswer>,
-    /// The attempt that all below speaks of.
+    /// The attempt that all below is about.
     pub attempt: i64,
     /// How far EvalAI knows this attempt to be.
     pub progress: Option<Progress>,
@@ -181,7 +181,7 @@ pub enum Swept {
     Resuming,
 }
 
-/// A submission that asks to be run and that nobody here knows: its message may be lost.
+/// A submission that asks to be run and that no object here is for: its message may be lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SweepRow {
     /// Root of the server that has the row, as in [`Target::api_server`]: ids are unique within a server only.

@@ -12,7 +12,7 @@ use super::{Row, TableError, Written};
 use crate::services::ObjectKey;
 use leaderboard_api as api;
 
-/// How long a row that was refused for its own sake is not tried again.
+/// How long a row that was refused for its own sake is not retried.
 const REFUSED: Duration = Duration::from_mins(5);
 
 /// What identifies a table and how it is reached.
@@ -323,8 +323,8 @@ mod tests {
         };
         ledger.record(table("t"), &a, update(1, "1/9", true), now);
         ledger.report(&a, &update(1, "1/9", true), Err(refused()), now);
-        let told = Some("table t: key team_id is empty: the team is not known");
-        assert_eq!(ledger.view(&a), Some(view(1, false, told)));
+        let error = Some("table t: key team_id is empty: the team is not known");
+        assert_eq!(ledger.view(&a), Some(view(1, false, error)));
         assert_eq!(ledger.next(&table("t")), None);
         assert!(!ledger.record(table("t"), &a, update(1, "1/9", true), now));
         assert!(ledger.record(table("t"), &a, update(1, "2/9", true), now));
@@ -339,7 +339,7 @@ mod tests {
         assert!(!ledger.report(&a, &update(1, "1/9", false), Ok(Written::Stale), now));
         ledger.record(table("t"), &a, update(1, "9/9", true), now);
         ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stale), now);
-        let told = "table t already holds a later attempt or another end of submission 7; the row is left as it is";
-        assert_eq!(ledger.view(&a), Some(view(1, false, Some(told))));
+        let error = "table t already holds a later attempt or another end of submission 7; the row is left as it is";
+        assert_eq!(ledger.view(&a), Some(view(1, false, Some(error))));
     }
 }

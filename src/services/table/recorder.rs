@@ -1,7 +1,7 @@
-//! Writes rows in the background: one task for each table, at most one write in 2 s, each behind the leader's fence.
+//! Writes rows in the background: one task for each table, at most one write in 2 s, each only while this process leads.
 //!
-//! The controller hands rows in and reads views, both from memory; changes wake the object. What is written next is
-//! the ledger's to say.
+//! The controller hands rows in and reads views, both from memory; changes wake the object. The ledger
+//! chooses what is written next.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -24,7 +24,7 @@ use leaderboard_api as api;
 const SPACING: Duration = Duration::from_secs(2);
 /// Pauses after failures in a row, half of which is no less than the spacing.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(4), Duration::from_mins(5));
-/// How often a fence that is down is looked at.
+/// How often a guard that forbids writes is asked again.
 const FENCE_PAUSE: Duration = Duration::from_secs(1);
 
 /// Writes one row; a seam for tests.
@@ -80,8 +80,8 @@ impl Recorder {
         Self { shared: shared.into() }
     }
 
-    /// Hands in the newest row of an object; `end` says that it is the last of its attempt. Cheap, and safe to call
-    /// in each pass: what is written or waiting already is not written again.
+    /// Hands in the newest row of an object; `end`: it is the last of its attempt. Cheap, and safe to call
+    /// in each reconcile: what is written or waiting already is not written again.
     pub fn record(&self, table: &api::Table, key: &ObjectKey, row: Row, end: bool) {
         let id = TableId::from(table);
         let update = RowUpdate { row: row.into(), end };

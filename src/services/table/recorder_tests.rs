@@ -137,8 +137,8 @@ async fn a_sick_table_is_tried_ever_more_slowly_until_it_is_well() {
     let mut bench = bench((0..6).map(|_| throttled()).collect());
     bench.recorder.record(&table("t"), &key("a"), row("1/1"), true);
     assert_eq!(bench.wake.recv().await, Some(key("a")));
-    let told = bench.recorder.view(&key("a")).unwrap().error.unwrap();
-    assert_eq!(told, "table t: UpdateItem failed: slow down; it is retried");
+    let error = bench.recorder.view(&key("a")).unwrap().error.unwrap();
+    assert_eq!(error, "table t: UpdateItem failed: slow down; it is retried");
     // The same failure again wakes nobody; the end does.
     assert_eq!(bench.wake.recv().await, Some(key("a")));
     assert!(bench.recorder.view(&key("a")).unwrap().end_written);

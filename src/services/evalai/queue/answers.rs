@@ -51,7 +51,7 @@ impl Queue {
         }
     }
 
-    /// What every answer says of the token.
+    /// What every answer shows about the token.
     fn note(&mut self, answer: &Answer<()>, now: &Now) {
         match answer {
             Answer::Throttled(wait) => self.budget.close_until(now.at + *wait),
@@ -243,7 +243,7 @@ fn done(sub: &mut Sub, request: &Request, now: &Now) {
             sub.close(if outcome == Outcome::Cancelled && wanted != outcome {
                 Ended::Otherwise(deleted.unwrap_or(Status::Cancelled))
             } else {
-                // A newer wish that came meanwhile is too late: what EvalAI has taken stands.
+                // A newer update that came meanwhile is too late: what EvalAI has stored stands.
                 Ended::Published { outcome, at }
             });
         }

@@ -22,7 +22,7 @@ const READ_ONE_BY_ONE: usize = 5;
 const ACCEPT_REACH: SignedDuration = SignedDuration::from_hours(5 * 24);
 /// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
 const SWEEP_REACH: SignedDuration = SignedDuration::from_hours(180 * 24);
-/// While writes are not allowed they are looked at again so often: nobody says when they are.
+/// While writes are not allowed they are checked again so often: no event reports that they are.
 const RECHECK: Duration = Duration::from_secs(1);
 
 /// First comes first.
@@ -37,7 +37,7 @@ pub(super) enum Priority {
     Acceptance,
     Sweep,
     Progress,
-    /// An end that EvalAI knows already, or did not take again and again.
+    /// An end that EvalAI knows already, or refused several times.
     Cancelled,
     /// What is left.
     Rest,
@@ -69,7 +69,7 @@ struct Offer {
 }
 
 impl Queue {
-    /// The next request, and marks it as sent. `may_write` is the fence: false keeps every write back.
+    /// The next request, and marks it as sent. Without `may_write` every write is kept back.
     pub fn next(&mut self, now: Now, may_write: bool) -> Next {
         self.open_writes(&now);
         let (due, later): (Vec<_>, Vec<_>) = self
@@ -78,7 +78,7 @@ impl Queue {
             .partition(|offer| offer.ready <= now.at);
         let first = |one: &&Offer, other: &&Offer| (one.priority, one.since).cmp(&(other.priority, other.since));
         let best = due.iter().min_by(first);
-        // Writes wait for room for two requests; the list of the runs that are to stop goes in between.
+        // Writes wait until the budget has two requests left; the list of the runs that are to stop goes in between.
         let list = due
             .iter()
             .filter(|offer| offer.priority == Priority::CancelList)
@@ -109,7 +109,7 @@ impl Queue {
         }
     }
 
-    /// When the budget has room: every read for a write keeps one request back for the write that follows it.
+    /// When the budget allows it: every read for a write keeps one request back for the write that follows it.
     fn affordable_at(&self, now: &Now, offer: &Offer) -> Duration {
         let reserved = self
             .lanes
@@ -136,12 +136,13 @@ impl Queue {
         let mut offers = Vec::new();
         if in_flight < MAX_IN_FLIGHT {
             let subs = self.subs.iter().filter_map(|(key, sub)| {
-                let by_list = ByList {
-                    asked: asked.contains_key(&sub.challenge),
-                    live: list_of_live(sub).is_some_and(|list| live.contains_key(&(sub.challenge, list)))
-                        || self.is_swept(sub),
+                let is_listed = |list| live.contains_key(&(sub.challenge, list));
+                let terms = Terms {
+                    may_write,
+                    asked_by_list: asked.contains_key(&sub.challenge),
+                    live_by_list: list_of_live(sub).is_some_and(is_listed) || self.is_swept(sub),
                 };
-                self.offer_of(key, sub, now, may_write, by_list)
+                self.offer_of(key, sub, now, terms)
             });
             offers.extend(subs);
         }
@@ -189,13 +190,13 @@ impl Queue {
         counts
     }
 
-    fn offer_of(&self, key: &Key, sub: &Sub, now: &Now, may_write: bool, by_list: ByList) -> Option<Offer> {
+    fn offer_of(&self, key: &Key, sub: &Sub, now: &Now, terms: Terms) -> Option<Offer> {
         let idle = Lane::default();
         let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
         if lane.busy.is_some() {
             return None;
         }
-        let (priority, since, write, step) = self.step_of(sub, lane, now, may_write, by_list)?;
+        let (priority, since, write, step) = self.step_of(sub, lane, now, terms)?;
         let again = if step == Step::Image {
             sub.image_at
         } else {
@@ -211,15 +212,8 @@ impl Queue {
     }
 
     /// What a submission wants first: priority, since when, whether it leads to a write, and the request.
-    fn step_of(
-        &self,
-        sub: &Sub,
-        lane: &Lane,
-        now: &Now,
-        may_write: bool,
-        by_list: ByList,
-    ) -> Option<(Priority, Duration, bool, Step)> {
-        let write = if may_write {
+    fn step_of(&self, sub: &Sub, lane: &Lane, now: &Now, terms: Terms) -> Option<(Priority, Duration, bool, Step)> {
+        let write = if terms.may_write {
             self.step_to_write(sub, lane, now)
         } else {
             None
@@ -228,10 +222,10 @@ impl Queue {
             return write;
         }
         if let Some(asked) = &sub.asked {
-            let alone = asked.listed || !by_list.asked;
+            let alone = asked.listed || !terms.asked_by_list;
             return alone.then_some((Priority::Acceptance, asked.since, false, Step::Get));
         }
-        let refresh = self.refresh_of(sub, now, by_list);
+        let refresh = self.refresh_of(sub, now, terms);
         // A file that is not there must not keep its submission from being read.
         if sub.wants_image() && (sub.image_at <= now.at || refresh.is_none()) {
             return Some((Priority::Free, now.at, false, Step::Image));
@@ -240,9 +234,9 @@ impl Queue {
     }
 
     /// A live submission is read again now and then.
-    fn refresh_of(&self, sub: &Sub, now: &Now, by_list: ByList) -> Option<(Priority, Duration, bool, Step)> {
+    fn refresh_of(&self, sub: &Sub, now: &Now, terms: Terms) -> Option<(Priority, Duration, bool, Step)> {
         // One that its list has missed has another status by now.
-        let refresh = self.timing.refresh * if by_list.live { 2 } else { 1 };
+        let refresh = self.timing.refresh * if terms.live_by_list { 2 } else { 1 };
         let due = sub.read.unwrap_or_default() + refresh;
         let stale = sub.read.is_none() || sub.outdated || due <= now.at;
         (sub.live.is_some() && stale).then_some((Priority::Rest, due, false, Step::Get))
@@ -368,13 +362,15 @@ impl Queue {
     }
 }
 
-/// What of a submission a list is asked for.
+/// What holds for the next request of a submission.
 #[derive(Clone, Copy)]
-struct ByList {
-    /// Whether it may run.
-    asked: bool,
-    /// Whether it was ended in a way that changes no status.
-    live: bool,
+struct Terms {
+    /// Writes are allowed.
+    may_write: bool,
+    /// A list is asked whether it may run.
+    asked_by_list: bool,
+    /// A list is asked whether it was ended in a way that changes no status.
+    live_by_list: bool,
 }
 
 /// The list that holds a live submission, going by its last row.

@@ -1,4 +1,4 @@
-//! What an answer about a whole challenge changes: lists of submissions, and what its leaderboards look like.
+//! What an answer about a whole challenge changes: lists of submissions, and what its leaderboards are.
 //!
 //! Owned by `queue`. Pure.
 
@@ -40,7 +40,7 @@ impl Queue {
     pub(super) fn took_of_challenge(&mut self, request: &Request, requested: Duration, reply: Reply, now: &Now) {
         match (request, reply) {
             (Request::List { challenge, purpose, .. }, Reply::Rows(answer)) => {
-                self.took_list(*challenge, *purpose, requested, answer, now);
+                self.took_list((*challenge, *purpose), requested, answer, now);
             }
             (Request::Phases(id), Reply::Phases(answer)) => {
                 self.took_of_check(*id, answer, now, |check, phases| {
@@ -66,7 +66,8 @@ impl Queue {
         }
     }
 
-    fn took_list(&mut self, id: i64, purpose: Purpose, requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
+    fn took_list(&mut self, list: (i64, Purpose), requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
+        let (id, purpose) = list;
         let (accept, refresh) = (self.timing.accept, self.timing.refresh);
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
@@ -122,7 +123,7 @@ impl Queue {
         }
     }
 
-    /// A row that asks to be run, long enough ago for its message to be lost, and that nobody here knows.
+    /// A row that asks to be run, long enough ago for its message to be lost, and that no object here is for.
     fn sweep_row(&mut self, id: i64, row: &Row, now: &Now) {
         let lost = SignedDuration::try_from(self.timing.lost).unwrap_or(SignedDuration::MAX);
         let Some(challenge) = self.challenges.get_mut(&id) else {
@@ -132,9 +133,9 @@ impl Queue {
             return;
         };
         let age = now.wall.duration_since(time);
-        challenge.swept.retain(|_, (_, said)| *said + SWEPT_FOR > now.at);
-        let said = challenge.swept.get(&row.id).is_some_and(|(at, _)| *at == time);
-        if age < lost || time < since || said || self.pks.contains_key(&row.id) {
+        challenge.swept.retain(|_, (_, found)| *found + SWEPT_FOR > now.at);
+        let is_known = challenge.swept.get(&row.id).is_some_and(|(at, _)| *at == time);
+        if age < lost || time < since || is_known || self.pks.contains_key(&row.id) {
             return;
         }
         // All that this queue serves is of one server.

@@ -56,7 +56,7 @@ pub struct Timing {
     pub accept: Duration,
     /// A message that has not come for so long is lost.
     pub lost: Duration,
-    /// A live submission is read again, in case somebody has ended it in a way that no list shows. Above all its participant
+    /// A live submission is read again, in case it was ended in a way that no list shows. Above all its participant
     /// may have deleted it: that leaves its status as it is, so the list of cancelled ones never holds it; and no list has
     /// those that are partially evaluated.
     pub refresh: Duration,
@@ -237,7 +237,7 @@ impl Queue {
         news
     }
 
-    /// From now on a cancellation of this attempt is looked for. `submitted_at` is EvalAI's own time.
+    /// From now on a cancellation of this attempt is checked for. `submitted_at` is EvalAI's own time.
     pub fn live(&mut self, subject: &Subject, submitted_at: Timestamp) -> bool {
         let Some(sub) = self.enter(subject) else {
             return false;

@@ -1,4 +1,4 @@
-//! What is asked again and again for a whole challenge: lists, and what its leaderboards look like.
+//! What is polled for a whole challenge: lists, and what its leaderboards are.
 //!
 //! Owned by `queue`. Pure.
 
@@ -15,7 +15,7 @@ use crate::services::evalai::row::{Phase, Split};
 /// Waits after failures in a row. Without jitter: one task makes all requests of a token.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_mins(1));
 
-/// Something asked again and again, one request at a time.
+/// A request that is repeated, one at a time.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Poll {
     pub busy: bool,
@@ -24,7 +24,7 @@ pub(super) struct Poll {
 }
 
 impl Poll {
-    /// It went well: next time `every` after the request, however long its answer took. A server that needs the whole time
+    /// It succeeded: next time `every` after the request, however long its answer took. A server that needs the whole time
     /// for its answer is given a rest.
     pub fn done(&mut self, requested: Duration, now: Duration, every: Duration) {
         *self = Self {
@@ -34,12 +34,12 @@ impl Poll {
         };
     }
 
-    /// Whether it went wrong last.
+    /// Whether it failed last.
     pub fn is_failing(&self) -> bool {
         self.failures > 0
     }
 
-    /// It went wrong: again later, and later each time.
+    /// It failed: again later, and later each time.
     pub fn failed(&mut self, now: Duration, every: Duration) {
         self.busy = false;
         self.due = now + pause(self.failures).max(every);
@@ -62,7 +62,7 @@ pub(super) struct Challenge {
     /// When each of its lists is due. One that was never asked for is due at once.
     pub lists: BTreeMap<Purpose, Poll>,
     pub check: ChallengeCheck,
-    /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when we said so.
+    /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when it was handed out.
     pub swept: BTreeMap<i64, (Timestamp, Duration)>,
 }
 
@@ -82,7 +82,7 @@ impl Challenge {
     }
 }
 
-/// Reading what a challenge's leaderboards look like, request by request.
+/// Reading what a challenge's leaderboards are, request by request.
 #[derive(Debug, Default)]
 pub(super) struct ChallengeCheck {
     pub poll: Poll,

@@ -1,4 +1,4 @@
-//! One submission in the queue: what is wished, what is known, and what follows from both.
+//! One submission in the queue: what is requested, what is known, and what follows from both.
 //!
 //! Owned by `queue`. Pure: the guard is asked here, nothing is sent.
 
@@ -14,9 +14,9 @@ use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
 use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, SubmissionState};
 
-/// Wait before an unknown word of EvalAI is read again.
+/// Wait before an unknown status of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
-/// Wait before an end is tried again that was refused, or that EvalAI breaks down over again and again.
+/// Wait before an end is retried that was refused, or that EvalAI breaks down over repeatedly.
 pub(super) const RETRY_END: Duration = Duration::from_mins(10);
 
 /// An update that is requested, and since when.
@@ -56,7 +56,7 @@ pub(super) struct Sub {
     pub end: Option<Pending<(Outcome, Arc<Payload>)>>,
     /// Digest of the partial results that were last answered.
     pub partial_sent: Option<u64>,
-    /// Why the end's results are not sent, whatever EvalAI says.
+    /// Why the end's results are not sent, whatever EvalAI shows.
     pub misfit: Option<String>,
     /// Request of the last read of the row.
     pub read: Option<Duration>,

@@ -159,7 +159,7 @@ fn a_cancellation_while_a_later_attempt_waits_ends_it() {
     assert_eq!(
         bench.view(7).ended,
         Some(Status::Cancelled),
-        "EvalAI was not told of attempt 2, but had said resuming"
+        "EvalAI did not know of attempt 2, but had shown resuming"
     );
 }
 
@@ -285,13 +285,13 @@ fn a_deleted_submission_that_waits_is_found_by_the_sweep() {
 
 #[test]
 fn each_write_follows_at_once_a_read_of_its_own() {
-    for (wish, write) in [
+    for (update, write) in [
         (DesiredUpdate::Partial(results(41.0)), "partial 7"),
         (DesiredUpdate::Final(Outcome::Cancelled, results(41.0)), "cancelled 7"),
     ] {
         let mut bench = Bench::new();
         bench.all_running(&[7, 8]);
-        bench.update(7, 1, wish);
+        bench.update(7, 1, update);
         let read = bench.expect("submission 7");
         // Meanwhile there is what would otherwise come first.
         bench.ask(9, 1);
@@ -320,9 +320,9 @@ const WORK: Duration = Duration::from_millis(80);
 /// One way to the server.
 const WAY: Duration = Duration::from_millis(5);
 
-/// A cancel so long after a list was answered, and a wish two seconds after that list. How long before the server began with
+/// A cancel so long after a list was answered, and a update two seconds after that list. How long before the server began with
 /// the write that undid the cancel it had come; none if it stands.
-fn undone(wish: &DesiredUpdate, offset: Duration) -> Option<Duration> {
+fn undone(update: &DesiredUpdate, offset: Duration) -> Option<Duration> {
     let mut bench = Bench::new();
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Submitted));
@@ -330,7 +330,7 @@ fn undone(wish: &DesiredUpdate, offset: Duration) -> Option<Duration> {
     bench.list("list of cancelled", vec![]);
     let cancel = bench.at + offset;
     bench.wait(2.0);
-    bench.update(7, 1, wish.clone());
+    bench.update(7, 1, update.clone());
     while let Some((_, ticket)) = bench.next() {
         bench.at += WAY;
         let arrived = bench.at;
@@ -354,24 +354,24 @@ fn undone(wish: &DesiredUpdate, offset: Duration) -> Option<Duration> {
 fn forty_cancels_aimed_between_a_list_and_a_write_are_undone_only_while_the_server_works_on_it() {
     // The way of the read's answer and of the write; all moments of this clock differ by a little.
     let on_the_way = WAY * 2 + Duration::from_millis(1);
-    for wish in [
+    for update in [
         DesiredUpdate::Queued,
         DesiredUpdate::Running,
         DesiredUpdate::Partial(results(41.0)),
     ] {
-        // From the list to the wish in steps of 100 ms, then through read and write in steps of 10 ms.
+        // From the list to the update in steps of 100 ms, then through read and write in steps of 10 ms.
         let offsets = (0..20)
             .map(|step| step * 100)
             .chain((0..20).map(|step| 1_990 + step * 10));
         let undone: Vec<_> = offsets
-            .filter_map(|offset| undone(&wish, Duration::from_millis(offset)))
+            .filter_map(|offset| undone(&update, Duration::from_millis(offset)))
             .collect();
         let before = undone.iter().filter(|before| **before > on_the_way).count();
         println!(
             "{} of 40 undone, {before} of them before the write was on its way",
             undone.len()
         );
-        assert_eq!(before, 0, "{wish:?}: {undone:?}");
-        assert!((5..12).contains(&undone.len()), "{wish:?}: {undone:?}");
+        assert_eq!(before, 0, "{update:?}: {undone:?}");
+        assert!((5..12).contains(&undone.len()), "{update:?}: {undone:?}");
     }
 }

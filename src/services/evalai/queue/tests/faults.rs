@@ -72,7 +72,7 @@ fn throttling_stops_everything_for_as_long_as_asked() {
     bench.expect_nothing();
     bench.wait(0.1);
     bench.get(7, row(7, Status::Submitted));
-    assert_eq!(bench.view(7).last_error, None, "that is nobody's fault");
+    assert_eq!(bench.view(7).last_error, None, "that is no error of this submission");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! What a submission is told, and when it is not.
+//! What is written of a submission, and when it is not.
 
 use super::*;
 
@@ -42,7 +42,7 @@ fn every_change_wakes_its_object_once_and_repeats_wake_nobody() {
         ..row(7, Status::Running)
     };
     bench.get(7, read.clone());
-    assert_eq!(bench.queue.take_changes(), [].into(), "a read that says what is known");
+    assert_eq!(bench.queue.take_changes(), [].into(), "a read that shows what is known");
     let now = bench.now();
     assert!(!bench.queue.update(&of(7, 1), DesiredUpdate::Running, now));
     assert!(!bench.queue.live(&of(7, 1), wall(-60)));
@@ -378,4 +378,17 @@ fn a_read_that_goes_well_does_not_hide_that_the_file_is_missing() {
     }
     assert!((3..10).contains(&files), "{files}: its pauses grow, whatever is read");
     assert!(reads >= 4, "{reads}");
+}
+
+#[test]
+fn a_challenge_that_nothing_needs_any_more_is_forgotten() {
+    let mut bench = Bench::new();
+    bench.serve();
+    bench.ask(7, 1);
+    assert_eq!(bench.queue.challenges.len(), 1);
+    let now = bench.now();
+    bench.queue.retire(&key(100), now);
+    assert_eq!(bench.queue.challenges.len(), 1, "a submission is asked about there");
+    bench.forget(7);
+    assert!(bench.queue.challenges.is_empty());
 }

@@ -228,7 +228,7 @@ impl Bench {
     fn all_running(&mut self, pks: &[i64]) {
         for pk in pks {
             self.live(*pk, 1);
-            self.wish(*pk, 1, DesiredUpdate::Running);
+            self.update(*pk, 1, DesiredUpdate::Running);
             self.answer_all(Status::Submitted);
             self.wait(5.0);
         }
@@ -256,10 +256,10 @@ impl Bench {
         self.get(pk, row(pk, Status::Submitted));
         self.live(pk, 1);
         self.list("list of cancelled", vec![]);
-        self.wish(pk, 1, DesiredUpdate::Queued);
+        self.update(pk, 1, DesiredUpdate::Queued);
         self.get(pk, row(pk, Status::Submitted));
         self.write(&format!("queued {pk}"));
-        self.wish(pk, 1, DesiredUpdate::Running);
+        self.update(pk, 1, DesiredUpdate::Running);
         self.get(pk, row(pk, Status::Queued));
         self.write(&format!("running {pk}"));
         self.expect_nothing();

@@ -25,7 +25,7 @@ fn priorities() {
         }
         sent.push(name);
     }
-    // The read for the cancelled end has to leave room in the budget for two writes; the rest waits for a place.
+    // The read for the cancelled end has to leave two writes in the budget; the rest waits for a place.
     let expected = [
         "submission 3",
         "list of cancelled",

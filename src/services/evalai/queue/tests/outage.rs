@@ -24,7 +24,7 @@ enum Away {
     Broken,
     /// 429, with a Retry-After.
     Throttled,
-    /// Connections are taken and nothing is said, until the client gives up.
+    /// Connections are accepted and nothing is answered, until the client gives up.
     Hanging,
     /// Reads are answered, writes end in its own page for an exception.
     ReadOnly,
@@ -152,7 +152,7 @@ impl Outage {
                 self.statuses.insert(subject.pk, Status::parse(outcome.as_str()));
                 Reply::Written(Answer::Done(()))
             }
-            other => panic!("{other:?} was not wished"),
+            other => panic!("{other:?} was not requested"),
         }
     }
 }

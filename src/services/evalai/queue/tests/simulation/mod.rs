@@ -20,7 +20,7 @@ use crate::services::token::Token;
 const SUBMISSIONS: i64 = 12;
 /// Those that their participant deletes at some time.
 const DELETED: [i64; 2] = [11, 12];
-/// Those that their participant calls finished at some times.
+/// Those that their participant edits to finished at some times.
 const FINISHED: [i64; 3] = [8, 9, 10];
 const MINUTE_LIMIT: usize = 54;
 /// Faults, cancellations and new attempts end here; what is left must come to its end after it.
@@ -66,7 +66,7 @@ enum Event {
     Arrive(Ticket),
     Save(Work),
     Answer(Ticket, Reply),
-    Pass,
+    Reconcile,
     Cancel(i64),
     Delete(i64),
     /// Its participant writes that it has finished.
@@ -212,7 +212,7 @@ impl World {
             world.push(at, Event::Lease(false));
             world.push(at + Duration::from_secs(20), Event::Lease(true));
         }
-        world.push(Duration::ZERO, Event::Pass);
+        world.push(Duration::ZERO, Event::Reconcile);
         world
     }
 
@@ -301,11 +301,11 @@ impl World {
             Event::Arrive(ticket) => self.arrive(ticket),
             Event::Save(work) => self.save(&work),
             Event::Answer(ticket, reply) => self.answer(&ticket, reply),
-            Event::Pass => {
+            Event::Reconcile => {
                 for pk in 1..=SUBMISSIONS {
-                    self.pass(pk);
+                    self.reconcile(pk);
                 }
-                self.push(self.at + Duration::from_secs(2), Event::Pass);
+                self.push(self.at + Duration::from_secs(2), Event::Reconcile);
             }
             Event::Cancel(pk) => {
                 let record = self.table.get_mut(&pk).unwrap();
@@ -342,8 +342,8 @@ impl World {
         self.queue.answered(ticket, reply, now);
     }
 
-    /// What the controller does with a submission each time it looks.
-    fn pass(&mut self, pk: i64) {
+    /// What the controller does with a submission in each reconcile.
+    fn reconcile(&mut self, pk: i64) {
         let actor = self.actors[&pk].clone();
         if actor.settled {
             return;
