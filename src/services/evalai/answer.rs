@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use leaderboard_api::text::one_line;
 use serde_json::{Map, Value};
 
 /// EvalAI's words to a user who is no host, whatever is asked for.
@@ -209,11 +210,7 @@ impl Said {
 
 /// One sentence without line breaks.
 fn sentence(status: u16, said: &Said) -> String {
-    let words = said.text().split_whitespace().collect::<Vec<_>>().join(" ");
-    let mut text: String = words.chars().take(LONGEST).collect();
-    if text.len() < words.len() {
-        text.push('…');
-    }
+    let text = one_line(said.text(), LONGEST);
     let text = if text.is_empty() { "nothing".to_owned() } else { text };
     let next = next_step(status, said)
         .map(|step| format!(" ({step})"))
