@@ -7,7 +7,7 @@ LAB := ./local/lab
 FUZZ_SECONDS ?= 600
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale cluster down status build static image images crds fmt lint deny bench fuzz chart-test lab-test
+.PHONY: help demo test test-core measure-scale cluster down status build static image images crds docs fmt lint deny bench fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -51,6 +51,9 @@ images: image ## Make and push all images of the demo
 
 crds: ## Generate crds/ from the types
 	UPDATE_CRDS=1 cargo test --profile $(PROFILE) --workspace --lib -- crds
+
+docs: ## Write the tables of reasons in docs/states.md
+	UPDATE_DOCS=1 cargo test --profile $(PROFILE) --workspace --lib -- documentation
 
 fmt: ## Format the code
 	cargo fmt --all

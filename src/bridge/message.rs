@@ -6,6 +6,7 @@ use serde_json::{Map, Value};
 use thiserror::Error;
 
 use leaderboard_api::image;
+use leaderboard_api::text::is_harmless;
 
 /// A message that names a submission of EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -65,7 +66,7 @@ pub fn parse(body: &str) -> Result<Message, Malformed> {
 fn fitting(text: &str) -> Option<String> {
     let text = text.trim();
     let starts_well = text.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit());
-    let fits = text.chars().count() <= image::LONGEST && !text.contains(char::is_whitespace);
+    let fits = text.chars().count() <= image::LONGEST && !text.contains(char::is_whitespace) && is_harmless(text);
     (starts_well && fits).then(|| text.to_owned())
 }
 
@@ -130,6 +131,10 @@ mod tests {
             ),
             (
                 r#"{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"submitted_image_uri":"Upper/case"}"#,
+                None,
+            ),
+            (
+                r#"{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"submitted_image_uri":"r.example/a\u001b[2J:1"}"#,
                 None,
             ),
             (

@@ -20,6 +20,7 @@ use super::queue::{QueueError, Reader, Received, batch_size};
 use super::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
 use super::{PULSE_LIMIT, Shared};
 use crate::backoff::Backoff;
+use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, client_errors, names, reasons};
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
@@ -250,7 +251,7 @@ impl Poller {
                     );
                     self.publish(
                         readers,
-                        "DeadLetter",
+                        reasons::DEAD_LETTER,
                         &format!("Moved to the dead-letter queue: {what}"),
                     )
                     .await;
@@ -281,7 +282,7 @@ impl Poller {
         let event = Event {
             type_: EventType::Warning,
             reason: reason.to_owned(),
-            note: Some(note.chars().take(1000).collect()),
+            note: Some(one_line(note, 1000)),
             action: "ReadQueue".to_owned(),
             secondary: None,
         };

@@ -26,6 +26,7 @@ use super::sync::Sync;
 use crate::kubernetes::Synced;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
+use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_api::{Leaderboard, Storage, Submission};
 
 /// Time any one call to the API server may take.
@@ -198,7 +199,7 @@ impl Context {
                 .map(|t| t.0)
                 .or(e.event_time.as_ref().map(|t| t.0))
         })?;
-        latest.message
+        latest.message.map(|message| one_line(&message, LONGEST_MESSAGE))
     }
 
     /// Drops everything that is remembered of a Submission that is gone.

@@ -4,6 +4,7 @@
 
 use std::collections::BTreeMap;
 
+use leaderboard_api::text::one_line;
 use serde::{Deserialize, Serialize};
 
 use super::schema::is_read;
@@ -14,6 +15,8 @@ pub const REPORT_KEY: &str = "logcopy/report.json";
 pub const OWNER_KEY: &str = "logcopy/owner";
 /// Largest report that is read or written, in bytes.
 pub const MAX_BYTES: usize = 1 << 20;
+/// Characters of a reason or a warning.
+pub const LONGEST_TEXT: usize = 2000;
 /// Version of the report.
 pub const SCHEMA: u32 = 1;
 /// Version of the owner's mark.
@@ -155,7 +158,18 @@ impl Report {
         }
         let report: Self = serde_json::from_slice(bytes).map_err(|e| ReportError::Malformed(e.to_string()))?;
         report.check()?;
-        Ok(report)
+        Ok(report.shown())
+    }
+
+    /// A checkpoint is the agent's own, and its reasons and warnings repeat parts of it.
+    fn shown(self) -> Self {
+        let line = |text: &String| one_line(text, LONGEST_TEXT);
+        Self {
+            entry_status: line(&self.entry_status),
+            why: self.why.as_ref().map(line),
+            warnings: self.warnings.iter().map(line).collect(),
+            ..self
+        }
     }
 
     fn check(&self) -> Result<(), ReportError> {

@@ -354,6 +354,18 @@ mod tests {
     }
 
     #[test]
+    fn what_a_report_quotes_is_one_harmless_line() {
+        let mut report = first_report(&fixtures::run(), "pod-1").unwrap();
+        report.why = Some("pair 1: \u{1b}[2J\nbad".into());
+        report.warnings = vec!["\u{202e}route 1".into()];
+        report.entry_status = "Started\u{7}".into();
+        let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
+        assert_eq!(read.why.as_deref(), Some("pair 1: \u{fffd}[2J bad"));
+        assert_eq!(read.warnings, ["\u{fffd}route 1"]);
+        assert_eq!(read.entry_status, "Started\u{fffd}");
+    }
+
+    #[test]
     fn what_a_pod_found_of_its_isolation_is_no_failure_unless_it_has_to_be_isolated() {
         let address = "10.96.0.1:443".parse().unwrap();
         for (finding, reason, required) in [

@@ -1,4 +1,4 @@
-//! What of a Leaderboard keeps its submissions from starting: missing, paused, not Ready, being deleted.
+//! What keeps the submissions of a Leaderboard from starting: it is missing, paused, not Ready or being deleted.
 //!
 //! Called by `why`, `overview` and `change`. Pure.
 
@@ -6,25 +6,25 @@ use leaderboard_api::conditions;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Leaderboard, reasons};
 
-/// What was seen of a submission's Leaderboard.
+/// The Leaderboard of a submission, as far as this person can read it.
 #[derive(Clone, Copy, Debug)]
-pub enum Sight<'a> {
-    There(&'a Leaderboard),
+pub enum Observed<'a> {
+    Found(&'a Leaderboard),
     Missing,
-    /// This person may not read Leaderboards.
-    Unread,
+    /// This person has no right to read Leaderboards.
+    Forbidden,
 }
 
-impl<'a> Sight<'a> {
-    /// The Leaderboard, if it was seen.
+impl<'a> Observed<'a> {
+    /// The Leaderboard, if it could be read.
     pub fn leaderboard(self) -> Option<&'a Leaderboard> {
         match self {
-            Self::There(leaderboard) => Some(leaderboard),
-            Self::Missing | Self::Unread => None,
+            Self::Found(leaderboard) => Some(leaderboard),
+            Self::Missing | Self::Forbidden => None,
         }
     }
 
-    /// Whether nothing new starts by the host's will.
+    /// Whether the host lets nothing new start.
     pub(super) fn is_paused(self) -> bool {
         self.leaderboard().is_some_and(|l| l.spec.paused)
     }
@@ -32,46 +32,47 @@ impl<'a> Sight<'a> {
 
 /// Something that is wrong with a Leaderboard.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Trouble {
+pub(super) struct Problem {
     /// A sentence.
-    pub words: String,
-    /// The reason whose next step mends it.
+    pub text: String,
+    /// The reason whose next step fixes it.
     pub reason: Option<String>,
 }
 
 /// All that is wrong with the Leaderboard of this name.
-pub(super) fn troubles(name: &str, sight: Sight<'_>) -> Vec<Trouble> {
-    let leaderboard = match sight {
-        Sight::There(leaderboard) => leaderboard,
-        Sight::Missing => {
-            let words = format!("There is no Leaderboard {name} in this namespace: nothing new starts.");
-            return vec![trouble(words, Some(reasons::LEADERBOARD_NOT_FOUND))];
+pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
+    let leaderboard = match observed {
+        Observed::Found(leaderboard) => leaderboard,
+        Observed::Missing => {
+            let text = format!("There is no Leaderboard {name} in this namespace: nothing new starts.");
+            return vec![problem(text, Some(reasons::LEADERBOARD_NOT_FOUND))];
         }
-        Sight::Unread => {
-            let words =
-                format!("You may not read Leaderboard {name}, so whether it is paused or not Ready is left out.");
-            return vec![trouble(words, None)];
+        Observed::Forbidden => {
+            let text = format!("You have no right to read Leaderboard {name}; it may be paused or not Ready.");
+            return vec![problem(text, None)];
         }
     };
     let mut found = Vec::new();
     if leaderboard.metadata.deletion_timestamp.is_some() {
-        let words = format!("Leaderboard {name} is being deleted and waits for its submissions.");
-        found.push(trouble(words, Some(reasons::IN_USE)));
+        let text = format!("Leaderboard {name} is being deleted and waits for its submissions.");
+        found.push(problem(text, Some(reasons::IN_USE)));
     }
     if leaderboard.spec.paused {
-        let words = format!("Leaderboard {name} is paused: nothing new starts, and what runs goes on.");
-        found.push(trouble(words, Some(reasons::PAUSED)));
+        let text = format!("Leaderboard {name} is paused: nothing new starts, and running submissions continue.");
+        found.push(problem(text, Some(reasons::PAUSED)));
     }
     found.extend(not_ready(name, leaderboard));
     found
 }
 
-fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Trouble> {
+fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Problem> {
     let status = leaderboard.status.as_ref();
     let ready = status.and_then(|status| conditions::get(&status.conditions, conditions::READY));
     let Some(ready) = ready else {
-        let words = format!("The operator has not looked at Leaderboard {name} yet. If that lasts, it does not run.");
-        return Some(trouble(words, None));
+        let text = format!(
+            "The operator has not processed Leaderboard {name} yet. If that lasts, check that the operator runs."
+        );
+        return Some(problem(text, None));
     };
     let what = match ready.status.as_str() {
         "True" => return None,
@@ -79,17 +80,17 @@ fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Trouble> {
         _ => "may not be Ready",
     };
     let colon = if ready.message.is_empty() { "." } else { ": " };
-    let words = format!(
+    let text = format!(
         "Leaderboard {name} {what} ({}){colon}{}",
         ready.reason,
         sentence(&ready.message)
     );
-    Some(trouble(words, Some(&ready.reason)))
+    Some(problem(text, Some(&ready.reason)))
 }
 
-fn trouble(words: String, reason: Option<&str>) -> Trouble {
-    Trouble {
-        words,
+fn problem(text: String, reason: Option<&str>) -> Problem {
+    Problem {
+        text,
         reason: reason.map(str::to_owned),
     }
 }

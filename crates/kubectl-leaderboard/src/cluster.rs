@@ -1,6 +1,6 @@
-//! The way to the API server: as kubectl finds it, and the few requests that the plugin makes. Secrets are never read.
+//! The API server: found as kubectl finds it, and the few requests that the plugin sends. It never reads a Secret.
 //!
-//! Called by `mod`; decides nothing.
+//! Called by `main`; decides nothing.
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ use kube::{Api, Client, Config, ResourceExt};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-use super::board::Sight;
+use super::board::Observed;
 use super::error::{Error, of_kubeconfig};
 use super::near;
 use leaderboard_api::{Leaderboard, Submission};
@@ -28,16 +28,16 @@ const PAGE: u32 = 500;
 /// Longest time one request may take.
 const LIMIT: Duration = Duration::from_secs(30);
 
-/// Which cluster and namespace; the same flags as kubectl's.
+/// Which cluster and namespace: the same flags as kubectl's.
 #[derive(Args, Debug)]
-pub struct Place {
-    /// The kubeconfig; else KUBECONFIG, else ~/.kube/config.
+pub struct Target {
+    /// Kubeconfig file [default: $KUBECONFIG, else ~/.kube/config].
     #[arg(long, global = true, value_name = "FILE")]
     kubeconfig: Option<PathBuf>,
-    /// The context of the kubeconfig; else its current one.
+    /// Context of the kubeconfig [default: the current one].
     #[arg(long, global = true)]
     context: Option<String>,
-    /// The namespace; else the context's.
+    /// Namespace [default: the context's].
     #[arg(short, long, global = true)]
     namespace: Option<String>,
 }
@@ -49,29 +49,29 @@ pub struct Cluster {
     pub namespace: String,
 }
 
-/// The Leaderboard of a submission, as far as this person may see it.
-pub enum Seen {
-    There(Box<Leaderboard>),
+/// The answer to a request for the Leaderboard of a submission.
+pub enum Fetched {
+    Found(Box<Leaderboard>),
     Missing,
-    Unread,
+    Forbidden,
 }
 
-impl Seen {
+impl Fetched {
     /// The same by reference.
-    pub fn sight(&self) -> Sight<'_> {
+    pub fn observed(&self) -> Observed<'_> {
         match self {
-            Self::There(leaderboard) => Sight::There(leaderboard),
-            Self::Missing => Sight::Missing,
-            Self::Unread => Sight::Unread,
+            Self::Found(leaderboard) => Observed::Found(leaderboard),
+            Self::Missing => Observed::Missing,
+            Self::Forbidden => Observed::Forbidden,
         }
     }
 }
 
 impl Cluster {
     /// Finds the cluster as kubectl does.
-    pub async fn connect(place: Place) -> Result<Self, Error> {
-        let config = config(&place).await?;
-        let namespace = place.namespace.unwrap_or_else(|| config.default_namespace.clone());
+    pub async fn connect(target: Target) -> Result<Self, Error> {
+        let config = config(&target).await?;
+        let namespace = target.namespace.unwrap_or_else(|| config.default_namespace.clone());
         Ok(Self {
             client: Client::try_from(config)?,
             namespace,
@@ -92,16 +92,16 @@ impl Cluster {
     }
 
     /// A Leaderboard by its name.
-    pub async fn leaderboard(&self, name: &str) -> Result<Seen, Error> {
+    pub async fn leaderboard(&self, name: &str) -> Result<Fetched, Error> {
         match self.in_time(self.api::<Leaderboard>().get_opt(name)).await? {
-            Ok(Some(found)) => Ok(Seen::There(Box::new(found))),
-            Ok(None) => Ok(Seen::Missing),
-            Err(kube::Error::Api(status)) if status.is_forbidden() => Ok(Seen::Unread),
+            Ok(Some(found)) => Ok(Fetched::Found(Box::new(found))),
+            Ok(None) => Ok(Fetched::Missing),
+            Err(kube::Error::Api(status)) if status.is_forbidden() => Ok(Fetched::Forbidden),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// All Leaderboards; none if this person may not read them.
+    /// All Leaderboards; none if this person has no right to read them.
     pub async fn leaderboards(&self) -> Result<Option<Vec<Leaderboard>>, Error> {
         match list(self, &self.api()).await {
             Ok(found) => Ok(Some(found)),
@@ -110,7 +110,7 @@ impl Cluster {
         }
     }
 
-    /// Changes a submission by a merge patch. What the API server answers is the caller's to judge.
+    /// Changes a submission by a merge patch. The caller judges the API server's answer.
     pub async fn patch(&self, name: &str, patch: &Value) -> Result<kube::Result<Submission>, Error> {
         let params = PatchParams {
             field_manager: Some(MANAGER.to_owned()),
@@ -133,21 +133,21 @@ impl Cluster {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
-    /// The error for a name that nothing has, with the names that may be meant.
+    /// The error for an unknown name, with the names that the person may have meant.
     async fn unknown(&self, name: &str) -> Result<Error, Error> {
         let all = list(self, &self.api::<PartialObjectMeta<Submission>>()).await;
         let known: Vec<String> = match all {
             Ok(found) => found.iter().map(ResourceExt::name_any).collect(),
-            // Who may read one object by its name need not be allowed to list them.
+            // The right to read an object by its name does not include the right to list them.
             Err(Error::Forbidden(_)) => Vec::new(),
             Err(error) => return Err(error),
         };
         let near = near::names(name, &known);
         let namespace = self.namespace.clone();
         let next = if near.is_empty() {
-            format!("`kubectl get submissions -n {namespace}` lists all; -n names another namespace")
+            format!("`kubectl get submissions -n {namespace}` lists all; use -n for another namespace")
         } else {
-            format!("Do you mean {}?", near.join(", "))
+            format!("Did you mean {}?", near.join(", "))
         };
         Ok(Error::Unknown {
             name: name.to_owned(),
@@ -162,18 +162,18 @@ impl Cluster {
     }
 }
 
-async fn config(place: &Place) -> Result<Config, Error> {
+async fn config(target: &Target) -> Result<Config, Error> {
     let options = KubeConfigOptions {
-        context: place.context.clone(),
+        context: target.context.clone(),
         ..KubeConfigOptions::default()
     };
     let failed = |error: KubeconfigError| of_kubeconfig(&error);
-    if let Some(path) = &place.kubeconfig {
+    if let Some(path) = &target.kubeconfig {
         let file = Kubeconfig::read_from(path).map_err(failed)?;
         return Config::from_custom_kubeconfig(file, &options).await.map_err(failed);
     }
-    // A context is of a kubeconfig; without one it may be a Pod's own.
-    if place.context.is_some() {
+    // A context is part of a kubeconfig; without one the account of a Pod may serve.
+    if target.context.is_some() {
         return Config::from_kubeconfig(&options).await.map_err(failed);
     }
     Config::infer().await.map_err(|error| of_kubeconfig(&error))

@@ -1,7 +1,7 @@
-//! `kubectl leaderboard`: why a submission is where it is, and to cancel or resume it.
+//! `kubectl leaderboard`: explains why a submission waits, runs or failed, and cancels or resumes it.
 //!
-//! `why`, `overview`, `change` and `transitions` are pure and hold what is
-//! said and decided; `cluster` is the way to the API server. Knows no EvalAI and no AWS: it says what the status says.
+//! `why`, `overview`, `change` and `transitions` are pure and hold what is printed and decided; `cluster` talks to the API
+//! server. It shows what the status holds, and contacts neither EvalAI nor AWS.
 
 mod board;
 mod change;
@@ -9,7 +9,6 @@ mod cluster;
 mod error;
 mod near;
 mod overview;
-mod steps;
 mod text;
 mod transitions;
 mod why;
@@ -26,55 +25,55 @@ use futures::StreamExt;
 use jiff::Timestamp;
 use kube::ResourceExt;
 
-use self::change::Wish;
-use self::cluster::{Cluster, Place};
+use self::change::Request;
+use self::cluster::{Cluster, Target};
 use self::error::Error;
 use self::transitions::Waiting;
-use leaderboard_api::client_errors::watch as watch_words;
+use leaderboard_api::client_errors::watch as watch_error;
 use leaderboard_api::{State, Submission};
 
-/// How often a race for the object is run before it is given up.
-const ROUNDS: usize = 4;
+/// How often a change is tried again after a conflict with somebody else's.
+const TRIES: usize = 4;
 
-/// Why submissions wait or fail, and to cancel or resume them.
+/// Explain, cancel and resume submissions.
 #[derive(Parser, Debug)]
 #[command(name = "kubectl-leaderboard", bin_name = "kubectl leaderboard", version, long_about = None)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
     #[command(flatten)]
-    place: Place,
+    target: Target,
 }
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Says why a submission is in its state and what to do next; without a name, of each that waits or is in trouble.
+    /// Explain a submission's state and the next step. Without NAME, list every submission that is waiting, failed or stuck.
     Why {
         /// Name of the submission.
         name: Option<String>,
     },
-    /// Stops a submission and keeps what it has reached.
+    /// Stop a submission. Completed routes are kept.
     #[command(
-        after_help = "Exit code 0: it is to be cancelled; with --wait, it has come to its end. 1: it had ended before."
+        after_help = "Exit code 0: the cancellation is requested; with --wait, the submission has ended. 1: it had already ended, or an error."
     )]
-    Cancel(Target),
-    /// Runs a Failed or Cancelled submission again from what is stored.
+    Cancel(Change),
+    /// Run a Failed or Cancelled submission again, from its stored results.
     #[command(
-        after_help = "Exit code 0: it is to be resumed; with --wait, it is Finished. 1: it can't be, or it did not finish."
+        after_help = "Exit code 0: the attempt is requested; with --wait, the submission is Finished. 1: it cannot be resumed, it did not finish, or an error."
     )]
-    Resume(Target),
+    Resume(Change),
 }
 
 #[derive(Args, Debug)]
-struct Target {
+struct Change {
     /// Name of the submission.
     name: String,
-    /// Waits for the end, and prints the states on the way.
+    /// Wait for the end, and print each state until then.
     #[arg(long)]
     wait: bool,
 }
 
-/// Runs what the command line asks for.
+/// Runs the command line.
 fn main() -> ExitCode {
     let cli = Cli::parse();
     // It fails only where a provider is installed already, which serves as well.
@@ -93,19 +92,19 @@ fn main() -> ExitCode {
 }
 
 async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
-    let cluster = Cluster::connect(cli.place).await?;
+    let cluster = Cluster::connect(cli.target).await?;
     match cli.command {
         Command::Why { name: Some(name) } => explain(&cluster, &name).await,
         Command::Why { name: None } => survey(&cluster).await,
-        Command::Cancel(target) => change(&cluster, Wish::Cancel, &target).await,
-        Command::Resume(target) => change(&cluster, Wish::Resume, &target).await,
+        Command::Cancel(target) => change(&cluster, Request::Cancel, &target).await,
+        Command::Resume(target) => change(&cluster, Request::Resume, &target).await,
     }
 }
 
 async fn explain(cluster: &Cluster, name: &str) -> Result<ExitCode, Error> {
     let submission = cluster.submission(name).await?;
     let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-    print(&why::explain(&submission, leaderboard.sight(), Timestamp::now()));
+    print(&why::explain(&submission, leaderboard.observed(), Timestamp::now()));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -122,46 +121,51 @@ async fn survey(cluster: &Cluster) -> Result<ExitCode, Error> {
     Ok(ExitCode::SUCCESS)
 }
 
-async fn change(cluster: &Cluster, wish: Wish, target: &Target) -> Result<ExitCode, Error> {
-    let attempt = tell(cluster, wish, &target.name).await?;
+async fn change(cluster: &Cluster, request: Request, target: &Change) -> Result<ExitCode, Error> {
+    let attempt = send(cluster, request, &target.name).await?;
     if !target.wait {
         return Ok(ExitCode::SUCCESS);
     }
     let end = wait(cluster, &target.name, attempt).await?;
-    // Who cancels wants it ended; who resumes wants a result.
-    let is_well = wish == Wish::Cancel || end == State::Finished;
-    Ok(if is_well { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    // A cancel succeeds with any end, a resume only with a result.
+    let is_fulfilled = request == Request::Cancel || end == State::Finished;
+    Ok(if is_fulfilled {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
 }
 
-/// Tells the API server what is wished; hands back the attempt whose end fulfils it.
-async fn tell(cluster: &Cluster, wish: Wish, name: &str) -> Result<i64, Error> {
-    for _ in 0..ROUNDS {
+/// Sends a request to the API server; returns the attempt whose end fulfils it.
+async fn send(cluster: &Cluster, request: Request, name: &str) -> Result<i64, Error> {
+    for _ in 0..TRIES {
         let submission = cluster.submission(name).await?;
         let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-        let plan = change::plan(wish, &submission, leaderboard.sight(), Timestamp::now()).map_err(Error::Unfit)?;
+        let plan =
+            change::plan(request, &submission, leaderboard.observed(), Timestamp::now()).map_err(Error::Unfit)?;
         if let Some(patch) = &plan.patch {
             match cluster.patch(name, patch).await? {
                 Ok(_) => {}
                 Err(kube::Error::Api(status)) if status.is_conflict() => continue,
-                Err(error) => return Err(refusal(wish, &submission, error)),
+                Err(error) => return Err(refusal(request, &submission, error)),
             }
         }
-        print(&plan.says);
+        print(&plan.lines);
         return Ok(plan.attempt);
     }
-    Err(Error::Busy(name.to_owned()))
+    Err(Error::Conflict(name.to_owned()))
 }
 
-/// A refusal of the API server's rules has a next step, and so has one of a person's rights where EvalAI is another way.
-fn refusal(wish: Wish, submission: &Submission, error: kube::Error) -> Error {
+/// The next step after a refusal by the API server's rules, or for lack of a right where EvalAI is another way.
+fn refusal(request: Request, submission: &Submission, error: kube::Error) -> Error {
     let kube::Error::Api(status) = &error else {
         return error.into();
     };
     let has_other_way = status.is_forbidden() && submission.spec.evalai.is_some();
     if has_other_way || status.is_invalid() || status.code == 400 {
         return Error::Refused {
-            words: error::phrase(&status.message),
-            next: change::after_refusal(wish, submission),
+            message: error::phrase(&status.message),
+            next: change::after_refusal(request, submission),
         };
     }
     if status.is_not_found() {
@@ -170,29 +174,29 @@ fn refusal(wish: Wish, submission: &Submission, error: kube::Error) -> Error {
     error.into()
 }
 
-/// Waits for the end of an attempt, and prints the states on the way.
+/// Waits for the end of an attempt, and prints each state until then.
 async fn wait(cluster: &Cluster, name: &str, attempt: i64) -> Result<State, Error> {
     let mut waiting = Waiting::new(attempt);
     let mut changes = pin!(cluster.changes(name));
-    let mut told = String::new();
+    let mut printed = String::new();
     while let Some(change) = changes.next().await {
         match change {
             Ok(Some(submission)) => {
-                let seen = waiting.see(&submission, Timestamp::now());
-                print(&seen.says);
-                if let Some(end) = seen.end {
+                let update = waiting.observe(&submission, Timestamp::now());
+                print(&update.lines);
+                if let Some(end) = update.end {
                     return Ok(end);
                 }
             }
             Ok(None) => return Err(Error::Gone(name.to_owned())),
             Err(error) => {
-                let words = error::phrase(&watch_words(&error));
-                if let Some(hopeless) = error::hopeless(error) {
-                    return Err(hopeless);
+                let message = error::phrase(&watch_error(&error));
+                if let Some(permanent) = error::permanent(error) {
+                    return Err(permanent);
                 }
-                if words != told {
-                    eprintln!("kubectl leaderboard: {words}; it is tried again.");
-                    told = words;
+                if message != printed {
+                    eprintln!("kubectl leaderboard: {message}; retrying.");
+                    printed = message;
                 }
             }
         }
@@ -204,9 +208,9 @@ fn print(lines: &[String]) {
     let mut out = std::io::stdout().lock();
     for line in lines {
         if let Err(error) = writeln!(out, "{line}") {
-            // Nobody has to listen.
+            // Ignore a closed pipe.
             if error.kind() != ErrorKind::BrokenPipe {
-                eprintln!("kubectl leaderboard: the output can't be written: {error}. See where it goes");
+                eprintln!("kubectl leaderboard: cannot write the output: {error}. Check where it is redirected to");
             }
             return;
         }

@@ -1,4 +1,4 @@
-//! Names that somebody may have meant. Pure; called by `cluster` for a name that is unknown.
+//! Names that a person may have meant. Pure; called by `cluster` for an unknown name.
 
 /// Names that are offered.
 const MOST: usize = 3;

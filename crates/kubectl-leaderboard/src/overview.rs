@@ -1,6 +1,6 @@
-//! All submissions of a namespace that are not simply running or finished well, one line each.
+//! All submissions of a namespace that wait, have failed or are stuck, one line each.
 //!
-//! Called by `mod` for `why` without a name. Pure: the time is handed in.
+//! Called by `main` for `why` without a name. Pure: the time is handed in.
 
 use std::collections::BTreeMap;
 
@@ -8,13 +8,14 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::ResourceExt;
 
-use super::board::{self, Sight};
-use super::text::{Page, WIDTH, clean, cut, join, span};
+use super::board::{self, Observed};
+use super::text::{Page, WIDTH, clean, join, span};
 use super::why;
 use leaderboard_api::conditions;
+use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 
-/// How long an end may wait for another system before that is trouble.
+/// How long an end may wait for another system before that is a problem.
 const PATIENCE_SECONDS: i64 = 300;
 
 /// A line of the table.
@@ -26,7 +27,7 @@ struct Row {
     why: String,
 }
 
-/// The lines of a namespace. No Leaderboards: this person may not read them.
+/// The lines of a namespace. No Leaderboards: this person has no right to read them.
 pub fn lines(
     namespace: &str,
     submissions: &[Submission],
@@ -34,47 +35,50 @@ pub fn lines(
     now: Timestamp,
 ) -> Vec<String> {
     let mut page = Page::default();
-    for words in of_leaderboards(submissions, leaderboards) {
-        page.say(&words);
+    for text in of_leaderboards(submissions, leaderboards) {
+        page.paragraph(&text);
     }
     page.gap();
     let mut rows: Vec<Row> = submissions.iter().filter_map(|s| row(s, now)).collect();
     rows.sort_by(|a, b| a.order.cmp(&b.order).then_with(|| a.name.cmp(&b.name)));
     if rows.is_empty() {
-        let count = submissions.len();
-        let words =
-            format!("Nothing waits, has failed or is in trouble in namespace {namespace} ({count} submissions).");
-        page.say(&words);
+        page.paragraph(&match submissions.len() {
+            0 => format!(
+                "Namespace {namespace} has no submissions. `kubectl get submissions -A` lists those of all namespaces."
+            ),
+            1 => format!("Namespace {namespace} has 1 submission. It is not waiting, failed or stuck."),
+            count => format!("Namespace {namespace} has {count} submissions. None is waiting, failed or stuck."),
+        });
         return page.into_lines();
     }
     let mut lines = page.into_lines();
     lines.extend(table(&rows));
     lines.push(String::new());
-    lines.push("`kubectl leaderboard why NAME` says more, and what to do next.".to_owned());
+    lines.push("`kubectl leaderboard why NAME` has the details and the next step.".to_owned());
     lines
 }
 
-/// What is wrong with the Leaderboards that there are, and with those that submissions name.
+/// What is wrong with the existing Leaderboards, and with those that submissions name.
 fn of_leaderboards(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> Vec<String> {
     let Some(leaderboards) = leaderboards else {
-        return vec!["You may not read Leaderboards, so whether one is paused or not Ready is left out.".to_owned()];
+        return vec!["You have no right to read Leaderboards; one may be paused or not Ready.".to_owned()];
     };
-    let mut sights: BTreeMap<String, Sight<'_>> = BTreeMap::new();
+    let mut observed: BTreeMap<String, Observed<'_>> = BTreeMap::new();
     let live = submissions.iter().filter(|s| !why::has_ended(s));
-    sights.extend(live.map(|s| (s.spec.leaderboard_name.clone(), Sight::Missing)));
-    sights.extend(leaderboards.iter().map(|l| (l.name_any(), Sight::There(l))));
-    let troubles = sights.iter().flat_map(|(name, sight)| board::troubles(name, *sight));
-    troubles.map(|trouble| trouble.words).collect()
+    observed.extend(live.map(|s| (s.spec.leaderboard_name.clone(), Observed::Missing)));
+    observed.extend(leaderboards.iter().map(|l| (l.name_any(), Observed::Found(l))));
+    let problems = observed.iter().flat_map(|(name, board)| board::problems(name, *board));
+    problems.map(|problem| problem.text).collect()
 }
 
-/// The line of a submission, unless all is well with it.
+/// The line of a submission, unless it has no problem.
 fn row(submission: &Submission, now: Timestamp) -> Option<Row> {
-    let unseen = SubmissionStatus::default();
-    let status = submission.status.as_ref().unwrap_or(&unseen);
+    let empty = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&empty);
     let others = other_systems(status, now);
     let doubt = is_false(status, conditions::PLAUSIBLE);
     let is_deleting = submission.metadata.deletion_timestamp.is_some();
-    let own = own_words(submission, status);
+    let own = own_reason(submission, status);
     if own.is_none() && others.is_none() && doubt.is_none() && !is_deleting {
         return None;
     }
@@ -96,22 +100,26 @@ fn row(submission: &Submission, now: Timestamp) -> Option<Row> {
     })
 }
 
-/// Why a submission is where it is; nothing if it runs, has finished, or was cancelled as wished.
-fn own_words(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
+/// Why a submission is in its state; nothing if it is running, has finished, or was cancelled as requested.
+fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
     let reason = status.reason.as_deref().unwrap_or_default();
     let message = status.message.as_deref().unwrap_or_default();
-    if why::is_attempt_wished(submission) {
+    if why::is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
         return Some(format!(
-            "Attempt {wanted} is wished; the operator has not taken it up yet."
+            "Attempt {wanted} is requested; the operator has not processed it yet."
         ));
     }
     match status.state {
-        None => Some("The operator has not looked at it yet.".to_owned()),
+        None => Some("The operator has not processed it yet.".to_owned()),
         Some(State::Pending) => Some(match &status.waiting {
             Some(waiting) => {
-                let eta = waiting.eta.as_ref().map(|eta| format!(", {eta}")).unwrap_or_default();
-                format!("{reason}: place {}{eta}", waiting.position)
+                let eta = waiting
+                    .eta
+                    .as_ref()
+                    .map(|eta| format!(", starts in {eta}"))
+                    .unwrap_or_default();
+                format!("{reason}: position {}{eta}", waiting.position)
             }
             None => format!("{reason}: {message}"),
         }),
@@ -124,14 +132,14 @@ fn own_words(submission: &Submission, status: &SubmissionStatus) -> Option<Strin
             }
         }
         Some(State::Failed) => {
-            let class = status.failure.as_ref().map(|f| format!(" ({})", why::class(f)));
+            let class = status.failure.as_ref().map(|f| format!(" ({})", why::class(f.class)));
             Some(format!("{reason}{}: {message}", class.unwrap_or_default()))
         }
         Some(State::Finished | State::Cancelled) => None,
     }
 }
 
-/// What keeps EvalAI, or after it DynamoDB, from knowing the end: the row follows EvalAI's word, so the first says it all.
+/// What keeps EvalAI, or after it DynamoDB, from having the result: the table's row follows EvalAI, so the first is enough.
 fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
     let late = |c: &&Condition| {
         let age = now.duration_since(c.last_transition_time.0).as_secs();
@@ -165,7 +173,7 @@ fn table(rows: &[Row]) -> Vec<String> {
     );
     let left = WIDTH.saturating_sub(name + state + since);
     let line = |a: &str, b: &str, c: &str, d: &str| {
-        let line = format!("{a:<name$}{b:<state$}{c:<since$}{}", cut(d, left));
+        let line = format!("{a:<name$}{b:<state$}{c:<since$}{}", one_line(d, left));
         line.trim_end().to_owned()
     };
     let mut lines = vec![line("NAME", "STATE", "SINCE", "WHY")];

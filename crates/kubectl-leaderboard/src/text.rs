@@ -1,22 +1,23 @@
-//! How words become lines: cleaned, wrapped, in rows with a label; and times as people say them.
+//! Lines of text: cleaned, wrapped, in rows with a label; and times as people write them.
 //!
-//! Called by every module of this room that prints. Pure: the time is handed in.
+//! Called by every module that prints. Pure: the time is handed in.
 
 use jiff::Timestamp;
+use leaderboard_api::text::one_line;
 
 /// Columns of a line. Only an address or a command that is to be copied may be longer.
 pub(super) const WIDTH: usize = 100;
 /// Columns of a label, and of what is below it.
 const INDENT: usize = 13;
 
-/// Lines in the making.
+/// Lines that are being written.
 #[derive(Default)]
 pub(super) struct Page(Vec<String>);
 
 impl Page {
     /// A paragraph.
-    pub(super) fn say(&mut self, words: &str) {
-        self.0.extend(wrap(words, WIDTH));
+    pub(super) fn paragraph(&mut self, text: &str) {
+        self.0.extend(wrap(text, WIDTH));
     }
 
     /// An empty line, unless there is one.
@@ -26,9 +27,9 @@ impl Page {
         }
     }
 
-    /// A label and words; without a label, more words below the row before. No words, no row.
-    pub(super) fn row(&mut self, label: &str, words: &str) {
-        self.labelled(label, wrap(words, WIDTH - INDENT));
+    /// A label and a text; without a label, more text below the row before. No text, no row.
+    pub(super) fn row(&mut self, label: &str, text: &str) {
+        self.labelled(label, wrap(text, WIDTH - INDENT));
     }
 
     /// A label and what is to be copied, so it is not broken.
@@ -54,10 +55,10 @@ impl Page {
     }
 }
 
-/// Words in lines of at most `width` columns.
-pub(super) fn wrap(words: &str, width: usize) -> Vec<String> {
+/// A text in lines of at most `width` columns.
+pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
-    for word in clean(words).split_whitespace() {
+    for word in clean(text).split_whitespace() {
         let letters: Vec<char> = word.chars().collect();
         for piece in letters.chunks(width.max(1)) {
             match lines.last_mut() {
@@ -72,31 +73,9 @@ pub(super) fn wrap(words: &str, width: usize) -> Vec<String> {
     lines
 }
 
-/// Words in one line of at most `width` columns.
-pub(super) fn cut(words: &str, width: usize) -> String {
-    let words = clean(words).split_whitespace().collect::<Vec<_>>().join(" ");
-    if words.chars().count() <= width {
-        return words;
-    }
-    let mut kept: String = words.chars().take(width.saturating_sub(1)).collect();
-    kept.truncate(kept.trim_end().len());
-    kept.push('…');
-    kept
-}
-
-/// Text of strangers (names of teams, words of registries) without what a terminal would obey.
+/// A text of any length: much of what is printed was written by strangers.
 pub(super) fn clean(text: &str) -> String {
-    let harmless = |c: char| match c {
-        c if c.is_whitespace() => ' ',
-        c if c.is_control() || is_invisible(c) => '\u{fffd}',
-        c => c,
-    };
-    text.chars().map(harmless).collect()
-}
-
-/// Marks without a width of their own, some of which turn the text around.
-fn is_invisible(c: char) -> bool {
-    matches!(c, '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{feff}')
+    one_line(text, usize::MAX)
 }
 
 /// Joins what is not empty by spaces.
@@ -156,21 +135,14 @@ mod tests {
     }
 
     #[test]
-    fn a_terminal_obeys_nobody() {
+    fn what_is_printed_is_harmless() {
         let hostile = "Team\u{1b}[2J\u{202e}\u{9b}31m\r\nSeven";
         assert_eq!(wrap(hostile, 80), ["Team\u{fffd}[2J\u{fffd}\u{fffd}31m Seven"]);
-        assert!(!cut(hostile, 80).contains('\u{1b}'));
+        assert_eq!(clean(hostile), "Team\u{fffd}[2J\u{fffd}\u{fffd}31m Seven");
     }
 
     #[test]
-    fn what_is_cut_says_so() {
-        assert_eq!(cut("one two", 7), "one two");
-        assert_eq!(cut("one two three", 8), "one two…");
-        assert_eq!(cut("one two three", 9), "one two…");
-    }
-
-    #[test]
-    fn times_are_said_in_one_unit() {
+    fn times_have_one_unit() {
         let at = |second: i64| Timestamp::from_second(1_793_527_200 + second).unwrap();
         assert_eq!(when(at(0), at(200)), "2026-11-01 10:00:00 UTC (3 min ago)");
         assert_eq!(when(at(12), at(0)), "2026-11-01 10:00:12 UTC (in 12 s)");

@@ -1,6 +1,6 @@
-//! What is said of a submission while somebody waits for its end.
+//! What is printed while a person waits for the end of a submission.
 //!
-//! Called by `mod` for each change that the watch brings. Pure: the time is handed in.
+//! Called by `main` for each change that the watch reports. Pure: the time is handed in.
 
 use jiff::Timestamp;
 use kube::ResourceExt;
@@ -9,7 +9,7 @@ use super::text::wrap;
 use leaderboard_api::conditions;
 use leaderboard_api::{State, Submission};
 
-/// Columns before the words of a transition.
+/// Columns before the text of a transition.
 const INDENT: usize = 10;
 
 /// A wait for the end of an attempt.
@@ -18,11 +18,11 @@ pub struct Waiting {
     last: Option<(State, String)>,
 }
 
-/// What a change of the object means to who waits.
+/// What a change of the object means for a wait.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Seen {
+pub struct Update {
     /// What is new, in lines.
-    pub says: Vec<String>,
+    pub lines: Vec<String>,
     /// The state, if it is the end.
     pub end: Option<State>,
 }
@@ -33,10 +33,10 @@ impl Waiting {
         Self { attempt, last: None }
     }
 
-    /// Looks at the object as it is now.
-    pub fn see(&mut self, submission: &Submission, now: Timestamp) -> Seen {
-        let nothing = Seen {
-            says: Vec::new(),
+    /// Takes the object as it is now.
+    pub fn observe(&mut self, submission: &Submission, now: Timestamp) -> Update {
+        let nothing = Update {
+            lines: Vec::new(),
             end: None,
         };
         let status = submission.status.as_ref().filter(|s| s.attempt >= Some(self.attempt));
@@ -47,22 +47,22 @@ impl Waiting {
         let end = is_over.then_some(state);
         let reason = status.reason.clone().unwrap_or_default();
         if self.last.as_ref() == Some(&(state, reason.clone())) {
-            return Seen { end, ..nothing };
+            return Update { end, ..nothing };
         }
         let message = status.message.as_deref().unwrap_or_default();
         let colon = if message.is_empty() { "" } else { ":" };
         let name = submission.name_any();
-        let words = format!("{name} is {} ({reason}){colon} {message}", state.as_str());
+        let text = format!("{name} is {} ({reason}){colon} {message}", state.as_str());
         self.last = Some((state, reason));
-        Seen {
-            says: hang(&now.strftime("%H:%M:%S").to_string(), &words),
+        Update {
+            lines: hang(&now.strftime("%H:%M:%S").to_string(), &text),
             end,
         }
     }
 }
 
-fn hang(label: &str, words: &str) -> Vec<String> {
-    let lines = wrap(words, super::text::WIDTH - INDENT);
+fn hang(label: &str, text: &str) -> Vec<String> {
+    let lines = wrap(text, super::text::WIDTH - INDENT);
     let labels = std::iter::once(label).chain(std::iter::repeat(""));
     labels
         .zip(lines)

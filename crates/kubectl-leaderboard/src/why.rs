@@ -1,51 +1,51 @@
-//! Why one submission is in its state, and what to do next: from what the API server has to lines of text.
+//! Why one submission is in its state, and what to do next: from the objects to lines of text.
 //!
-//! Called by `mod` for `why NAME`. Pure: knows no client, and the time is handed in. What it says of a reason is `steps`'.
+//! Called by `main` for `why NAME`. Pure: knows no client, and the time is handed in. Meanings and next steps are those of
+//! `leaderboard_api::reasons`.
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use kube::ResourceExt;
 
-use super::board::{self, Sight};
-use super::steps;
+use super::board::{self, Observed};
 use super::text::{Page, join, span, when};
 use leaderboard_api::conditions;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, PairStatus, Rerun, State, Submission, SubmissionStatus, reasons};
 
-/// What is known, and what is said of it so far.
-struct Story<'a> {
+/// What is known, and the lines about it so far.
+struct Explanation<'a> {
     submission: &'a Submission,
     status: &'a SubmissionStatus,
-    leaderboard: Sight<'a>,
+    leaderboard: Observed<'a>,
     now: Timestamp,
     page: Page,
 }
 
-/// All that there is to say of a submission.
-pub fn explain(submission: &Submission, leaderboard: Sight<'_>, now: Timestamp) -> Vec<String> {
-    let unseen = SubmissionStatus::default();
-    let mut story = Story {
+/// All that is known of a submission.
+pub fn explain(submission: &Submission, leaderboard: Observed<'_>, now: Timestamp) -> Vec<String> {
+    let empty = SubmissionStatus::default();
+    let mut explanation = Explanation {
         submission,
-        status: submission.status.as_ref().unwrap_or(&unseen),
+        status: submission.status.as_ref().unwrap_or(&empty),
         leaderboard,
         now,
         page: Page::default(),
     };
-    story.headline();
-    story.page.gap();
-    story.belongs_to();
-    story.reason();
-    story.rerun();
-    story.failure();
-    story.line();
-    story.attempt();
-    story.run();
-    story.systems();
-    story.log();
-    story.next();
-    story.page.into_lines()
+    explanation.headline();
+    explanation.page.gap();
+    explanation.belongs_to();
+    explanation.reason();
+    explanation.rerun();
+    explanation.failure();
+    explanation.line();
+    explanation.attempt();
+    explanation.run();
+    explanation.systems();
+    explanation.log();
+    explanation.next();
+    explanation.page.into_lines()
 }
 
 /// Since when a submission is in its state.
@@ -71,56 +71,55 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     found.or_else(|| submission.creation_timestamp().map(|t| t.0))
 }
 
-/// Whether an attempt has come to its end and no higher one is wished.
+/// Whether the attempt has ended and no higher one is requested.
 pub(super) fn has_ended(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
-    status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED)) && !is_attempt_wished(submission)
+    status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED))
+        && !is_attempt_requested(submission)
 }
 
-/// Whether a higher attempt is wished than the operator has begun.
-pub(super) fn is_attempt_wished(submission: &Submission) -> bool {
-    let begun = submission.status.as_ref().and_then(|s| s.attempt);
-    begun.is_some_and(|begun| submission.spec.attempt > begun)
+/// Whether a higher attempt is requested than the operator has started.
+pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
+    let started = submission.status.as_ref().and_then(|s| s.attempt);
+    started.is_some_and(|started| submission.spec.attempt > started)
 }
 
-/// A command of this plugin for a submission, as a person types it.
+/// A command of this plugin for a submission, to be copied.
 pub(super) fn command(verb: &str, submission: &Submission) -> String {
     let namespace = submission.namespace().map(|n| format!(" -n {n}")).unwrap_or_default();
     format!("kubectl leaderboard {verb} {}{namespace}", submission.name_any())
 }
 
-/// The class of a failure, and whether it is charged.
-pub(super) fn class(failure: &Failure) -> &'static str {
-    match (failure.class, failure.charged) {
-        (FailureClass::Participant, true) => "the participant's, charged",
-        (FailureClass::Participant, false) => "the participant's, not charged",
-        (FailureClass::Infrastructure, true) => "the infrastructure's, charged",
-        (FailureClass::Infrastructure, false) => "the infrastructure's, not charged",
+/// The class of a failure.
+pub(super) fn class(class: FailureClass) -> &'static str {
+    match class {
+        FailureClass::Participant => "participant failure",
+        FailureClass::Infrastructure => "infrastructure failure",
     }
 }
 
-impl Story<'_> {
+impl Explanation<'_> {
     fn headline(&mut self) {
         let name = self.submission.name_any();
         let since = since(self.submission).map(|at| when(at, self.now));
         let made = self.submission.creation_timestamp().map(|t| when(t.0, self.now));
-        let words = match (self.status.state, since) {
+        let text = match (self.status.state, since) {
             (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
             (Some(state), None) => format!("{name} is {}.", state.as_str()),
             (None, _) => {
-                let made = made.map(|made| format!(", made {made}")).unwrap_or_default();
-                format!("{name} is new{made}: the operator has not looked at it yet.")
+                let made = made.map(|made| format!(", created {made}")).unwrap_or_default();
+                format!("{name} is new{made}: the operator has not processed it yet.")
             }
         };
-        self.page.say(&words);
+        self.page.paragraph(&text);
         if let Some(at) = &self.submission.metadata.deletion_timestamp {
             let asked = when(at.0, self.now);
-            self.page.say(&format!(
-                "It was deleted {asked}; it goes when every system has its end."
+            self.page.paragraph(&format!(
+                "It was deleted {asked}; the object is kept until every system has the result."
             ));
         }
-        for trouble in board::troubles(&self.submission.spec.leaderboard_name, self.leaderboard) {
-            self.page.say(&trouble.words);
+        for problem in board::problems(&self.submission.spec.leaderboard_name, self.leaderboard) {
+            self.page.paragraph(&problem.text);
         }
     }
 
@@ -129,20 +128,20 @@ impl Story<'_> {
         let track = self.status.track.as_deref().or(spec.track.as_deref());
         let team = self.status.team.as_ref().or(spec.team.as_ref());
         let team = team.and_then(|team| team.name.as_deref().or(team.id.as_deref()));
-        let mut words = match track {
+        let mut text = match track {
             Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
-            None => format!("not known yet, of Leaderboard {}", spec.leaderboard_name),
+            None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
         };
         if let Some(team) = team {
-            words = format!("{words}, by {team}");
+            text = format!("{text}, by {team}");
         }
         if let Some(evalai) = spec.evalai {
-            words = format!(
-                "{words}; submission {} of phase {} in EvalAI",
+            text = format!(
+                "{text}; EvalAI submission {}, phase {}",
                 evalai.submission, evalai.phase
             );
         }
-        self.page.row("Track", &words);
+        self.page.row("Track", &text);
     }
 
     fn reason(&mut self) {
@@ -150,18 +149,14 @@ impl Story<'_> {
         let stalled = conditions::get(&self.status.conditions, conditions::STALLED).filter(|c| c.status == "True");
         let same = stalled.filter(|c| c.reason == *reason);
         let since = same.map(|c| format!("Since {}.", when(c.last_transition_time.0, self.now)));
-        let words = [
-            &format!("{reason}:"),
-            &steps::meaning(reason),
-            &since.unwrap_or_default(),
-        ];
-        self.page.row("Reason", &join(&words.map(String::as_str)));
+        let text = [&format!("{reason}:"), &meaning(reason), &since.unwrap_or_default()];
+        self.page.row("Reason", &join(&text.map(String::as_str)));
         self.page
             .row("Message", self.status.message.as_deref().unwrap_or_default());
         if let Some(other) = stalled.filter(|c| c.reason != *reason) {
             let since = when(other.last_transition_time.0, self.now);
-            let words = format!("{} since {since}: {}", other.reason, sentence(&other.message));
-            self.page.row("Stalled", &words);
+            let text = format!("{} since {since}: {}", other.reason, sentence(&other.message));
+            self.page.row("Stalled", &text);
         }
     }
 
@@ -176,76 +171,79 @@ impl Story<'_> {
         let again = self.status.rerun_as.as_ref();
         let again = again.map(|rerun| {
             let name = &rerun.submission_name;
-            format!("as {name}{}; EvalAI has cancelled this one.", ago(rerun))
+            format!("as {name}{}; EvalAI cancelled this one.", ago(rerun))
         });
-        for words in [of, again].into_iter().flatten() {
-            self.page.row("Re-run", &words);
+        for text in [of, again].into_iter().flatten() {
+            self.page.row("Re-run", &text);
         }
     }
 
     fn failure(&mut self) {
         let Some(failure) = &self.status.failure else { return };
-        let pair = failure.pair.map(|pair| format!(", in pair {pair}")).unwrap_or_default();
-        let words = format!("{}, {}{pair}.", failure.reason, class(failure));
-        self.page.row("Failure", &words);
-        // While it is being stopped the message above speaks of the stop.
+        let pair = failure.pair.map(|pair| format!(" in pair {pair}")).unwrap_or_default();
+        let counts = if failure.charged {
+            "counts as an attempt"
+        } else {
+            "does not count as an attempt"
+        };
+        let class = class(failure.class);
+        let text = format!("{}{pair}: {class}, {counts}.", failure.reason);
+        self.page.row("Failure", &text);
+        // While the run is being stopped, the message above is that of the stop.
         if self.status.message.as_deref() != Some(failure.message.as_str()) {
             self.page.row("", &failure.message);
         }
     }
 
-    /// The place in line, and what the Leaderboard lets run at once.
+    /// The position in the line, and the limits of the Leaderboard.
     fn line(&mut self) {
         if let Some(at) = &self.status.next_retry_time {
-            let words = format!("its next Job is made {}.", when(at.0, self.now));
-            self.page.row("Next try", &words);
+            let text = format!("the next Job is created {}.", when(at.0, self.now));
+            self.page.row("Next try", &text);
         }
         let Some(waiting) = &self.status.waiting else { return };
         let eta = match &waiting.eta {
-            Some(eta) => format!("it starts in about {eta}"),
+            Some(eta) => format!("starts in about {eta}"),
             None if self.leaderboard.is_paused() => "no estimate while the Leaderboard is paused".to_owned(),
             None => "no estimate until runs of this track have ended".to_owned(),
         };
-        let mut words = format!("place {}; {eta}.", waiting.position);
+        let mut text = format!("position {}; {eta}.", waiting.position);
         if let Some(leaderboard) = self.leaderboard.leaderboard() {
             let counts = leaderboard.status.as_ref().and_then(|s| s.counts);
-            let concurrency = leaderboard.spec.concurrency;
-            let now = counts.map(|c| format!("{} run, {} wait", c.running, c.pending));
-            let total = concurrency.total.map(|n| format!("concurrency.total is {n}"));
-            let team = concurrency.per_team.map(|n| format!("concurrency.perTeam is {n}"));
+            let limits = leaderboard.spec.concurrency;
+            let now = counts.map(|c| format!("{} running, {} waiting", c.running, c.pending));
+            let total = limits.total.map(|n| format!("concurrency.total is {n}"));
+            let team = limits.per_team.map(|n| format!("concurrency.perTeam is {n}"));
             let facts: Vec<String> = [now, total, team].into_iter().flatten().collect();
-            words = join(&[&words, &sentence(&facts.join(", "))]);
+            text = join(&[&text, &sentence(&facts.join(", "))]);
         }
-        self.page.row("In line", &words);
+        self.page.row("In line", &text);
     }
 
     fn attempt(&mut self) {
         let status = self.status;
         let Some(attempt) = status.attempt else { return };
-        let mut words = attempt.to_string();
+        let mut text = attempt.to_string();
         if status.retry > 0 {
             let of = self.leaderboard.leaderboard();
             let of = of.map(|l| format!(" of {}", l.spec.retries.infrastructure));
-            words = format!(
-                "{words}; {}{} retries after failures of the infrastructure, which cost nothing",
+            text = format!(
+                "{text}; {}{} retries after infrastructure failures, which do not count as attempts",
                 status.retry,
                 of.unwrap_or_default()
             );
         }
         if status.recreated > 0 {
-            words = format!(
-                "{words}; its Job was deleted by somebody else {} times",
-                status.recreated
-            );
+            text = format!("{text}; somebody else deleted its Job {} times", status.recreated);
         }
-        if is_attempt_wished(self.submission) {
+        if is_attempt_requested(self.submission) {
             let wanted = self.submission.spec.attempt;
-            words = format!("{words}; attempt {wanted} is wished and begins when the operator takes it up");
+            text = format!("{text}; attempt {wanted} is requested and starts when the operator processes it");
         }
         if self.submission.spec.cancel && !has_ended(self.submission) {
-            words = format!("{words}; it is to be cancelled");
+            text = format!("{text}; its cancellation is requested");
         }
-        self.page.row("Attempt", &sentence(&words));
+        self.page.row("Attempt", &sentence(&text));
     }
 
     fn run(&mut self) {
@@ -257,9 +255,10 @@ impl Story<'_> {
         });
         let parts: Vec<String> = [progress, score].into_iter().flatten().collect();
         self.page.row("Routes", &sentence(&parts.join(", ")));
+        let failed = status.failure.as_ref().and_then(|failure| failure.pair);
         for pair in status.pairs.iter().filter(|pair| pair.crashes > 0) {
-            let words = crashes(pair, self.now);
-            self.page.row(&format!("Pair {}", pair.id), &words);
+            let text = crashes(pair, failed == Some(pair.id), self.now);
+            self.page.row(&format!("Pair {}", pair.id), &text);
         }
         if !has_ended(self.submission) {
             let job = status.job_name.as_deref().unwrap_or_default();
@@ -271,7 +270,7 @@ impl Story<'_> {
         }
     }
 
-    /// What the other systems know of the end, and whether the scores are to be trusted.
+    /// Which other systems have the result, and whether the scores can be trusted.
     fn systems(&mut self) {
         let systems = [
             (conditions::ARCHIVED, "S3"),
@@ -280,29 +279,30 @@ impl Story<'_> {
         ];
         for (type_, system) in systems {
             if let Some(condition) = conditions::get(&self.status.conditions, type_) {
-                self.page.row(system, &system_words(condition, system, self.now));
+                self.page.row(system, &system_text(condition, system, self.now));
             }
         }
         let plausible = conditions::get(&self.status.conditions, conditions::PLAUSIBLE);
         if let Some(doubt) = plausible.filter(|c| c.status == "False") {
-            let words = format!("{}: {}", doubt.reason, sentence(&doubt.message));
-            self.page.row("Scores", &words);
+            let text = format!("{}: {}", doubt.reason, sentence(&doubt.message));
+            self.page.row("Scores", &text);
         }
     }
 
-    /// Where the log of a failure is. It may hold private routes, so it is read by those alone who may read the bucket.
+    /// Where the log of a failure is. It may reveal private routes, so it is not shown: only who may read the bucket can read it.
     fn log(&mut self) {
         let Some(failure) = self.status.failure.as_ref().filter(|_| has_ended(self.submission)) else {
             return;
         };
-        let (Some(whose), Some(results)) = (steps::log_of(&failure.reason), &self.status.results_url) else {
+        let log = reasons::of(&failure.reason).and_then(|reason| reason.log);
+        let (Some(log), Some(results)) = (log, &self.status.results_url) else {
             return self
                 .page
-                .row("Log", "none explains it: the message says what is known.");
+                .row("Log", "no log explains it; the message has all that is known.");
         };
-        let whose = of_pair(&whose, failure.pair);
-        let words = format!("{} For hosts alone, since it may show the routes:", sentence(&whose));
-        self.page.row("Log", &words);
+        let log = of_pair(log, failure.pair);
+        let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private routes.");
+        self.page.row("Log", &text);
         let storage = self.status.plan.as_ref().map(|plan| &plan.storage);
         let flag = |name: &str, value: Option<&String>| value.map(|v| format!(" {name} {v}")).unwrap_or_default();
         let region = flag("--region", storage.and_then(|s| s.region.as_ref()));
@@ -314,8 +314,8 @@ impl Story<'_> {
     fn next(&mut self) {
         self.page.gap();
         let mut label = "Next";
-        for words in next_steps(self.submission, self.status, self.leaderboard) {
-            self.page.row(label, &words);
+        for text in next_steps(self.submission, self.status, self.leaderboard) {
+            self.page.row(label, &text);
             label = "";
         }
         if let Some(verb) = verb(self.submission, self.status) {
@@ -324,36 +324,43 @@ impl Story<'_> {
     }
 }
 
-/// Words of the documentation about the pair that failed.
-fn of_pair(words: &str, pair: Option<i32>) -> String {
-    let Some(pair) = pair else { return words.to_owned() };
-    let number = pair.to_string();
-    words
-        .replace("failure.pair", &format!("pair {number}"))
-        .replace("<n>", &number)
+fn meaning(reason: &str) -> String {
+    reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.meaning))
 }
 
-fn crashes(pair: &PairStatus, now: Timestamp) -> String {
-    let times = if pair.crashes == 1 {
-        "crashed once".to_owned()
-    } else {
-        format!("crashed {} times", pair.crashes)
+/// A text of the table of reasons about the pair that failed.
+fn of_pair(text: &str, pair: Option<i32>) -> String {
+    let text = reasons::plain(text);
+    pair.map_or(text.clone(), |pair| text.replace("<n>", &pair.to_string()))
+}
+
+/// The reason of an end whose cause is not known.
+const UNKNOWN_END: &str = "unseen";
+
+/// How a pair crashed. The message of a failure has the count at which the pair failed; its containers may end once more before
+/// the Job is gone, so that the count is left out where both are shown.
+fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
+    let times = match pair.crashes {
+        _ if is_failed => String::new(),
+        1 => ", crashed once".to_owned(),
+        count => format!(", crashed {count} times"),
     };
-    let last = pair.last.as_ref().map(|last| {
+    let known = pair.last.as_ref().filter(|last| last.reason != UNKNOWN_END);
+    let last = known.map(|last| {
         let code = last.exit_code.map(|code| format!(" (exit code {code})"));
         let ago = last.time.as_ref().map(|time| {
             let seconds = now.duration_since(time.0).as_secs();
             format!(", {} ago", span(seconds))
         });
         let (code, ago) = (code.unwrap_or_default(), ago.unwrap_or_default());
-        format!("; the last end: {}{code}{ago}", last.reason)
+        format!("; last end: {}{code}{ago}", last.reason)
     });
     let last = last.unwrap_or_default();
-    format!("{} of {} routes, {times}{last}.", pair.done, pair.total)
+    format!("{} of {} routes done{times}{last}.", pair.done, pair.total)
 }
 
-fn system_words(condition: &Condition, system: &str, now: Timestamp) -> String {
-    let meaning = steps::meaning(&condition.reason).replacen("The other system", system, 1);
+fn system_text(condition: &Condition, system: &str, now: Timestamp) -> String {
+    let meaning = meaning(&condition.reason).replacen("The other system", system, 1);
     let since = match (condition.status.as_str(), condition.reason.as_str()) {
         ("True", _) | (_, reasons::NOT_REQUIRED) => String::new(),
         _ => format!("Since {}.", when(condition.last_transition_time.0, now)),
@@ -362,46 +369,44 @@ fn system_words(condition: &Condition, system: &str, now: Timestamp) -> String {
     join(&[&format!("{}:", condition.reason), &meaning, &message, &since])
 }
 
-/// What to do next, the reason's step first.
-fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Sight<'_>) -> Vec<String> {
+/// What to do next; the step of the reason comes first.
+fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
     let mut reasons: Vec<&str> = status.reason.as_deref().into_iter().collect();
-    // While it is being stopped the reason speaks of the stop.
+    // While the run is being stopped, the reason is that of the stop.
     reasons.extend(status.failure.as_ref().map(|failure| failure.reason.as_str()));
     let doubt = conditions::get(&status.conditions, conditions::PLAUSIBLE).filter(|c| c.status == "False");
     reasons.extend(doubt.map(|c| c.reason.as_str()));
-    let troubles = if has_ended(submission) {
+    let problems = if has_ended(submission) {
         Vec::new()
     } else {
-        board::troubles(&submission.spec.leaderboard_name, leaderboard)
+        board::problems(&submission.spec.leaderboard_name, leaderboard)
     };
-    reasons.extend(troubles.iter().filter_map(|trouble| trouble.reason.as_deref()));
+    reasons.extend(problems.iter().filter_map(|problem| problem.reason.as_deref()));
     let pair = status.failure.as_ref().and_then(|failure| failure.pair);
     let mut steps: Vec<String> = Vec::new();
-    let of_failure = |reason: &str| after_failure(submission, status, reason);
-    let next = |reason| of_failure(reason).or_else(|| steps::of(reason).map(|step| step.next));
-    for next in reasons.into_iter().filter_map(next).map(|next| of_pair(&next, pair)) {
+    let next = |reason| next_step(status.failure.as_ref(), reason);
+    for next in reasons.into_iter().filter_map(next).map(|next| of_pair(next, pair)) {
         if !steps.contains(&next) {
             steps.push(next);
         }
     }
-    if status.state.is_none() && troubles.is_empty() {
-        steps.push("Nothing; if it lasts for a minute, look whether the operator runs.".to_owned());
+    if status.state.is_none() && problems.is_empty() {
+        steps.push("Nothing. If it lasts for a minute, check that the operator runs.".to_owned());
     }
     steps
 }
 
-/// The next step of a failure whose reason is also one of a wait, of which the documentation's row speaks.
-fn after_failure(submission: &Submission, status: &SubmissionStatus, reason: &str) -> Option<String> {
-    const BOTH: [&str; 2] = [reasons::NOT_ISOLATED, reasons::PHASE_DIFFERS];
-    status
-        .failure
-        .as_ref()
-        .filter(|failure| failure.reason == reason && BOTH.contains(&reason))?;
-    let then = if has_ended(submission) { ", then resume it" } else { "" };
-    Some(format!("Do what the message says{then}."))
+/// The next step of a reason: of an infrastructure failure the one that hosts do after it.
+fn next_step(failure: Option<&Failure>, reason: &str) -> Option<&'static str> {
+    let is_of_host = failure.is_some_and(|f| f.reason == reason && f.class == FailureClass::Infrastructure);
+    if is_of_host {
+        reasons::after_failure(reason)
+    } else {
+        reasons::of(reason).map(|reason| reason.next_step)
+    }
 }
 
-/// The command of this plugin that carries the next step out.
+/// The command of this plugin for the next step.
 fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static str> {
     if submission.metadata.deletion_timestamp.is_some() {
         return None;
@@ -409,8 +414,8 @@ fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static s
     let reason = status.reason.as_deref().unwrap_or_default();
     if has_ended(submission) {
         let is_infrastructure = |f: &Failure| f.class == FailureClass::Infrastructure;
-        let is_mendable = status.failure.as_ref().is_some_and(is_infrastructure);
-        return (is_mendable || reason == reasons::CANCELLED).then_some("resume");
+        let is_resumable = status.failure.as_ref().is_some_and(is_infrastructure);
+        return (is_resumable || reason == reasons::CANCELLED).then_some("resume");
     }
     [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]
         .contains(&reason)

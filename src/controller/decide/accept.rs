@@ -10,7 +10,7 @@ use super::isolation::Missing;
 use super::{Action, end, isolation};
 use crate::controller::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
-use leaderboard_api::text::sentence;
+use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
 
 /// How long EvalAI may take before its silence is shown.
@@ -256,8 +256,17 @@ fn missing_track(draft: &Draft<'_>, leaderboard: &LeaderboardSpec) -> String {
     )
 }
 
+/// A team of a Submission as people see it: anybody who may create one writes its name.
+fn shown(team: &Team) -> Team {
+    let line = |text: &Option<String>| text.as_deref().map(|text| one_line(text, LONGEST_NAME));
+    Team {
+        id: line(&team.id),
+        name: line(&team.name),
+    }
+}
+
 fn take_team(draft: &mut Draft<'_>, info: Option<&EvalaiInfo>) {
-    let given = draft.spec().team.clone();
+    let given = draft.spec().team.as_ref().map(shown);
     let is_pinned = draft.status.plan.is_some() && draft.status.team.is_some();
     if is_pinned {
         // A row that is edited later changes neither the run's place in line nor its row of the table.

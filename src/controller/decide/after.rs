@@ -248,7 +248,7 @@ fn published(draft: &mut Draft<'_>, team: Option<&str>) {
     });
     let shown = message.clone().unwrap_or_default();
     draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
-    draft.event(false, conditions::PUBLISHED, "EvalAI has the result.");
+    draft.event(false, reasons::PUBLISHED, "EvalAI has the result.");
     if let Some(message) = message {
         draft.event(true, reasons::TEAM_DIFFERS, message);
     }

@@ -23,9 +23,7 @@ pub(super) fn for_both(step: &'static str) -> Steps {
 /// The log of an agent explains what happened. Only hosts can read it.
 pub(super) fn in_the_log_of(agent: i32) -> Steps {
     Steps {
-        hosts: format!(
-            "Look at agent/agent{agent}/leaderboard.log of the results; the participant fixes the agent and submits again."
-        ),
+        hosts: of_participant(reasons::AGENT_CRASHED).replace("<n>", &agent.to_string()),
         participant: "Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have its log.",
     }
 }
@@ -33,30 +31,22 @@ pub(super) fn in_the_log_of(agent: i32) -> Steps {
 /// An agent needs more memory than there is.
 pub(super) fn smaller() -> Steps {
     Steps {
-        hosts: "The participant reduces the agent's memory use; its limit is agent.resources of the Leaderboard."
-            .to_owned(),
+        hosts: of_participant(reasons::OUT_OF_MEMORY),
         participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.",
     }
+}
+
+fn of_participant(reason: &str) -> String {
+    reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.next_step))
 }
 
 /// What a host does about a failure of the infrastructure that no retry has ended.
 pub(super) fn of_infrastructure(reason: &str) -> &'static str {
     match reason {
-        // The words of `workspace` hold it already.
+        // The text of `workspace` already has the step, or the step before this one.
         reasons::PREFIX_IN_USE => "",
-        reasons::NOT_ISOLATED => "Then resume it.",
-        reasons::JOB_DELETED => "Find out who deletes Jobs in this namespace, then resume it.",
-        reasons::NODE_LOST => "Look at the node, then resume it.",
-        reasons::RESULTS_NOT_STORED => "Look at the log of logcopy and at the bucket, then resume it.",
-        reasons::SIMULATION_CRASHED => {
-            "Look at the simulator's log, then resume it, which repeats the route it was at."
-        }
-        reasons::JOB_FAILED => "Look at the Job's events, then resume it.",
-        reasons::PHASE_DIFFERS => {
-            "Set the phase back in EvalAI, then resume it; if the Submission has the wrong phase, apply it anew."
-        }
-        reasons::SCHEDULE_DEADLINE => "Add a node or make room, then resume it.",
-        _ => "Fix that, then resume it.",
+        reasons::NOT_ISOLATED => "Then resume the submission.",
+        _ => reasons::after_failure(reason).unwrap_or("Fix this, then resume the submission."),
     }
 }
 

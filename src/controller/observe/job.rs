@@ -5,6 +5,7 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 
 use crate::controller::view::{JobEnd, JobView};
+use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 
 /// Reduces a Job. `pod` is its newest.
 pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
@@ -52,7 +53,7 @@ fn end(job: &Job) -> Option<JobEnd> {
     Some(JobEnd::Failed {
         at: condition.last_transition_time.as_ref().map(|t| t.0),
         reason: condition.reason.clone().unwrap_or_default(),
-        message: condition.message.clone().unwrap_or_default(),
+        message: one_line(condition.message.as_deref().unwrap_or_default(), LONGEST_MESSAGE),
     })
 }
 

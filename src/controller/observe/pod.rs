@@ -9,10 +9,8 @@ use leaderboard_runner::verdict::{Verdict, What};
 use crate::controller::view::{ContainerView, EndView, PodView};
 use crate::pod::run::Stop;
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
+use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_api::{names, reasons};
-
-/// Longest text of Kubernetes that is passed on to people.
-const MAX_WORDS: usize = 600;
 
 /// Reduces a Pod.
 pub fn view(pod: &Pod) -> PodView {
@@ -207,11 +205,7 @@ fn foreign_why(message: &str) -> Option<String> {
 }
 
 fn short(text: &str) -> String {
-    let text = text.trim();
-    match text.char_indices().nth(MAX_WORDS) {
-        Some((end, _)) => format!("{} …", &text[..end]),
-        None => text.to_owned(),
-    }
+    one_line(text, LONGEST_MESSAGE)
 }
 
 #[cfg(test)]
@@ -242,6 +236,19 @@ mod tests {
         assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
         let kubelets = seen("agent-1", "StartError", "exec: no such file");
         assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
+    }
+
+    #[test]
+    fn what_a_container_or_the_kubelet_reports_is_one_harmless_line() {
+        let harmless = "disk\u{fffd}[2J full";
+        for (container, reason) in [("contents", "Error"), ("agent-1", "StartError")] {
+            let end = seen(container, reason, "disk\u{1b}[2J\r\n full\n");
+            assert_eq!(end.why.as_deref(), Some(harmless), "{container}");
+        }
+        let verdict = r#"{"what":"exited","exitCode":1,"signal":null,"why":"disk\u001b[2J\nfull"}"#;
+        assert_eq!(seen("agent-1", "Error", verdict).why.as_deref(), Some(harmless));
+        let long = seen("contents", "Error", &"x".repeat(5000)).why.unwrap();
+        assert_eq!(long.chars().count(), LONGEST_MESSAGE);
     }
 
     #[test]

@@ -5,12 +5,11 @@ use std::collections::BTreeMap;
 use crate::pod::gather::Gathered;
 use crate::pod::judge::Ending;
 use crate::pod::places::Setting;
-use crate::pod::report::{MAX_BYTES, Report, SCHEMA};
+use crate::pod::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
+use leaderboard_api::text::one_line;
 
 /// Warnings of the results' check that are reported.
 const WARNINGS: usize = 50;
-/// Characters of a reason or a warning that are reported.
-const REASON: usize = 2000;
 
 /// The report of a round; its number is the caller's.
 pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&Ending>) -> Report {
@@ -69,5 +68,5 @@ pub(super) fn to_bytes(report: &Report) -> Vec<u8> {
 }
 
 fn shorten(text: &str) -> String {
-    text.chars().take(REASON).collect()
+    one_line(text, LONGEST_TEXT)
 }

@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use leaderboard_api::text::one_line;
 use serde_json::{Map, Value};
 
 /// EvalAI's answer to a user who is no host, whatever is asked for.
@@ -211,11 +212,7 @@ impl Body {
 
 /// One sentence without line breaks.
 fn sentence(status: u16, body: &Body) -> String {
-    let whole = body.text().split_whitespace().collect::<Vec<_>>().join(" ");
-    let mut text: String = whole.chars().take(LONGEST).collect();
-    if text.len() < whole.len() {
-        text.push('…');
-    }
+    let text = one_line(&body.text(), LONGEST);
     let text = if text.is_empty() { "nothing".to_owned() } else { text };
     let next = next_step(status, body)
         .map(|step| format!(" ({step})"))

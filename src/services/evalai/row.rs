@@ -9,6 +9,7 @@ use serde_json::Value;
 
 use super::status::Status;
 use leaderboard_api::ImageReference;
+use leaderboard_api::text::{LONGEST_NAME, one_line};
 
 /// A submission as EvalAI shows it to a host.
 #[derive(Clone, Debug, PartialEq)]
@@ -103,7 +104,7 @@ impl<'de> Deserialize<'de> for Row {
             },
             phase: raw.challenge_phase.as_i64(),
             team_id: raw.participant_team.as_i64(),
-            team_name: text(&raw.participant_team_name),
+            team_name: text(&raw.participant_team_name).map(|name| one_line(&name, LONGEST_NAME)),
             submitted_at: time(&raw.submitted_at),
             resumed_at: time(&raw.rerun_resumed_at),
             completed_at: time(&raw.completed_at),
@@ -192,6 +193,15 @@ mod tests {
         );
         assert_eq!(row.wanted_at(), row.submitted_at);
         assert!(row.names("submission-7-1") && row.names("SUBMISSION-7-1") && !row.names("submission-7-2"));
+    }
+
+    #[test]
+    fn a_teams_name_is_one_harmless_line() {
+        let row: Row = serde_json::from_value(json!({
+            "id": 7, "status": "queued", "participant_team_name": "Team\u{1b}[2J\n\u{202e}Seven",
+        }))
+        .unwrap();
+        assert_eq!(row.team_name.as_deref(), Some("Team\u{fffd}[2J \u{fffd}Seven"));
     }
 
     #[test]

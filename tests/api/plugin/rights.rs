@@ -1,4 +1,4 @@
-//! How the plugin finds its cluster and its person, and which rights it needs.
+//! How the plugin finds its cluster and credentials, and which rights it needs.
 
 use std::ffi::OsString;
 use std::io::Write as _;
@@ -11,37 +11,37 @@ use tempfile::TempDir;
 use tokio::process::Command;
 use tokio::time::timeout;
 
-use super::desk::{Desk, Said, Waits, assert_has, end, ended, plugin, running, waiting};
+use super::terminal::{Printed, Terminal, Waits, assert_has, end, ended, plugin, running, waiting};
 use crate::api::bridge::LIMIT;
 use crate::api::objects::{Kind, merge};
 
 const DOCS: &str = include_str!("../../../docs/plugin.md");
-/// Rights are known to the API server a moment after they were given.
+/// The API server applies new rights after a moment.
 const POLL: Duration = Duration::from_millis(50);
 
 #[tokio::test]
 async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
-    let desk = Desk::new().await;
-    desk.submission("a", &json!({}), &waiting()).await;
+    let terminal = Terminal::new().await;
+    terminal.submission("a", &json!({}), &waiting()).await;
     let program = plugin();
     let bin = program.parent().unwrap();
     let mut path = OsString::from(bin);
     path.push(":");
     path.push(std::env::var_os("PATH").unwrap_or_default());
-    let mut kubectl = Command::from(desk.server.kubectl());
+    let mut kubectl = Command::from(terminal.server.kubectl());
     kubectl
         .env("PATH", path)
-        .args(["leaderboard", "why", "a", "-n", &desk.namespace]);
-    let words = Said::of(&ended(&mut kubectl).await).well();
-    assert!(words.starts_with("a is Pending since "), "{words}");
+        .args(["leaderboard", "why", "a", "-n", &terminal.namespace]);
+    let text = Printed::of(&ended(&mut kubectl).await).well();
+    assert!(text.starts_with("a is Pending since "), "{text}");
 
-    let (folder, file) = person(&desk, &json!({}));
+    let (folder, file) = person(&terminal, &json!({}));
     let mut command = Command::new(plugin());
     command
         .env("KUBECONFIG", &file)
         .args(["why", "a", "--context", "person"]);
     assert!(
-        Said::of(&ended(&mut command).await)
+        Printed::of(&ended(&mut command).await)
             .well()
             .starts_with("a is Pending since ")
     );
@@ -49,8 +49,8 @@ async fn kubectl_finds_it_on_the_path_and_the_context_names_the_namespace() {
     command
         .env("KUBECONFIG", &file)
         .args(["why", "a", "--context", "nobody"]);
-    let words = Said::of(&ended(&mut command).await).refused();
-    assert_has(&words, &["no cluster is configured: ", "nobody", "Set KUBECONFIG"]);
+    let text = Printed::of(&ended(&mut command).await).refused();
+    assert_has(&text, &["no cluster is configured: ", "nobody", "Set KUBECONFIG"]);
     drop(folder);
 }
 
@@ -60,8 +60,8 @@ async fn a_cluster_that_is_not_there_is_one_line() {
     let missing = folder.path().join("missing");
     let mut command = Command::new(plugin());
     command.arg("why").arg("--kubeconfig").arg(&missing);
-    let words = Said::of(&ended(&mut command).await).refused();
-    assert_has(&words, &["no cluster is configured: ", "Set KUBECONFIG"]);
+    let text = Printed::of(&ended(&mut command).await).refused();
+    assert_has(&text, &["no cluster is configured: ", "Set KUBECONFIG"]);
 
     let broken = folder.path().join("broken");
     std::fs::write(&broken, "users: [secret-token\nclusters: {").unwrap();
@@ -71,58 +71,75 @@ async fn a_cluster_that_is_not_there_is_one_line() {
         if !set.is_empty() {
             command.arg(&broken);
         }
-        let words = Said::of(&ended(&mut command).await).refused();
-        assert_has(&words, &["no cluster is configured: ", "not YAML"]);
-        assert!(!words.contains("secret-token"), "{words}");
+        let text = Printed::of(&ended(&mut command).await).refused();
+        assert_has(&text, &["no cluster is configured: ", "not YAML"]);
+        assert!(!text.contains("secret-token"), "{text}");
     }
 
-    let desk = Desk::new().await;
+    let terminal = Terminal::new().await;
     let (_folder, file) = person(
-        &desk,
+        &terminal,
         &json!({"exec": {
             "apiVersion": "client.authentication.k8s.io/v1", "command": "sh", "interactiveMode": "Never",
             "args": ["-c", "echo secret-token; echo 'log in first' >&2; exit 3"],
         }}),
     );
-    let words = desk.run_as(&file, &["why"]).await.refused();
-    assert_has(&words, &["the cluster does not let you in: ", "log in first"]);
-    assert!(!words.contains("secret-token"), "{words}");
+    let text = terminal.run_as(&file, &["why"]).await.refused();
+    assert_has(
+        &text,
+        &["the cluster does not accept your credentials: ", "log in first"],
+    );
+    assert!(!text.contains("secret-token"), "{text}");
 }
 
-/// The rights that the documentation lists are enough, and without them it is said what is missing.
+/// The rights that the documentation lists are enough, and without them the plugin names what is missing.
 #[tokio::test]
 async fn the_documented_rights_are_enough() {
-    let desk = Desk::new().await;
-    desk.leaderboard(&json!({})).await;
-    desk.submission("runs", &json!({}), &running()).await;
-    let name = format!("person-of-{}", desk.namespace);
-    let (_folder, file) = person(&desk, &json!({"as": name}));
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({})).await;
+    terminal.submission("runs", &json!({}), &running()).await;
+    let name = format!("person-of-{}", terminal.namespace);
+    let (_folder, file) = person(&terminal, &json!({"as": name}));
     for arguments in [&["why"][..], &["why", "runs"], &["cancel", "runs"]] {
-        let words = desk.run_as(&file, arguments).await.refused();
-        assert_has(&words, &["you may not do that: ", "is forbidden", "docs/plugin.md"]);
+        let text = terminal.run_as(&file, arguments).await.refused();
+        assert_has(
+            &text,
+            &[
+                "missing right: ",
+                "is forbidden",
+                "Ask the host for get, list, watch and patch",
+            ],
+        );
     }
 
-    give(&desk, &name, "submissions");
-    until_allowed(&desk, &name, "submissions").await;
-    let words = desk.run_as(&file, &["why", "runs"]).await.well();
-    assert_has(&words, &["You may not read Leaderboard local"]);
-    let words = desk.run_as(&file, &["why"]).await.well();
-    assert_has(&words, &["You may not read Leaderboards"]);
+    give(&terminal, &name, "submissions");
+    until_allowed(&terminal, &name, "submissions").await;
+    let text = terminal.run_as(&file, &["why", "runs"]).await.well();
+    assert_has(&text, &["You have no right to read Leaderboard local"]);
+    let text = terminal.run_as(&file, &["why"]).await.well();
+    assert_has(&text, &["You have no right to read Leaderboards"]);
 
-    give(&desk, &name, "leaderboards");
-    until_allowed(&desk, &name, "leaderboards").await;
-    assert!(!desk.run_as(&file, &["why", "runs"]).await.well().contains("may not"));
-    let mut command = desk.command(&["cancel", "runs", "--wait"]);
+    give(&terminal, &name, "leaderboards");
+    until_allowed(&terminal, &name, "leaderboards").await;
+    assert!(
+        !terminal
+            .run_as(&file, &["why", "runs"])
+            .await
+            .well()
+            .contains("no right")
+    );
+    let mut command = terminal.command(&["cancel", "runs", "--wait"]);
     let mut waits = Waits::start(command.arg("--kubeconfig").arg(&file));
     waits.until("runs is Running").await;
-    desk.status(Kind::Submission, "runs", &end("Cancelled", "Cancelled"))
+    terminal
+        .status(Kind::Submission, "runs", &end("Cancelled", "Cancelled"))
         .await;
     assert_eq!(waits.code().await, Some(0));
 }
 
 /// The kubeconfig of a person whose context names the namespace.
-fn person(desk: &Desk, user: &Value) -> (TempDir, PathBuf) {
-    let text = std::fs::read_to_string(&desk.kubeconfig).unwrap();
+fn person(terminal: &Terminal, user: &Value) -> (TempDir, PathBuf) {
+    let text = std::fs::read_to_string(&terminal.kubeconfig).unwrap();
     let mut config: Value = serde_json::from_str(&text).unwrap();
     if user.get("exec").is_some() {
         config["users"][0]["user"] = user.clone();
@@ -130,7 +147,7 @@ fn person(desk: &Desk, user: &Value) -> (TempDir, PathBuf) {
         merge(&mut config["users"][0]["user"], user);
     }
     config["contexts"][0]["name"] = json!("person");
-    config["contexts"][0]["context"]["namespace"] = json!(desk.namespace);
+    config["contexts"][0]["context"]["namespace"] = json!(terminal.namespace);
     config["current-context"] = json!("person");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("config");
@@ -140,7 +157,7 @@ fn person(desk: &Desk, user: &Value) -> (TempDir, PathBuf) {
 }
 
 /// Gives a person the rights on one kind that docs/plugin.md lists.
-fn give(desk: &Desk, person: &str, resource: &str) {
+fn give(terminal: &Terminal, person: &str, resource: &str) {
     let (_, rest) = DOCS.split_once("```yaml\n").unwrap();
     let (role, _) = rest.split_once("```").unwrap();
     let role: Value = serde_saphyr::from_str(role).unwrap();
@@ -149,7 +166,7 @@ fn give(desk: &Desk, person: &str, resource: &str) {
         .iter()
         .find(|rule| rule["resources"] == json!([resource]))
         .unwrap();
-    let meta = json!({"name": resource, "namespace": desk.namespace});
+    let meta = json!({"name": resource, "namespace": terminal.namespace});
     let role = json!({"apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role", "metadata": meta, "rules": [rule]});
     let binding = json!({
         "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "RoleBinding", "metadata": meta,
@@ -157,7 +174,7 @@ fn give(desk: &Desk, person: &str, resource: &str) {
         "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "User", "name": person}],
     });
     let list = json!({"apiVersion": "v1", "kind": "List", "items": [role, binding]});
-    let mut kubectl = desk.server.kubectl();
+    let mut kubectl = terminal.server.kubectl();
     let mut child = kubectl
         .args(["apply", "-f", "-"])
         .stdin(Stdio::piped())
@@ -173,12 +190,12 @@ fn give(desk: &Desk, person: &str, resource: &str) {
     assert!(child.wait().unwrap().success());
 }
 
-/// Waits until the API server knows of a person's right.
-async fn until_allowed(desk: &Desk, person: &str, resource: &str) {
+/// Waits until the API server applies a person's right.
+async fn until_allowed(terminal: &Terminal, person: &str, resource: &str) {
     let review = json!({
         "apiVersion": "authorization.k8s.io/v1", "kind": "SubjectAccessReview",
         "spec": {"user": person, "resourceAttributes": {
-            "group": "leaderboard.carla.org", "resource": resource, "verb": "list", "namespace": desk.namespace,
+            "group": "leaderboard.carla.org", "resource": resource, "verb": "list", "namespace": terminal.namespace,
         }},
     });
     let allowed = async {
@@ -186,7 +203,7 @@ async fn until_allowed(desk: &Desk, person: &str, resource: &str) {
             let request = http::Request::post("/apis/authorization.k8s.io/v1/subjectaccessreviews");
             let request = request.header("content-type", "application/json");
             let request = request.body(review.to_string().into_bytes()).unwrap();
-            let answer: Value = desk.client.request(request).await.unwrap();
+            let answer: Value = terminal.client.request(request).await.unwrap();
             if answer["status"]["allowed"] == json!(true) {
                 return;
             }

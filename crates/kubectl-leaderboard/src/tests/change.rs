@@ -1,41 +1,47 @@
-//! `cancel` and `resume`, and what is said while their end is waited for.
+//! `cancel` and `resume`, and what is printed while their end is waited for.
 
 use serde_json::{Value, json};
 
 use super::{
     assert_width, cancelled, crashed, finished, leaderboard, node_lost, now, running, submission, waiting, with,
 };
-use crate::board::Sight;
-use crate::change::{Plan, Wish, after_refusal, plan};
+use crate::board::Observed;
+use crate::change::{Change, Request, after_refusal, plan};
 use crate::transitions::Waiting;
 use leaderboard_api::{State, Submission};
 
-fn planned(wish: Wish, submission: &Submission) -> Result<Plan, String> {
-    let plan = plan(wish, submission, Sight::There(&leaderboard()), now());
+fn planned(request: Request, submission: &Submission) -> Result<Change, String> {
+    let plan = plan(request, submission, Observed::Found(&leaderboard()), now());
     if let Ok(plan) = &plan {
-        assert_width(&plan.says);
+        assert_width(&plan.lines);
     }
     plan
 }
 
-fn says(plan: &Plan) -> String {
-    plan.says.join(" ")
+fn text(plan: &Change) -> String {
+    plan.lines.join(" ")
 }
 
 #[test]
-fn a_cancel_says_what_happens_at_its_stage() {
+fn a_cancel_explains_what_happens_at_its_stage() {
     let prepared = with(waiting(), &json!({"jobName": "submission-42-1", "reason": "Preparing"}));
     for (status, expected) in [
         (Value::Null, "It has no Job, so it ends at once."),
         (waiting(), "It has no Job, so it ends at once."),
-        (prepared, "if its Pod is up already, that is told first"),
-        (running(), "if it takes longer than 120 s, its Job is deleted"),
+        (
+            prepared,
+            "a Pod that is already running is first asked to stop and has 120 s",
+        ),
+        (
+            running(),
+            "After 120 s the Job is deleted, then the Pod is force-deleted.",
+        ),
     ] {
-        let plan = planned(Wish::Cancel, &submission(&status)).unwrap();
+        let plan = planned(Request::Cancel, &submission(&status)).unwrap();
         assert_eq!(plan.patch.as_ref().map(|p| &p["spec"]), Some(&json!({"cancel": true})));
         assert_eq!(plan.attempt, 1);
-        assert!(says(&plan).contains(expected), "{expected}: {}", says(&plan));
-        assert!(says(&plan).contains("`kubectl leaderboard resume submission-42 -n carla` takes it up again."));
+        assert!(text(&plan).contains(expected), "{expected}: {}", text(&plan));
+        assert!(text(&plan).contains("To continue it later: `kubectl leaderboard resume submission-42 -n carla`."));
     }
 }
 
@@ -43,13 +49,13 @@ fn a_cancel_says_what_happens_at_its_stage() {
 fn the_grace_is_the_leaderboards_of_this_moment() {
     let mut slow = leaderboard();
     slow.spec.deadlines.cancel_seconds = 900;
-    for (sight, expected) in [
-        (Sight::There(&slow), "longer than 900 s, its Job"),
-        (Sight::Missing, "longer than 120 s, its Job"),
-        (Sight::Unread, "longer than deadlines.cancelSeconds, its Job"),
+    for (leaderboard, expected) in [
+        (Observed::Found(&slow), "After 900 s the Job"),
+        (Observed::Missing, "After 120 s the Job"),
+        (Observed::Forbidden, "After deadlines.cancelSeconds the Job"),
     ] {
-        let plan = plan(Wish::Cancel, &submission(&running()), sight, now()).unwrap();
-        assert!(says(&plan).contains(expected), "{}", says(&plan));
+        let plan = plan(Request::Cancel, &submission(&running()), leaderboard, now()).unwrap();
+        assert!(text(&plan).contains(expected), "{}", text(&plan));
     }
 }
 
@@ -57,9 +63,9 @@ fn the_grace_is_the_leaderboards_of_this_moment() {
 fn what_is_cancelled_already_is_not_patched_again() {
     let mut object = submission(&running());
     object.spec.cancel = true;
-    let plan = planned(Wish::Cancel, &object).unwrap();
+    let plan = planned(Request::Cancel, &object).unwrap();
     assert_eq!(plan.patch, None);
-    assert!(says(&plan).starts_with("submission-42 is being cancelled already."));
+    assert!(text(&plan).starts_with("submission-42 is already being cancelled."));
 }
 
 #[test]
@@ -69,15 +75,15 @@ fn what_has_ended_is_not_cancelled() {
         (crashed(), "Failed"),
         (cancelled(), "Cancelled"),
     ] {
-        let why_not = planned(Wish::Cancel, &submission(&status)).unwrap_err();
+        let why_not = planned(Request::Cancel, &submission(&status)).unwrap_err();
         let expected =
             format!("submission-42 is {state} since 2026-11-01 11:57:00 UTC (3 min ago), so there is nothing");
         assert!(why_not.starts_with(&expected), "{why_not}");
     }
     let mut higher = submission(&crashed());
     higher.spec.attempt = 2;
-    let plan = planned(Wish::Cancel, &higher).unwrap();
-    assert_eq!(plan.attempt, 2, "the attempt that is wished can still be cancelled");
+    let plan = planned(Request::Cancel, &higher).unwrap();
+    assert_eq!(plan.attempt, 2, "the requested attempt can still be cancelled");
 }
 
 #[test]
@@ -85,16 +91,20 @@ fn what_failed_or_was_cancelled_is_resumed() {
     for status in [crashed(), node_lost(), cancelled()] {
         let mut object = submission(&status);
         object.spec.cancel = true;
-        let plan = planned(Wish::Resume, &object).unwrap();
+        let plan = planned(Request::Resume, &object).unwrap();
         let patch = json!({"metadata": {"resourceVersion": "17"}, "spec": {"attempt": 2, "cancel": false}});
         assert_eq!(plan.patch, Some(patch));
         assert_eq!(plan.attempt, 2);
         assert!(
-            says(&plan).contains("It takes up what is stored in s3://results/v2/42"),
+            text(&plan).contains("It continues from the results in s3://results/v2/42"),
             "{}",
-            says(&plan)
+            text(&plan)
         );
-        assert!(says(&plan).contains("EvalAI is asked first."), "{}", says(&plan));
+        assert!(
+            text(&plan).contains("The operator asks EvalAI first."),
+            "{}",
+            text(&plan)
+        );
     }
 }
 
@@ -107,45 +117,51 @@ fn nothing_else_is_resumed_and_the_next_step_is_named() {
     for (object, expected, next) in [
         (
             submission(&Value::Null),
-            "submission-42 is new; only what is Failed",
+            "submission-42 is new; only Failed and Cancelled",
             "cancel submission-42 -n carla",
         ),
         (
             submission(&waiting()),
-            "submission-42 is Pending; only what is Failed",
+            "submission-42 is Pending; only Failed and Cancelled",
             "cancel submission-42 -n carla",
         ),
         (
             submission(&running()),
-            "submission-42 is Running; only what is Failed",
+            "submission-42 is Running; only Failed and Cancelled",
             "cancel submission-42 -n carla",
         ),
         (
             submission(&finished()),
-            "submission-42 is Finished, which is for ever.",
+            "submission-42 has finished and cannot be resumed.",
             "Submit the image again",
         ),
         (going, "submission-42 is being deleted.", "apply it again"),
         (
             higher,
-            "attempt 2 of submission-42 is wished already",
+            "attempt 2 of submission-42 is already requested",
             "why submission-42 -n carla",
         ),
     ] {
-        let why_not = planned(Wish::Resume, &object).unwrap_err();
+        let why_not = planned(Request::Resume, &object).unwrap_err();
         assert!(why_not.starts_with(expected) && why_not.contains(next), "{why_not}");
     }
 }
 
 #[test]
-fn a_resume_says_what_keeps_the_leaderboard_from_it() {
+fn a_resume_names_what_keeps_the_leaderboard_from_it() {
     let mut paused = leaderboard();
     paused.spec.paused = true;
-    let plan = plan(Wish::Resume, &submission(&crashed()), Sight::There(&paused), now()).unwrap();
+    let plan = plan(
+        Request::Resume,
+        &submission(&crashed()),
+        Observed::Found(&paused),
+        now(),
+    )
+    .unwrap();
     assert!(
-        says(&plan).contains("Leaderboard carla-20 is paused"),
+        text(&plan).contains("Leaderboard carla-20 is paused"),
         "{}",
-        says(&plan)
+        text(&plan)
     );
 }
 
@@ -153,12 +169,12 @@ fn a_resume_says_what_keeps_the_leaderboard_from_it() {
 fn a_refusal_names_the_other_way() {
     let evalais = submission(&crashed());
     assert_eq!(
-        after_refusal(Wish::Resume, &evalais),
+        after_refusal(Request::Resume, &evalais),
         "Resume submission 42 in EvalAI (challenge 3): its message raises the attempt here"
     );
     let mut local = evalais;
     local.spec.evalai = None;
-    let next = after_refusal(Wish::Resume, &local);
+    let next = after_refusal(Request::Resume, &local);
     assert!(
         next.ends_with("`kubectl leaderboard why submission-42 -n carla`"),
         "{next}"
@@ -166,24 +182,31 @@ fn a_refusal_names_the_other_way() {
 }
 
 #[test]
-fn who_waits_hears_each_transition_once_and_the_end() {
+fn a_wait_prints_each_transition_once_and_the_end() {
     let mut wait = Waiting::new(2);
     let attempt = |status: Value| submission(&with(status, &json!({"attempt": 2})));
-    let mut see = |object: &Submission| wait.see(object, now());
-    assert_eq!(see(&submission(&crashed())).end, None, "that was the attempt before");
-    let seen = see(&attempt(waiting()));
+    let mut observe = |object: &Submission| wait.observe(object, now());
     assert_eq!(
-        seen.says[0],
+        observe(&submission(&crashed())).end,
+        None,
+        "that was the attempt before"
+    );
+    let update = observe(&attempt(waiting()));
+    assert_eq!(
+        update.lines[0],
         "12:00:00  submission-42 is Pending (WaitingForSlot): All slots of the Leaderboard are in use;"
     );
-    assert_width(&seen.says);
-    assert!(see(&attempt(waiting())).says.is_empty());
+    assert_width(&update.lines);
+    assert!(observe(&attempt(waiting())).lines.is_empty());
     assert_eq!(
-        see(&attempt(running())).says,
+        observe(&attempt(running())).lines,
         ["12:00:00  submission-42 is Running (Running): 12/20 routes done."]
     );
     let more = with(running(), &json!({"attempt": 2, "message": "13/20 routes done."}));
-    assert!(see(&submission(&more)).says.is_empty(), "progress is no transition");
-    let seen = see(&attempt(finished()));
-    assert_eq!((seen.end, seen.says.len()), (Some(State::Finished), 1));
+    assert!(
+        observe(&submission(&more)).lines.is_empty(),
+        "progress is no transition"
+    );
+    let update = observe(&attempt(finished()));
+    assert_eq!((update.end, update.lines.len()), (Some(State::Finished), 1));
 }

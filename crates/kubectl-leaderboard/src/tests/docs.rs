@@ -6,8 +6,8 @@ use serde_json::json;
 use super::{
     cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
 };
-use crate::board::Sight;
-use crate::change::{Wish, plan};
+use crate::board::Observed;
+use crate::change::{Request, plan};
 use crate::error::Error;
 use crate::transitions::Waiting;
 use crate::{overview, why};
@@ -20,16 +20,16 @@ fn assert_shown(lines: &[String]) {
     assert!(DOCS.contains(&block), "docs/plugin.md does not show\n{block}");
 }
 
-fn planned(wish: Wish, submission: &Submission) -> Result<Vec<String>, String> {
-    let plan = plan(wish, submission, Sight::There(&leaderboard()), now());
-    plan.map(|plan| plan.says)
+fn planned(request: Request, submission: &Submission) -> Result<Vec<String>, String> {
+    let plan = plan(request, submission, Observed::Found(&leaderboard()), now());
+    plan.map(|plan| plan.lines)
 }
 
 #[test]
 fn why() {
     for status in [crashed(), waiting()] {
         let board = leaderboard();
-        assert_shown(&why::explain(&submission(&status), Sight::There(&board), now()));
+        assert_shown(&why::explain(&submission(&status), Observed::Found(&board), now()));
     }
 }
 
@@ -40,7 +40,7 @@ fn why_of_all() {
     let stalled = with(
         running(),
         &json!({"conditions": [condition("Running", "True", "Running", ""),
-                               condition("Stalled", "True", "NotStored", "Its results cannot be read: 503.")]}),
+                               condition("Stalled", "True", "NotStored", "The results cannot be read: 503.")]}),
     );
     let refused = with(
         finished(),
@@ -62,16 +62,15 @@ fn why_of_all() {
 
 #[test]
 fn cancel_and_resume() {
-    assert_shown(&planned(Wish::Cancel, &submission(&running())).unwrap());
-    assert_shown(&planned(Wish::Resume, &submission(&crashed())).unwrap());
-    let why_not = planned(Wish::Resume, &submission(&running())).unwrap_err();
+    assert_shown(&planned(Request::Cancel, &submission(&running())).unwrap());
+    assert_shown(&planned(Request::Resume, &submission(&crashed())).unwrap());
+    let why_not = planned(Request::Resume, &submission(&running())).unwrap_err();
     assert_shown(&[format!("kubectl leaderboard: {}", Error::Unfit(why_not))]);
 }
 
 #[test]
 fn the_states_on_the_way() {
-    let stopping =
-        json!({"reason": "Stopping", "message": "It is being stopped as wished; what it has reached is kept."});
+    let stopping = json!({"reason": "Stopping", "message": "Stopping as requested; completed routes are kept."});
     let mut wait = Waiting::new(1);
     let mut lines = Vec::new();
     for (time, status) in [
@@ -80,7 +79,7 @@ fn the_states_on_the_way() {
         ("2026-11-01T12:00:07Z", cancelled()),
     ] {
         let now: Timestamp = time.parse().unwrap();
-        lines.extend(wait.see(&submission(&status), now).says);
+        lines.extend(wait.observe(&submission(&status), now).lines);
     }
     assert_shown(&lines);
 }

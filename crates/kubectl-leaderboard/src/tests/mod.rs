@@ -1,4 +1,4 @@
-//! What the plugin says and decides, as tables: objects in, lines out.
+//! What the plugin prints and decides, as tables: objects in, lines out.
 
 mod change;
 mod docs;
@@ -55,7 +55,7 @@ fn condition(type_: &str, truth: &str, reason: &str, message: &str) -> Value {
            "lastTransitionTime": "2026-11-01T11:00:00Z"})
 }
 
-/// In line, third.
+/// Third in the line.
 fn waiting() -> Value {
     json!({
         "state": "Pending", "attempt": 1, "reason": "WaitingForSlot", "track": "sensors",
@@ -76,7 +76,7 @@ fn running() -> Value {
     })
 }
 
-/// Its agent crashed; EvalAI does not know yet.
+/// Its agent crashed; EvalAI does not have the result yet.
 fn crashed() -> Value {
     let message = "Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the participant fixes the \
                    agent and submits again.";
@@ -101,7 +101,7 @@ fn crashed() -> Value {
 /// Its node was lost too often.
 fn node_lost() -> Value {
     let message =
-        "Node gpu-3 was lost and its Pod with it; finished routes are kept. Look at the node, then resume it.";
+        "Node gpu-3 and its Pod were lost; completed routes are kept. Look at the node, then resume the submission.";
     json!({
         "state": "Failed", "attempt": 1, "retry": 2, "reason": "NodeLost", "message": message, "track": "sensors",
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
@@ -123,9 +123,9 @@ fn finished() -> Value {
     })
 }
 
-/// A person has cancelled it.
+/// A person cancelled it.
 fn cancelled() -> Value {
-    let message = "It was cancelled; what it had reached is kept.";
+    let message = "The submission was cancelled; completed routes are kept.";
     json!({
         "state": "Cancelled", "attempt": 1, "reason": "Cancelled", "message": message,
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
@@ -148,6 +148,6 @@ fn assert_width(lines: &[String]) {
             "{} columns: {line}",
             line.chars().count()
         );
-        assert_eq!(line.trim_end(), line, "nothing is behind the last word");
+        assert_eq!(line.trim_end(), line, "no line ends with white space");
     }
 }

@@ -8,25 +8,25 @@ use super::{
 use crate::overview::lines;
 use leaderboard_api::{Leaderboard, Submission};
 
-fn said(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> String {
+fn printed(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> String {
     let lines = lines("carla", submissions, leaderboards, now());
     assert_width(&lines);
     lines.join("\n")
 }
 
 #[test]
-fn those_that_wait_failed_or_are_in_trouble_have_a_line() {
+fn those_that_wait_failed_or_are_stuck_have_a_line() {
     let first = with(waiting(), &json!({"waiting": {"position": 1}}));
     let stalled = with(
         running(),
-        &json!({"reason": "NotStored", "message": "Its results cannot be read.",
+        &json!({"reason": "NotStored", "message": "The results cannot be read.",
                 "conditions": [condition("Running", "True", "Running", ""),
-                               condition("Stalled", "True", "NotStored", "Its results cannot be read: 503.")]}),
+                               condition("Stalled", "True", "NotStored", "The results cannot be read: 503.")]}),
     );
     let refused = with(
         finished(),
         &json!({"conditions": [condition("Finished", "True", "Finished", ""),
-                               condition("Published", "False", "Refused", "EvalAI does not take the result.")]}),
+                               condition("Published", "False", "Refused", "EvalAI rejected the result.")]}),
     );
     let submissions = [
         named("well", &running()),
@@ -41,72 +41,73 @@ fn those_that_wait_failed_or_are_in_trouble_have_a_line() {
         named("new", &Value::Null),
     ];
     assert_eq!(
-        said(&submissions, Some(&[leaderboard()])),
+        printed(&submissions, Some(&[leaderboard()])),
         "\
 NAME         STATE     SINCE   WHY
-stalled      Running   60 min  NotStored: Its results cannot be read: 503.
-new          (new)             The operator has not looked at it yet.
-first        Pending   60 min  WaitingForSlot: place 1
-third        Pending   60 min  WaitingForSlot: place 3, 20-35 min
-crashed      Failed    3 min   EvalAI: Waiting. AgentCrashed (the participant's, charged): Agent 2…
-lost         Failed    3 min   NodeLost (the infrastructure's, not charged): Node gpu-3 was lost an…
+stalled      Running   60 min  NotStored: The results cannot be read: 503.
+new          (new)             The operator has not processed it yet.
+first        Pending   60 min  WaitingForSlot: position 1
+third        Pending   60 min  WaitingForSlot: position 3, starts in 20-35 min
+crashed      Failed    3 min   EvalAI: Waiting. AgentCrashed (participant failure): Agent 2 crashed…
+lost         Failed    3 min   NodeLost (infrastructure failure): Node gpu-3 and its Pod were lost;…
 unpublished  Finished  3 min   EvalAI: Refused.
 
-`kubectl leaderboard why NAME` says more, and what to do next."
+`kubectl leaderboard why NAME` has the details and the next step."
     );
 }
 
 #[test]
-fn leaderboards_in_trouble_are_named_also_when_no_submission_waits() {
+fn leaderboards_with_a_problem_are_named_also_when_no_submission_waits() {
     let mut paused = leaderboard();
     paused.spec.paused = true;
-    let words = said(&[named("done", &finished())], Some(&[paused]));
+    let text = printed(&[named("done", &finished())], Some(&[paused]));
     assert_eq!(
-        words,
+        text,
         "\
-Leaderboard carla-20 is paused: nothing new starts, and what runs goes on.
+Leaderboard carla-20 is paused: nothing new starts, and running submissions continue.
 
-Nothing waits, has failed or is in trouble in namespace carla (1 submissions)."
+Namespace carla has 1 submission. It is not waiting, failed or stuck."
     );
-    let words = said(&[named("a", &waiting()), named("b", &waiting())], Some(&[]));
-    assert_eq!(words.matches("There is no Leaderboard carla-20").count(), 1, "{words}");
-    let words = said(&[named("done", &finished())], Some(&[]));
+    let text = printed(&[named("a", &waiting()), named("b", &waiting())], Some(&[]));
+    assert_eq!(text.matches("There is no Leaderboard carla-20").count(), 1, "{text}");
+    let text = printed(&[named("done", &finished())], Some(&[]));
     assert!(
-        !words.contains("There is no Leaderboard"),
-        "what has ended needs none: {words}"
+        !text.contains("There is no Leaderboard"),
+        "what has ended needs none: {text}"
     );
-    let words = said(&[], None);
-    assert!(words.starts_with("You may not read Leaderboards"), "{words}");
+    assert!(printed(&[], Some(&[])).starts_with("Namespace carla has no submissions."));
+    let text = printed(&[], None);
+    assert!(text.starts_with("You have no right to read Leaderboards"), "{text}");
 }
 
 #[test]
-fn one_that_goes_or_begins_anew_has_a_line() {
+fn one_that_is_being_deleted_or_resumed_has_a_line() {
     let mut going = named("going", &finished());
     going.metadata.deletion_timestamp = going.metadata.creation_timestamp.clone();
     let mut higher = named("higher", &cancelled());
     higher.spec.attempt = 2;
-    let words = said(&[going, higher], Some(&[leaderboard()]));
-    assert!(words.contains("going   Finished   3 min  Being deleted."), "{words}");
+    let text = printed(&[going, higher], Some(&[leaderboard()]));
+    assert!(text.contains("going   Finished   3 min  Being deleted."), "{text}");
     assert!(
-        words.contains("Attempt 2 is wished; the operator has not taken it up yet."),
-        "{words}"
+        text.contains("Attempt 2 is requested; the operator has not processed it yet."),
+        "{text}"
     );
 }
 
 #[test]
-fn an_end_that_is_being_published_is_no_trouble_yet() {
+fn an_end_that_is_being_published_is_no_problem_yet() {
     let fresh = json!({"type": "Published", "status": "False", "reason": "Waiting", "message": "",
                        "lastTransitionTime": "2026-11-01T11:59:00Z"});
     let status = with(
         finished(),
         &json!({"conditions": [condition("Finished", "True", "Finished", ""), fresh]}),
     );
-    let words = said(&[named("done", &status)], Some(&[leaderboard()]));
-    assert!(words.starts_with("Nothing waits"), "{words}");
+    let text = printed(&[named("done", &status)], Some(&[leaderboard()]));
+    assert!(text.starts_with("Namespace carla has 1 submission."), "{text}");
 }
 
 #[test]
-fn long_names_leave_room_for_the_reason() {
-    let words = said(&[named(&"n".repeat(52), &crashed())], Some(&[leaderboard()]));
-    assert!(words.contains("…"), "{words}");
+fn long_names_leave_space_for_the_reason() {
+    let text = printed(&[named(&"n".repeat(52), &crashed())], Some(&[leaderboard()]));
+    assert!(text.contains("…"), "{text}");
 }

@@ -9,7 +9,7 @@ use crate::controller::decide::{Action, Tell};
 use crate::controller::view::{Standing, Turn};
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
-use leaderboard_api::{FailureClass, conditions, reasons};
+use leaderboard_api::{FailureClass, Team, conditions, reasons};
 
 #[test]
 fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
@@ -29,6 +29,19 @@ fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
     let pinned = status.plan.unwrap();
     assert_eq!(pinned.slices, ["0-1", "2-3"]);
     assert_eq!((pinned.image.as_str(), pinned.resume), ("team/agent:1", false));
+}
+
+#[test]
+fn the_team_of_a_submission_is_shown_as_one_harmless_line() {
+    let mut world = World::local();
+    world.submission().spec.team = Some(Team {
+        id: Some("t1\u{7}".into()),
+        name: Some("Team\u{1b}[2J\nSeven".into()),
+    });
+    world.pass();
+    let team = world.status().team.unwrap();
+    assert_eq!(team.id.as_deref(), Some("t1\u{fffd}"));
+    assert_eq!(team.name.as_deref(), Some("Team\u{fffd}[2J Seven"));
 }
 
 #[test]

@@ -267,7 +267,7 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         );
         let message = plan.status.message.unwrap();
         assert!(
-            message.contains(&format!("again in {pause} s")) && !message.contains("resume it"),
+            message.contains(&format!("again in {pause} s")) && !message.contains("resume the submission"),
             "{message}"
         );
         world.job_gone();
@@ -292,7 +292,7 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         .status
         .failure
         .unwrap();
-    assert!(!failure.charged && failure.message.contains("resume it"));
+    assert!(!failure.charged && failure.message.contains("resume the submission"));
 }
 
 #[test]

@@ -117,7 +117,10 @@ fn a_pod_that_was_not_isolated_ends_at_once_and_is_tried_again_uncharged() {
     let failure = world.status().failure.unwrap();
     assert_eq!(
         (failure.reason.as_str(), failure.message.as_str()),
-        (reasons::NOT_ISOLATED, format!("{why} Then resume it.").as_str())
+        (
+            reasons::NOT_ISOLATED,
+            format!("{why} Then resume the submission.").as_str()
+        )
     );
     assert!(!failure.charged);
     world.job_gone();

@@ -4,7 +4,6 @@ mod accept;
 mod after;
 mod builders;
 mod crashes;
-mod docs;
 mod end;
 mod failure;
 mod isolation;

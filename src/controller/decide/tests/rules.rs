@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{JobSight, NodeSight, Standing, View};
 use leaderboard_api::conditions::{self, FINISHED, PUBLISHED};
+use leaderboard_api::reasons::{self, Class};
 use leaderboard_api::{FailureClass, PolicySource, State, SubmissionStatus};
 
 /// Passes after which nothing may change any more in a world that stands still.
@@ -18,6 +19,7 @@ pub fn check(view: &View, plan: &Plan) {
     logs_come_first(plan);
     a_reporting_node_has_its_grace(view, plan);
     status_is_whole(plan);
+    reasons_are_of_the_table(plan);
     conditions_are_conventional(plan);
     live_ones_are_looked_at_again(plan);
     a_wait_hears_evalai(view, plan);
@@ -172,6 +174,25 @@ fn status_is_whole(plan: &Plan) {
     if let Some(message) = &status.message {
         assert!(message.ends_with(['.', '…']), "no sentence: {message}");
         assert!(!message.contains(".."), "{message}");
+    }
+}
+
+/// Each reason has a meaning and a next step, and that of a failure has its class.
+fn reasons_are_of_the_table(plan: &Plan) {
+    let status = &plan.status;
+    let conditions = status.conditions.iter().map(|condition| &condition.reason);
+    let events = plan.events.iter().map(|event| &event.reason);
+    for reason in status.reason.iter().chain(conditions).chain(events) {
+        assert!(reasons::of(reason).is_some(), "{reason} is not in the table of reasons");
+    }
+    if let Some(failure) = &status.failure {
+        let known = reasons::of(&failure.reason).expect("a reason of the table");
+        let class = match failure.class {
+            FailureClass::Participant => Class::Participant,
+            FailureClass::Infrastructure => Class::Infrastructure,
+        };
+        let is_of_either = known.after_failure.is_some();
+        assert!(is_of_either || known.class == class, "{failure:?}");
     }
 }
 

@@ -28,14 +28,14 @@ pub fn plugin() -> PathBuf {
 }
 
 /// A namespace, and a person at a terminal.
-pub struct Desk {
+pub struct Terminal {
     pub server: &'static ApiServer,
     pub client: Client,
     pub namespace: String,
     pub kubeconfig: PathBuf,
 }
 
-impl Desk {
+impl Terminal {
     pub async fn new() -> Self {
         let server = server().await;
         Self {
@@ -77,7 +77,7 @@ impl Desk {
     }
 
     /// Attempt and cancel of a submission as they are stored.
-    pub async fn wished(&self, name: &str) -> (i64, bool) {
+    pub async fn requested(&self, name: &str) -> (i64, bool) {
         let object = self.api(Kind::Submission).get(name).await.unwrap();
         let spec = &object.data["spec"];
         (spec["attempt"].as_i64().unwrap(), spec["cancel"].as_bool().unwrap())
@@ -94,14 +94,14 @@ impl Desk {
         command
     }
 
-    pub async fn run(&self, arguments: &[&str]) -> Said {
-        Said::of(&ended(&mut self.command(arguments)).await)
+    pub async fn run(&self, arguments: &[&str]) -> Printed {
+        Printed::of(&ended(&mut self.command(arguments)).await)
     }
 
     /// The same as a person with these rights alone.
-    pub async fn run_as(&self, person: &Path, arguments: &[&str]) -> Said {
+    pub async fn run_as(&self, person: &Path, arguments: &[&str]) -> Printed {
         let mut command = self.command(arguments);
-        Said::of(&ended(command.arg("--kubeconfig").arg(person)).await)
+        Printed::of(&ended(command.arg("--kubeconfig").arg(person)).await)
     }
 
     pub fn waits(&self, arguments: &[&str]) -> Waits {
@@ -109,15 +109,15 @@ impl Desk {
     }
 }
 
-/// What a command has said.
+/// What a command printed.
 #[derive(Debug)]
-pub struct Said {
+pub struct Printed {
     pub code: Option<i32>,
     pub out: String,
     pub err: String,
 }
 
-impl Said {
+impl Printed {
     pub fn of(output: &Output) -> Self {
         let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).unwrap();
         Self {
@@ -127,7 +127,7 @@ impl Said {
         }
     }
 
-    /// Its output, if it went well.
+    /// Its output, if it succeeded.
     pub fn well(self) -> String {
         assert_eq!((self.code, self.err.as_str()), (Some(0), ""), "{self:?}");
         for line in self.out.lines() {
@@ -136,12 +136,12 @@ impl Said {
         self.out
     }
 
-    /// Its one line, if it did not.
+    /// Its one line, if it failed.
     pub fn refused(self) -> String {
         assert_eq!((self.code, self.out.as_str()), (Some(1), ""), "{self:?}");
         assert_eq!(self.err.lines().count(), 1, "{}", self.err);
-        let words = self.err.strip_prefix("kubectl leaderboard: ");
-        words.expect("it says who speaks").trim_end().to_owned()
+        let text = self.err.strip_prefix("kubectl leaderboard: ");
+        text.expect("it begins with the program's name").trim_end().to_owned()
     }
 }
 
@@ -158,17 +158,17 @@ impl Waits {
         Self { child, lines }
     }
 
-    /// Reads until a line holds these words.
-    pub async fn until(&mut self, words: &str) {
+    /// Reads until a line contains this text.
+    pub async fn until(&mut self, text: &str) {
         let found = async {
             while let Some(line) = self.lines.next_line().await.unwrap() {
-                if line.contains(words) {
+                if line.contains(text) {
                     return true;
                 }
             }
             false
         };
-        assert!(timeout(LIMIT, found).await.expect(words), "it ended without {words}");
+        assert!(timeout(LIMIT, found).await.expect(text), "it ended without {text}");
     }
 
     pub async fn code(mut self) -> Option<i32> {
@@ -241,7 +241,7 @@ pub fn finished() -> Value {
 }
 
 pub fn assert_has(text: &str, expected: &[&str]) {
-    for words in expected {
-        assert!(text.contains(words), "{words}\n\n{text}");
+    for part in expected {
+        assert!(text.contains(part), "{part}\n\n{text}");
     }
 }

@@ -1,0 +1,121 @@
+"""Words that a reader does not search for, and the usual ones of the field.
+
+Only words without another use are listed, so that a finding is never a matter of taste. Code is left out: only the comments
+and strings of Rust and Python, and the whole of any other text file.
+"""
+
+import io
+import re
+import subprocess
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+# At the start of a message: nobody knows whose Pod it is.
+NAMED = {"Its Pod": "The Pod, or its name", "Its Job": "The Job, or its name"}
+USUAL = {
+    "wish": "request",
+    "wishes": "requests",
+    "wished": "requested",
+    "mend": "fix",
+    "mends": "fixes",
+    "mended": "fixed",
+    "mending": "fixing",
+    "whoever": "anyone who",
+    "for ever": "permanently",
+    "bury": "dead-letter",
+    "buries": "dead-letters",
+    "buried": "dead-lettered",
+    "fate": "outcome",
+    "is told": "receives, or is asked",
+}
+PATTERN = re.compile(
+    "|".join(rf"\b(?:{word})\b".replace(" ", r"\s+") for word in NAMED)
+    + "|(?i:"
+    + "|".join(rf"\b(?:{word})\b".replace(" ", r"\s+") for word in USUAL)
+    + ")"
+)
+# A comment, a raw string, a string, or a character, which may be a quotation mark.
+RUST = re.compile(r"//[^\n]*|/\*.*?\*/|\br(#*)\".*?\"\1|\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^\\'\n])'", re.DOTALL)
+# Written by programs, or about these words.
+LEFT_OUT = ("Cargo.lock", "go.sum", "words.py", "words.allow", "test_words.py")
+
+
+class Finding(NamedTuple):
+    path: str
+    line: int
+    word: str
+    better: str
+
+    def __str__(self) -> str:
+        return f'{self.path}:{self.line}: "{self.word}": write {self.better}'
+
+
+def find(path: str, text: str) -> Iterator[Finding]:
+    """The words of a file that have a usual one."""
+    for line, part in parts(path, text):
+        for match in PATTERN.finditer(part):
+            word = " ".join(match.group().split())
+            better = NAMED.get(word) or USUAL[word.lower()]
+            yield Finding(path, line + part.count("\n", 0, match.start()), word, better)
+
+
+def parts(path: str, text: str) -> Iterator[tuple[int, str]]:
+    """What people read of a file, with the line it starts in."""
+    if path.endswith(".rs"):
+        for match in RUST.finditer(text):
+            yield text.count("\n", 0, match.start()) + 1, match.group()
+    elif path.endswith(".py") or text.startswith("#!/usr/bin/env python3"):
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type not in (tokenize.NAME, tokenize.OP, tokenize.NUMBER):
+                yield token.start[0], token.string
+    else:
+        yield 1, text
+
+
+def allowed(listing: str) -> list[tuple[str, str]]:
+    """The allowed lines: a path, and a part of a line."""
+    lines = (line.strip() for line in listing.splitlines())
+    pairs = (line.split(": ", 1) for line in lines if line and not line.startswith("#"))
+    return [(pair[0], pair[1]) for pair in pairs]
+
+
+def check(texts: dict[str, str], listing: str) -> tuple[list[Finding], list[str]]:
+    """What is found and not allowed, and what is allowed without a finding."""
+    rules = allowed(listing)
+    used: set[tuple[str, str]] = set()
+    findings = []
+    for path, text in sorted(texts.items()):
+        lines = text.splitlines()
+        for finding in find(path, text):
+            matching = {rule for rule in rules if rule[0] == path and rule[1] in lines[finding.line - 1]}
+            used |= matching
+            if not matching:
+                findings.append(finding)
+    return findings, [f"{path}: {part}" for path, part in rules if (path, part) not in used]
+
+
+def tracked(folder: Path) -> dict[str, str]:
+    """The text files of the repository."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=folder, check=True, capture_output=True, text=True)
+    texts = {}
+    for name in filter(None, listed.stdout.split("\0")):
+        path = folder / name
+        if path.is_symlink() or not path.is_file() or path.name in LEFT_OUT:
+            continue
+        try:
+            texts[name] = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue
+    return texts
+
+
+def main(folder: Path, allow: Path) -> int:
+    texts = tracked(folder)
+    findings, unused = check(texts, allow.read_text(encoding="utf-8"))
+    for finding in findings:
+        print(finding)
+    for rule in unused:
+        print(f'{allow.name}: "{rule}" allows nothing any more: remove it')
+    return 1 if findings or unused else 0
