@@ -13,6 +13,7 @@ mod api {
     mod boards;
     mod bridge;
     mod columns;
+    mod counts;
     mod definitions;
     mod endpoints;
     mod evalai;

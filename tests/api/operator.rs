@@ -38,34 +38,10 @@ impl Operator {
     pub fn start_as(namespace: &str, aws: Aws, config: Config) -> Self {
         let (stop, signal) = Stop::new();
         let seen = Observability::new(signal);
-        let clients = Clients {
-            api: Client::try_from(config.clone()).unwrap(),
-            watch: watch_client(config.clone()).unwrap(),
-            lease: leader::lease_client(config).unwrap(),
-        };
-        // A machine that compiles something else at the same time may leave an API server silent for ten seconds.
-        let timing = Timing {
-            lease: LEASE,
-            renew_deadline: LEASE / 2,
-            call: LEASE / 4,
-            ..Timing::default()
-        };
-        let lease = leader::Settings {
-            timing,
-            ..leader::Settings::new(namespace, "operator", Identity::random("test"))
-        };
-        let settings = Settings {
-            image: "operator:1".into(),
-            image_pull_policy: None,
-            region: Some("us-east-1".into()),
-            namespace: Some(namespace.to_owned()),
-            concurrency: 16,
-        };
-        let running = run::run(clients, lease, settings, aws, seen.clone());
         Self {
+            task: tokio::spawn(Box::pin(run(namespace, aws, config, seen.clone()))),
             seen,
             stop,
-            task: tokio::spawn(Box::pin(running)),
         }
     }
 
@@ -85,4 +61,37 @@ impl Operator {
         let ended = tokio::time::timeout(END_LIMIT, self.task).await;
         ended.expect("it ends when told").unwrap().unwrap();
     }
+}
+
+/// A controller that runs until its stop signal; started as a task by [`Operator`].
+pub fn run(
+    namespace: &str,
+    aws: Aws,
+    config: Config,
+    seen: Observability,
+) -> impl Future<Output = Result<(), RunError>> + Send + use<> {
+    let clients = Clients {
+        api: Client::try_from(config.clone()).unwrap(),
+        watch: watch_client(config.clone()).unwrap(),
+        lease: leader::lease_client(config).unwrap(),
+    };
+    // A machine that compiles something else at the same time may leave an API server silent for ten seconds.
+    let timing = Timing {
+        lease: LEASE,
+        renew_deadline: LEASE / 2,
+        call: LEASE / 4,
+        ..Timing::default()
+    };
+    let lease = leader::Settings {
+        timing,
+        ..leader::Settings::new(namespace, "operator", Identity::random("test"))
+    };
+    let settings = Settings {
+        image: "operator:1".into(),
+        image_pull_policy: None,
+        region: Some("us-east-1".into()),
+        namespace: Some(namespace.to_owned()),
+        concurrency: 16,
+    };
+    run::run(clients, lease, settings, aws, seen)
 }

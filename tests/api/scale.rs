@@ -3,7 +3,7 @@
 //!
 //! The small size belongs to the tests. The full one measures, and takes a quarter of an hour: `make measure-scale`.
 
-mod player;
+pub(super) mod player;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;

@@ -29,6 +29,40 @@ const POLL: Duration = Duration::from_millis(50);
 /// A free port can be taken by somebody else before the server has it.
 const TRIES: usize = 3;
 
+/// Users with all rights whose requests the audit log has, each for one test that counts them.
+const COUNTED: u32 = 32;
+
+/// A request of a counted user.
+#[derive(Debug, Clone, serde::Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Request {
+    user: User,
+    pub verb: String,
+    object_ref: Option<ObjectRef>,
+}
+
+#[derive(Debug, Clone, serde::Deserialize)]
+struct User {
+    username: String,
+}
+
+#[derive(Debug, Clone, serde::Deserialize)]
+struct ObjectRef {
+    resource: String,
+    subresource: Option<String>,
+}
+
+impl Request {
+    /// What it is about: a resource, with the subresource behind a slash.
+    pub fn resource(&self) -> String {
+        let Some(object) = &self.object_ref else {
+            return String::new();
+        };
+        let part = object.subresource.as_ref().map(|part| format!("/{part}"));
+        format!("{}{}", object.resource, part.unwrap_or_default())
+    }
+}
+
 /// The running API server.
 pub struct ApiServer {
     folder: PathBuf,
@@ -56,6 +90,27 @@ impl ApiServer {
     /// How it is reached with all rights, for clients of one's own kind.
     pub fn config(&self) -> Config {
         self.config.clone()
+    }
+
+    /// How a user reaches it that nobody else is, and the user's name for [`ApiServer::requests`].
+    pub fn counted(&self) -> (Config, String) {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        assert!(number < COUNTED, "there are only {COUNTED} counted users");
+        let user = format!("counted-{number}");
+        let mut config = self.config();
+        config.auth_info.token = Some(user.clone().into());
+        (config, user)
+    }
+
+    /// The requests of a counted user that were answered, oldest first. Watches are in it once they have ended.
+    pub fn requests(&self, user: &str) -> Vec<Request> {
+        let log = fs::read_to_string(self.folder.join("audit.log")).unwrap_or_default();
+        // The last line may be half written.
+        let all = log
+            .lines()
+            .filter_map(|line| serde_json::from_str::<Request>(line).ok());
+        all.filter(|request| request.user.username == user).collect()
     }
 
     /// A new namespace, `<name>-<number>`.
@@ -246,12 +301,24 @@ fn log(folder: &Path, program: &str) -> io::Result<File> {
     File::create(folder.join(format!("{program}.log")))
 }
 
-/// The folder, the token of its only user, and the key that signs the tokens of service accounts.
+/// The folder, its users' tokens, whose requests are logged, and the key that signs the tokens of service accounts.
 fn prepare(folder: &Path) -> Result<(), String> {
     let failed = |error: io::Error| format!("{} cannot be prepared: {error}", folder.display());
     _ = fs::remove_dir_all(folder);
     fs::DirBuilder::new().mode(0o700).create(folder).map_err(failed)?;
-    fs::write(folder.join("tokens.csv"), "tests,admin,admin,system:masters\n").map_err(failed)?;
+    let counted: Vec<_> = (0..COUNTED).map(|number| format!("counted-{number}")).collect();
+    let mut tokens = "tests,admin,admin,system:masters\n".to_owned();
+    for user in &counted {
+        _ = writeln!(tokens, "{user},{user},{user},system:masters");
+    }
+    fs::write(folder.join("tokens.csv"), tokens).map_err(failed)?;
+    let policy = serde_json::json!({
+        "apiVersion": "audit.k8s.io/v1",
+        "kind": "Policy",
+        "omitStages": ["RequestReceived", "ResponseStarted"],
+        "rules": [{"level": "Metadata", "users": counted}, {"level": "None"}],
+    });
+    fs::write(folder.join("audit-policy.json"), policy.to_string()).map_err(failed)?;
     let key = Command::new("openssl")
         // The traditional format: the server reads no other for this kind of key.
         .args(["ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out"])
@@ -293,6 +360,8 @@ fn apiserver_arguments(folder: &Path, etcd_port: u16, port: u16) -> Vec<String> 
         format!("--secure-port={port}"),
         format!("--cert-dir={}", file("certificates")),
         format!("--token-auth-file={}", file("tokens.csv")),
+        format!("--audit-policy-file={}", file("audit-policy.json")),
+        format!("--audit-log-path={}", file("audit.log")),
         "--authorization-mode=RBAC".into(),
         // Nobody makes the namespaces' service accounts.
         "--disable-admission-plugins=ServiceAccount".into(),

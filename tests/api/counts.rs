@@ -1,0 +1,138 @@
+//! What one submission costs, counted where the machine makes no difference: requests to the API server and to S3, reconciles,
+//! allocations, and the bytes of a cached object. The table is `counts/expected.json`; `UPDATE_COUNTS=1` writes it anew.
+//!
+//! The whole controller runs on the real API server; Job controller, kubelet and logcopy are played, so that nothing but the
+//! controller decides what is asked and written.
+
+mod lifecycle;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::{env, fs};
+
+use futures::future::join_all;
+use serde::{Deserialize, Serialize};
+
+use lifecycle::{Cached, Scenario};
+
+const TABLE: &str = "tests/api/counts/expected.json";
+const UPDATE: &str = "UPDATE_COUNTS";
+/// What depends on a moment, such as reads of a report while a run ends, may differ by this part of the expected, and by one.
+const TOLERANCE: f64 = 0.25;
+
+/// What one submission costs from its creation until nothing more comes of its end.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub struct Cost {
+    /// Requests to the API server by verb and resource. Watches, the Lease and questions after rights are the process's own.
+    pub writes: BTreeMap<String, u64>,
+    pub reads: BTreeMap<String, u64>,
+    pub s3_requests: u64,
+    pub reconciles: u64,
+    pub allocations: u64,
+    pub allocated_kilobytes: u64,
+}
+
+/// The whole table.
+#[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+struct Table {
+    lifecycles: BTreeMap<String, Cost>,
+    /// By kind.
+    bytes_per_cached_object: BTreeMap<String, u64>,
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_submission_costs_what_the_table_says() {
+    let lifecycles =
+        join_all(Scenario::ALL.map(async |scenario| (scenario.name.to_owned(), Box::pin(scenario.cost()).await))).await;
+    let cached =
+        join_all(Cached::ALL.map(async |cached| (format!("{cached:?}"), Box::pin(cached.bytes()).await))).await;
+    let seen = Table {
+        lifecycles: lifecycles.into_iter().collect(),
+        bytes_per_cached_object: cached.into_iter().collect(),
+    };
+    println!("{}", text(&seen));
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(TABLE);
+    if env::var_os(UPDATE).is_some() {
+        return fs::write(path, text(&seen)).unwrap();
+    }
+    let expected: Table = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
+    let differences = differences(&expected, &seen);
+    assert!(
+        differences.is_empty(),
+        "what a submission costs has changed; if it should, {UPDATE}=1 writes {TABLE} anew:\n{}",
+        differences.join("\n")
+    );
+}
+
+fn text(table: &Table) -> String {
+    serde_json::to_string_pretty(table).unwrap() + "\n"
+}
+
+fn differences(expected: &Table, seen: &Table) -> Vec<String> {
+    let mut found = Vec::new();
+    let names = |table: &Table| table.lifecycles.keys().cloned().collect::<Vec<_>>();
+    if names(expected) != names(seen) {
+        found.push(format!("lifecycles: {:?}, expected {:?}", names(seen), names(expected)));
+    }
+    for (name, cost) in &seen.lifecycles {
+        let expected = expected.lifecycles.get(name).cloned().unwrap_or_default();
+        for (what, expected, seen) in [
+            ("writes", &expected.writes, &cost.writes),
+            ("reads", &expected.reads, &cost.reads),
+        ] {
+            if expected != seen {
+                let (before, now): (u64, u64) = (expected.values().sum(), seen.values().sum());
+                found.push(format!("{name}: {now} {what} {seen:?}, expected {before} {expected:?}"));
+            }
+        }
+        for (what, expected, seen) in [
+            ("S3 requests", expected.s3_requests, cost.s3_requests),
+            ("reconciles", expected.reconciles, cost.reconciles),
+            ("allocations", expected.allocations, cost.allocations),
+            (
+                "kilobytes allocated",
+                expected.allocated_kilobytes,
+                cost.allocated_kilobytes,
+            ),
+        ] {
+            found.extend(differs(expected, seen).then(|| format!("{name}: {seen} {what}, expected {expected}")));
+        }
+    }
+    for (kind, seen) in &seen.bytes_per_cached_object {
+        let expected = expected.bytes_per_cached_object.get(kind).copied().unwrap_or_default();
+        found.extend(differs(expected, *seen).then(|| format!("{kind}: {seen} bytes each, expected {expected}")));
+    }
+    found
+}
+
+#[allow(clippy::cast_precision_loss, reason = "no count comes near 2^52")]
+fn differs(expected: u64, seen: u64) -> bool {
+    let allowed = (expected as f64 * TOLERANCE).max(1.0);
+    expected.abs_diff(seen) as f64 > allowed
+}
+
+#[test]
+fn exact_numbers_must_be_met_and_others_nearly() {
+    let cost = |events: u64, allocations: u64| Cost {
+        writes: [("create events".to_owned(), events)].into(),
+        allocations,
+        ..Cost::default()
+    };
+    let table = |cost| Table {
+        lifecycles: [("local".to_owned(), cost)].into(),
+        bytes_per_cached_object: [("Pod".to_owned(), 1000)].into(),
+    };
+    let expected = table(cost(4, 1000));
+    assert!(differences(&expected, &table(cost(4, 1200))).is_empty());
+    let found = differences(&expected, &table(cost(5, 1300)));
+    assert_eq!(
+        found,
+        [
+            r#"local: 5 writes {"create events": 5}, expected 4 {"create events": 4}"#,
+            "local: 1300 allocations, expected 1000",
+        ]
+    );
+    assert_eq!(differences(&Table::default(), &expected).len(), 4);
+}

@@ -1,0 +1,444 @@
+//! One submission's whole life with a controller on a thread of its own, whose allocations are counted there.
+
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use allocation_counter::AllocationInfo;
+use aws_sdk_dynamodb::types::{AttributeDefinition, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType};
+use evalai_stand_in::model::FileState;
+use evalai_stand_in::submissions::{NewSubmission, create as push};
+use evalai_stand_in::{Config, Handle};
+use jiff::Timestamp;
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Pod, Secret};
+use kube::api::{Api, DynamicObject, ListParams, Patch, PatchParams, PostParams};
+use kube::core::{ApiResource, NamespaceResourceScope};
+use kube::runtime::wait::await_condition;
+use kube::{Client, Resource};
+use leaderboard_api::{Leaderboard, State, Submission, conditions, reasons};
+use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::shutdown::Stop;
+use serde_json::{Map, Value, json};
+use tokio::net::TcpListener;
+use tokio::sync::oneshot;
+use tokio::time::{Instant, sleep, timeout};
+
+use super::super::bridge::StandIn;
+use super::super::objects::{Kind, create};
+use super::super::operator;
+use super::super::scale::player::{Player, Props, ROUTES};
+use super::Cost;
+use crate::support::apiserver::{Request, server};
+use crate::support::ministack;
+
+const BOARD: &str = "carla";
+/// Far longer than anything here takes.
+const LIMIT: Duration = Duration::from_mins(3);
+/// A controller that has asked for nothing during so long has nothing more to do. Nobody can wait for what does not come.
+/// It is longer than the controller waits with a Leaderboard's counts.
+const QUIET: Duration = Duration::from_secs(7);
+const LOOK: Duration = Duration::from_millis(200);
+/// The process's own requests.
+const OF_THE_PROCESS: [&str; 2] = ["leases", "selfsubjectaccessreviews"];
+const READS: [&str; 2] = ["get", "list"];
+/// No report comes before the last one: how many there are would depend on the machine.
+const NO_REPORT: Duration = Duration::from_hours(1);
+/// So often a controller comes to rest in a submission's life.
+const STAGES: usize = 3;
+/// So many objects more are cached in the second of two runs.
+const CACHED: u32 = 100;
+
+/// A kind of Leaderboard.
+#[derive(Clone, Copy)]
+pub struct Scenario {
+    pub name: &'static str,
+    has_evalai: bool,
+    has_limits: bool,
+}
+
+impl Scenario {
+    pub const ALL: [Self; 4] = [
+        Self::of("local", false, false),
+        Self::of("local, limited", false, true),
+        Self::of("EvalAI and table", true, false),
+        Self::of("EvalAI and table, limited", true, true),
+    ];
+
+    const fn of(name: &'static str, has_evalai: bool, has_limits: bool) -> Self {
+        Self {
+            name,
+            has_evalai,
+            has_limits,
+        }
+    }
+
+    /// What a submission costs, and what a controller without one does not.
+    pub async fn cost(self) -> Cost {
+        let (idle, one) = tokio::join!(self.run(false), self.run(true));
+        Cost {
+            allocations: one.allocations.saturating_sub(idle.allocations),
+            allocated_kilobytes: one.allocated_kilobytes.saturating_sub(idle.allocated_kilobytes),
+            ..one
+        }
+    }
+
+    async fn run(self, has_submission: bool) -> Cost {
+        let world = World::new(self).await;
+        let controller = Controller::start(&world).await;
+        world.ready().await;
+        controller.quiet().await;
+        let before = (
+            controller.requests().await.len(),
+            controller.reconciles(),
+            world.s3.requests(),
+        );
+        if has_submission {
+            world.live(&controller).await;
+        } else {
+            // As long as a life takes: the process's own work is not the submission's.
+            for _ in 0..STAGES {
+                controller.quiet().await;
+            }
+        }
+        let requests = controller.requests().await.split_off(before.0);
+        let reconciles = controller.reconciles() - before.1;
+        let s3_requests = world.s3.requests() - before.2;
+        let memory = controller.end().await;
+        let mut cost = Cost {
+            s3_requests,
+            reconciles,
+            allocations: memory.count_total,
+            allocated_kilobytes: memory.bytes_total >> 10,
+            ..Cost::default()
+        };
+        for request in requests {
+            let is_read = READS.contains(&request.verb.as_str());
+            let of = if is_read { &mut cost.reads } else { &mut cost.writes };
+            *of.entry(format!("{} {}", request.verb, request.resource()))
+                .or_insert(0) += 1;
+        }
+        cost
+    }
+}
+
+/// A kind of object that the controller keeps a copy of.
+#[derive(Clone, Copy, Debug)]
+pub enum Cached {
+    Pod,
+    Job,
+    Submission,
+}
+
+impl Cached {
+    pub const ALL: [Self; 3] = [Self::Pod, Self::Job, Self::Submission];
+
+    /// What a controller with many of them holds more than one without, for each.
+    pub async fn bytes(self) -> u64 {
+        let (none, many) = tokio::join!(self.held(0), self.held(CACHED));
+        u64::try_from(many.saturating_sub(none)).unwrap_or_default() / u64::from(CACHED)
+    }
+
+    async fn held(self, count: u32) -> i64 {
+        let world = World::new(Scenario::ALL[0]).await;
+        // What a real run leaves is copied.
+        let first = Controller::start(&world).await;
+        world.ready().await;
+        world.live(&first).await;
+        first.end().await;
+        match self {
+            Self::Pod => world.copy::<Pod>(count).await,
+            Self::Job => world.copy::<Job>(count).await,
+            Self::Submission => world.copy::<Submission>(count).await,
+        }
+        let second = Controller::start(&world).await;
+        world.ready().await;
+        second.quiet().await;
+        second.end().await.bytes_current
+    }
+}
+
+/// What is around a controller.
+struct World {
+    client: Client,
+    namespace: String,
+    aws: StandIn,
+    /// Between the controller and S3.
+    s3: ministack::Proxy,
+    evalai: Option<Handle>,
+    bucket: String,
+    labels: Vec<String>,
+}
+
+impl World {
+    async fn new(scenario: Scenario) -> Self {
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let aws = StandIn::start().await;
+        let client = server().await.client();
+        let namespace = server().await.namespace("counts").await;
+        let (config, _) = Config::in_memory().unwrap();
+        let labels = config.seed.challenges[0].phases[0].splits[0].schema.labels.clone();
+        let evalai = if scenario.has_evalai {
+            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let config = Config { throttle: 0, ..config };
+            Some(evalai_stand_in::serve(config, vec![listener]))
+        } else {
+            None
+        };
+        let bucket = aws.name("counts");
+        let s3 = aws.aws.s3(None, Some(&aws.endpoint));
+        s3.create_bucket().bucket(&bucket).send().await.unwrap();
+        let world = Self {
+            s3: ministack::server().await.proxy().await,
+            client,
+            namespace,
+            aws,
+            evalai,
+            bucket,
+            labels,
+        };
+        world.make_board(scenario).await;
+        world
+    }
+
+    async fn make_board(&self, scenario: Scenario) {
+        let mut spec = json!({
+            "storage": {"bucket": self.bucket, "endpoint": self.s3.endpoint()},
+            "syncPeriodSeconds": 5,
+            "pairs": 1,
+            "routes": ROUTES,
+        });
+        if scenario.has_limits {
+            spec["concurrency"] = json!({"total": 2, "perTeam": 1});
+        }
+        if let Some(evalai) = &self.evalai {
+            let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": "local-host-token"}});
+            let secret: Secret = serde_json::from_value(secret).unwrap();
+            let secrets = self.api::<Secret>();
+            secrets.create(&PostParams::default(), &secret).await.unwrap();
+            spec["evalai"] = json!({
+                "apiServer": evalai.url(), "challenge": 1, "requestsPerMinute": 6000,
+                "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
+            });
+            spec["tracks"] = json!([{"name": "sensors", "codename": "SENSORS", "phase": 1}]);
+            spec["table"] = json!({"name": self.make_table().await, "endpoint": self.aws.endpoint});
+        }
+        let api = Kind::Leaderboard.api(&self.client, &self.namespace);
+        let board = Kind::Leaderboard.object(BOARD, &[&json!({ "spec": spec })]);
+        create(&api, board, false).await.unwrap();
+    }
+
+    async fn make_table(&self) -> String {
+        let name = self.aws.name("counts");
+        let client = self.aws.aws.dynamodb(None, Some(&self.aws.endpoint));
+        let mut request = client
+            .create_table()
+            .table_name(&name)
+            .billing_mode(BillingMode::PayPerRequest);
+        for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
+            let definition = AttributeDefinition::builder()
+                .attribute_name(key)
+                .attribute_type(ScalarAttributeType::S)
+                .build();
+            let element = KeySchemaElement::builder().attribute_name(key).key_type(role).build();
+            request = request
+                .attribute_definitions(definition.unwrap())
+                .key_schema(element.unwrap());
+        }
+        request.send().await.unwrap();
+        name
+    }
+
+    fn api<K>(&self) -> Api<K>
+    where
+        K: Resource<Scope = NamespaceResourceScope, DynamicType = ()>,
+    {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    async fn ready(&self) {
+        let ready = |found: Option<&Leaderboard>| {
+            let status = found.and_then(|board| board.status.as_ref());
+            status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::READY))
+        };
+        let reached = timeout(LIMIT, await_condition(self.api(), BOARD, ready)).await;
+        reached.expect("the Leaderboard is ready").unwrap();
+    }
+
+    /// A submission from its creation until every system has its end. The controller comes to rest in between, so that it
+    /// makes no difference how fast it is: with a Job, with a running Pod, and with an end.
+    async fn live(&self, controller: &Controller) {
+        let mut spec = json!({"leaderboardName": BOARD});
+        if let Some(evalai) = &self.evalai {
+            let new = NewSubmission {
+                team: 1,
+                phase: 1,
+                user: 11,
+                input: br#"{"submitted_image_uri": "registry.example/team-a:1"}"#.to_vec(),
+                fields: Map::new(),
+            };
+            let pk = evalai.with_state(|state| push(state, new, FileState::Stored, Timestamp::now()));
+            spec["evalai"] = json!({"challenge": 1, "phase": 1, "submission": pk});
+            spec["track"] = Value::Null;
+        }
+        let api = Kind::Submission.api(&self.client, &self.namespace);
+        let submission = Kind::Submission.object("one", &[&json!({ "spec": spec })]);
+        create(&api, submission, false).await.unwrap();
+        self.until("it has a Job", |s| {
+            s.status.as_ref().is_some_and(|s| s.job_name.is_some())
+        })
+        .await;
+        controller.quiet().await;
+        let player = Player::start(Props {
+            client: self.client.clone(),
+            namespace: self.namespace.clone(),
+            s3: self.aws.aws.s3(None, Some(&self.aws.endpoint)),
+            bucket: self.bucket.clone(),
+            period: NO_REPORT,
+            labels: self.labels.clone(),
+        });
+        self.until("it runs", |s| {
+            s.status.as_ref().is_some_and(|s| s.state == Some(State::Running))
+        })
+        .await;
+        controller.quiet().await;
+        player.fall_the_curtain();
+        self.until("every system has its end", is_settled).await;
+        controller.quiet().await;
+    }
+
+    async fn until(&self, what: &str, holds: impl Fn(&Submission) -> bool) {
+        let holds = |found: Option<&Submission>| found.is_some_and(&holds);
+        let reached = timeout(LIMIT, await_condition(self.api(), "one", holds)).await;
+        reached
+            .unwrap_or_else(|_| panic!("not after {LIMIT:?}: {what}"))
+            .unwrap();
+    }
+
+    /// Copies the one object of a kind with its status.
+    async fn copy<K>(&self, count: u32)
+    where
+        K: Resource<Scope = NamespaceResourceScope, DynamicType = ()>,
+    {
+        let api: Api<DynamicObject> =
+            Api::namespaced_with(self.client.clone(), &self.namespace, &ApiResource::erase::<K>(&()));
+        let model = api.list(&ListParams::default()).await.unwrap().items.remove(0);
+        let status = json!({"status": model.data["status"]});
+        for number in 0..count {
+            let mut object = model.clone();
+            object.metadata.name = Some(format!("copy-{number}"));
+            object.metadata.uid = None;
+            object.metadata.resource_version = None;
+            object.metadata.finalizers = None;
+            if let Some(labels) = object.data.pointer_mut("/spec/template/metadata/labels") {
+                *labels = json!({});
+            }
+            if let Some(spec) = object.data["spec"].as_object_mut() {
+                spec.remove("selector");
+            }
+            let created = api.create(&PostParams::default(), &object).await;
+            let name = created.unwrap().metadata.name.unwrap();
+            api.patch_status(&name, &PatchParams::default(), &Patch::Merge(&status))
+                .await
+                .unwrap();
+        }
+    }
+}
+
+fn is_settled(submission: &Submission) -> bool {
+    let conditions = submission.status.as_ref().map(|status| status.conditions.as_slice());
+    let conditions = conditions.unwrap_or_default();
+    let is_known = |type_: &str| {
+        let found = conditions::get(conditions, type_);
+        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+    };
+    conditions::is_true(conditions, conditions::FINISHED)
+        && is_known(conditions::PUBLISHED)
+        && is_known(conditions::RECORDED)
+}
+
+/// A controller on a thread of its own.
+struct Controller {
+    user: String,
+    seen: Observability,
+    measured: oneshot::Sender<()>,
+    thread: JoinHandle<AllocationInfo>,
+}
+
+impl Controller {
+    async fn start(world: &World) -> Self {
+        let (config, user) = server().await.counted();
+        let (stop, signal) = Stop::new();
+        let seen = Observability::new(signal);
+        let (measured, until) = oneshot::channel::<()>();
+        let (namespace, endpoint, of_thread) = (world.namespace.clone(), world.aws.endpoint.clone(), seen.clone());
+        let thread = std::thread::spawn(move || {
+            let mut running = None;
+            let memory = allocation_counter::measure(|| {
+                let runtime = tokio::runtime::Builder::new_current_thread()
+                    .enable_all()
+                    .build()
+                    .unwrap();
+                let task = runtime.spawn(async move {
+                    let aws = ministack::aws(&endpoint).await;
+                    Box::pin(operator::run(&namespace, aws, config, of_thread)).await
+                });
+                // What it holds at this moment is what counts, so it ends only after the measurement.
+                let _ = runtime.block_on(until);
+                running = Some((runtime, task));
+            });
+            let (runtime, task) = running.unwrap();
+            stop.send_replace(true);
+            runtime.block_on(task).unwrap().unwrap();
+            memory
+        });
+        Self {
+            user,
+            seen,
+            measured,
+            thread,
+        }
+    }
+
+    /// What it has asked the API server for, watches and the process's own requests left out.
+    async fn requests(&self) -> Vec<Request> {
+        let all = server().await.requests(&self.user).into_iter();
+        let counts =
+            |request: &Request| request.verb != "watch" && !OF_THE_PROCESS.contains(&request.resource().as_str());
+        all.filter(counts).collect()
+    }
+
+    fn reconciles(&self) -> u64 {
+        let text = self.seen.metrics.text().unwrap();
+        let lines = text
+            .lines()
+            .filter(|line| line.starts_with("leaderboard_reconciles_total{"));
+        let numbers = lines.filter_map(|line| line.rsplit(' ').next()?.parse::<u64>().ok());
+        numbers.sum()
+    }
+
+    /// Waits until it has nothing more to do.
+    async fn quiet(&self) {
+        let quiet = async {
+            let mut known = (self.requests().await.len(), self.reconciles());
+            let mut since = Instant::now();
+            while since.elapsed() < QUIET {
+                sleep(LOOK).await;
+                let now = (self.requests().await.len(), self.reconciles());
+                if now != known {
+                    (known, since) = (now, Instant::now());
+                }
+            }
+        };
+        timeout(LIMIT, quiet).await.expect("the controller comes to rest");
+    }
+
+    /// Ends it, and gives what it has allocated until now and still holds.
+    async fn end(self) -> AllocationInfo {
+        self.measured.send(()).expect("the controller had ended by itself");
+        let ended = tokio::task::spawn_blocking(|| self.thread.join().unwrap());
+        timeout(LIMIT, ended)
+            .await
+            .expect("it ends at the stop signal")
+            .unwrap()
+    }
+}
