@@ -45,8 +45,9 @@ struct Table {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_submission_costs_what_the_table_says() {
     let lifecycles =
-        join_all(Scenario::ALL.map(async |scenario| (scenario.name.to_owned(), scenario.cost().await))).await;
-    let cached = join_all(Cached::ALL.map(async |cached| (format!("{cached:?}"), cached.bytes().await))).await;
+        join_all(Scenario::ALL.map(async |scenario| (scenario.name.to_owned(), Box::pin(scenario.cost()).await))).await;
+    let cached =
+        join_all(Cached::ALL.map(async |cached| (format!("{cached:?}"), Box::pin(cached.bytes()).await))).await;
     let seen = Table {
         lifecycles: lifecycles.into_iter().collect(),
         bytes_per_cached_object: cached.into_iter().collect(),

@@ -35,13 +35,16 @@ const BOARD: &str = "carla";
 /// Far longer than anything here takes.
 const LIMIT: Duration = Duration::from_mins(3);
 /// A controller that has asked for nothing during so long has nothing more to do. Nobody can wait for what does not come.
-const QUIET: Duration = Duration::from_secs(4);
+/// It is longer than the controller waits with a Leaderboard's counts.
+const QUIET: Duration = Duration::from_secs(7);
 const LOOK: Duration = Duration::from_millis(200);
 /// The process's own requests.
 const OF_THE_PROCESS: [&str; 2] = ["leases", "selfsubjectaccessreviews"];
 const READS: [&str; 2] = ["get", "list"];
 /// No report comes before the last one: how many there are would depend on the machine.
 const NO_REPORT: Duration = Duration::from_hours(1);
+/// So often a controller comes to rest in a submission's life.
+const STAGES: usize = 3;
 /// So many objects more are cached in the second of two runs.
 const CACHED: u32 = 100;
 
@@ -90,8 +93,12 @@ impl Scenario {
             world.s3.requests(),
         );
         if has_submission {
-            world.live().await;
-            controller.quiet().await;
+            world.live(&controller).await;
+        } else {
+            // As long as a life takes: the process's own work is not the submission's.
+            for _ in 0..STAGES {
+                controller.quiet().await;
+            }
         }
         let requests = controller.requests().await.split_off(before.0);
         let reconciles = controller.reconciles() - before.1;
@@ -132,14 +139,12 @@ impl Cached {
     }
 
     async fn held(self, count: u32) -> i64 {
-        let mut world = World::new(Scenario::ALL[0]).await;
+        let world = World::new(Scenario::ALL[0]).await;
         // What a real run leaves is copied.
         let first = Controller::start(&world).await;
         world.ready().await;
-        world.live().await;
-        first.quiet().await;
+        world.live(&first).await;
         first.end().await;
-        world.player = None;
         match self {
             Self::Pod => world.copy::<Pod>(count).await,
             Self::Job => world.copy::<Job>(count).await,
@@ -160,8 +165,8 @@ struct World {
     /// Between the controller and S3.
     s3: ministack::Proxy,
     evalai: Option<Handle>,
-    /// None once all runs have ended.
-    player: Option<Player>,
+    bucket: String,
+    labels: Vec<String>,
 }
 
 impl World {
@@ -183,33 +188,27 @@ impl World {
         let s3 = aws.aws.s3(None, Some(&aws.endpoint));
         s3.create_bucket().bucket(&bucket).send().await.unwrap();
         let world = Self {
-            player: Some(Player::start(Props {
-                client: client.clone(),
-                namespace: namespace.clone(),
-                s3,
-                bucket: bucket.clone(),
-                period: NO_REPORT,
-                labels,
-            })),
             s3: ministack::server().await.proxy().await,
             client,
             namespace,
             aws,
             evalai,
+            bucket,
+            labels,
         };
-        world.make_board(scenario, &bucket).await;
+        world.make_board(scenario).await;
         world
     }
 
-    async fn make_board(&self, scenario: Scenario, bucket: &str) {
+    async fn make_board(&self, scenario: Scenario) {
         let mut spec = json!({
-            "storage": {"bucket": bucket, "endpoint": self.s3.endpoint()},
-            "periodSeconds": 5,
+            "storage": {"bucket": self.bucket, "endpoint": self.s3.endpoint()},
+            "syncPeriodSeconds": 5,
             "pairs": 1,
             "routes": ROUTES,
         });
         if scenario.has_limits {
-            spec["running"] = json!({"total": 2, "perTeam": 1});
+            spec["concurrency"] = json!({"total": 2, "perTeam": 1});
         }
         if let Some(evalai) = &self.evalai {
             let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": "local-host-token"}});
@@ -265,9 +264,10 @@ impl World {
         reached.expect("the Leaderboard is ready").unwrap();
     }
 
-    /// A submission from its creation until every system has its end.
-    async fn live(&self) {
-        let mut spec = json!({"leaderboard": BOARD});
+    /// A submission from its creation until every system has its end. The controller comes to rest in between, so that it
+    /// makes no difference how fast it is: with a Job, with a running Pod, and with an end.
+    async fn live(&self, controller: &Controller) {
+        let mut spec = json!({"leaderboardName": BOARD});
         if let Some(evalai) = &self.evalai {
             let new = NewSubmission {
                 team: 1,
@@ -283,12 +283,27 @@ impl World {
         let api = Kind::Submission.api(&self.client, &self.namespace);
         let submission = Kind::Submission.object("one", &[&json!({ "spec": spec })]);
         create(&api, submission, false).await.unwrap();
+        self.until("it has a Job", |s| {
+            s.status.as_ref().is_some_and(|s| s.job_name.is_some())
+        })
+        .await;
+        controller.quiet().await;
+        let player = Player::start(Props {
+            client: self.client.clone(),
+            namespace: self.namespace.clone(),
+            s3: self.aws.aws.s3(None, Some(&self.aws.endpoint)),
+            bucket: self.bucket.clone(),
+            period: NO_REPORT,
+            labels: self.labels.clone(),
+        });
         self.until("it runs", |s| {
             s.status.as_ref().is_some_and(|s| s.state == Some(State::Running))
         })
         .await;
-        self.player.as_ref().unwrap().fall_the_curtain();
+        controller.quiet().await;
+        player.fall_the_curtain();
         self.until("every system has its end", is_settled).await;
+        controller.quiet().await;
     }
 
     async fn until(&self, what: &str, holds: impl Fn(&Submission) -> bool) {
@@ -334,7 +349,7 @@ fn is_settled(submission: &Submission) -> bool {
     let conditions = conditions.unwrap_or_default();
     let is_known = |type_: &str| {
         let found = conditions::get(conditions, type_);
-        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_WANTED)
+        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
     };
     conditions::is_true(conditions, conditions::FINISHED)
         && is_known(conditions::PUBLISHED)
