@@ -81,10 +81,10 @@ async fn no_request_is_lost_on_a_connection_that_the_server_gives_up() {
     };
     let requests = [
         list.clone(),
-        Request::Progress(subject(), Progress::Queued, None),
+        Request::Progress(submission(), Progress::Queued, None),
         list.clone(),
-        Request::Progress(subject(), Progress::Running, None),
-        Request::Final(subject(), Outcome::Failed, Arc::default()),
+        Request::Progress(submission(), Progress::Running, None),
+        Request::Final(submission(), Outcome::Failed, Arc::default()),
         list,
     ];
     for request in requests {
@@ -100,7 +100,7 @@ async fn a_write_to_a_server_that_is_not_there_was_not_sent() {
     let url = format!("http://{}", listener.local_addr().unwrap());
     drop(listener);
     let client = Client::new(&url, Timeouts::default()).unwrap();
-    let write = Request::Progress(subject(), Progress::Queued, None);
+    let write = Request::Progress(submission(), Progress::Queued, None);
     let answer = client.send(&Token::parse("x").unwrap(), &write).await.answer();
     assert!(
         matches!(&answer, Answer::Unanswered(silence) if !silence.sent),

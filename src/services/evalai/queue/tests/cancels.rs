@@ -134,12 +134,12 @@ fn a_cancel_before_the_first_read_of_an_attempt_that_evalai_has_asked_for_stays(
             ..row(7, Status::Cancelled)
         };
         let now = bench.now();
-        bench.queue.ask(&subject(&key(7), 7, run), false, now);
+        bench.queue.ask(&subject(&key(7), 7, &run), false, now);
         bench.get(7, cancelled.clone());
         assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, ended));
         bench
             .queue
-            .update(&subject(&key(7), 7, run), DesiredUpdate::Queued, now);
+            .update(&subject(&key(7), 7, &run), DesiredUpdate::Queued, now);
         if ended.is_some() {
             bench.expect_nothing();
         } else {

@@ -142,12 +142,12 @@ fn after_a_restart_a_run_with_a_job_is_still_not_finished_by_others() {
         ..row(7, Status::Finished)
     };
     let now = bench.now();
-    bench.queue.ask(&subject(&key(7), 7, run), false, now);
+    bench.queue.ask(&subject(&key(7), 7, &run), false, now);
     bench.get(7, finished.clone());
     assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, None));
     bench
         .queue
-        .update(&subject(&key(7), 7, run), DesiredUpdate::Running, now);
+        .update(&subject(&key(7), 7, &run), DesiredUpdate::Running, now);
     bench.get(7, finished);
     bench.write("running 7");
 }

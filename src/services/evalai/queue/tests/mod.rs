@@ -14,7 +14,7 @@ use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
 use crate::services::evalai::status::Status;
-use crate::services::evalai::types::ImageAnswer;
+use crate::services::evalai::types::{ImageAnswer, Run};
 use crate::services::token::Token;
 
 /// A queue whose time is ours.
@@ -59,18 +59,18 @@ fn run(pk: i64, attempt: i64) -> Run {
     }
 }
 
-fn subject(key: &Key, pk: i64, run: Run) -> Subject {
+fn subject(key: &Key, pk: i64, run: &Run) -> Subject {
     Subject {
         target: Arc::new(target()),
         key: key.clone(),
         pk,
-        run,
+        run: run.clone(),
     }
 }
 
 /// The attempt of a submission, as its object asks about it.
 fn of(pk: i64, attempt: i64) -> Subject {
-    subject(&key(pk), pk, run(pk, attempt))
+    subject(&key(pk), pk, &run(pk, attempt))
 }
 
 fn row(pk: i64, status: Status) -> Row {

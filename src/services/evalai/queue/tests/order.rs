@@ -68,7 +68,7 @@ fn one_request_a_submission_and_four_in_all() {
         ..key(7)
     };
     let now = bench.now();
-    bench.queue.ask(&subject(&again, 7, run(7, 1)), false, now);
+    bench.queue.ask(&subject(&again, 7, &run(7, 1)), false, now);
     bench.expect_nothing();
 }
 
