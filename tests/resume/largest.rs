@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use leaderboard_api::ResultsFormat;
+use leaderboard_api::LeaderboardVersion;
 use leaderboard_operator::pod::gather::results_plan;
 use leaderboard_operator::pod::report::Report;
 use leaderboard_operator::pod::run::STATUS_FOLDER;
@@ -99,7 +99,7 @@ async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys_memory() {
     let (sink, endpoint, serving) = serve().await;
-    let mut submission = Submission::on(&endpoint, "bucket", ResultsFormat::V2, &mut Rng::new()).await;
+    let mut submission = Submission::on(&endpoint, "bucket", LeaderboardVersion::V2, &mut Rng::new()).await;
     submission.run.plan.slices = (0..PAIRS)
         .map(|pair| format!("{}-{}", 2 * pair, 2 * pair + 1))
         .collect();

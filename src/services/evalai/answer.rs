@@ -212,7 +212,7 @@ impl Body {
 
 /// One sentence without line breaks.
 fn sentence(status: u16, body: &Body) -> String {
-    let text = one_line(&body.text(), LONGEST);
+    let text = one_line(body.text(), LONGEST);
     let text = if text.is_empty() { "nothing".to_owned() } else { text };
     let next = next_step(status, body)
         .map(|step| format!(" ({step})"))

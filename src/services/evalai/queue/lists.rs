@@ -49,7 +49,7 @@ impl Queue {
             }
             (Request::Splits(id), Reply::Splits(answer)) => {
                 self.took_of_check(*id, answer, now, |check, splits: Vec<Split>| {
-                    check.splits = Some(splits)
+                    check.splits = Some(splits);
                 });
             }
             (Request::DatasetSplit(id, split), Reply::DatasetSplit(answer)) => {
