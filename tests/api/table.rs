@@ -339,11 +339,11 @@ async fn a_key_that_is_a_number_takes_no_name() {
 }
 
 #[tokio::test]
-async fn the_recorder_writes_in_the_background_behind_its_fence() {
+async fn the_recorder_writes_in_the_background_only_while_it_may() {
     let stand_in = StandIn::start().await;
     let (spec, _) = usual(&stand_in).await;
-    let fence = Arc::new(AtomicBool::new(true));
-    let (may_write, (wake, mut woken)) = (fence.clone(), mpsc::unbounded_channel());
+    let leads = Arc::new(AtomicBool::new(true));
+    let (may_write, (wake, mut woken)) = (leads.clone(), mpsc::unbounded_channel());
     let (stop, stopped) = Stop::new();
     let recorder = Recorder::new(
         stand_in.aws.clone(),
@@ -367,8 +367,8 @@ async fn the_recorder_writes_in_the_background_behind_its_fence() {
     let view = recorder.view(&key("a")).unwrap();
     assert_eq!((view.attempt, view.end_written, view.error), (1, true, None));
     let view = recorder.view(&key("b")).unwrap();
-    let told = format!("table {} does not exist", stand_in.name("nowhere"));
-    assert!(!view.end_written && view.error.unwrap().starts_with(&told));
+    let missing = format!("table {} does not exist", stand_in.name("nowhere"));
+    assert!(!view.end_written && view.error.unwrap().starts_with(&missing));
     assert_eq!(rows(&stand_in, &spec.name).await.len(), 1);
     stop.send_replace(true);
 }

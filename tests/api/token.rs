@@ -36,12 +36,12 @@ async fn it_is_read_from_a_key_of_the_entry() {
 }
 
 #[tokio::test]
-async fn why_there_is_none_is_said_without_what_is_stored() {
+async fn why_there_is_none_is_an_error_without_what_is_stored() {
     let stand_in = StandIn::start().await;
     stand_in.store("keyless", r#"{"other": "very-secret"}"#).await;
     stand_in.store("plain", "very-secret").await;
     stand_in.store("empty", r#"{"auth_token": " "}"#).await;
-    for (name, words) in [
+    for (name, text) in [
         ("missing", "check its name, region and the permission to read it"),
         ("keyless", "check token.secretsManager.key"),
         ("plain", "check token.secretsManager.key"),
@@ -52,8 +52,11 @@ async fn why_there_is_none_is_said_without_what_is_stored() {
             .read(&stand_in.aws)
             .await
             .unwrap_err();
-        let said = error.to_string();
-        assert!(said.contains(words) && !said.contains("very-secret"), "{name}: {said}");
+        let error = error.to_string();
+        assert!(
+            error.contains(text) && !error.contains("very-secret"),
+            "{name}: {error}"
+        );
     }
 }
 
