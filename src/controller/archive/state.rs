@@ -23,7 +23,7 @@ const SPACING: Duration = Duration::from_millis(10);
 /// Reads of live reports that one bucket is asked for in a second, at most: the period of all stretches with their number.
 const LIVE_A_SECOND: f64 = 100.0;
 /// When a read that failed is made again while a decision waits for it.
-const READ_AGAIN: Duration = Duration::from_secs(5);
+const READ_AGAIN: Duration = Duration::from_secs(10);
 /// The same of texts, of the fence and of a log.
 const TRY_AGAIN: Duration = Duration::from_secs(3);
 /// How long the fence is tried. After that `decide` goes on without it, and a late mark would stop the next Pod.
@@ -78,11 +78,11 @@ pub(super) struct Work {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum What {
     Report {
-        sent: ReportDemand,
+        sent: Sent,
         etag: Option<String>,
     },
     Texts {
-        sent: Option<ReportDemand>,
+        sent: Option<Sent>,
     },
     Fence {
         attempt: i64,
@@ -94,6 +94,14 @@ pub(super) enum What {
         demand: LogDemand,
         tail: Option<Tail>,
     },
+}
+
+/// What was known when a read was sent.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Sent {
+    demand: ReportDemand,
+    /// Of which memory of the run: what was dropped since is not answered.
+    memory: u64,
 }
 
 /// What a read of the report brought.
@@ -139,6 +147,7 @@ pub(super) struct State {
     due: [BTreeSet<(Instant, Uid)>; KINDS.len()],
     under_way: [usize; KINDS.len()],
     next_read: Option<Instant>,
+    memories: u64,
 }
 
 struct Run {
@@ -151,6 +160,7 @@ struct Run {
 }
 
 struct ReportRun {
+    memory: u64,
     wanted: ReportDemand,
     since: Instant,
     is_under_way: bool,
@@ -222,8 +232,11 @@ impl State {
             }
             return;
         };
+        self.memories += 1;
+        let memory = self.memories;
         let run = self.run(uid, target);
         let known = run.report.get_or_insert_with(|| ReportRun {
+            memory,
             wanted: demand.clone(),
             since: now,
             is_under_way: false,
@@ -234,6 +247,10 @@ impl State {
         });
         if !answers(&known.wanted, &demand) || !answers(&demand, &known.wanted) {
             known.since = now;
+        }
+        // A run that goes on again has another end.
+        if known.of.as_ref().is_some_and(|of| of.stage > demand.stage) {
+            known.of = None;
         }
         known.wanted = demand;
         if !known.is_under_way {
@@ -439,11 +456,12 @@ impl State {
         self.under_way[work.kind as usize] -= 1;
         match (&work.what, done) {
             (What::Report { sent, .. }, Done::Report(answer)) => {
-                let Some(known) = self.runs.get_mut(&work.uid).and_then(|run| run.report.as_mut()) else {
+                let known = self.runs.get_mut(&work.uid).and_then(|run| run.report.as_mut());
+                let Some(known) = known.filter(|known| known.memory == sent.memory) else {
                     return false;
                 };
                 known.is_under_way = false;
-                let is_new = known.take(sent, answer);
+                let is_new = known.take(&sent.demand, answer);
                 self.plan_read(&work.uid, now);
                 is_new
             }
@@ -451,15 +469,18 @@ impl State {
                 let Some(run) = self.runs.get_mut(&work.uid) else {
                     return false;
                 };
-                if let (Some(known), Some(sent)) = (run.report.as_mut(), sent) {
-                    known.take(sent, report);
+                let mut is_new = false;
+                if let (Some(known), Some(sent)) = (run.report.as_mut(), sent)
+                    && known.memory == sent.memory
+                {
+                    is_new = known.take(&sent.demand, report);
                 }
                 if let Some(known) = run.texts.as_mut() {
                     known.is_under_way = false;
                     known.tried = Some(now);
-                    known.got = texts.map_or_else(ObservedTexts::Unread, |texts| ObservedTexts::Read(Arc::new(texts)));
+                    is_new |= known.take(texts);
                 }
-                true
+                is_new
             }
             (What::Fence { attempt, retry, .. }, Done::Fence(result)) => {
                 self.fence_done(&work.uid, (*attempt, *retry), &result, now)
@@ -474,13 +495,14 @@ impl State {
         let Some(fence) = fence.filter(|fence| (fence.attempt, fence.retry) == of) else {
             return false;
         };
+        let had_failed = fence.has_failed;
         fence.is_held = result.is_ok();
         fence.has_failed = result.is_err();
         let again = now + TRY_AGAIN;
         if !fence.is_held && again < fence.since + FENCE_TRIES {
             self.plan(uid, Kind::Fence, Some(again));
         }
-        true
+        result.is_ok() || !had_failed
     }
 
     fn log_done(&mut self, uid: &Uid, of: &LogDemand, answer: LogAnswer, now: Instant) -> bool {
@@ -517,14 +539,14 @@ impl State {
                 let report = run.report.as_mut()?;
                 report.is_under_way = true;
                 What::Report {
-                    sent: report.wanted.clone(),
+                    sent: report.sent(),
                     etag: report.etag.clone(),
                 }
             }
             Kind::Texts => {
                 run.texts.as_mut()?.is_under_way = true;
                 What::Texts {
-                    sent: run.report.as_ref().map(|report| report.wanted.clone()),
+                    sent: run.report.as_ref().map(ReportRun::sent),
                 }
             }
             Kind::Fence => {
@@ -618,9 +640,36 @@ impl State {
     }
 }
 
+impl TextsRun {
+    /// Returns whether there is something new to decide on. Another text for the same is not: it would be asked for again at once.
+    fn take(&mut self, texts: Result<Texts, String>) -> bool {
+        let got = texts.map_or_else(ObservedTexts::Unread, |texts| ObservedTexts::Read(Arc::new(texts)));
+        let is_same = match (&self.got, &got) {
+            (ObservedTexts::Unread(_), ObservedTexts::Unread(_)) => true,
+            (ObservedTexts::Read(old), ObservedTexts::Read(new)) => {
+                old.of == new.of && old.problem.is_some() == new.problem.is_some()
+            }
+            _ => false,
+        };
+        self.got = got;
+        !is_same
+    }
+}
+
 impl ReportRun {
+    fn sent(&self) -> Sent {
+        Sent {
+            demand: self.wanted.clone(),
+            memory: self.memory,
+        }
+    }
+
     /// Returns whether there is something new to decide on.
     fn take(&mut self, sent: &ReportDemand, answer: Answer) -> bool {
+        let sent = &ReportDemand {
+            stage: sent.stage.min(self.wanted.stage),
+            ..sent.clone()
+        };
         let (error, etag, content) = match answer {
             Answer::NotModified => (None, self.etag.take(), self.content.clone()),
             Answer::Absent => (None, None, Some(Content::Absent)),

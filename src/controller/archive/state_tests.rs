@@ -295,6 +295,50 @@ fn what_nobody_needs_is_dropped() {
 }
 
 #[test]
+fn what_is_dropped_or_goes_on_again_is_not_answered_by_what_was_asked_before() {
+    // The Job is gone, and another one is made while that is being read.
+    let mut bench = Bench::new();
+    bench.demand(Stage::JobEnded);
+    let under_way = bench.begin();
+    bench.demand_as(None);
+    bench.demand(Stage::Live);
+    assert!(!bench.answer(&under_way, found(4)));
+    assert_eq!((bench.stage(), bench.done()), (None, None));
+
+    let mut bench = Bench::new();
+    bench.demand(Stage::JobEnded);
+    let under_way = bench.begin();
+    bench.demand(Stage::Live);
+    bench.answer(&under_way, found(3));
+    assert_eq!(bench.stage(), Some(Stage::Live));
+    bench.wait(SPACING);
+    bench.demand(Stage::JobEnded);
+    bench.read(found(3));
+    bench.demand(Stage::Live);
+    assert_eq!((bench.stage(), bench.done()), (None, Some(3)), "its numbers stay");
+    bench.wait(SPACING);
+    bench.demand(Stage::JobEnded);
+    assert!(bench.read(found(4)), "the second end is read too");
+}
+
+#[test]
+fn texts_that_cannot_be_read_wake_their_submission_once() {
+    let mut bench = Bench::new();
+    let id = ReportId::of(b"1");
+    let want = |bench: &mut Bench| bench.state.want_texts(&uid("u"), &bench.target.clone(), id, bench.now);
+    for (number, is_new) in [(1, true), (2, false), (3, false)] {
+        want(&mut bench);
+        let work = bench.begin();
+        let done = Done::Texts {
+            report: Answer::Failed("away".into()),
+            texts: Err(format!("request {number} timed out")),
+        };
+        assert_eq!(bench.state.done(&work, done, bench.now), is_new);
+        bench.wait(TRY_AGAIN);
+    }
+}
+
+#[test]
 fn a_fence_is_tried_until_it_is_held_or_its_time_is_over() {
     let mut bench = Bench::new();
     assert_eq!(bench.fence(), ObservedFence::NotRequested);
@@ -307,7 +351,8 @@ fn a_fence_is_tried_until_it_is_held_or_its_time_is_over() {
         while let Some(work) = bench.state.next(bench.now) {
             tries += 1;
             let is_new = bench.state.done(&work, Done::Fence(Err("away".into())), bench.now);
-            assert!(is_new && matches!(bench.fence(), ObservedFence::Failed(_)));
+            assert_eq!(is_new, tries == 1, "the same is nothing new");
+            assert!(matches!(bench.fence(), ObservedFence::Failed(_)));
             assert!(bench.now < begin + FENCE_TRIES, "a late mark would stop the next Pod");
         }
         bench.wait(Duration::from_secs(1));
