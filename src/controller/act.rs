@@ -13,15 +13,13 @@ use kube::runtime::events::{Event as KubeEvent, EventType};
 use kube::{Api, Resource, ResourceExt};
 use serde_json::json;
 
-use super::bucket::BucketError;
+use super::archive::state::LogDemand;
 use super::context::{CALL_TIMEOUT, Context};
-use super::decide::{Action, Event, Plan};
-use super::failure_log;
+use super::decide::{Action, Event, LogPlace, Plan};
 use super::job_spec::{self, JobInput};
 use super::observe::{is_pod_of, uid_of};
 use super::significance::{Change, change, patience};
 use super::view::View;
-use crate::pod::report::{OWNER_KEY, Owner};
 use leaderboard_api::client_errors;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
@@ -36,24 +34,16 @@ pub enum ActError {
     },
     #[error("{what} of {object}: the API server did not answer within {} s", CALL_TIMEOUT.as_secs())]
     Silent { what: &'static str, object: String },
-    #[error("the fence of {object} could not be written: {source}")]
-    Fence { object: String, source: Box<BucketError> },
     #[error("{object} has no plan although its Job is to be made; its Leaderboard may have been deleted just now")]
     NoPlan { object: String },
 }
 
 impl ActError {
-    /// Whether a bucket that hangs is all that is in the way.
-    pub fn is_of_a_silent_bucket(&self) -> bool {
-        matches!(self, Self::Fence { source, .. } if matches!(source.as_ref(), BucketError::Silent(_)))
-    }
-
     /// One word for metrics.
     pub fn label(&self) -> &'static str {
         match self {
             Self::Kubernetes { .. } => "kubernetes",
             Self::Silent { .. } => "timeout",
-            Self::Fence { .. } => "fence",
             Self::NoPlan { .. } => "plan",
         }
     }
@@ -75,6 +65,9 @@ pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Du
     for event in &plan.events {
         actor.publish(event).await;
     }
+    context
+        .archive_workers
+        .demand(&view.submission, &plan.status, plan.report);
     for action in &plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
@@ -115,7 +108,10 @@ impl Actor<'_> {
                 grace_seconds,
             } => self.delete_job(name, uid, *grace_seconds).await,
             Action::ForceDeletePod { name, uid } => self.delete_pod(name, uid, 0).await,
-            Action::TakeOwnership => self.take_ownership(status).await,
+            Action::TakeOwnership => {
+                self.context.archive_workers.want_fence(self.submission(), status);
+                Ok(())
+            }
             Action::AnnotateStop { pod, stop } => {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
@@ -125,7 +121,11 @@ impl Actor<'_> {
                 self.patch::<Job>("the time to live", name, &patch).await
             }
             Action::KeepLog { places } => {
-                failure_log::keep(self.context, self.view, status, places).await;
+                self.keep_log(places, status);
+                Ok(())
+            }
+            Action::ReadTexts { of } => {
+                self.context.archive_workers.want_texts(self.submission(), status, *of);
                 Ok(())
             }
             Action::JoinLine(place) => {
@@ -141,20 +141,33 @@ impl Actor<'_> {
                 Ok(())
             }
             Action::Tell(tell) => {
-                self.context.sync.tell(self.context, self.view, status, *tell).await;
+                self.context.sync.tell(self.context, self.view, status, *tell);
                 Ok(())
             }
             Action::ForgetEvalai => {
+                self.context.sync.forget_evalai(self.submission());
+                Ok(())
+            }
+            Action::Forget => {
                 self.context.sync.forget(self.submission());
-                self.context.failure_logs.forget(&uid_of(self.submission()));
+                self.context.archive_workers.forget(&uid_of(self.submission()));
                 Ok(())
             }
             Action::Record { end } => {
-                let sync = &self.context.sync;
-                sync.record(self.context, self.view, status, *end).await;
+                self.context.sync.record(self.view, status, *end);
                 Ok(())
             }
         }
+    }
+
+    fn keep_log(&self, places: &[LogPlace], status: &SubmissionStatus) {
+        let demand = LogDemand {
+            attempt: status.attempt.unwrap_or(1),
+            retry: status.retry,
+            places: places.to_vec(),
+            is_over: status.times.finished.is_some(),
+        };
+        self.context.archive_workers.want_log(self.submission(), status, demand);
     }
 
     async fn set_finalizer(&self, wanted: bool) -> Result<(), ActError> {
@@ -328,21 +341,6 @@ impl Actor<'_> {
             Err(error) if !is_gone(&error) && !is_conflict(&error) => Err(error),
             _ => Ok(()),
         }
-    }
-
-    async fn take_ownership(&self, status: &SubmissionStatus) -> Result<(), ActError> {
-        let Some(plan) = &status.plan else { return Ok(()) };
-        let archive = self.context.archive(&plan.storage, &plan.run_id);
-        let mark = format!(
-            "controller-{}",
-            status.times.stopping.as_ref().map_or(0, |t| t.0.as_second())
-        );
-        let write = archive.put(OWNER_KEY, Owner::new(mark).to_json());
-        let written = self.context.buckets.call(&plan.storage, CALL_TIMEOUT, write).await;
-        written.map(|_| ()).map_err(|source| ActError::Fence {
-            object: self.name(),
-            source: Box::new(source),
-        })
     }
 
     async fn patch<K>(&self, what: &'static str, name: &str, patch: &serde_json::Value) -> Result<(), ActError>

@@ -5,20 +5,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Event, Pod};
+use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
-use kube::api::ListParams;
 use kube::runtime::events::Recorder;
 use kube::runtime::reflector::{ObjectRef, Store};
-use kube::{Api, Client, ResourceExt};
+use kube::{Client, ResourceExt};
 
-use super::bucket::{self, Buckets};
-use super::failure_log::FailureLogs;
+use super::archive::{ArchiveWorkers, bucket_id};
 use super::leaderboards::Desk;
 use super::memory::Memory;
 use super::network_policy;
-use super::observe::node::Nodes;
-use super::observe::report::Reports;
+use super::observe::lookups::Lookups;
 use super::observe::{is_pod_of, uid_of};
 use super::reruns::Reruns;
 use super::slots::SlotAllocator;
@@ -26,7 +23,6 @@ use super::sync::Sync;
 use crate::kubernetes::Synced;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_api::{Leaderboard, Storage, Submission};
 
 /// Time any one call to the API server may take.
@@ -107,15 +103,13 @@ pub struct Context {
     pub settings: Settings,
     pub stores: Stores,
     pub memory: Memory,
-    pub reports: Reports,
+    pub archive_workers: ArchiveWorkers,
+    pub lookups: Lookups,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
-    pub failure_logs: FailureLogs,
     pub desk: Desk,
     pub sync: Sync,
     pub aws: Aws,
-    pub buckets: Buckets,
-    pub nodes: Nodes,
     pub recorder: Recorder,
     wake: Wake,
     archives: Mutex<HashMap<String, Archive>>,
@@ -126,7 +120,7 @@ impl Context {
         client: Client,
         settings: Settings,
         stores: Stores,
-        sync: Sync,
+        (sync, archive_workers, lookups): (Sync, ArchiveWorkers, Lookups),
         aws: Aws,
         recorder: Recorder,
         wake: Wake,
@@ -136,15 +130,13 @@ impl Context {
             settings,
             stores,
             memory: Memory::default(),
-            reports: Reports::default(),
+            archive_workers,
+            lookups,
             reruns: Reruns::default(),
             slots: Arc::default(),
-            failure_logs: FailureLogs::default(),
             desk: Desk::default(),
             sync,
             aws,
-            buckets: Buckets::default(),
-            nodes: Nodes::default(),
             recorder,
             wake,
             archives: Mutex::default(),
@@ -156,11 +148,11 @@ impl Context {
         self.stores.shows_policy(leaderboard) && !self.desk.policy_failed(&uid_of(leaderboard))
     }
 
-    /// The prefix of a run; clients are kept by region and endpoint. A pass calls it through `buckets`.
+    /// The prefix of a run; clients are kept by region and endpoint.
     pub fn archive(&self, storage: &Storage, run_id: &str) -> Archive {
         let mut archives = self.archives.lock().unwrap_or_else(PoisonError::into_inner);
         let shared = archives
-            .entry(bucket::id(storage))
+            .entry(bucket_id(storage))
             .or_insert_with(|| Archive::of_run(&self.aws, storage, run_id));
         shared.at_prefix(leaderboard_api::effective::key_prefix(storage, run_id))
     }
@@ -171,41 +163,9 @@ impl Context {
         (self.wake)(board);
     }
 
-    /// Half the period of a submission's Leaderboard, in seconds.
-    pub fn half_period(&self, submission: &Submission) -> f64 {
-        let namespace = submission.namespace().unwrap_or_default();
-        let reference = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
-        let period = self
-            .stores
-            .leaderboards
-            .get(&reference)
-            .map_or(10, |l| l.spec.sync_period_seconds);
-        Duration::from_secs(period.unsigned_abs()).as_secs_f64() / 2.0
-    }
-
-    /// The words of the Job's last FailedCreate event. Events are read only while a Job has no Pod.
-    pub async fn failed_create(&self, namespace: &str, job: &str) -> Option<String> {
-        let events: Api<Event> = Api::namespaced(self.client.clone(), namespace);
-        let selector = format!("involvedObject.kind=Job,involvedObject.name={job},reason=FailedCreate");
-        let params = ListParams::default().fields(&selector).limit(50);
-        let found = tokio::time::timeout(CALL_TIMEOUT, events.list(&params))
-            .await
-            .ok()?
-            .ok()?;
-        let latest = found.items.into_iter().max_by_key(|e| {
-            e.last_timestamp
-                .as_ref()
-                .or(e.first_timestamp.as_ref())
-                .map(|t| t.0)
-                .or(e.event_time.as_ref().map(|t| t.0))
-        })?;
-        latest.message.map(|message| one_line(&message, LONGEST_MESSAGE))
-    }
-
     /// Drops everything that is remembered of a Submission that is gone.
     pub fn forget(&self, uid: &str) {
         self.memory.forget(uid);
-        self.reports.forget(uid);
-        self.failure_logs.forget(uid);
+        self.archive_workers.forget(uid);
     }
 }

@@ -1,24 +1,20 @@
 //! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
 //! stored in S3 for people.
 //!
-//! Called by `act`, where `decide` wishes it; `sync` hands the text on to EvalAI's hosts. A log may hold private routes, so it
-//! never gets into status, events or our own log. Nothing here fails a pass or holds an end up.
+//! Called by the bucket's worker in `archive`, for what `decide` asks for; `sync` hands the text on to EvalAI's hosts. A log may
+//! hold private routes, so it never gets into status, events or our own log.
 
-use std::collections::HashMap;
 use std::pin::pin;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use futures::AsyncReadExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::api::LogParams;
-use kube::{Api, Client, ResourceExt};
+use kube::{Api, Client};
 
-use super::context::Context;
+use super::archive::state::{LogAnswer, LogDemand};
 use super::decide::{LogAt, LogPlace};
-use super::observe::uid_of;
-use super::view::View;
-use leaderboard_api::SubmissionStatus;
+use crate::services::archive::Archive;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 
@@ -32,20 +28,6 @@ const NODE_LINES: i64 = 200;
 const NODE_BYTES: u64 = 1 << 20;
 /// Time that reading one place, or storing, may take.
 const TRY: Duration = Duration::from_secs(5);
-
-/// What was kept, by UID of the Submission.
-#[derive(Default)]
-pub struct FailureLogs(Mutex<HashMap<String, Kept>>);
-
-/// The log of one failed Job.
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Kept {
-    attempt: Option<i64>,
-    retry: i32,
-    /// None: there is no log.
-    tail: Option<Tail>,
-    stored: bool,
-}
 
 /// The last lines of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -82,93 +64,60 @@ impl Tail {
     }
 }
 
-impl FailureLogs {
-    /// The log of the failure that a status speaks of.
-    pub fn tail(&self, uid: &str, status: &SubmissionStatus) -> Option<Tail> {
-        self.of(uid, status)?.tail
-    }
-
-    /// Drops what is kept for an object.
-    pub fn forget(&self, uid: &str) {
-        self.lock().remove(uid);
-    }
-
-    fn of(&self, uid: &str, status: &SubmissionStatus) -> Option<Kept> {
-        let found = self.lock().get(uid).cloned();
-        found.filter(|kept| kept.attempt == status.attempt && kept.retry == status.retry)
-    }
-
-    fn put(&self, uid: &str, kept: Kept) {
-        self.lock().insert(uid.to_owned(), kept);
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, Kept>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
 /// What became of looking for a log.
 #[derive(Debug, PartialEq, Eq)]
 enum Look {
     Found(Tail),
     /// Nobody has one.
     Nothing,
-    /// Somebody who may have one did not answer.
+    /// One that may have it did not answer.
     Unclear,
 }
 
 /// Keeps the tail of the first log that is there. Stores it once the submission has come to its end.
-pub(super) async fn keep(context: &Context, view: &View, status: &SubmissionStatus, places: &[LogPlace]) {
-    let uid = uid_of(view.submission.as_ref());
-    let is_over = status.times.finished.is_some();
-    let logs = &context.failure_logs;
-    let mut kept = match logs.of(&uid, status) {
-        Some(kept) => kept,
-        None => match look(context, view, status, places).await {
-            Look::Found(tail) => Kept::new(status, Some(tail)),
-            Look::Nothing if is_over => Kept::new(status, None),
-            // A later place, or a later time, may have it.
-            Look::Nothing | Look::Unclear => return,
+pub(super) async fn keep(
+    client: &Client,
+    archive: &Archive,
+    (namespace, name): (&str, &str),
+    demand: &LogDemand,
+    known: Option<Tail>,
+) -> LogAnswer {
+    let (tail, is_unclear) = match known {
+        Some(tail) => (Some(tail), false),
+        None => match look(client, archive, (namespace, name), demand).await {
+            Look::Found(tail) => (Some(tail), false),
+            Look::Nothing => (None, false),
+            Look::Unclear => (None, true),
         },
     };
-    if is_over && !kept.stored {
-        kept.stored = store(context, view, status, kept.tail.as_ref()).await;
-    }
-    logs.put(&uid, kept);
-}
-
-impl Kept {
-    fn new(status: &SubmissionStatus, tail: Option<Tail>) -> Self {
-        Self {
-            attempt: status.attempt,
-            retry: status.retry,
-            tail,
-            stored: false,
-        }
+    let is_stored = match &tail {
+        Some(tail) if demand.is_over => store(archive, name, tail).await,
+        _ => true,
+    };
+    LogAnswer {
+        tail,
+        is_unclear: is_unclear || !is_stored,
     }
 }
 
-async fn look(context: &Context, view: &View, status: &SubmissionStatus, places: &[LogPlace]) -> Look {
+async fn look(client: &Client, archive: &Archive, (namespace, name): (&str, &str), demand: &LogDemand) -> Look {
     let mut look = Look::Nothing;
-    for place in places {
-        let read = match &place.at {
-            LogAt::Node { pod, previous } => {
-                let namespace = view.submission.namespace().unwrap_or_default();
-                let read = of_node(&context.client, &namespace, pod, &place.container, *previous);
-                let read = tokio::time::timeout(TRY, read).await;
-                read.unwrap_or_else(|_| Err("no answer in time".into()))
+    for place in &demand.places {
+        let read = async {
+            match &place.at {
+                LogAt::Node { pod, previous } => of_node(client, namespace, pod, &place.container, *previous).await,
+                LogAt::Bucket { key } => archive.tail(key, STORED_BYTES).await.map_err(|error| error.to_string()),
             }
-            LogAt::Bucket { key } => of_bucket(context, status, key).await,
         };
-        match read {
+        let read = tokio::time::timeout(TRY, read).await;
+        match read.unwrap_or_else(|_| Err("no answer in time".into())) {
             Ok(Some(bytes)) => {
-                if let Some(found) = found(status, place, &bytes) {
+                if let Some(found) = found(demand.attempt, place, &bytes) {
                     return Look::Found(found);
                 }
             }
             Ok(None) => {}
             Err(why) => {
-                let name = view.submission.name_any();
                 tracing::warn!(submission = %name, container = %place.container, %why, "the log of a failure was not read");
                 look = Look::Unclear;
             }
@@ -177,8 +126,8 @@ async fn look(context: &Context, view: &View, status: &SubmissionStatus, places:
     look
 }
 
-fn found(status: &SubmissionStatus, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
-    let (container, attempt) = (place.container.clone(), status.attempt.unwrap_or(1));
+fn found(attempt: i64, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
+    let container = place.container.clone();
     let key = match &place.at {
         LogAt::Bucket { key } => Some(key.clone()),
         LogAt::Node { .. } => None,
@@ -227,26 +176,14 @@ async fn of_node(
     read.map(|_| Some(bytes)).map_err(|error| error.to_string())
 }
 
-/// The end of a log that logcopy has stored. None if there is none.
-async fn of_bucket(context: &Context, status: &SubmissionStatus, key: &str) -> Result<Option<Vec<u8>>, String> {
-    let Some(plan) = &status.plan else { return Ok(None) };
-    let archive = context.archive(&plan.storage, &plan.run_id);
-    let read = archive.tail(key, STORED_BYTES);
-    let read = context.buckets.call_large(&plan.storage, TRY, read).await;
-    read.map_err(|error| error.to_string())
-}
-
-/// True when there is nothing left to store.
-async fn store(context: &Context, view: &View, status: &SubmissionStatus, tail: Option<&Tail>) -> bool {
-    let (Some(tail), Some(plan)) = (tail, &status.plan) else {
-        return true;
-    };
-    let archive = context.archive(&plan.storage, &plan.run_id);
+async fn store(archive: &Archive, name: &str, tail: &Tail) -> bool {
     let put = archive.put(FAILURE_LOG_KEY, tail.for_hosts().into_bytes());
-    let Err(why) = context.buckets.call_large(&plan.storage, TRY, put).await else {
-        return true;
+    let why = match tokio::time::timeout(TRY, put).await {
+        Ok(Ok(_)) => return true,
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "no answer in time".to_owned(),
     };
-    tracing::warn!(submission = %view.submission.name_any(), %why, "the log of a failure was not stored");
+    tracing::warn!(submission = %name, %why, "the log of a failure was not stored");
     false
 }
 
@@ -301,13 +238,6 @@ mod tests {
 
     use super::*;
 
-    fn status() -> SubmissionStatus {
-        SubmissionStatus {
-            attempt: Some(1),
-            ..SubmissionStatus::default()
-        }
-    }
-
     fn place() -> LogPlace {
         let key = "agent/agent2/leaderboard.log".to_owned();
         LogPlace {
@@ -320,20 +250,20 @@ mod tests {
     fn a_tail_is_the_end_of_the_text_and_no_longer_than_allowed() {
         let long: Vec<String> = (0..5000).map(|n| format!("line {n} ü")).collect();
         let long = long.join("\n");
-        let cut = found(&status(), &place(), long.as_bytes()).unwrap().for_hosts();
+        let cut = found(1, &place(), long.as_bytes()).unwrap().for_hosts();
         assert_eq!(cut.chars().count(), TAIL_CHARS);
         let heading = "The end of agent-2's log in attempt 1; all of it is in agent/agent2/leaderboard.log.\n";
         assert!(cut.starts_with(heading) && cut.ends_with("line 4999 ü"), "{cut}");
-        let short = found(&status(), &place(), b"short\n").unwrap();
+        let short = found(1, &place(), b"short\n").unwrap();
         assert_eq!(short.for_hosts(), format!("{heading}short"));
         for nothing in ["", " \n\r\n", "\u{1b}[0m\u{0}"] {
-            assert_eq!(found(&status(), &place(), nothing.as_bytes()), None, "{nothing:?}");
+            assert_eq!(found(1, &place(), nothing.as_bytes()), None, "{nothing:?}");
         }
     }
 
     #[test]
     fn what_participants_read_of_a_log_names_no_file_of_the_hosts() {
-        let tail = found(&status(), &place(), b"Traceback: boom\n").unwrap();
+        let tail = found(1, &place(), b"Traceback: boom\n").unwrap();
         assert_eq!(
             tail.for_participants(),
             "The end of agent-2's log in attempt 1:\nTraceback: boom"
@@ -356,22 +286,6 @@ mod tests {
         ] {
             assert_eq!(tail(TAIL_CHARS, bytes).as_deref(), Some(text), "{bytes:?}");
         }
-    }
-
-    #[test]
-    fn a_log_belongs_to_one_job() {
-        let logs = FailureLogs::default();
-        let mut status = status();
-        let found = found(&status, &place(), b"t").unwrap();
-        assert!(found.is_agents());
-        logs.put("u", Kept::new(&status, Some(found.clone())));
-        assert_eq!(logs.tail("u", &status), Some(found));
-        assert_eq!(logs.tail("v", &status), None);
-        status.retry = 1;
-        assert_eq!(logs.tail("u", &status), None, "another Job, another log");
-        status.retry = 0;
-        logs.forget("u");
-        assert_eq!(logs.tail("u", &status), None);
     }
 
     /// What a node's answer of this status and body is taken for, and what was asked.

@@ -22,7 +22,9 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
+use super::archive::{ArchiveWorkers, WakeSubmission};
 use super::context::{Context, Settings, Stores};
+use super::observe::lookups::Lookups;
 use super::sync::Sync;
 use crate::kubernetes::Synced;
 use crate::observability::shutdown::Stop;
@@ -61,6 +63,8 @@ pub struct Surroundings {
     pub requests: mpsc::UnboundedReceiver<Arrived>,
     /// The Leaderboards that were woken.
     pub woken: mpsc::UnboundedReceiver<String>,
+    /// The Submissions that were woken with an answer of their own.
+    pub answered: mpsc::UnboundedReceiver<String>,
     _stop: watch::Sender<bool>,
 }
 
@@ -101,7 +105,16 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         meter: Meter::default(),
         tasks: tasks.clone(),
     });
-    let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, tasks));
+    let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, tasks.clone()));
+    let (answered_by, answered) = mpsc::unbounded_channel();
+    let answered_by = move || -> WakeSubmission {
+        let answered_by = answered_by.clone();
+        Box::new(move |submission| {
+            let _ = answered_by.send(submission.name);
+        })
+    };
+    let archive_workers = ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered_by());
+    let lookups = Lookups::start(client.clone(), &tasks, answered_by());
     let policies_synced = Synced::default();
     policies_synced.set(true);
     let stores = Stores {
@@ -128,12 +141,21 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let wake = Box::new(move |board: ObjectRef<Leaderboard>| {
         let _ = woken_by.send(board.name);
     });
-    let context = Context::new(client, settings, stores, sync, aws, events, wake);
+    let context = Context::new(
+        client,
+        settings,
+        stores,
+        (sync, archive_workers, lookups),
+        aws,
+        events,
+        wake,
+    );
     context.stores.fill(&context.slots);
     Surroundings {
         context,
         requests,
         woken,
+        answered,
         _stop: stop,
     }
 }

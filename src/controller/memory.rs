@@ -29,8 +29,6 @@ pub struct Memory {
 struct Entry {
     written: Option<Written>,
     partial: Option<(i64, u32)>,
-    /// The attempt whose result could not be read, and why.
-    unread: Option<(i64, String)>,
     /// When its place may be written.
     place_at: Option<Instant>,
 }
@@ -111,28 +109,6 @@ impl Memory {
     /// Remembers a partial result.
     pub fn told_partial(&self, submission: &Submission, attempt: i64, done: u32) {
         self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
-    }
-
-    /// Why the result of the present attempt could not be read when it was to be told; None if it could last.
-    pub fn unread(&self, submission: &Submission) -> Option<String> {
-        let attempt = submission.status.as_ref()?.attempt?;
-        let (of, why) = self.lock().get(&uid_of(submission))?.unread.clone()?;
-        (of == attempt).then_some(why)
-    }
-
-    /// Remembers that its result could not be read. The first words stand: others for the same would be a write each.
-    pub fn note_unread(&self, submission: &Submission, why: &str) {
-        let attempt = submission.status.as_ref().and_then(|s| s.attempt).unwrap_or(1);
-        let mut entries = self.lock();
-        let known = &mut entries.entry(uid_of(submission)).or_default().unread;
-        if known.as_ref().is_none_or(|(of, _)| *of != attempt) {
-            *known = Some((attempt, why.to_owned()));
-        }
-    }
-
-    /// All of its result could be read.
-    pub fn note_read(&self, submission: &Submission) {
-        self.lock().entry(uid_of(submission)).or_default().unread = None;
     }
 
     /// Drops an object that is gone.

@@ -1,13 +1,13 @@
 //! The controller: drives Submissions through their states and keeps everything they own.
 //!
-//! A pass observes (`observe`: caches, memory, one short read from S3), decides (`decide`: pure) and acts (`act`). Its way to
-//! S3 is `bucket`.
+//! A reconcile observes (`observe`: caches and memory), decides (`decide`: pure) and acts (`act`). What it needs of S3 the workers
+//! of `archive` read and write next to it.
 //! `job_spec`, `pod_overlay` and `network_policy` build what is created in the cluster; they know no client and no clock.
 //! `run` wires it all together for the replica that leads.
 
 pub mod act;
+pub mod archive;
 pub mod backoff;
-pub mod bucket;
 pub mod context;
 pub mod decide;
 pub mod failure_log;

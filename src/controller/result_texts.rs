@@ -1,96 +1,56 @@
-//! The texts of a result: what EvalAI shows, and the row of the table. Numbers come from the report alone, never printed
-//! again; texts from S3 count only with the digest that the report names.
+//! The texts of a result: what EvalAI shows, and the row of the table. Pure: what S3 holds was read by its worker (`archive`).
 
-use std::time::Duration;
-
-use jiff::SignedDuration;
 use leaderboard_results::{Format, metrics, number_text};
 use serde_json::Value;
-use sha2::{Digest, Sha256};
 
-use super::bucket::BucketError;
-use super::context::Context;
+use super::archive::digest::ReportDigest;
 use super::failure_log::Tail;
-use super::sync::END_WAITS;
-use super::view::View;
-use crate::pod::report::Report;
-use crate::pod::upload::hex;
+use super::view::{ObservedTexts, Texts, View};
 use crate::services::evalai::Payload;
 use crate::services::table::Row;
 use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus};
 
-/// Largest text that is passed on to EvalAI, in bytes.
-const MAX_TEXT: u64 = 16 << 20;
-/// Time a text may take to be read.
-const TEXT_TIMEOUT: Duration = Duration::from_secs(20);
-/// Where logcopy puts the texts, below the run's prefix.
-const STDOUT_KEY: &str = "evalai/stdout.txt";
-const METADATA_KEY: &str = "evalai/metadata.json";
-
-/// Why there is no text of a result.
-#[derive(thiserror::Error, Debug)]
-pub(super) enum TextError {
-    /// It may come.
-    #[error(transparent)]
-    Unread(#[from] BucketError),
-    /// What is stored is not what the report names: the Pod ended between the two. It will hardly change.
-    #[error("{key} {problem}")]
-    Unfit {
-        /// Below the run's prefix.
-        key: &'static str,
-        problem: &'static str,
-    },
-}
-
-impl TextError {
-    /// How long an end waits for its texts.
-    pub(super) fn patience(&self) -> SignedDuration {
-        match self {
-            Self::Unread(_) => END_WAITS,
-            Self::Unfit { .. } => SignedDuration::from_mins(10),
-        }
+/// The texts of the report that is in the view, if they were read.
+fn texts(view: &View) -> Option<&Texts> {
+    let report = view.report.ours()?;
+    match &view.texts {
+        ObservedTexts::Read(texts) if texts.of == report.id => Some(texts),
+        _ => None,
     }
 }
 
-/// The payload of a final result.
-pub(super) async fn payload(context: &Context, view: &View, report: &Report) -> Result<Payload, TextError> {
-    let text = |key| stored(context, view, report, key);
-    let (stdout, metadata) = futures::future::try_join(text(STDOUT_KEY), text(METADATA_KEY)).await?;
-    Ok(Payload {
-        stdout,
-        metadata,
-        ..without_texts(view, report)
-    })
+/// The payload of a final result: without results of its own where none are stored.
+pub(super) fn payload(view: &View) -> Payload {
+    let Some(texts) = texts(view) else {
+        return Payload {
+            phase: phase(view),
+            result: "[]".into(),
+            ..Payload::default()
+        };
+    };
+    Payload {
+        phase: phase(view),
+        result: texts.result.clone(),
+        stdout: texts.stdout.clone(),
+        metadata: texts.metadata.clone(),
+        ..Payload::default()
+    }
 }
 
 /// The payload of a partial result. `is_shown` says that its phase's leaderboard shows it.
-pub(super) async fn partial_payload(
-    context: &Context,
-    view: &View,
-    report: &Report,
-    is_shown: bool,
-) -> Result<Payload, TextError> {
-    let payload = payload(context, view, report).await?;
-    Ok(Payload {
-        result: partial_results(report, is_shown).to_owned(),
-        ..payload
+pub(super) fn partial_payload(view: &View, is_shown: bool) -> Option<Payload> {
+    let result = partial_results(texts(view)?, is_shown).to_owned();
+    Some(Payload {
+        result,
+        ..payload(view)
     })
 }
 
 /// The metrics over the routes so far where people see them, else the original's zeros: EvalAI keeps them, and would show them as
 /// final of a row that its participant calls finished.
-fn partial_results(report: &Report, is_shown: bool) -> &str {
-    let so_far = report.partial_results.as_ref().filter(|_| is_shown);
-    so_far.unwrap_or(&report.results)
-}
-
-/// The numbers alone.
-pub(super) fn without_texts(view: &View, report: &Report) -> Payload {
-    Payload {
-        phase: phase(view),
-        result: report.results.clone(),
-        ..Payload::default()
-    }
+fn partial_results(texts: &Texts, is_shown: bool) -> &str {
+    let so_far = texts.partial.as_ref().filter(|_| is_shown);
+    so_far.unwrap_or(&texts.result)
 }
 
 /// Phase whose leaderboard gets the result.
@@ -128,29 +88,9 @@ pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTai
     payload.environment_log = tail.for_hosts();
 }
 
-async fn stored(context: &Context, view: &View, report: &Report, key: &'static str) -> Result<String, TextError> {
-    let unfit = |problem| TextError::Unfit { key, problem };
-    let Some(expected) = report.files.get(key) else {
-        return Ok(String::new());
-    };
-    let status = view.submission.status.as_ref();
-    let Some(plan) = status.and_then(|s| s.plan.as_ref()) else {
-        return Ok(String::new());
-    };
-    let archive = context.archive(&plan.storage, &plan.run_id);
-    let read = archive.get(key, MAX_TEXT);
-    let object = context.buckets.call_large(&plan.storage, TEXT_TIMEOUT, read).await;
-    let missing = || unfit("is missing although the report names it");
-    let bytes = object?.ok_or_else(missing)?.bytes;
-    if hex(&Sha256::digest(&bytes)) != expected.sha256 {
-        return Err(unfit("is of another round than the report"));
-    }
-    String::from_utf8(bytes).map_err(|_| unfit("is not text"))
-}
-
 /// The row of a submission as it stands; none before it has a team. Only a finished one has metrics, those of its report, as in
 /// the original's table: of every other the columns are absent, whatever an earlier operator has written there.
-pub(super) fn row(report: Option<&Report>, status: &SubmissionStatus) -> Option<Row> {
+pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> Option<Row> {
     let team = status.team.as_ref()?;
     let plan = status.plan.as_ref()?;
     let text = |time: Option<&k8s_openapi::apimachinery::pkg::apis::meta::v1::Time>| {
@@ -195,22 +135,22 @@ fn table_status(state: Option<State>) -> &'static str {
 }
 
 /// The metric columns, as text with the digits of results.json; those without a value are to be removed.
-fn columns(report: Option<&Report>, format: LeaderboardVersion) -> Vec<(String, Option<String>)> {
+fn columns(report: Option<&ReportDigest>, format: LeaderboardVersion) -> Vec<(String, Option<String>)> {
     let format = match format {
         LeaderboardVersion::V1 => Format::V1,
         LeaderboardVersion::V2 => Format::V2,
     };
-    let parsed: Value = report
-        .and_then(|report| serde_json::from_str(&report.results).ok())
-        .unwrap_or_default();
-    let accuracies = &parsed[0]["accuracies"];
+    let accuracies = report.and_then(|report| report.metrics.as_ref());
     let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
         Some(number) => number_text(number),
         None => value.to_string(),
     };
-    let all = metrics(format)
-        .iter()
-        .map(|metric| (metric.column.to_owned(), accuracies.get(metric.name).map(text)));
+    let all = metrics(format).iter().map(|metric| {
+        (
+            metric.column.to_owned(),
+            accuracies.and_then(|all| all.get(metric.name)).map(text),
+        )
+    });
     all.collect()
 }
 
@@ -219,12 +159,13 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    fn report(results: &str) -> Report {
-        serde_json::from_value(json!({
+    fn report(results: &str) -> ReportDigest {
+        let report: crate::pod::report::Report = serde_json::from_value(json!({
             "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "pairs": [],
-            "final": false, "eligible": false, "entryStatus": "Started", "results": results, "partialResults": "so far",
+            "final": true, "eligible": true, "entryStatus": "Finished", "results": results,
         }))
-        .unwrap()
+        .unwrap();
+        ReportDigest::from(&report)
     }
 
     fn plan() -> Value {
@@ -301,15 +242,19 @@ mod tests {
 
     #[test]
     fn a_partial_result_has_the_metrics_so_far_where_a_report_has_them() {
-        let mut report = report("zeros");
-        assert_eq!(partial_results(&report, true), "so far");
+        let mut texts = Texts {
+            result: "zeros".into(),
+            partial: Some("so far".into()),
+            ..Texts::default()
+        };
+        assert_eq!(partial_results(&texts, true), "so far");
         assert_eq!(
-            partial_results(&report, false),
+            partial_results(&texts, false),
             "zeros",
             "nobody is to see them before the end"
         );
-        report.partial_results = None;
-        assert_eq!(partial_results(&report, true), "zeros", "of an older operator's Pod");
+        texts.partial = None;
+        assert_eq!(partial_results(&texts, true), "zeros", "of an older operator's Pod");
     }
 
     #[test]

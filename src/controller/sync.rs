@@ -1,30 +1,24 @@
 //! The controller's side of EvalAI and DynamoDB: turns views of the services into what `decide` reads, and what `decide`
-//! wants into wishes and rows. Never waits for either; reads S3 for the texts of a result.
+//! wants into updates and rows. Never waits for either. Decides nothing.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use kube::ResourceExt;
 
-use super::bucket::BucketError;
 use super::context::Context;
 use super::decide::Tell;
-use super::observe::{report, uid_of};
+use super::observe::uid_of;
 use super::reruns;
-use super::result_texts::{self, TextError};
-use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, ReportSight, Standing, View};
+use super::result_texts;
+use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::services::ObjectKey;
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
-
-/// How long an end waits to be told for a result that cannot be read: as long as the end itself.
-pub(super) const END_WAITS: SignedDuration = SignedDuration::from_hours(24);
-/// What is left to tell an end in before the finalizer of a deleted object gives up.
-const BEFORE_RELEASE: SignedDuration = SignedDuration::from_mins(2);
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct Sync {
@@ -113,16 +107,16 @@ impl Sync {
         log_refused(&view.submission, followed);
     }
 
-    /// Tells EvalAI. Texts that cannot be read now are told by a later pass.
-    pub async fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: Tell) {
+    /// Updates EvalAI with what the view shows.
+    pub fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: Tell) {
         let Some(subject) = self.subject(view) else { return };
         let update = match tell {
             Tell::Queued => Some(DesiredUpdate::Queued),
             Tell::Running => Some(DesiredUpdate::Running),
-            Tell::Partial => partial(context, view).await.map(DesiredUpdate::Partial),
-            Tell::Finished => final_wish(context, view, status, Outcome::Finished).await,
-            Tell::Failed => final_wish(context, view, status, Outcome::Failed).await,
-            Tell::Cancelled => final_wish(context, view, status, Outcome::Cancelled).await,
+            Tell::Partial => partial(context, view).map(DesiredUpdate::Partial),
+            Tell::Finished => Some(final_update(context, view, status, Outcome::Finished)),
+            Tell::Failed => Some(final_update(context, view, status, Outcome::Failed)),
+            Tell::Cancelled => Some(final_update(context, view, status, Outcome::Cancelled)),
         };
         if matches!(tell, Tell::Queued | Tell::Running) {
             self.follow(view, status);
@@ -132,27 +126,21 @@ impl Sync {
         }
     }
 
-    /// Nothing more is wanted of EvalAI for this object.
+    /// Both systems have what this object has for them.
     pub fn forget(&self, submission: &Submission) {
+        self.gone(&object_key(submission));
+    }
+
+    /// Nothing more is wanted of EvalAI; what is known is forgotten.
+    pub fn forget_evalai(&self, submission: &Submission) {
         self.hub.forget(&object_key(submission));
     }
 
-    /// Writes the row, or lets the next write carry it. That of a finished submission has the metrics of what was stored last.
-    pub async fn record(&self, context: &Context, view: &View, status: &SubmissionStatus, end: bool) {
+    /// Writes the row, or lets the next write carry it.
+    pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
-        let sight = if result_texts::is_finished(status) {
-            last_report(context, view).await
-        } else {
-            ReportSight::NotRead
-        };
-        if matches!(sight, ReportSight::Unreadable(_)) && may_wait(view, status, END_WAITS) {
-            return;
-        }
-        if end && !matches!(sight, ReportSight::Unreadable(_)) {
-            context.memory.note_read(&view.submission);
-        }
-        if let Some(row) = result_texts::row(sight.ours().map(Arc::as_ref), status) {
+        if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
             self.recorder
                 .record(table, &object_key(view.submission.as_ref()), row, end);
         }
@@ -188,92 +176,24 @@ fn run_of(submission: &Submission) -> Run {
     }
 }
 
-async fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
+fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
     let report = view.report.ours()?;
     let leaderboard = object_key(view.leaderboard.as_deref()?);
     let is_shown = context.sync.hub.shows_partial(&leaderboard, result_texts::phase(view));
-    let read = result_texts::partial_payload(context, view, report, is_shown).await;
+    let payload = result_texts::partial_payload(view, is_shown)?;
     let attempt = view.submission.spec.attempt;
-    // What takes too long or is not there is left out: the next route has a result of its own.
-    if !matches!(read, Err(TextError::Unread(BucketError::Refused(_)))) {
-        context.memory.told_partial(&view.submission, attempt, report.done);
-    }
-    let unread = |why: &TextError| {
-        tracing::warn!(submission = %view.submission.name_any(), %why, "the texts of a partial result were not read");
-    };
-    Some(Arc::new(read.inspect_err(unread).ok()?))
+    context.memory.told_partial(&view.submission, attempt, report.done);
+    Some(Arc::new(payload))
 }
 
-/// The report as it is stored at the end; passes after the end read none.
-async fn last_report(context: &Context, view: &View) -> ReportSight {
-    let sight = match view.report.ours() {
-        Some(report) => ReportSight::Ours(Arc::clone(report)),
-        None => report::read_now(context, &view.submission, view.now).await,
-    };
-    if let ReportSight::Unreadable(why) = &sight {
-        note_unread(context, view, why);
-    }
-    sight
-}
-
-/// The status tells it until the result could be read, our own log once.
-fn note_unread(context: &Context, view: &View, why: &str) {
-    if view.unread.is_none() {
-        tracing::warn!(submission = %view.submission.name_any(), %why, "the result cannot be read, so its end waits");
-    }
-    context.memory.note_unread(&view.submission, why);
-}
-
-/// Whether an end that is told once waits for its result: so long after it was decided, and not until the finalizer gives up.
-fn may_wait(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> bool {
-    let end = conditions::get(&status.conditions, conditions::FINISHED);
-    let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
-    let patience = until(end.map_or(view.now, |c| c.last_transition_time.0), longest);
-    let Some(deleted) = &view.submission.metadata.deletion_timestamp else {
-        return view.now < patience;
-    };
-    let seconds = view
-        .leaderboard
-        .as_ref()
-        .map_or(0, |l| l.spec.deadlines.finalize_seconds);
-    let release = until(deleted.0, SignedDuration::from_secs(seconds) - BEFORE_RELEASE);
-    view.now < patience.min(release)
-}
-
-async fn final_wish(
-    context: &Context,
-    view: &View,
-    status: &SubmissionStatus,
-    outcome: Outcome,
-) -> Option<DesiredUpdate> {
-    let sight = last_report(context, view).await;
-    let mut payload = match &sight {
-        ReportSight::Ours(report) => match result_texts::payload(context, view, report).await {
-            Ok(payload) => {
-                context.memory.note_read(&view.submission);
-                payload
-            }
-            Err(error) if may_wait(view, status, error.patience()) => {
-                note_unread(context, view, &error.to_string());
-                return None;
-            }
-            Err(_) => result_texts::without_texts(view, report),
-        },
-        // What is Finished is nothing without its result.
-        ReportSight::Unreadable(_) if outcome == Outcome::Finished || may_wait(view, status, END_WAITS) => return None,
-        _ => Payload {
-            phase: result_texts::phase(view),
-            result: "[]".into(),
-            ..Payload::default()
-        },
-    };
+fn final_update(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
+    let mut payload = result_texts::payload(view);
     payload.stderr = result_texts::stderr(status);
     if outcome == Outcome::Failed {
-        let uid = uid_of(view.submission.as_ref());
-        let tail = context.failure_logs.tail(&uid, status);
+        let tail = context.archive_workers.tail(&view.submission, status);
         result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
     }
-    Some(DesiredUpdate::Final(outcome, Arc::new(payload)))
+    DesiredUpdate::Final(outcome, Arc::new(payload))
 }
 
 /// Whether it is run only with an image that EvalAI names.

@@ -1,4 +1,4 @@
-//! Rows of an end, against stand-ins for S3 and DynamoDB of the test's own.
+//! Rows of an end, against a stand-in for DynamoDB of the test's own.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ use tokio::sync::mpsc;
 
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
-use crate::controller::view::{JobSight, NodeSight, Turn};
+use crate::controller::view::{JobSight, NodeSight, ObservedFence, ObservedLog, ObservedTexts, ReportSight, Turn};
 use leaderboard_api::State;
 
 /// Longer than a write takes on a busy machine.
@@ -20,10 +20,9 @@ const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
 
 type Item = BTreeMap<String, String>;
 
-/// One object in one bucket, one row in one table.
+/// One row in one table.
 #[derive(Clone)]
 struct Stored {
-    report: Arc<Mutex<String>>,
     item: Arc<Mutex<Item>>,
     /// Told each row that was written.
     written: mpsc::UnboundedSender<Item>,
@@ -49,9 +48,7 @@ impl Stored {
 }
 
 async fn answer(Shared(stored): Shared<Stored>, headers: HeaderMap, body: Bytes) -> Response {
-    let Some(target) = headers.get("x-amz-target") else {
-        return stored.report.lock().unwrap().clone().into_response();
-    };
+    let target = &headers["x-amz-target"];
     if target.to_str().unwrap().ends_with("UpdateItem") {
         stored.update(&serde_json::from_slice(&body).unwrap());
         return "{}".into_response();
@@ -62,7 +59,6 @@ async fn answer(Shared(stored): Shared<Stored>, headers: HeaderMap, body: Bytes)
 
 struct Bench {
     around: Surroundings,
-    stored: Stored,
     written: mpsc::UnboundedReceiver<Item>,
     view: View,
     status: SubmissionStatus,
@@ -73,7 +69,6 @@ async fn bench(state: State) -> Bench {
     let (sender, written) = mpsc::unbounded_channel();
     let partial = BTreeMap::from([("driving_score".to_owned(), "10.5".to_owned())]);
     let stored = Stored {
-        report: Arc::default(),
         item: Arc::new(Mutex::new(partial)),
         written: sender,
     };
@@ -105,16 +100,19 @@ async fn bench(state: State) -> Bench {
         pod: None,
         node: NodeSight::Unknown,
         report: ReportSight::NotRead,
+        report_stage: None,
+        report_waited: std::time::Duration::ZERO,
+        texts: ObservedTexts::NotRead,
+        fence: ObservedFence::NotRequested,
+        log: ObservedLog::NotRequested,
         evalai: None,
         record: Some(RecordView::default()),
         partial_told: None,
-        unread: None,
         rerun_as: None,
         evalai_writes_from: None,
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,
-        stored,
         written,
         view,
         status,
@@ -122,96 +120,48 @@ async fn bench(state: State) -> Bench {
 }
 
 impl Bench {
-    fn stores(&self, report: &str) {
-        report.clone_into(&mut self.stored.report.lock().unwrap());
-    }
-
-    async fn records_the_end(&self) {
-        let context = &self.around.context;
-        context.sync.record(context, &self.view, &self.status, true).await;
+    fn records_the_end(&self) {
+        self.around.context.sync.record(&self.view, &self.status, true);
     }
 
     async fn row(&mut self) -> Item {
         let row = tokio::time::timeout(LIMIT, self.written.recv()).await;
         row.expect("a row is written").unwrap()
     }
-
-    fn unread(&self) -> Option<String> {
-        self.around.context.memory.unread(&self.view.submission)
-    }
-
-    fn is_handed_in(&self) -> bool {
-        let recorder = &self.around.context.sync.recorder;
-        recorder.view(&object_key(self.view.submission.as_ref())).is_some()
-    }
 }
 
-fn last() -> String {
+fn last() -> ReportSight {
     let results = json!([{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]);
-    json!({
+    let report = json!({
         "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
         "pairs": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": results.to_string(),
-    })
-    .to_string()
+    });
+    let report: crate::pod::report::Report = serde_json::from_value(report).unwrap();
+    ReportSight::Ours(Arc::new((&report).into()))
 }
 
 #[tokio::test]
 async fn the_row_of_an_end_has_the_metrics_of_the_last_report() {
     let mut bench = bench(State::Finished).await;
-    bench.stores(&last());
-    bench.records_the_end().await;
+    bench.view.report = last();
+    bench.records_the_end();
     let row = bench.row().await;
     assert_eq!(row["submission_status"], "FINISHED");
     assert_eq!(row["driving_score"], "43.125", "not those of a partial result");
 }
 
 #[tokio::test]
-async fn the_row_of_an_end_without_results_that_count_has_no_metrics_and_waits_for_no_report() {
+async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
     for (state, status) in [(State::Cancelled, "CANCELLED"), (State::Failed, "FAILED")] {
         let mut bench = bench(state).await;
-        bench.stores("torn");
-        bench.records_the_end().await;
+        bench.view.report = last();
+        bench.records_the_end();
         let row = bench.row().await;
         assert_eq!(
             (row["submission_status"].as_str(), row.get("driving_score")),
             (status, None)
         );
     }
-}
-
-#[tokio::test]
-async fn the_row_of_an_end_waits_for_a_report_that_cannot_be_read_but_not_for_ever() {
-    let mut bench = bench(State::Finished).await;
-    bench.stores("torn");
-    bench.records_the_end().await;
-    assert!(!bench.is_handed_in());
-    assert!(bench.unread().unwrap().contains("not one of ours"));
-    bench.stores(&last());
-    bench.records_the_end().await;
-    assert_eq!(bench.row().await["driving_score"], "43.125");
-    assert_eq!(bench.unread(), None);
-
-    let mut bench = self::bench(State::Finished).await;
-    bench.stores("torn");
-    bench.view.now = bench.view.now.checked_add(END_WAITS).unwrap();
-    bench.records_the_end().await;
-    assert_eq!(bench.row().await["submission_status"], "FINISHED");
-
-    let mut bench = self::bench(State::Finished).await;
-    bench.stores("torn");
-    let mut submission = bench.view.submission.as_ref().clone();
-    submission.metadata.deletion_timestamp = Some(Time(bench.view.now));
-    bench.view.submission = Arc::new(submission);
-    bench.records_the_end().await;
-    assert!(!bench.is_handed_in());
-    // The finalizer is about to give up.
-    bench.view.now = bench
-        .view
-        .now
-        .checked_add(SignedDuration::from_secs(900 - 120))
-        .unwrap();
-    bench.records_the_end().await;
-    assert_eq!(bench.row().await["submission_status"], "FINISHED");
 }
 
 #[test]

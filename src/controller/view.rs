@@ -1,11 +1,12 @@
 //! The world of one submission, as one pass saw it. `observe` fills it, `decide` reads it; it holds no client and no clock.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 
+use super::archive::digest::{ReportDigest, ReportId};
 pub use super::turns::Turn;
-use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::{Leaderboard, Rerun, Submission};
 
@@ -23,14 +24,19 @@ pub struct View {
     pub pod: Option<PodView>,
     pub node: NodeSight,
     pub report: ReportSight,
+    /// What was known of the run when the answer in `report` was asked for; None: nothing was read for this Job.
+    pub report_stage: Option<Stage>,
+    /// How long the present report has been asked for.
+    pub report_waited: Duration,
+    pub texts: ObservedTexts,
+    pub fence: ObservedFence,
+    pub log: ObservedLog,
     /// None for a submission that is not EvalAI's.
     pub evalai: Option<EvalaiView>,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
     /// Routes that the last partial result told EvalAI of, in this attempt.
     pub partial_told: Option<u32>,
-    /// Why its result could not be read when it was to be told last.
-    pub unread: Option<String>,
     /// The submission that re-runs this one, as its status says.
     pub rerun_as: Option<Rerun>,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
@@ -146,27 +152,115 @@ pub struct EndView {
     pub why: Option<String>,
 }
 
+/// What was known of a run when its report was asked for. What is stored later than that is not in the answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Stage {
+    /// Its agents may still run.
+    Live,
+    /// Its agents and simulators had ended.
+    RunEnded,
+    /// Its Job had ended, or was gone.
+    JobEnded,
+}
+
+/// Which report a decision needs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReportDemand {
+    pub attempt: i64,
+    pub retry: i32,
+    /// UID of the Pod.
+    pub pod: Option<String>,
+    pub stage: Stage,
+    /// How often the report of a live run is read.
+    pub period: Duration,
+}
+
 /// The report in S3, as far as it was read.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ReportSight {
-    /// There was no reason to look.
+    /// It was not read, or nobody has asked for it.
     NotRead,
     Absent,
     /// Another object's or attempt's.
     Foreign,
     /// S3 did not answer, or not with a report.
     Unreadable(String),
-    Ours(Arc<Report>),
+    Ours(Arc<ReportDigest>),
 }
 
 impl ReportSight {
     /// The report, if it is ours.
-    pub fn ours(&self) -> Option<&Arc<Report>> {
+    pub fn ours(&self) -> Option<&Arc<ReportDigest>> {
         match self {
             Self::Ours(report) => Some(report),
             _ => None,
         }
     }
+}
+
+/// The texts of a result, as they are published.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Texts {
+    /// The report that names them.
+    pub of: ReportId,
+    /// The metrics as EvalAI takes them.
+    pub result: String,
+    /// The same over the routes so far, while the run goes on.
+    pub partial: Option<String>,
+    pub stdout: String,
+    pub metadata: String,
+    /// Why `stdout` and `metadata` are not there.
+    pub problem: Option<TextProblem>,
+}
+
+/// Why there is no text of a result.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum TextProblem {
+    /// It may come.
+    Unread(String),
+    /// What is stored is not what the report names: the Pod ended between the two. It will hardly change.
+    Unfit(String),
+}
+
+impl TextProblem {
+    pub fn why(&self) -> &str {
+        match self {
+            Self::Unread(why) | Self::Unfit(why) => why,
+        }
+    }
+}
+
+/// The texts of a report, as far as they were read.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ObservedTexts {
+    NotRead,
+    /// Not even the report that names them was there.
+    Unread(String),
+    Read(Arc<Texts>),
+}
+
+/// Whether our own mark is in `logcopy/owner`, so that a lost Pod stores nothing more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ObservedFence {
+    NotRequested,
+    /// Requested this long ago.
+    Pending(Duration),
+    /// The last write failed; it is tried again. Requested this long ago.
+    Failed(Duration),
+    Held,
+}
+
+/// What became of the log that explains a failure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ObservedLog {
+    NotRequested,
+    /// Requested this long ago.
+    Pending(Duration),
+    Kept,
+    /// There is none.
+    None,
+    /// It could not be read or stored.
+    GivenUp,
 }
 
 /// What is known of the submission in EvalAI.

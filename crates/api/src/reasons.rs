@@ -173,7 +173,7 @@ reasons! {
             "Nothing. The message names what was lost.";
         STOPPING = "Stopping",
             "The submission is being stopped; completed routes are kept.",
-            "Nothing. It ends within about two minutes after `deadlines.cancelSeconds`; later while the bucket cannot be read.";
+            "Nothing. It ends within about three minutes after `deadlines.cancelSeconds`; later while the bucket cannot be read.";
         NOT_STALLED = "NotStalled",
             "The submission is not held up (condition `Stalled`).",
             "Nothing.";

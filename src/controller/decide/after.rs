@@ -6,6 +6,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after, seconds};
+use super::reading::{self, Reading};
 use super::{Action, Tell, accept, log, stop};
 use crate::controller::view::{EvalaiEnd, JobSight, JobView};
 use leaderboard_api::conditions::{self, Truth};
@@ -28,14 +29,17 @@ const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: o
 pub(super) fn decide(draft: &mut Draft<'_>) {
     leave_job(draft);
     show_refused_attempt(draft);
-    // Before EvalAI is told, since its hosts read it there.
-    log::keep_at_end(draft);
-    let published = publish(draft);
+    // Before EvalAI has the end, since its hosts read it there.
+    let log_left = log::keep_at_end(draft);
+    let published = publish(draft, log_left);
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = published != Sync::Waiting && record(draft) == Sync::Done;
-    let complete = published == Sync::Done && recorded;
+    if let Some(left) = log_left {
+        draft.requeue_in(left);
+    }
+    let complete = published == Sync::Done && recorded && log_left.is_none();
     if complete && !follow_rerun(draft) {
-        draft.act(Action::ForgetEvalai);
+        draft.act(Action::Forget);
     } else {
         draft.requeue_in(AGAIN);
     }
@@ -138,6 +142,10 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
         }
         return is_old;
     }
+    let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
+    if is_recorded && matches!(row_of_end(draft), Reading::Waits(_)) {
+        return true;
+    }
     let message = format!(
         "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state and score stay, in the table too.",
         rerun.submission_name
@@ -172,7 +180,7 @@ fn may_be_older(read_at: Option<Timestamp>, rerun: Option<&Time>, now: Timestamp
     rerun.0 <= latest && read_at <= after(rerun.0, RERUN_SECONDS)
 }
 
-fn publish(draft: &mut Draft<'_>) -> Sync {
+fn publish(draft: &mut Draft<'_>, log_left: Option<Duration>) -> Sync {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
@@ -203,37 +211,42 @@ fn publish(draft: &mut Draft<'_>) -> Sync {
             Sync::Refused
         }
         None => {
-            let wish = match draft.status.state {
-                Some(State::Finished) => Tell::Finished,
-                Some(State::Cancelled) => Tell::Cancelled,
-                _ => Tell::Failed,
-            };
-            draft.act(Action::Tell(wish));
-            let failed = view.error.map(|e| format!("The last request failed: {}", sentence(&e)));
-            let failed = failed.or(unread(draft));
-            let (reason, message) = if is_overtaken {
-                (
-                    reasons::CONCURRENT_UPDATE,
-                    failed.or_else(|| Some(TOLD_AGAIN.to_owned())),
-                )
-            } else if let Some(until) = draft.view.evalai_writes_from {
-                draft.requeue_at(until);
-                (
-                    reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
-                    Some(previous_controller(until)),
-                )
-            } else {
-                (reasons::WAITING, failed)
-            };
-            draft.condition(
-                conditions::PUBLISHED,
-                Truth::False,
-                reason,
-                &message.unwrap_or_default(),
-            );
+            send_end(draft, view.error, is_overtaken, log_left);
             Sync::Waiting
         }
     }
+}
+
+/// Sends the end with all that belongs to it, once that is there.
+fn send_end(draft: &mut Draft<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
+    let mut unread = None;
+    match reading::result_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why)),
+        Reading::Done if log_left.is_some() => {}
+        Reading::Done => draft.act(Action::Tell(match draft.status.state {
+            Some(State::Finished) => Tell::Finished,
+            Some(State::Cancelled) => Tell::Cancelled,
+            _ => Tell::Failed,
+        })),
+    }
+    let failed = error.map(|e| format!("The last request failed: {}", sentence(&e)));
+    let failed = failed.or(unread);
+    let (reason, message) = if is_overtaken {
+        (
+            reasons::CONCURRENT_UPDATE,
+            failed.or_else(|| Some(TOLD_AGAIN.to_owned())),
+        )
+    } else if let Some(until) = draft.view.evalai_writes_from {
+        draft.requeue_at(until);
+        (
+            reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
+            Some(previous_controller(until)),
+        )
+    } else {
+        (reasons::WAITING, failed)
+    };
+    let message = message.unwrap_or_default();
+    draft.condition(conditions::PUBLISHED, Truth::False, reason, &message);
 }
 
 /// EvalAI has the end. Its row may by now be another team's, to whom EvalAI shows the result: participants can edit it.
@@ -270,13 +283,17 @@ pub fn previous_controller(until: Timestamp) -> String {
     )
 }
 
-/// What keeps an end from being told before anybody was asked.
-fn unread(draft: &Draft<'_>) -> Option<String> {
-    let why = draft.view.unread.as_ref()?;
-    Some(format!(
-        "The stored result cannot be read: {} It is told when it can; look at the bucket.",
-        sentence(why)
-    ))
+/// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
+fn cannot_be_read(draft: &Draft<'_>, type_: &str, why: &str) -> String {
+    const BEGINS: &str = "The stored result cannot be read:";
+    let known = conditions::get(&draft.status.conditions, type_).map(|c| c.message.clone());
+    let known = known.filter(|message| message.starts_with(BEGINS));
+    known.unwrap_or_else(|| {
+        format!(
+            "{BEGINS} {} It is published when it can; look at the bucket.",
+            sentence(why)
+        )
+    })
 }
 
 /// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
@@ -344,7 +361,11 @@ fn record(draft: &mut Draft<'_>) -> Sync {
         draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
         return Sync::Done;
     }
-    draft.act(Action::Record { end: true });
+    let mut unread = None;
+    match row_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
+        Reading::Done => draft.act(Action::Record { end: true }),
+    }
     let (reason, message) = match view.error {
         Some(error) => (
             reasons::REFUSED,
@@ -353,10 +374,19 @@ fn record(draft: &mut Draft<'_>) -> Sync {
                 sentence(&error)
             ),
         ),
-        None => (reasons::WAITING, unread(draft).unwrap_or_default()),
+        None => (reasons::WAITING, unread.unwrap_or_default()),
     };
     draft.condition(conditions::RECORDED, Truth::False, reason, &message);
     Sync::Waiting
+}
+
+/// Whether all that the row shows is there: only that of a finished submission has metrics.
+fn row_of_end(draft: &mut Draft<'_>) -> Reading {
+    if draft.is_successful() {
+        reading::report_of_end(draft)
+    } else {
+        Reading::Done
+    }
 }
 
 fn keep_job_for_its_time(draft: &mut Draft<'_>, job: &JobView) {
@@ -387,7 +417,7 @@ fn release(draft: &mut Draft<'_>, complete: bool) {
             reasons::RELEASED_UNPUBLISHED,
             "It was deleted and its end could not be published in time; it is released.",
         );
-        draft.act(Action::ForgetEvalai);
+        draft.act(Action::Forget);
         draft.act(Action::ReleaseFinalizer);
     } else {
         draft.requeue_at(until);

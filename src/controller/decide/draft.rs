@@ -5,7 +5,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::{Action, Event, Plan, Tell};
+use super::{Action, Event, Plan, Tell, reading};
 use crate::controller::view::View;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
@@ -20,6 +20,8 @@ pub(super) struct Draft<'a> {
     actions: Vec<Action>,
     events: Vec<Event>,
     requeue: Option<Duration>,
+    /// The end is published with the report.
+    pub(super) needs_report: bool,
 }
 
 impl<'a> Draft<'a> {
@@ -32,6 +34,7 @@ impl<'a> Draft<'a> {
             actions: Vec::new(),
             events: Vec::new(),
             requeue: None,
+            needs_report: false,
         }
     }
 
@@ -90,6 +93,16 @@ impl<'a> Draft<'a> {
 
     pub(super) fn is_finished(&self) -> bool {
         conditions::is_true(&self.status.conditions, conditions::FINISHED)
+    }
+
+    /// Its results count.
+    pub(super) fn is_successful(&self) -> bool {
+        self.status.state == Some(State::Finished)
+    }
+
+    /// How often the report of a live run is read.
+    pub(super) fn period(&self) -> Duration {
+        Duration::from_secs(self.leaderboard().map_or(10, |l| l.sync_period_seconds).unsigned_abs())
     }
 
     pub(super) fn is_running(&self) -> bool {
@@ -275,6 +288,7 @@ impl<'a> Draft<'a> {
 
     pub(super) fn into_plan(self) -> Plan {
         Plan {
+            report: reading::demand(&self),
             status: self.status,
             actions: self.actions,
             events: self.events,

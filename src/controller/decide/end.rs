@@ -6,13 +6,15 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
-use super::failure;
-use crate::controller::view::{JobEnd, ReportSight, View};
-use crate::pod::report::Report;
+use super::{failure, reading};
+use crate::controller::archive::digest::ReportDigest;
+use crate::controller::view::{JobEnd, ReportSight, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, State, reasons};
 
+/// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
+const NO_ANSWER: &str = "its bucket has not answered yet.";
 /// First delay before a new Job after an infrastructure failure; doubles with each.
 const RETRY_SECONDS: i64 = 10;
 /// Most doublings of that delay.
@@ -27,12 +29,24 @@ const READ_AT_LEAST_SECONDS: i64 = 60;
 /// The Job is terminal, or gone because we ended it (`None`).
 pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
     let view = draft.view;
+    // A mark that comes late would stop the next Pod.
+    if let Some(left) = reading::requested_fence_left(draft) {
+        return draft.requeue_in(left);
+    }
+    // Without a plan nobody knows where a report would be.
+    let is_read = reading::is_of(draft, Stage::JobEnded) && view.report != ReportSight::NotRead;
+    if draft.status.plan.is_some() && !is_read {
+        if let Some(left) = reading::answer_left(draft) {
+            return draft.requeue_in(left);
+        }
+        if wait_for_bucket(draft, NO_ANSWER) {
+            return;
+        }
+    }
     let report = match &view.report {
-        ReportSight::Ours(report) => Some(report.as_ref()),
-        // Without a plan nobody knows where a report would be.
-        ReportSight::NotRead if draft.status.plan.is_some() => return draft.requeue_in(Duration::from_secs(1)),
+        ReportSight::Ours(report) if is_read => Some(report.as_ref()),
         ReportSight::Unreadable(why) if wait_for_bucket(draft, why) => return,
-        ReportSight::Absent | ReportSight::Foreign | ReportSight::NotRead | ReportSight::Unreadable(_) => None,
+        _ => None,
     };
     let complete = report.filter(|r| is_complete(r));
     if let Some(report) = complete.filter(|r| r.eligible) {
@@ -63,6 +77,9 @@ pub(super) fn of_complete_run(draft: &mut Draft<'_>) -> bool {
     let Some(pod) = view.pod.as_ref().filter(|pod| pod.run_ended.is_some()) else {
         return false;
     };
+    if !reading::is_of(draft, Stage::RunEnded) {
+        return false;
+    }
     let report = view.report.ours().filter(|r| r.pod_uid == pod.uid);
     let Some(report) = report.filter(|r| is_complete(r) && r.eligible) else {
         return false;
@@ -71,12 +88,12 @@ pub(super) fn of_complete_run(draft: &mut Draft<'_>) -> bool {
     true
 }
 
-fn is_complete(report: &Report) -> bool {
+fn is_complete(report: &ReportDigest) -> bool {
     report.is_final && report.done == report.total && report.total > 0
 }
 
 /// Whether a report says how a run came to its own end, whatever becomes of its Job.
-pub(super) fn is_verdict(report: &Report) -> bool {
+pub(super) fn is_verdict(report: &ReportDigest) -> bool {
     is_complete(report) || (report.is_final && report.why.is_some())
 }
 
@@ -122,7 +139,12 @@ pub(super) fn cancel_reason(draft: &Draft<'_>) -> &'static str {
     }
 }
 
-fn cause(draft: &Draft<'_>, report: Option<&Report>, complete: Option<&Report>, job_end: Option<&JobEnd>) -> Failure {
+fn cause(
+    draft: &Draft<'_>,
+    report: Option<&ReportDigest>,
+    complete: Option<&ReportDigest>,
+    job_end: Option<&JobEnd>,
+) -> Failure {
     // A refused checkpoint may still be mended while the run goes on; only the last word counts.
     if let Some(why) = report.filter(|r| r.is_final).and_then(|r| r.why.as_deref()) {
         return failure::invalid_results(why);
@@ -168,7 +190,7 @@ fn retry(draft: &mut Draft<'_>, found: &Failure) {
     draft.requeue_at(at);
 }
 
-fn finished(draft: &mut Draft<'_>, report: &Report) {
+fn finished(draft: &mut Draft<'_>, report: &ReportDigest) {
     draft.status.failure = None;
     let score = draft.status.score.clone().unwrap_or_default();
     let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);

@@ -7,8 +7,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::Draft;
 use super::next_steps::{Steps, for_both, in_the_log_of, infrastructure_for_participants, of_infrastructure, smaller};
+use crate::controller::archive::digest::ReportDigest;
 use crate::controller::view::{ContainerView, EndView, JobEnd, NodeSight, PodView};
-use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, LastEnd, PairStatus, SubmissionStatus, reasons};
@@ -105,7 +105,7 @@ fn pair_named(why: &str) -> Option<i32> {
 
 /// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
 /// results that can be read is tried again as one that crashed.
-pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &Report) -> bool {
+pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
     let by_itself = |pair: &PairStatus| matches!(last_word(pair), Some("exited" | "incomplete"));
     let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
     is_of_results && status.pairs.iter().any(by_itself) && report.is_final && report.why.is_some()

@@ -5,9 +5,9 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 
 use super::draft::{Draft, after};
-use super::{Action, Tell, accept, end, failure, isolation, job_name, line, start, stop};
-use crate::controller::view::{JobSight, JobView, PodView, Standing};
-use crate::pod::report::Report;
+use super::{Action, Tell, accept, end, failure, isolation, job_name, line, reading, start, stop};
+use crate::controller::archive::digest::ReportDigest;
+use crate::controller::view::{JobSight, JobView, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{PairStatus, Progress, State, reasons};
@@ -16,6 +16,8 @@ use leaderboard_api::{PairStatus, Progress, State, reasons};
 const MAX_RECREATED: i32 = 3;
 /// When a submission in line is looked at again, should nothing wake it before.
 const BACKSTOP: Duration = Duration::from_mins(5);
+/// When a live run is looked at again, should nothing wake it before: its report, its Pod, its node or EvalAI.
+const LIVE_BACKSTOP: Duration = Duration::from_mins(5);
 /// How soon a Job that was just asked for is looked for.
 const LOOK: Duration = Duration::from_secs(15);
 
@@ -142,7 +144,7 @@ fn start_job(draft: &mut Draft<'_>) {
 
 /// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
 /// crash or a slow watch looks the same. `start_job` sets the mark, `start::watch` takes it away.
-fn was_seen(draft: &Draft<'_>) -> bool {
+pub(super) fn was_seen(draft: &Draft<'_>) -> bool {
     const BEFORE_IT: [&str; 3] = [
         reasons::JOB_NAME_TAKEN,
         reasons::LEADERBOARD_NOT_FOUND,
@@ -158,8 +160,17 @@ fn was_seen(draft: &Draft<'_>) -> bool {
 
 /// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
 fn without_its_job(draft: &mut Draft<'_>) {
+    // What the run has stored last decides whether it is made again.
+    let is_read = reading::is_of(draft, Stage::JobEnded);
+    if !draft.is_to_stop()
+        && was_seen(draft)
+        && !is_read
+        && let Some(left) = reading::answer_left(draft)
+    {
+        return draft.requeue_in(left);
+    }
     // A report from before this Job was seen is its predecessor's.
-    let is_verdict = draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
+    let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
     if draft.is_to_stop() || (is_verdict && was_seen(draft)) {
         return end::decide(draft, None);
     }
@@ -173,6 +184,9 @@ fn without_its_job(draft: &mut Draft<'_>) {
         draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
         draft.say(draft.live_state(), reasons::NOT_ISOLATED, missing.message);
         return draft.requeue_in(BACKSTOP);
+    }
+    if let Some(left) = reading::requested_fence_left(draft) {
+        return draft.requeue_in(left);
     }
     if was_seen(draft) {
         if draft.status.recreated >= MAX_RECREATED {
@@ -229,8 +243,10 @@ fn with_job(draft: &mut Draft<'_>, job: &JobView) {
     tell(draft);
     if draft.is_running() {
         record(draft);
+        draft.requeue_in(LIVE_BACKSTOP);
+    } else {
+        draft.requeue_in(draft.period());
     }
-    draft.requeue_in(period(draft));
 }
 
 fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
@@ -242,7 +258,7 @@ fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
     failure::note_ends(&mut draft.status, pod);
 }
 
-fn take_report(draft: &mut Draft<'_>, report: &Report) {
+fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
     let clamp = |n: u32| i32::try_from(n).unwrap_or(i32::MAX);
     draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
     if let Some(score) = report.score {
@@ -276,12 +292,10 @@ fn take_report(draft: &mut Draft<'_>, report: &Report) {
 }
 
 /// Says that scores do not follow from the infractions, and that they do again.
-fn note_scores(draft: &mut Draft<'_>, report: &Report) {
-    const LONGEST: usize = 500;
-    let (truth, reason, message) = match report.warnings.first() {
+fn note_scores(draft: &mut Draft<'_>, report: &ReportDigest) {
+    let (truth, reason, message) = match &report.warning {
         Some(first) => {
-            let first: String = first.chars().take(LONGEST).collect();
-            let message = format!("Scores do not follow from the infractions: {}", sentence(&first));
+            let message = format!("Scores do not follow from the infractions: {}", sentence(first));
             (Truth::False, reasons::UNEXPLAINED_SCORES, message)
         }
         None if conditions::get(&draft.status.conditions, conditions::PLAUSIBLE).is_none() => return,
@@ -332,8 +346,9 @@ fn tell(draft: &mut Draft<'_>) {
         return;
     }
     draft.act(Action::Tell(Tell::Running));
-    let done = draft.view.report.ours().map(|r| r.done);
-    if done.is_some_and(|d| d > 0) && done != draft.view.partial_told {
+    let Some(report) = draft.view.report.ours() else { return };
+    let is_new = report.done > 0 && Some(report.done) != draft.view.partial_told;
+    if is_new && reading::has_texts(draft, report) {
         draft.act(Action::Tell(Tell::Partial));
     }
 }
@@ -342,8 +357,4 @@ fn record(draft: &mut Draft<'_>) {
     if draft.view.record.is_some() {
         draft.act(Action::Record { end: false });
     }
-}
-
-fn period(draft: &Draft<'_>) -> Duration {
-    Duration::from_secs(draft.leaderboard().map_or(10, |l| l.sync_period_seconds).unsigned_abs())
 }

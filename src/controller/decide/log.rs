@@ -3,9 +3,11 @@
 //! Called by `stop`, while the Pod is still there, and by `after`. An agent's log is in S3, where logcopy stores it; the
 //! others are on the node alone, and only as long as their Pod lives.
 
+use std::time::Duration;
+
 use super::draft::Draft;
 use super::{Action, trouble};
-use crate::controller::view::PodView;
+use crate::controller::view::{ObservedLog, PodView};
 use crate::pod::run::console;
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
 
@@ -26,21 +28,37 @@ pub enum LogAt {
     Bucket { key: String },
 }
 
-/// Wishes for the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away.
-pub(super) fn keep_while_there(draft: &mut Draft<'_>) {
+/// How long a log is waited for before its Pod goes, or EvalAI has the end without it.
+const LONGEST: Duration = Duration::from_secs(15);
+
+/// Requests the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away. Returns how
+/// long that end waits for it.
+pub(super) fn keep_while_there(draft: &mut Draft<'_>) -> Option<Duration> {
     if draft.is_cancelled() {
-        return;
+        return None;
     }
     let mut places = places(&draft.status, draft.view.pod.as_ref());
     // What is in S3 is complete only when the Pod has ended; it is read then, and the best place first.
-    if places.first().is_some_and(is_on_node) {
-        places.retain(is_on_node);
-        draft.act(Action::KeepLog { places });
+    if !places.first().is_some_and(is_on_node) {
+        return None;
+    }
+    places.retain(is_on_node);
+    draft.act(Action::KeepLog { places });
+    left(draft.view.log, Some(LONGEST))
+}
+
+/// How long a log is still waited for; `at_first`: while nobody has been asked for it.
+fn left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
+    match log {
+        ObservedLog::NotRequested => at_first,
+        ObservedLog::Pending(waited) => LONGEST.checked_sub(waited).filter(|left| !left.is_zero()),
+        ObservedLog::Kept | ObservedLog::None | ObservedLog::GivenUp => None,
     }
 }
 
-/// Wishes for the log of a run that has failed, until EvalAI's answer to the end is known: its hosts read it there.
-pub(super) fn keep_at_end(draft: &mut Draft<'_>) {
+/// Requests the log of a run that has failed, until EvalAI's answer to the end is known: its hosts read it there. Returns how
+/// long EvalAI waits for it.
+pub(super) fn keep_at_end(draft: &mut Draft<'_>) -> Option<Duration> {
     let before = draft.view.submission.status.as_ref();
     let has_just_ended = !before.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
     let published = before.and_then(|s| conditions::get(&s.conditions, conditions::PUBLISHED));
@@ -51,8 +69,16 @@ pub(super) fn keep_at_end(draft: &mut Draft<'_>) {
         let places = places(&draft.status, draft.view.pod.as_ref());
         if !places.is_empty() {
             draft.act(Action::KeepLog { places });
+            // What is known is of the time before the end.
+            let log = if has_just_ended {
+                ObservedLog::NotRequested
+            } else {
+                draft.view.log
+            };
+            return left(log, Some(LONGEST));
         }
     }
+    left(draft.view.log, None).filter(|_| !has_just_ended)
 }
 
 fn is_on_node(place: &LogPlace) -> bool {

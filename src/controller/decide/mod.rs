@@ -14,6 +14,7 @@ mod line;
 mod live;
 mod log;
 mod next_steps;
+mod reading;
 mod start;
 mod stop;
 #[cfg(test)]
@@ -22,8 +23,9 @@ mod trouble;
 
 use std::time::Duration;
 
+use super::archive::digest::ReportId;
 use super::turns::InLine;
-use super::view::View;
+use super::view::{ReportDemand, View};
 use crate::pod::run::Stop;
 pub use after::previous_controller;
 use draft::Draft;
@@ -36,6 +38,8 @@ pub struct Plan {
     pub status: SubmissionStatus,
     pub actions: Vec<Action>,
     pub events: Vec<Event>,
+    /// The report that the next decision needs; None: none.
+    pub report: Option<ReportDemand>,
     /// When to look again without any other cause.
     pub requeue: Option<Duration>,
 }
@@ -67,14 +71,18 @@ pub enum Action {
     SetJobTtl { name: String, seconds: i32 },
     /// Keep the tail of the log that explains the failure, from the first of these places that has it.
     KeepLog { places: Vec<LogPlace> },
+    /// Read the texts of this report, so that they can be published.
+    ReadTexts { of: ReportId },
     /// Ask EvalAI for the submission.
     AskEvalai,
     /// Look for its end in EvalAI from now on, although EvalAI is told nothing of it yet.
     FollowEvalai,
     /// Tell EvalAI.
     Tell(Tell),
-    /// Nothing more is wanted from EvalAI for this object.
+    /// Forget what EvalAI last said, so that it is asked anew.
     ForgetEvalai,
+    /// Every system has the end: drop all that is remembered for it.
+    Forget,
     /// Write the row.
     Record { end: bool },
 }

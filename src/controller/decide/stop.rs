@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
-use super::{Action, failure, log, start};
+use super::{Action, failure, log, reading, start};
 use crate::controller::view::{JobView, NodeSight, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::reasons;
@@ -29,7 +29,7 @@ const SOON: Duration = Duration::from_secs(2);
 pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
     let since = stopping_since(draft);
     show(draft);
-    log::keep_while_there(draft);
+    let log_left = log::keep_while_there(draft);
     let view = draft.view;
     // Without agents there is nothing to store; with them, a logcopy that is being restarted may still do so.
     let listening = view
@@ -37,22 +37,31 @@ pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
         .as_ref()
         .filter(|p| p.logcopy_running || p.agent_started.is_some());
     let Some(pod) = listening else {
-        draft.act(delete(job, DELETE_GRACE_SECONDS));
-        return draft.requeue_in(SOON);
+        return end_job(draft, job, DELETE_GRACE_SECONDS, log_left);
     };
     let delete_at = after(since, draft.deadlines().cancel_seconds + STOP_MARGIN_SECONDS);
     let force_at = after(delete_at, DELETE_GRACE_SECONDS + STOP_MARGIN_SECONDS);
     if draft.now() >= force_at {
-        force(draft, pod);
-        draft.act(delete(job, 0));
+        if log_left.is_none() && force(draft, pod) {
+            end_job(draft, job, 0, None);
+        }
         draft.requeue_in(SOON);
     } else if draft.now() >= delete_at {
-        draft.act(delete(job, DELETE_GRACE_SECONDS));
+        end_job(draft, job, DELETE_GRACE_SECONDS, log_left);
         draft.requeue_at(force_at);
     } else {
         annotate(draft, pod);
         draft.requeue_at(delete_at);
     }
+}
+
+/// Deletes a Job, once the log that goes with its Pod is kept or was waited for long enough.
+fn end_job(draft: &mut Draft<'_>, job: &JobView, grace_seconds: i64, log_left: Option<Duration>) {
+    if let Some(left) = log_left {
+        return draft.requeue_in(left);
+    }
+    draft.act(delete(job, grace_seconds));
+    draft.requeue_in(SOON);
 }
 
 /// When the stop began. A clock that was set back must not put its end off, so the stop begins anew then.
@@ -103,13 +112,18 @@ pub(super) fn delete(job: &JobView, grace_seconds: i64) -> Action {
     }
 }
 
-/// The fence goes first: what a Pod we can't reach still writes counts for nobody.
-fn force(draft: &mut Draft<'_>, pod: &PodView) {
+/// Removes a Pod that we can't reach. The fence goes first: what it still writes counts for nobody. Returns whether it did.
+fn force(draft: &mut Draft<'_>, pod: &PodView) -> bool {
     draft.act(Action::TakeOwnership);
+    if let Some(left) = reading::fence_left(draft) {
+        draft.requeue_in(left);
+        return false;
+    }
     draft.act(Action::ForceDeletePod {
         name: pod.name.clone(),
         uid: pod.uid.clone(),
     });
+    true
 }
 
 /// We, or somebody else, deleted the Job; it goes with its Pod.
@@ -168,7 +182,8 @@ pub(super) fn leave_lost_pod(draft: &mut Draft<'_>, job: &JobView, pod: &PodView
     let found = failure::node_lost(pod.node.as_deref(), draft.view.node);
     start::replacing(draft, &failure::what_happened(&found));
     draft.fail(found);
-    force(draft, pod);
-    draft.act(delete(job, 0));
-    draft.requeue_in(SOON);
+    if force(draft, pod) {
+        draft.act(delete(job, 0));
+        draft.requeue_in(SOON);
+    }
 }

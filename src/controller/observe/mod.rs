@@ -1,13 +1,13 @@
-//! Reads the world of one submission into a `View`: caches, memory and one short read from S3. Decides nothing.
+//! Reads the world of one submission into a `View`: caches and memory. Decides nothing.
 
 pub mod job;
+pub mod lookups;
 pub mod node;
 pub mod pod;
-pub mod report;
 
 use std::sync::Arc;
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use kube::runtime::reflector::ObjectRef;
@@ -18,8 +18,12 @@ use super::decide::job_name;
 use super::view::{JobSight, NodeSight, PodView, ReportSight, View};
 use leaderboard_api::{Leaderboard, Submission, conditions, names};
 
+/// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
+/// than all the rest.
+const REFUSED_AFTER: SignedDuration = SignedDuration::from_secs(45);
+
 /// Sees everything a pass may depend on.
-pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
+pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let submission = context.memory.with_own_status(submission);
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
@@ -27,20 +31,23 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let is_policy_in_place = leaderboard.as_ref().is_some_and(|l| context.is_policy_in_place(l));
     let status = submission.status.clone().unwrap_or_default();
     let name = job_name(&submission.name_any(), &status);
+    let this = || ObjectRef::from_obj(submission.as_ref());
     let (job, pod) = children(context, &submission, &namespace, &name);
     let job = match job {
         JobSight::Ours(mut job) if pod.is_none() && job.end.is_none() => {
-            job.failed_create = context.failed_create(&namespace, &job.name).await;
+            if job.created.is_some_and(|at| now.duration_since(at) >= REFUSED_AFTER) {
+                job.failed_create = context.lookups.refusal(&namespace, &job.name, this());
+            }
             JobSight::Ours(job)
         }
         other => other,
     };
-    let node = match &pod {
-        Some(pod) if pod.delete_by.is_some() => node::sight(context, pod).await,
-        Some(pod) if pod.agent_started.is_some() && pod.run_ended.is_none() => node::recent_sight(context, pod).await,
-        _ => NodeSight::Unknown,
-    };
-    let report = report::read(context, &submission, &job, pod.as_ref(), now).await;
+    let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
+    let node = pod.as_ref().filter(matters).and_then(|pod| pod.node.as_ref());
+    let node = node.map_or(NodeSight::Unknown, |name| context.lookups.node(name, this()));
+    let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
+    let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
+    let archive = context.archive_workers.observe(&submission, pod_uid, is_over);
     let record = leaderboard
         .as_ref()
         .and_then(|l| context.sync.record_view(l, &submission));
@@ -48,7 +55,6 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission, known);
     let turn = context.slots.turn(&submission, leaderboard.as_deref());
     let partial_told = context.memory.partial_told(&submission);
-    let unread = context.memory.unread(&submission);
     let rerun_as = context.reruns.of(&submission);
     let evalai_writes_from = context.sync.hub.writes_from();
     View {
@@ -60,11 +66,15 @@ pub async fn observe(context: &Context, submission: Arc<Submission>) -> View {
         job,
         pod,
         node,
-        report,
+        report: archive.report.report,
+        report_stage: archive.report.stage,
+        report_waited: archive.report.waited,
+        texts: archive.texts,
+        fence: archive.fence,
+        log: archive.log,
         evalai,
         record,
         partial_told,
-        unread,
         rerun_as,
         evalai_writes_from,
     }
@@ -97,14 +107,6 @@ fn is_owned_by(job: &Job, submission: &Submission) -> bool {
 pub(super) fn is_pod_of(pod: &Pod, job: &Job) -> bool {
     let uid = job.uid();
     pod.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
-}
-
-/// Whether the report of this submission has to be read at all.
-fn report_matters(submission: &Submission, job: &JobSight) -> bool {
-    let status = submission.status.as_ref();
-    let known_job = status.is_some_and(|s| s.job_name.is_some()) || job.ours().is_some();
-    let finished = status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
-    known_job && !finished
 }
 
 /// The label selector of everything the operator makes for submissions.

@@ -27,6 +27,8 @@ pub(super) struct Reports {
     pub(super) rows: mpsc::UnboundedReceiver<ObjectKey>,
     /// What EvalAI has news of.
     pub(super) evalai: mpsc::UnboundedReceiver<Changed>,
+    /// Submissions that have an answer from S3, or of the API server.
+    pub(super) answers: mpsc::UnboundedReceiver<ObjectRef<Submission>>,
 }
 
 /// Wakes a Leaderboard.
@@ -60,6 +62,7 @@ pub(super) fn of_submissions(
         mapped(watches.pods.subscribe(), of_pod(Arc::clone(shared), boards.clone())),
         mapped(received(reports.rows), |key| Some(reference(&key))),
         mapped(evalai, of_evalai),
+        received(reports.answers).boxed(),
         shared.context.slots.woken().boxed(),
     ])
     .boxed()

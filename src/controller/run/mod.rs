@@ -16,18 +16,20 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
-use kube::runtime::reflector::Store;
+use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
 use kube::{Client, ResourceExt};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
+use super::archive::{ArchiveWorkers, WakeSubmission};
 use super::backoff::BackoffMap;
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
 use super::leaderboards::isolation;
 use super::observe::children_selector;
+use super::observe::lookups::Lookups;
 use super::sync::Sync;
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
 use crate::kubernetes::{Watch, guarded, spawn_watch};
@@ -242,12 +244,20 @@ impl Parts {
             // Without a receiver the process is ending.
             let _ = to_queue.send(board);
         });
+        let (answered, answers) = mpsc::unbounded_channel();
+        let archive_workers = ArchiveWorkers::new(
+            self.aws.clone(),
+            self.client.clone(),
+            self.seen.tasks.clone(),
+            waking(&answered),
+        );
+        let lookups = Lookups::start(self.client.clone(), &self.seen.tasks, waking(&answered));
         let events = events(&self.client);
         let context = Context::new(
             self.client,
             self.settings,
             watches.stores(),
-            sync,
+            (sync, archive_workers, lookups),
             self.aws,
             events,
             wake,
@@ -264,7 +274,7 @@ impl Parts {
             Arc::clone(&shared.context),
         );
         self.seen.tasks.stay("policies", restored);
-        let reports = events::Reports { rows, evalai };
+        let reports = events::Reports { rows, evalai, answers };
         let of_submissions = events::of_submissions(&watches, reports, &boards, &shared);
         let of_leaderboards = events::of_leaderboards(&watches, woken_boards, &shared);
         let mut leadership = leader.leadership();
@@ -283,6 +293,15 @@ impl Parts {
         }
         Ok(())
     }
+}
+
+/// Puts a Submission into the queue.
+fn waking(queue: &mpsc::UnboundedSender<ObjectRef<Submission>>) -> WakeSubmission {
+    let queue = queue.clone();
+    Box::new(move |submission| {
+        // Without a receiver the process is ending.
+        let _ = queue.send(submission);
+    })
 }
 
 /// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.

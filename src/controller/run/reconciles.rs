@@ -24,8 +24,6 @@ use leaderboard_api::{Leaderboard, Submission};
 const TIME_LIMIT: Duration = Duration::from_secs(90);
 /// Events of one object that come together are one reconcile.
 const DEBOUNCE: Duration = Duration::from_millis(50);
-/// A reconcile that could not write to a bucket which hangs is repeated after this long.
-const BUCKET_AGAIN: Duration = Duration::from_secs(10);
 /// An object without any other cause is reconciled this often.
 const RESYNC: Duration = Duration::from_mins(10);
 
@@ -62,7 +60,7 @@ pub(super) async fn run(
         .debounce(DEBOUNCE);
     let of_submissions = applier(
         |object, shared: Arc<Shared>| Box::pin(reconcile_submission(object, shared)),
-        |object: Arc<Submission>, error: &ReconcileError, shared| after_error(object.as_ref(), error, &shared),
+        |object: Arc<Submission>, _: &ReconcileError, shared| after_error(object.as_ref(), &shared),
         Arc::clone(&shared),
         stores.submissions.clone(),
         submissions.take_until(Box::pin(stop.wait())).map(Ok::<_, Infallible>),
@@ -70,7 +68,7 @@ pub(super) async fn run(
     );
     let of_leaderboards = applier(
         |object, shared: Arc<Shared>| Box::pin(reconcile_leaderboard(object, shared)),
-        |object: Arc<Leaderboard>, error: &ReconcileError, shared| after_error(object.as_ref(), error, &shared),
+        |object: Arc<Leaderboard>, _: &ReconcileError, shared| after_error(object.as_ref(), &shared),
         Arc::clone(&shared),
         stores.leaderboards.clone(),
         leaderboards.take_until(Box::pin(stop.wait())).map(Ok::<_, Infallible>),
@@ -88,7 +86,7 @@ async fn reconcile_submission(submission: Arc<Submission>, shared: Arc<Shared>) 
     let name = key(submission.as_ref()).to_string();
     let slots = &shared.context.slots;
     let work = async {
-        let view = observe(&shared.context, Arc::clone(&submission)).await;
+        let view = observe(&shared.context, Arc::clone(&submission));
         let plan = decide(&view);
         let requeue = plan.requeue;
         settle(slots, &submission, &plan);
@@ -161,11 +159,7 @@ fn jittered_resync() -> Duration {
     jittered(RESYNC, 0.2)
 }
 
-fn after_error(object: &impl Resource, error: &ReconcileError, shared: &Shared) -> Action {
-    // It fails at once, so that the pauses would be minutes long before the bucket is back.
-    if matches!(error, ReconcileError::Act(error) if error.is_of_a_silent_bucket()) {
-        return Action::requeue(BUCKET_AGAIN);
-    }
+fn after_error(object: &impl Resource, shared: &Shared) -> Action {
     Action::requeue(shared.backoff.failed(&uid_of(object)))
 }
 

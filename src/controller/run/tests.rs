@@ -13,9 +13,10 @@ use crate::controller::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 11] = [
+const TASKS: [&str; 12] = [
     "gauges",
     "lease",
+    "lookups",
     "permissions",
     "policies",
     "reconciles",

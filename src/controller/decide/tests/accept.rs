@@ -223,7 +223,7 @@ fn an_image_that_can_never_be_pulled_fails_at_once_without_a_job() {
             let plan = world.pass();
             assert!(has(&plan, |a| *a == Action::Record { end: true }), "{:?}", plan.actions);
             world.recorded();
-            assert!(has(&world.pass(), |a| *a == Action::ForgetEvalai));
+            assert!(has(&world.pass(), |a| *a == Action::Forget));
         }
     }
 }
@@ -277,7 +277,7 @@ fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
         condition(&plan, RECORDED),
         ("False".into(), reasons::NOT_REQUIRED.into())
     );
-    assert!(has(&plan, |a| *a == Action::ForgetEvalai));
+    assert!(has(&plan, |a| *a == Action::Forget));
 }
 
 #[test]
@@ -335,11 +335,7 @@ fn what_waits_before_its_acceptance_hears_of_its_end_in_evalai() {
         world.in_evalai().cancelled = true;
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert_eq!(tells(&plan), [], "{reason}");
-        assert!(
-            has(&plan, |a| *a == Action::ForgetEvalai),
-            "{reason}: {:?}",
-            plan.actions
-        );
+        assert!(has(&plan, |a| *a == Action::Forget), "{reason}: {:?}", plan.actions);
     }
 }
 

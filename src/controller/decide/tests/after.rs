@@ -15,7 +15,6 @@ fn finished() -> World {
     world.complete();
     world.report(final_report());
     world.pass_to(Finished, reasons::FINISHED);
-    world.view.report = ReportSight::NotRead;
     world
 }
 
@@ -46,7 +45,7 @@ fn evalai_first_then_the_table_then_rest() {
         assert_eq!(condition(&plan, RECORDED).0, "True");
         assert_eq!(
             (plan.actions.as_slice(), plan.requeue),
-            ([Action::ForgetEvalai].as_slice(), None)
+            ([Action::Forget].as_slice(), None)
         );
         // The services have forgotten; the conditions remember.
         world.view.evalai = None;
@@ -54,7 +53,7 @@ fn evalai_first_then_the_table_then_rest() {
         let plan = world.pass();
         assert_eq!(
             (plan.status.state, plan.actions.as_slice()),
-            (Some(state), [Action::ForgetEvalai].as_slice())
+            (Some(state), [Action::Forget].as_slice())
         );
     }
 }
@@ -62,20 +61,27 @@ fn evalai_first_then_the_table_then_rest() {
 #[test]
 fn an_end_whose_result_cannot_be_read_says_why_it_waits() {
     let mut world = finished();
-    world.view.unread = Some("the bucket results did not answer in time".into());
+    world.view.report = ReportSight::Unreadable("the bucket results did not answer in time".into());
     let told = |plan: &Plan, type_: &str| {
         let condition = conditions::get(&plan.status.conditions, type_).unwrap();
         (condition.reason.clone(), condition.message.clone())
     };
     let waits = (
         reasons::WAITING.to_owned(),
-        "The stored result cannot be read: the bucket results did not answer in time. It is told when it can; look at the bucket."
+        "The stored result cannot be read: the bucket results did not answer in time. It is published when it can; look at the bucket."
             .to_owned(),
     );
     assert_eq!(told(&world.pass(), PUBLISHED), waits);
+    world.view.report = ReportSight::Unreadable("request 2 timed out".into());
+    assert_eq!(
+        told(&world.pass(), PUBLISHED),
+        waits,
+        "another text is not another write"
+    );
+    world.view.report = ReportSight::Unreadable("the bucket results did not answer in time".into());
     world.published();
     assert_eq!(told(&world.pass(), RECORDED), waits);
-    world.view.unread = None;
+    world.report(final_report());
     assert_eq!(
         told(&world.pass(), RECORDED),
         (reasons::WAITING.to_owned(), String::new())
@@ -157,7 +163,7 @@ fn a_refused_result_is_said_once_and_does_not_hold_up_the_row() {
     assert!(world.pass().events.is_empty());
     world.recorded();
     let plan = world.pass();
-    assert!(plan.requeue.is_some() && !has(&plan, |a| *a == Action::ForgetEvalai));
+    assert!(plan.requeue.is_some() && !has(&plan, |a| *a == Action::Forget));
 }
 
 #[test]
@@ -178,14 +184,14 @@ fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
         "the row said FINISHED"
     );
     assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
-    assert!(!has(&plan, |a| *a == Action::ForgetEvalai));
+    assert!(!has(&plan, |a| *a == Action::Forget));
     // The row that was handed in is not the written one.
     world.view.record.as_mut().unwrap().end_written = false;
     assert!(has(&world.pass(), |a| *a == Action::Record { end: true }));
     world.recorded();
     let plan = world.pass();
     assert_eq!(condition(&plan, RECORDED).0, "True");
-    assert!(has(&plan, |a| *a == Action::ForgetEvalai));
+    assert!(has(&plan, |a| *a == Action::Forget));
 }
 
 #[test]
@@ -278,7 +284,7 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
 
         says(&mut world, "finished");
         let plan = world.pass();
-        assert_eq!((plan.actions, plan.status.rerun_as), (vec![Action::ForgetEvalai], None));
+        assert_eq!((plan.actions, plan.status.rerun_as), (vec![Action::Forget], None));
 
         says(&mut world, "cancelled");
         let plan = world.pass();
@@ -303,7 +309,7 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
         let again = world.pass();
         assert_eq!(
             (again.actions.as_slice(), again.events.len()),
-            ([Action::ForgetEvalai].as_slice(), 0)
+            ([Action::Forget].as_slice(), 0)
         );
         assert_eq!(condition(&again, RECORDED).0, "True");
         assert_eq!(again.status.message, plan.status.message, "it is said once");
@@ -339,7 +345,7 @@ fn a_row_that_was_read_before_the_rerun_is_asked_for_anew() {
     unproven.go_to(600);
     unproven.in_evalai().read_at = Some(at(590));
     let plan = unproven.pass();
-    assert_eq!((plan.actions, plan.requeue), (vec![Action::ForgetEvalai], None));
+    assert_eq!((plan.actions, plan.requeue), (vec![Action::Forget], None));
     // A time to come would be asked about until then.
     unproven.view.rerun_as.as_mut().unwrap().time = Some(Time(at(90_000)));
     assert_eq!(unproven.pass().requeue, None);

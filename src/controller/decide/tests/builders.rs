@@ -7,10 +7,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::json;
 
 use super::rules;
+use crate::controller::archive::digest::ReportDigest;
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobSight, JobView, NodeSight, PodView,
-    RecordView, ReportSight, Standing, Turn, View,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobSight, JobView, NodeSight, ObservedFence,
+    ObservedLog, ObservedTexts, PodView, RecordView, ReportSight, Stage, Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -102,10 +103,15 @@ impl World {
                 pod: None,
                 node: NodeSight::Unknown,
                 report: ReportSight::NotRead,
+                // Whatever is asked for is there already; the tests of waiting say otherwise.
+                report_stage: Some(Stage::JobEnded),
+                report_waited: std::time::Duration::ZERO,
+                texts: ObservedTexts::NotRead,
+                fence: ObservedFence::Held,
+                log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
                 record: Some(RecordView::default()),
                 partial_told: None,
-                unread: None,
                 rerun_as: None,
                 evalai_writes_from: None,
             },
@@ -195,7 +201,13 @@ impl World {
 
     /// Its report says this.
     pub fn report(&mut self, report: Report) {
-        self.view.report = ReportSight::Ours(Arc::new(report));
+        let digest = ReportDigest::from(&report);
+        self.view.texts = ObservedTexts::Read(Arc::new(Texts {
+            of: digest.id,
+            result: report.results,
+            ..Texts::default()
+        }));
+        self.view.report = ReportSight::Ours(Arc::new(digest));
     }
 
     pub fn status(&self) -> SubmissionStatus {

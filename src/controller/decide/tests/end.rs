@@ -374,7 +374,7 @@ fn a_report_that_was_not_read_is_read_first() {
     let plan = world.pass();
     assert_eq!(
         (plan.status, plan.requeue),
-        (before, Some(std::time::Duration::from_secs(1)))
+        (before, Some(std::time::Duration::from_secs(15)))
     );
 }
 

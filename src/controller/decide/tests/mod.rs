@@ -11,6 +11,7 @@ mod line;
 mod log;
 mod nodes;
 mod properties;
+mod reading;
 mod resume;
 mod rules;
 mod run;

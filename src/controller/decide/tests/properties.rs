@@ -1,6 +1,7 @@
 //! Any mix of observations, in any order: the rules hold at every step.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use proptest::prelude::*;
@@ -9,7 +10,8 @@ use proptest::sample::select;
 use super::builders::*;
 use crate::controller::decide::job_name;
 use crate::controller::view::{
-    EvalaiEnd, EvalaiView, JobEnd, JobSight, JobView, NodeSight, PodView, ReportSight, Standing, Turn,
+    EvalaiEnd, EvalaiView, JobEnd, JobSight, JobView, NodeSight, ObservedFence, ObservedLog, ObservedTexts, PodView,
+    ReportSight, Stage, Standing, Turn,
 };
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
@@ -22,6 +24,13 @@ enum Change {
     Pod(Option<Box<PodView>>),
     Node(NodeSight),
     Report(ReportSight),
+    Answers {
+        stage: Option<Stage>,
+        waited: Duration,
+        fence: ObservedFence,
+        log: ObservedLog,
+        texts: ObservedTexts,
+    },
     Evalai(Box<EvalaiView>),
     Recorded(bool),
     Turn(Turn),
@@ -179,7 +188,7 @@ fn report_sight() -> impl Strategy<Value = ReportSight> {
             ..report(done)
         };
         told.pairs[0].crashes = crashes;
-        ReportSight::Ours(Arc::new(told))
+        ReportSight::Ours(Arc::new((&told).into()))
     });
     prop_oneof![
         1 => Just(ReportSight::NotRead),
@@ -188,6 +197,46 @@ fn report_sight() -> impl Strategy<Value = ReportSight> {
         1 => select(vec!["a", "b"]).prop_map(|why| ReportSight::Unreadable(why.into())),
         5 => ours,
     ]
+}
+
+/// What the bucket's worker has answered, and how long it has been asked.
+fn answers() -> impl Strategy<Value = Change> {
+    let waited = || select([0, 5, 15, 59, 60].map(Duration::from_secs).to_vec());
+    let stage = select(vec![
+        None,
+        Some(Stage::Live),
+        Some(Stage::RunEnded),
+        Some(Stage::JobEnded),
+    ]);
+    let fence = waited().prop_flat_map(|waited| {
+        select(vec![
+            ObservedFence::NotRequested,
+            ObservedFence::Pending(waited),
+            ObservedFence::Failed(waited),
+            ObservedFence::Held,
+        ])
+    });
+    let log = waited().prop_flat_map(|waited| {
+        select(vec![
+            ObservedLog::NotRequested,
+            ObservedLog::Pending(waited),
+            ObservedLog::Kept,
+            ObservedLog::None,
+            ObservedLog::GivenUp,
+        ])
+    });
+    let texts = select(vec![
+        ObservedTexts::NotRead,
+        ObservedTexts::Unread("away".into()),
+        ObservedTexts::Read(Arc::default()),
+    ]);
+    (stage, waited(), fence, log, texts).prop_map(|(stage, waited, fence, log, texts)| Change::Answers {
+        stage,
+        waited,
+        fence,
+        log,
+        texts,
+    })
 }
 
 fn evalai_view() -> impl Strategy<Value = EvalaiView> {
@@ -251,6 +300,7 @@ fn change() -> impl Strategy<Value = Change> {
         6 => prop::option::weighted(0.9, pod_view().prop_map(Box::new)).prop_map(Change::Pod),
         3 => select(nodes).prop_map(Change::Node),
         5 => report_sight().prop_map(Change::Report),
+        4 => answers(),
         3 => evalai_view().prop_map(Box::new).prop_map(Change::Evalai),
         1 => any::<bool>().prop_map(Change::Recorded),
         2 => select(turns).prop_map(Change::Turn),
@@ -296,6 +346,19 @@ fn apply(world: &mut World, change: Change) {
         Change::Pod(pod) => world.view.pod = pod.map(|pod| *pod),
         Change::Node(node) => world.view.node = node,
         Change::Report(report) => world.view.report = report,
+        Change::Answers {
+            stage,
+            waited,
+            fence,
+            log,
+            texts,
+        } => {
+            world.view.report_stage = stage;
+            world.view.report_waited = waited;
+            world.view.fence = fence;
+            world.view.log = log;
+            world.view.texts = texts;
+        }
         Change::Evalai(view) => world.view.evalai = is_evalais.then_some(*view),
         Change::Recorded(end) => world.view.record.get_or_insert_default().end_written = end,
         Change::Turn(turn) => world.view.turn = turn,
@@ -344,7 +407,11 @@ proptest! {
             world.pass();
         }
         world.submission().spec.cancel = true;
+        // Its worker is never answered.
+        world.view.report_stage = None;
         for _ in 0..12 {
+            world.view.report_waited += Duration::from_mins(5);
+            world.view.fence = ObservedFence::Failed(world.view.report_waited);
             if world.view.report == ReportSight::NotRead {
                 world.view.report = ReportSight::Absent;
             }

@@ -92,7 +92,7 @@ fn logs_come_first(plan: &Plan) {
     let takes_it_away = |a: &Action| {
         matches!(
             a,
-            Action::DeleteJob { .. } | Action::ForceDeletePod { .. } | Action::Tell(_) | Action::ForgetEvalai
+            Action::DeleteJob { .. } | Action::ForceDeletePod { .. } | Action::Tell(_) | Action::Forget
         )
     };
     let first = plan.actions.iter().position(takes_it_away);
@@ -102,7 +102,7 @@ fn logs_come_first(plan: &Plan) {
     let told = plan
         .actions
         .iter()
-        .position(|a| matches!(a, Action::Tell(_) | Action::ForgetEvalai));
+        .position(|a| matches!(a, Action::Tell(_) | Action::Forget));
     assert!(told.is_none_or(|told| place < told), "{:?}", plan.actions);
 }
 

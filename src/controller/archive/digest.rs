@@ -1,0 +1,167 @@
+//! A report reduced to what decisions and the table need: under 1 KB while the run goes on, whatever the report embeds.
+
+use leaderboard_results::{Format, metrics};
+use serde_json::{Map, Value};
+use sha2::{Digest, Sha256};
+
+use crate::pod::report::{Report, ReportError, ReportPair};
+use crate::pod::run::Stop;
+
+/// Longest text of a report that is kept, in characters.
+const LONGEST: usize = 500;
+
+/// Tells one report from another by its bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ReportId([u8; 16]);
+
+/// What is kept of a report. Its texts are read again when they are published.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReportDigest {
+    pub id: ReportId,
+    pub attempt: i64,
+    /// UID of the Pod that wrote it.
+    pub pod_uid: String,
+    pub done: u32,
+    pub total: u32,
+    pub pairs: Vec<ReportPair>,
+    pub score: Option<f64>,
+    pub is_final: bool,
+    pub eligible: bool,
+    pub entry_status: String,
+    pub stopped: Option<Stop>,
+    /// Why a checkpoint was refused for good.
+    pub why: Option<String>,
+    /// The first warning.
+    pub warning: Option<String>,
+    /// The metrics of a final report, for the table.
+    pub metrics: Option<Box<Map<String, Value>>>,
+}
+
+impl ReportId {
+    pub(super) fn of(bytes: &[u8]) -> Self {
+        let mut id = [0; 16];
+        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
+        Self(id)
+    }
+}
+
+impl ReportDigest {
+    /// Reads a report as hostile text. None: it is of another object.
+    pub(super) fn read(bytes: &[u8], uid: &str) -> Result<Option<(Self, Report)>, ReportError> {
+        let report = Report::parse(bytes)?;
+        let is_of = report.submission_uid == uid;
+        Ok(is_of.then(|| (Self::of(&report, ReportId::of(bytes)), report)))
+    }
+
+    pub fn of(report: &Report, id: ReportId) -> Self {
+        Self {
+            id,
+            attempt: report.attempt,
+            pod_uid: cut(&report.pod_uid),
+            done: report.done,
+            total: report.total,
+            pairs: report.pairs.iter().map(bounded).collect(),
+            score: report.score,
+            is_final: report.is_final,
+            eligible: report.eligible,
+            entry_status: cut(&report.entry_status),
+            stopped: report.stopped,
+            why: report.why.as_deref().filter(|_| report.is_final).map(cut),
+            warning: report.warnings.first().map(|warning| cut(warning)),
+            metrics: report.is_final.then(|| accuracies(&report.results)).flatten(),
+        }
+    }
+}
+
+/// The metrics that a table has columns for, of either format.
+fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
+    let mut parsed: Value = serde_json::from_str(results).ok()?;
+    let all = parsed.get_mut(0)?.get_mut("accuracies")?.as_object_mut()?;
+    let columns = [Format::V1, Format::V2].into_iter().flat_map(metrics);
+    let kept = columns.filter_map(|metric| all.remove_entry(metric.name));
+    Some(Box::new(kept.collect()))
+}
+
+fn bounded(pair: &ReportPair) -> ReportPair {
+    ReportPair {
+        state: cut(&pair.state),
+        ..pair.clone()
+    }
+}
+
+fn cut(text: &str) -> String {
+    text.chars().take(LONGEST).collect()
+}
+
+#[cfg(test)]
+impl From<&Report> for ReportDigest {
+    fn from(report: &Report) -> Self {
+        Self::of(report, ReportId::of(&serde_json::to_vec(report).unwrap()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// A report of a real size: 40 kB of results, two pairs.
+    fn report(is_final: bool) -> Vec<u8> {
+        let pair = |id: u32| json!({"id": id, "done": 10, "total": 10, "crashes": 1, "state": "Running"});
+        let accuracies = json!({"Driving score": 43.125, "other": "x".repeat(40_000)});
+        json!({
+            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "0a86cbb5-8f3c-4a55-b5a1-9a4ff7a5c9a2", "round": 9,
+            "done": 20, "total": 20, "pairs": [pair(1), pair(2)], "score": 43.125, "final": is_final, "eligible": is_final,
+            "entryStatus": "Finished", "why": "w".repeat(9_000), "warnings": vec!["v".repeat(9_000); 9],
+            "results": json!([{"accuracies": accuracies}]).to_string(), "partialResults": "p".repeat(40_000),
+            "files": {"evalai/stdout.txt": {"size": 9, "sha256": "0".repeat(64)}},
+        })
+        .to_string()
+        .into_bytes()
+    }
+
+    fn size(digest: &ReportDigest) -> usize {
+        let texts = [
+            Some(&digest.pod_uid),
+            Some(&digest.entry_status),
+            digest.why.as_ref(),
+            digest.warning.as_ref(),
+        ];
+        let pairs: usize = digest
+            .pairs
+            .iter()
+            .map(|pair| size_of::<ReportPair>() + pair.state.capacity())
+            .sum();
+        size_of::<ReportDigest>() + pairs + texts.into_iter().flatten().map(String::capacity).sum::<usize>()
+    }
+
+    #[test]
+    fn a_live_report_of_a_real_size_is_kept_in_less_than_a_kilobyte() {
+        let bytes = report(false);
+        assert!(bytes.len() > 80_000);
+        let (digest, _) = ReportDigest::read(&bytes, "u").unwrap().unwrap();
+        assert!(size(&digest) < 1024, "{} bytes", size(&digest));
+        assert_eq!((digest.metrics, digest.why), (None, None));
+        assert_eq!((digest.done, digest.pairs.len(), digest.score), (20, 2, Some(43.125)));
+    }
+
+    #[test]
+    fn a_final_report_keeps_the_metrics_of_the_table_alone() {
+        let (digest, _) = ReportDigest::read(&report(true), "u").unwrap().unwrap();
+        let metrics = digest.metrics.unwrap();
+        assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
+        assert_eq!(digest.why.unwrap().len(), LONGEST);
+    }
+
+    #[test]
+    fn a_report_of_another_object_is_told_apart() {
+        assert_eq!(ReportDigest::read(&report(true), "v").unwrap(), None);
+        assert!(
+            ReportDigest::read(b"torn", "u")
+                .unwrap_err()
+                .to_string()
+                .contains("not one of ours")
+        );
+    }
+}
