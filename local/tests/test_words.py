@@ -19,14 +19,16 @@ class Words(unittest.TestCase):
         self.assertEqual(found("a.md", text), [(1, "Wish"), (2, "mend"), (3, "for ever"), (5, "Its Pod")])
 
     def test_rust_is_searched_in_comments_and_strings(self) -> None:
-        text = "\n".join([
-            "/// A wish.",
-            "fn wish(fate: &'a str) -> char { '\"' }",
-            'let a = "the \\" fate"; // mend',
-            'let b = r#"whoever "#;',
-            "/* buried",
-            "   for ever */",
-        ])
+        text = "\n".join(
+            [
+                "/// A wish.",
+                "fn wish(fate: &'a str) -> char { '\"' }",
+                'let a = "the \\" fate"; // mend',
+                'let b = r#"whoever "#;',
+                "/* buried",
+                "   for ever */",
+            ]
+        )
         lines = [(1, "wish"), (3, "fate"), (3, "mend"), (4, "whoever"), (5, "buried"), (6, "for ever")]
         self.assertEqual(found("a.rs", text), lines)
 

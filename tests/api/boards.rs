@@ -98,7 +98,7 @@ impl World {
         create(&api, object, false).await.unwrap();
     }
 
-    /// An edit, as a person makes it after mending something: everything is asked again.
+    /// An edit, as a person makes it after a fix: everything is asked again.
     async fn edit(&self, ttl: i32) {
         let patch = Patch::Merge(json!({"spec": {"ttlSecondsAfterFinished": ttl}}));
         let api = self.boards().await;

@@ -169,7 +169,7 @@ fn egress(policy: &NetworkPolicy) -> Value {
     serde_json::to_value(&policy.spec.as_ref().unwrap().egress).unwrap()
 }
 
-/// What a Pod is told of its isolation.
+/// What a Pod receives about its isolation.
 fn told(job: &Job) -> Value {
     let pod = job.spec.as_ref().unwrap().template.spec.as_ref().unwrap();
     let workspace = pod

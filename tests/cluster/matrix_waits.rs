@@ -396,7 +396,7 @@ async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, lab
 
     case.cause();
     nodes.delete(label, &DeleteParams::default()).await.unwrap();
-    case.shows(scene, "lost-node", "Replacing", "Its Pod was lost").await;
+    case.shows(scene, "lost-node", "Replacing", "The Pod was lost").await;
     label_node(nodes, REAL_NODE, json!(label)).await;
     finishes(case, scene, "lost-node").await;
     let status = scene

@@ -85,7 +85,7 @@ fn a_crashed_last_route_is_not_finished_in_a_pod() {
         let result = merged(&plan, &repeated).unwrap();
         assert_eq!((result.is_final, result.outcome), (true, Outcome::Finished));
 
-        // Whoever reads the files later has the last word of everybody.
+        // The files that are read later are the last of every worker.
         let later = Plan {
             strictness: Strictness::Offline,
             ..plan.clone()

@@ -276,7 +276,7 @@ impl Container {
         self.life = Life::Phase(0);
     }
 
-    /// One step with the given fate of its child; an agent whose command ends has complete results iff `complete`.
+    /// One step with the given state of its child; an agent whose command ends has complete results iff `complete`.
     fn step(&mut self, side: Side, peer: &Self, child: Child, complete: bool) {
         match self.life {
             Life::Phase(phase) => self.act(side, PHASES[usize::from(phase)], peer, child, complete),

@@ -1,6 +1,6 @@
 //! Keeps the last whole checkpoint, and gives it back before the command starts again.
 //!
-//! The evaluator truncates its file before it writes it anew. Whoever is killed in between leaves half of a file, from which
+//! The evaluator truncates its file before it writes it anew. An evaluator that is killed in between leaves half of a file, from which
 //! the next evaluator would start at the first route. So each time the file was written, a copy of it is made in the agent's
 //! sub-folder of the status files, where nothing but this container writes.
 //!

@@ -76,7 +76,7 @@ struct Written {
 }
 
 impl Folders {
-    /// Watches `root` and `folders` in it, and whoever has written `file`. Without inotify (`LEADERBOARD_INOTIFY=off`, or the
+    /// Watches `root` and `folders` in it, and the writers of `file`. Without inotify (`LEADERBOARD_INOTIFY=off`, or the
     /// node has none left) the caller's slow poll does alone.
     pub(crate) fn watch(root: &Path, folders: &[String], file: Option<&Path>) -> Self {
         let inotify = if env::var_os("LEADERBOARD_INOTIFY").is_some_and(|value| value == "off") {

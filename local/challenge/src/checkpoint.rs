@@ -182,7 +182,7 @@ impl Checkpoint {
     }
 }
 
-/// Truncates, then writes in pieces, calling `between` before each: whoever reads meanwhile sees an empty or half file.
+/// Truncates, then writes in pieces, calling `between` before each: a reader meanwhile finds an empty or half file.
 pub fn write_in_pieces(path: &Path, text: &str, mut between: impl FnMut()) -> io::Result<()> {
     const PIECES: usize = 4;
     let mut file = File::create(path)?;

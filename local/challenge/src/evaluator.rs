@@ -298,7 +298,7 @@ impl Worker<'_> {
         self.file.routes.global_record = Some(global);
     }
 
-    /// Routes of real challenges take minutes, those of tests must take at least as long as whoever copies the checkpoint.
+    /// Routes of real challenges take minutes, those of tests must take at least as long as a copy of the checkpoint.
     fn await_copy(&self) {
         let Some(copy) = &self.route_copy else { return };
         let begin = Instant::now();

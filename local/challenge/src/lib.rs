@@ -1,5 +1,5 @@
 //! Stand-ins for the images of a challenge: a simulator and an agent that behave as CARLA and the Leaderboard do towards
-//! whoever runs them, in milliseconds and without a GPU. The programs in `bin/` call `simulator::run` and
+//! the programs that run them, in milliseconds and without a GPU. The programs in `bin/` call `simulator::run` and
 //! `evaluator::run`. Nothing here knows the operator: it is written from the Leaderboard's own behaviour, so that it
 //! can contradict the operator.
 

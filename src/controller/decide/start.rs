@@ -15,20 +15,20 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, State, names, reasons};
 
-/// What is said of a Pod that does as it should.
-pub(super) const PREPARED: &str = "Its Pod is being prepared.";
-const LOST: &str = "Its Pod was lost; the Job makes another one, which goes on from S3.";
+/// The message for a Pod that starts as it should.
+pub(super) const PREPARED: &str = "The Pod is being prepared.";
+const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
 /// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then. Less than the minute
 /// in which people want to see a cause.
 const SILENCE: i64 = 45;
-/// The minutes of silence that are told: a count of every one would be a write each.
-const TOLD_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
+/// The minutes of silence that are reported: a count of every one would be a write each.
+const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
 /// How long a new Pod may find no node before that is shown: the Pod whose slot it got may still be leaving.
 const SETTLE_SECONDS: i64 = 5;
 /// How long a Job may take to make its Pod before that is shown.
 const POD_SECONDS: i64 = 45;
 
-/// Says how far a Job's Pod is, and fails the attempt when a start has taken too long.
+/// Reports how far a Job's Pod is, and fails the attempt when a start has taken too long.
 pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
     let view = draft.view;
     let Some(pod) = &view.pod else {
@@ -71,15 +71,15 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
     }
 }
 
-/// What is said of a run whose node is away, before Kubernetes has given its Pod up.
+/// The message for a run whose node is away, before Kubernetes has given its Pod up.
 fn left_by_node(draft: &Draft<'_>, pod: &PodView) -> Option<String> {
     let node = pod.node.as_deref().filter(|_| draft.is_running())?;
     match draft.view.node {
         NodeSight::Gone => Some(format!(
-            "Its Pod was lost with its node: {node} is gone. The Job makes another one, which goes on from S3."
+            "The Pod was lost with its node {node}. A new Pod will resume from the results in S3."
         )),
         NodeSight::Silent { since } => Some(format!(
-            "Its node {node} has been silent since {since:.0}. If that lasts, its Pod is given up, and another one goes on from S3."
+            "Node {node} has been silent since {since:.0}. If that lasts, the Pod is given up, and a new Pod will resume from the results in S3."
         )),
         NodeSight::Reports | NodeSight::Unknown => None,
     }
@@ -102,7 +102,7 @@ fn show_running(draft: &mut Draft<'_>) {
     let message = progress.map(|p| format!("{} routes done.", p.text)).unwrap_or_default();
     draft.moves();
     draft.condition(conditions::RUNNING, Truth::True, reason, "");
-    // A changed count is progress, not a transition: `say` tells events only when state or reason moved.
+    // A changed count is progress, not a transition: `say` sends events only when state or reason changed.
     draft.say(state, reason, message);
 }
 
@@ -111,7 +111,7 @@ fn show_trouble(draft: &mut Draft<'_>, found: &Trouble, has_started: bool) {
     if draft.is_running() && !has_started {
         replacing(
             draft,
-            &format!("Its Pod was lost, and the new one waits. {}", found.message),
+            &format!("The Pod was lost, and the new one waits. {}", found.message),
         );
     } else {
         draft.say(draft.live_state(), found.reason, found.message.clone());
@@ -125,13 +125,13 @@ fn show_preparing(draft: &mut Draft<'_>, pod: &PodView, since: Timestamp) {
         draft.requeue_at(after(since, SILENCE));
         PREPARED.to_owned()
     } else {
-        let told = TOLD_MINUTES.iter().rev().find(|m| silent >= **m * 60);
+        let told = REPORTED_MINUTES.iter().rev().find(|m| silent >= **m * 60);
         let long = told.map_or_else(String::new, |m| format!(", for over {m} min"));
         let node = pod.node.as_deref().map(|n| format!(" on {n}")).unwrap_or_default();
-        format!("Its Pod is being prepared{node}: {}{long}.", stage(pod))
+        format!("The Pod is being prepared{node}: {}{long}.", stage(pod))
     };
     if draft.is_running() {
-        replacing(draft, &format!("Its Pod was lost. {message}"));
+        replacing(draft, &format!("The Pod was lost. {message}"));
     } else {
         draft.say(State::Pending, reasons::PREPARING, message);
     }
@@ -151,7 +151,7 @@ fn stage(pod: &PodView) -> &'static str {
     } else if ended(names::CONTAINER_WORKSPACE) {
         "logcopy starts"
     } else if ended(names::CONTAINER_CONTENTS) {
-        "its workspace is filled"
+        "the workspace is filled"
     } else {
         "images are pulled and contents copied"
     }
@@ -162,17 +162,17 @@ fn without_pod(draft: &mut Draft<'_>, job: &JobView) {
     if let Some(words) = &job.failed_create {
         let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
         let (reason, what) = if is_quota {
-            (reasons::QUOTA_EXCEEDED, "The namespace's quota leaves no room")
+            (reasons::QUOTA_EXCEEDED, "The namespace's quota does not allow the Pod")
         } else {
-            (reasons::POD_REFUSED, "The API server refuses its Pod")
+            (reasons::POD_REFUSED, "The API server refuses the Pod")
         };
         let message = sentence(&format!("{what}: {words}"));
         wait_for_node(draft, job, reason, &message);
     } else if had_pod {
         replacing(draft, LOST);
     } else if job.created.is_some_and(|at| draft.now() >= after(at, POD_SECONDS)) {
-        let message = "Its Job has no Pod yet, and nobody says why. Look at the Job, and whether the cluster's \
-                       controller manager runs.";
+        let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
+                       cluster's controller manager runs.";
         draft.condition(conditions::STALLED, Truth::True, reasons::PREPARING, message);
         draft.say(State::Pending, reasons::PREPARING, message);
     }
@@ -199,14 +199,14 @@ fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &s
     if limit > 0 {
         let deadline = after(since.unwrap_or(draft.now()), limit);
         if draft.now() >= deadline {
-            let what = format!("No node took its Pod within {limit} s: {message}");
+            let what = format!("No node accepted the Pod within {limit} s: {message}");
             return draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
         }
         draft.requeue_at(deadline);
     }
     draft.condition(conditions::STALLED, Truth::True, reason, message);
     if draft.is_running() {
-        replacing(draft, &format!("Its Pod was lost, and the new one waits. {message}"));
+        replacing(draft, &format!("The Pod was lost, and the new one waits. {message}"));
     } else {
         draft.say(State::Pending, reason, message);
     }
@@ -233,9 +233,9 @@ fn too_late(found: &Trouble, seconds: i64) -> Failure {
 }
 
 fn start_deadline(pod: &PodView, seconds: i64) -> Failure {
-    let node = pod.node.as_deref().unwrap_or("its node");
+    let node = pod.node.as_deref().unwrap_or("the node");
     let what = format!(
-        "Its Pod did not start within {seconds} s, and {node} does not say why: {}.",
+        "The Pod did not start within {seconds} s, and {node} reports no reason: {}.",
         stage(pod)
     );
     failure::infrastructure(reasons::START_DEADLINE, &what)

@@ -1,6 +1,6 @@
 //! Which replica leads: a Lease of our own, and the fence that every write outside the cluster passes.
 //!
-//! `main` starts it once; whoever writes to EvalAI or DynamoDB asks `Fence::may_write` right before. `decide` is pure,
+//! `main` starts it once; every writer to EvalAI or DynamoDB asks `Fence::may_write` right before. `decide` is pure,
 //! `record` translates between Leases and what `decide` reads, `elector` does the calls. Knows no Submission.
 //!
 //! What is promised: at any moment at most one process may write, also when processes are paused, answers are lost and
@@ -177,7 +177,7 @@ pub fn start(client: kube::Client, settings: Settings, seen: &Observability) -> 
 }
 
 impl Leader {
-    /// Where this process stands, now and later. `Lost` is the last that is told.
+    /// Where this process stands, now and later. `Lost` is the last value.
     pub fn leadership(&self) -> watch::Receiver<Leadership> {
         self.leadership.clone()
     }

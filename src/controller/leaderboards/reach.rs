@@ -217,7 +217,7 @@ mod tests {
             ("good", vec![(0, Finding::Good)], vec![(0, None), (10_000, None)]),
             ("bad", vec![(0, bad())], vec![(0, Some(False))]),
             ("hidden", vec![(0, hidden())], vec![(0, Some(Unknown))]),
-            ("mended", vec![(0, bad()), (5, Finding::Good)], vec![(5, None)]),
+            ("fixed", vec![(0, bad()), (5, Finding::Good)], vec![(5, None)]),
             ("never answered", vec![(0, silent())], vec![(0, Some(Unknown))]),
             (
                 "away for a minute",

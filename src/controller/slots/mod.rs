@@ -2,7 +2,7 @@
 //!
 //! A submission joins the line of its Leaderboard when all but the slot is settled (`Action::JoinLine`), and the answer wakes
 //! it. A granted slot is a reservation until the watch shows its Job, or until it turns out that none comes. Fed by the watches
-//! of Submissions, Jobs and Leaderboards and by the reconciles. No call here waits for anything: whoever is next does not depend
+//! of Submissions, Jobs and Leaderboards and by the reconciles. No call here waits for anything: the next in line does not depend
 //! on a bucket, a token or another Leaderboard. The order of the line is `turns`, which is pure.
 
 mod line;
@@ -109,7 +109,7 @@ impl SlotAllocator {
         self.change(&board_of(submission), |line| line.join(name, attempt, place));
     }
 
-    /// Its Job is about to be created, or is there.
+    /// The Job is about to be created, or exists.
     pub fn starts(&self, submission: &Submission) {
         self.change(&board_of(submission), |line| line.starts(&uid_of(submission)));
     }

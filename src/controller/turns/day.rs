@@ -39,7 +39,7 @@ impl Day {
         self.line.push(waiting(&format!("{:06}", self.number), team, self.now));
     }
 
-    /// Starts whoever may, then goes on to the next end. Hands back the team that ended.
+    /// Starts all that may start, then goes on to the next end. Returns the team that ended.
     fn step(&mut self) -> String {
         self.past.occupied = self.running.iter().map(|(_, team)| team.clone()).collect();
         let turns = turns(&self.line, &self.past, limits(self.slots));

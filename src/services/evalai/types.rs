@@ -70,7 +70,7 @@ pub struct Run {
     pub job: String,
     /// A person has begun it here: EvalAI has not asked for it by a message, nor by its row.
     pub by_hand: bool,
-    /// Its Job was made.
+    /// The Job was created.
     pub has_job: bool,
 }
 

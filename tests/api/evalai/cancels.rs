@@ -170,7 +170,7 @@ async fn measure(what: &str, list_delay_ms: u64, requests_per_minute: u32) {
     );
 }
 
-/// Cancels each at a random moment; all that are left wish for newer partial results in each period.
+/// Cancels each at a random moment; all that are left request newer partial results in each period.
 async fn cancel_all(world: &World, pks: &[i64]) -> BTreeMap<i64, Timestamp> {
     let mut moments: Vec<_> = pks.iter().map(|pk| (OVER.mul_f64(fastrand::f64()), *pk)).collect();
     moments.sort();

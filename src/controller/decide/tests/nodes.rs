@@ -19,7 +19,7 @@ fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
     let wanted = |a: &Action| matches!(a, Action::TakeOwnership | Action::ForceDeletePod { .. });
     assert_eq!(plan.actions.iter().filter(|a| wanted(a)).count(), 2);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 0, .. })));
-    // A crash of ours before the actions: they are wished again.
+    // A crash of ours before the actions: they are requested again.
     assert!(has(&world.pass(), |a| matches!(a, Action::ForceDeletePod { .. })));
     world.job().deleting = true;
     world.pass_to(Running, reasons::REPLACING);
@@ -68,7 +68,7 @@ fn a_node_that_is_away_is_told_before_kubernetes_gives_its_pod_up() {
         )));
         world.view.node = NodeSight::Reports;
         world.pass_to(Running, reasons::RUNNING);
-        // Of one that is being stopped the stop is told.
+        // For one that is being stopped, the stop is shown.
         world.view.node = node;
         world.submission().spec.cancel = true;
         world.pass_to(Running, reasons::STOPPING);

@@ -218,7 +218,7 @@ fn a_silent_kubelet_fails_as_infrastructure_after_start_seconds() {
     world.job_gone();
     let failure = world.pass_to(Failed, reasons::START_DEADLINE).status.failure.unwrap();
     assert_eq!(failure.class, Infrastructure);
-    assert!(failure.message.contains("node-a does not say why"));
+    assert!(failure.message.contains("node-a reports no reason"));
 }
 
 #[test]
