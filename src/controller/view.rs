@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use leaderboard_runner::verdict::Verdict;
 
 use super::archive::digest::{ReportDigest, ReportId};
 pub use super::turns::Turn;
@@ -146,9 +147,11 @@ pub struct EndView {
     /// When this life of it began.
     pub began: Option<Timestamp>,
     pub at: Option<Timestamp>,
-    /// The runner's word for it, `exited`, `idle`, `peerCrashed`, …; `incomplete` if the command ended well by itself.
-    pub what: Option<String>,
-    /// The runner's or Kubernetes' sentence.
+    /// What the runner of a simulator or agent reported. An agent can forge its own.
+    pub verdict: Option<Verdict>,
+    /// The reason that a container of the host's reported, such as `PrefixInUse`.
+    pub own_reason: Option<String>,
+    /// The sentence of a container of the host's, or Kubernetes' own.
     pub why: Option<String>,
 }
 

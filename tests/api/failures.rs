@@ -25,6 +25,7 @@ use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::pod::report::{OWNER_KEY, Owner};
 use leaderboard_operator::services::archive::Archive;
+use leaderboard_runner::verdict::{Verdict, What};
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;
@@ -269,15 +270,20 @@ fn ago(seconds: i64) -> String {
     at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
 }
 
-/// The Pod's status after the crash. What the agent leaves as its last word is no verdict of a runner.
+/// The Pod's status after the crash. What the agent leaves as its last message is no verdict of a runner; its simulator's runner
+/// has followed it.
 fn crashed() -> Value {
     let now = ago(0);
     let mut status = running();
-    let word = json!({"reason": ROUTE, "message": ROUTE}).to_string();
-    let agent = &mut status["containerStatuses"][1];
-    agent["ready"] = json!(false);
-    agent["state"] =
-        json!({"terminated": {"exitCode": 1, "reason": "Error", "message": word, "startedAt": now, "finishedAt": now}});
+    let forged = json!({"reason": ROUTE, "message": ROUTE}).to_string();
+    let followed = Verdict::new(What::PeerCrashed, 0, "the agent crashed, so the server was stopped").to_json();
+    for (container, message) in [(0, followed), (1, forged)] {
+        let container = &mut status["containerStatuses"][container];
+        container["ready"] = json!(false);
+        container["state"] = json!({"terminated": {
+            "exitCode": 1, "reason": "Error", "message": message, "startedAt": now, "finishedAt": now,
+        }});
+    }
     status
 }
 

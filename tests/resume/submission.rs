@@ -109,10 +109,7 @@ impl Submission {
             .args([member.side.name(), &format!("--pair={}", member.pair)])
             .arg(format!("--status={}", places.status().display()))
             .args(["--grace-seconds=5", "--ready-seconds=60", "--peer-seconds=60"])
-            .env(
-                "LEADERBOARD_TERMINATION_LOG",
-                root.join(format!("{member}.termination")),
-            )
+            .arg(format!("--termination-log={}/{member}.termination", root.display()))
             .env_remove("RESUME")
             .env_remove("CHALLENGE_FORMAT");
         match member.side {

@@ -20,8 +20,10 @@ both:       --ready-seconds 3600   how long a server may take until its port ans
             --grace-seconds 20     between SIGTERM and SIGKILL
             --peer-seconds 600     how long to wait for the other side's end of a round
             --log-limit 2147483648 bytes of output that are kept in the log
+            --termination-log /dev/termination-log  where the verdict is written
 simulator:  --flush-seconds 1800   how long to hold the exit until the results are stored
             --cancel-seconds 120   the same after a cancel
+            --answer-seconds 10    how long a server may take to answer when its agent has crashed
             --log FILE             where output is kept, too
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
@@ -30,6 +32,9 @@ agent:      --work /tmp/agent      where leaderboard.log is written
 
 /// Where agents keep their results, as everywhere in the CARLA Leaderboard's cloud.
 const WORK: &str = "/tmp/agent";
+
+/// Where the kubelet reads a container's last message. A flag and no variable: the environment is the image's.
+const TERMINATION_LOG: &str = "/dev/termination-log";
 
 /// What one container is to do.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,6 +46,7 @@ pub struct Job {
     pub peer: Duration,
     /// Bytes of output that are kept in the log.
     pub log_limit: u64,
+    pub termination_log: PathBuf,
     pub role: Role,
     /// The command and its arguments; never empty.
     pub command: Vec<OsString>,
@@ -53,6 +59,7 @@ pub enum Role {
         port: u16,
         flush: Duration,
         cancel: Duration,
+        answer: Duration,
         log: Option<PathBuf>,
     },
     Agent {
@@ -126,6 +133,9 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         grace: options.seconds("--grace-seconds", 20)?,
         peer: options.seconds("--peer-seconds", 600)?,
         log_limit: options.optional("--log-limit", "a number of bytes")?.unwrap_or(2 << 30),
+        termination_log: options
+            .take("--termination-log")?
+            .map_or_else(|| TERMINATION_LOG.into(), PathBuf::from),
         role: role(side, &mut options)?,
         command,
     };
@@ -144,6 +154,7 @@ fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
                 .get(),
             flush: options.seconds("--flush-seconds", 1800)?,
             cancel: options.seconds("--cancel-seconds", 120)?,
+            answer: options.seconds("--answer-seconds", 10)?,
             log: options
                 .take("--log")?
                 .filter(|path| !path.is_empty())
@@ -265,9 +276,11 @@ mod tests {
                 port: 2100,
                 flush,
                 cancel: Duration::from_mins(2),
+                answer: Duration::from_secs(10),
                 log: None,
             }
         );
+        assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
         assert_eq!(job.log_limit, 2 << 30);
         assert_eq!(
             [job.ready, job.grace, job.peer].map(|time| time.as_secs()),

@@ -72,6 +72,10 @@ pub(crate) enum Cause {
     ChildEnded,
     Idle,
     NotReady,
+    /// The agent crashed, and the server does not answer any more.
+    ServerSilent,
+    /// The server failed while another process of the Pod listened on its port.
+    PortTaken,
     /// With the exit code of a shell that cannot start a command.
     CannotStart(i32),
     /// The status folder cannot be written, so nothing can be agreed.
@@ -224,7 +228,13 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
         Cause::AlreadyDone => silent(hold(Hold::Flush), 0),
         Cause::Cancelled => silent(hold(Hold::Cancel), 0),
         Cause::PeerDone => SIMULATOR_DONE,
-        Cause::PeerCrashed | Cause::ChildEnded | Cause::Idle | Cause::NotReady | Cause::CannotStart(_) => {
+        Cause::PeerCrashed
+        | Cause::ChildEnded
+        | Cause::Idle
+        | Cause::NotReady
+        | Cause::ServerSilent
+        | Cause::PortTaken
+        | Cause::CannotStart(_) => {
             let ran = !matches!(cause, Cause::NotReady | Cause::CannotStart(_));
             if side == Side::Simulator && seen.peer_done {
                 SIMULATOR_DONE

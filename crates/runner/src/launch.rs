@@ -4,10 +4,8 @@ use std::env;
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io;
-use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::Duration;
 
 use crate::checkpoint;
 use crate::group::{self, Group};
@@ -79,16 +77,6 @@ fn expand_all(words: &[OsString], environment: &[(&str, OsString)]) -> Vec<OsStr
     words.iter().map(|word| expand(word, lookup)).collect()
 }
 
-/// Whether a server answers on the port.
-pub(crate) fn answers(port: u16) -> bool {
-    let address = SocketAddr::from(([127, 0, 0, 1], port));
-    let Ok(stream) = TcpStream::connect_timeout(&address, Duration::from_millis(100)) else {
-        return false;
-    };
-    // A free port of the ephemeral range can be answered by our own end of the connection.
-    stream.local_addr().is_ok_and(|own| own != address)
-}
-
 /// The program's name, for messages.
 pub(crate) fn program(job: &Job) -> &OsStr {
     job.command
@@ -98,8 +86,6 @@ pub(crate) fn program(job: &Job) -> &OsStr {
 
 #[cfg(test)]
 mod tests {
-    use std::net::TcpListener;
-
     use super::*;
 
     #[test]
@@ -132,14 +118,5 @@ mod tests {
         let made = [("PATH", OsString::from("made")), ("RESUME", OsString::new())];
         let words = ["$(PATH)", "--resume=$(RESUME)", "$(NOBODY_HAS_THIS)"].map(OsString::from);
         assert_eq!(expand_all(&words, &made), ["made", "--resume=", "$(NOBODY_HAS_THIS)"]);
-    }
-
-    #[test]
-    fn a_port_answers_only_while_somebody_listens() {
-        let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
-        let port = listener.local_addr().unwrap().port();
-        assert!(answers(port));
-        drop(listener);
-        assert!(!answers(port));
     }
 }

@@ -10,6 +10,7 @@ mod launch;
 mod memory;
 mod report;
 mod run;
+mod server;
 mod tee;
 mod wake;
 

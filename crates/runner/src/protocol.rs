@@ -33,9 +33,12 @@ pub struct Pair(u16);
 pub struct NotAPair;
 
 impl Pair {
+    /// The highest number.
+    pub const MAX: u16 = 999;
+
     /// The pair with this number, if there may be one.
     pub const fn new(number: u16) -> Option<Self> {
-        if number >= 1 && number <= 999 {
+        if number >= 1 && number <= Self::MAX {
             Some(Self(number))
         } else {
             None

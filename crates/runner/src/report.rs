@@ -1,10 +1,10 @@
 //! The verdict: its sentence, and writing it where the kubelet finds it. Called by `run`.
 
-use std::env;
 use std::ffi::OsStr;
 use std::fs::OpenOptions;
 use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
 
 use leaderboard_runner::protocol::Side;
 use leaderboard_runner::verdict::{Verdict, What};
@@ -18,6 +18,7 @@ use crate::group::Status;
 #[derive(Debug)]
 pub(crate) struct End<'a> {
     pub(crate) side: Side,
+    pub(crate) round: u32,
     pub(crate) cause: Cause,
     /// How the command ended, if it was started.
     pub(crate) status: Option<Status>,
@@ -44,11 +45,10 @@ pub(crate) fn verdict(end: &End<'_>) -> Verdict {
         why.push_str(&results_text(results));
     }
     Verdict {
-        what: what(end),
         exit_code,
         signal,
         out_of_memory: end.out_of_memory,
-        why,
+        ..Verdict::new(what(end), end.round, why)
     }
 }
 
@@ -60,6 +60,8 @@ const fn what(end: &End<'_>) -> What {
         Cause::Cancelled => What::Cancelled,
         Cause::Idle => What::Idle,
         Cause::NotReady => What::NotReady,
+        Cause::ServerSilent => What::ServerSilent,
+        Cause::PortTaken => What::PortTaken,
         Cause::CannotStart(_) | Cause::Mute => What::CannotStart,
         Cause::ChildEnded => match end.status {
             Some(Status::Exited(_)) => What::Exited,
@@ -71,7 +73,7 @@ const fn what(end: &End<'_>) -> What {
 fn reason(end: &End<'_>) -> String {
     let of = |simulator: &str, agent: &str| if end.side == Side::Simulator { simulator } else { agent }.to_owned();
     match end.cause {
-        Cause::Terminated => "the container was told to end from outside".to_owned(),
+        Cause::Terminated => "the container was ended from outside".to_owned(),
         Cause::AlreadyDone => "the pair was done before this container began".to_owned(),
         Cause::PeerDone => "the agent is done, so the server was stopped".to_owned(),
         Cause::PeerCrashed => of(
@@ -84,6 +86,8 @@ fn reason(end: &End<'_>) -> String {
             "the server did not answer on its port in time",
             "the simulator was not ready in time",
         ),
+        Cause::ServerSilent => "the agent crashed, and the server does not answer any more".to_owned(),
+        Cause::PortTaken => "another process of the Pod listens on the server's port".to_owned(),
         Cause::CannotStart(_) | Cause::Mute => end.detail.unwrap_or("the command could not be started").to_owned(),
         Cause::ChildEnded => match end.status {
             Some(Status::Exited(code)) => format!("the command exited with code {code}"),
@@ -103,9 +107,7 @@ fn results_text(results: &Result<Checkpoint, Unreadable>) -> String {
 }
 
 /// Replaces the termination message by `verdict`. A container without that file goes without.
-pub(crate) fn write(verdict: &Verdict) {
-    let path = env::var_os("LEADERBOARD_TERMINATION_LOG");
-    let path = path.as_deref().unwrap_or(OsStr::new("/dev/termination-log"));
+pub(crate) fn write(path: &Path, verdict: &Verdict) {
     let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
     // Written in place: the file is a mount of its own, so nothing can be renamed over it.
     let opened = OpenOptions::new()
@@ -132,6 +134,7 @@ mod tests {
 
     const END: End<'_> = End {
         side: Side::Agent,
+        round: 2,
         cause: Cause::ChildEnded,
         status: Some(Status::Exited(3)),
         out_of_memory: false,
@@ -205,8 +208,8 @@ mod tests {
     fn the_numbers_are_the_commands_own() {
         let exited = verdict(&END);
         assert_eq!(
-            (exited.exit_code, exited.signal, exited.out_of_memory),
-            (Some(3), None, false)
+            (exited.round, exited.exit_code, exited.signal, exited.out_of_memory),
+            (Some(2), Some(3), None, false)
         );
         let killed = verdict(&End {
             status: Some(Status::Killed(Some(11))),

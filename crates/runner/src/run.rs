@@ -1,7 +1,7 @@
 //! One container's life: looks at the world, asks `decide`, does what it says. Called by `main`.
 //!
-//! All waiting is one `poll` over signals, changed folders and the command's output; a look once a second stands behind it.
-//! No policy here: what follows from what is `decide`'s.
+//! All waiting is one `poll` over signals, changed folders and the command's output; a look once a second stands behind it. No
+//! policy here: what follows from what is `decide`'s.
 
 use std::io;
 use std::os::fd::AsFd;
@@ -17,6 +17,7 @@ use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave
 use crate::group::{Group, spawn_code};
 use crate::keep::Keeper;
 use crate::launch;
+use crate::server::{self, Listener, Question};
 use crate::tee::Tee;
 use crate::wake::{Folders, Signals};
 use crate::{checkpoint, memory, report, say};
@@ -51,6 +52,8 @@ pub(crate) struct Runner {
     /// An agent's.
     keeper: Option<Keeper>,
     memory_kills: u64,
+    /// Another container listened on the server's port.
+    is_port_taken: bool,
     detail: Option<String>,
 }
 
@@ -83,14 +86,16 @@ impl Runner {
             tee: None,
             keeper,
             memory_kills: memory::kills(),
+            is_port_taken: false,
             detail: None,
         }
     }
 
     /// Lives, ends, and returns the exit code.
     pub(crate) fn run(mut self) -> i32 {
-        report::write(&Verdict::silent_death());
+        self.write_verdict(&Verdict::silent_death(self.round));
         let cause = self.live();
+        let cause = self.of_the_server(cause);
         self.end_processes();
         let conclusion = self.conclude(cause);
         let code = self.hold(conclusion);
@@ -148,15 +153,68 @@ impl Runner {
         if self.group.as_ref().is_some_and(|group| group.status().is_some()) {
             return Child::Ended;
         }
-        if let (Phase::Booting, Role::Simulator { port, .. }) = (self.phase, &self.job.role)
+        if let (Phase::Booting, Some((port, _))) = (self.phase, self.server())
             && Instant::now() >= self.next_probe
         {
             self.next_probe = Instant::now() + (self.since.elapsed() / 8).clamp(FIRST_PROBE, PROBE_EVERY);
-            if launch::answers(*port) {
+            if server::answers(port) && self.is_own_server(port) {
                 return Child::Ready;
             }
         }
         Child::Quiet
+    }
+
+    /// A simulator's port, and how long its server may take to answer.
+    const fn server(&self) -> Option<(u16, Duration)> {
+        match self.job.role {
+            Role::Simulator { port, answer, .. } => Some((port, answer)),
+            Role::Agent { .. } => None,
+        }
+    }
+
+    /// Whether it is this container's server that listens. Another container's listener is no readiness.
+    fn is_own_server(&mut self, port: u16) -> bool {
+        let listener = server::listener(port);
+        if listener == Listener::Foreign && !self.is_port_taken {
+            self.is_port_taken = true;
+            self.say(&format!("a process of another container listens on port {port}"));
+        }
+        listener == Listener::Own
+    }
+
+    /// What only the network shows of the end of a simulator: that its port is taken, or that its server hangs.
+    fn of_the_server(&mut self, cause: Cause) -> Cause {
+        let Some((port, answer)) = self.server() else {
+            return cause;
+        };
+        match (self.phase, cause) {
+            (Phase::Booting, Cause::ChildEnded | Cause::NotReady) => {
+                self.is_own_server(port);
+                if self.is_port_taken && server::may_agents_run(&self.job.status) {
+                    Cause::PortTaken
+                } else {
+                    cause
+                }
+            }
+            (Phase::Running, Cause::PeerCrashed) if self.is_server_silent(port, answer) => Cause::ServerSilent,
+            _ => cause,
+        }
+    }
+
+    /// Whether the server hangs. One that ends while it is asked does not.
+    fn is_server_silent(&mut self, port: u16, answer: Duration) -> bool {
+        let begin = Instant::now();
+        let mut question = Question::ask(port);
+        loop {
+            let has_ended = self.group.as_ref().is_none_or(|group| group.status().is_some());
+            if has_ended || self.terminated || question.as_mut().is_ok_and(Question::is_answered) {
+                return false;
+            }
+            if begin.elapsed() >= answer {
+                return true;
+            }
+            self.wait(Duration::from_millis(20));
+        }
     }
 
     /// Until the agent has been silent for too long.
@@ -198,6 +256,7 @@ impl Runner {
             return Err(self.too_many_crashes());
         }
         self.round = round + 1;
+        self.write_verdict(&Verdict::silent_death(self.round));
         if self.me.side == Side::Agent {
             self.since = Instant::now();
         }
@@ -319,13 +378,14 @@ impl Runner {
         let complete = matches!(&results, Some(Ok(found)) if found.complete);
         let verdict = report::verdict(&report::End {
             side: self.me.side,
+            round: self.round,
             cause,
             status: self.group.as_ref().and_then(Group::status),
             out_of_memory: ran && memory::kills() > self.memory_kills,
             results: results.as_ref(),
             detail: self.detail.as_deref(),
         });
-        report::write(&verdict);
+        self.write_verdict(&verdict);
         self.say(&verdict.why);
         let seen = self.look();
         self.announce_end(decide::conclude(self.me.side, cause, complete, &seen))
@@ -342,6 +402,7 @@ impl Runner {
         let detail = self.detail.as_deref();
         let end = report::End {
             side: self.me.side,
+            round: self.round,
             cause,
             status: None,
             out_of_memory: false,
@@ -349,7 +410,7 @@ impl Runner {
             detail,
         };
         let verdict = report::verdict(&end);
-        report::write(&verdict);
+        self.write_verdict(&verdict);
         self.say(&verdict.why);
         Conclusion {
             mark: None,
@@ -427,6 +488,10 @@ impl Runner {
             Err(error) => return Err(error),
         }
         Ok(input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true))
+    }
+
+    fn write_verdict(&self, verdict: &Verdict) {
+        report::write(&self.job.termination_log, verdict);
     }
 
     fn say(&self, text: &str) {

@@ -1,23 +1,29 @@
-//! What a container says about its own end, in `/dev/termination-log`, from where the kubelet copies it into the container
+//! What a container reports about its own end, in its termination message, from where the kubelet copies it into the container
 //! status.
 //!
-//! Written by the runner, parsed by the controller as hostile text (the agent's processes can write the same file while
-//! they live; the runner has the last word). Knows no file system.
+//! Written by the runner, parsed by the controller as hostile text: an agent's processes can write the same file while they
+//! live, so an agent's verdict can only count against the agent. Knows no file system.
 
+use serde::de::IntoDeserializer;
+use serde::de::value::{Error as ValueError, StrDeserializer};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// No verdict is longer, in bytes. Eleven containers share 12 KiB; at nine each may have 1365.
-pub const MAX_BYTES: usize = 1000;
+/// No verdict is longer, in bytes. The containers of a Pod share 12 KiB of termination messages: 16 pairs leave 351 bytes each.
+pub const MAX_BYTES: usize = 340;
+/// Nothing longer is parsed: what the version before wrote at most.
+const MAX_READ_BYTES: usize = 1000;
+/// Version of the document. Version 1 had no number and no round.
+pub const SCHEMA: u32 = 2;
 
-/// How the command of a container came to its end. Whether its results are complete is told by the container's exit code
+/// How the command of a container came to its end. Whether its results are complete is shown by the container's exit code
 /// (0) and by the status files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub enum What {
     /// It exited by itself, with `exitCode`.
     Exited,
-    /// It died of a signal nobody of us sent, `signal`.
+    /// It died of a signal that the runner did not send, `signal`.
     Killed,
     /// The agent printed nothing for too long and was stopped.
     Idle,
@@ -25,58 +31,84 @@ pub enum What {
     PeerCrashed,
     /// The submission was stopped (`simulation.cancel`), or its results were stored before this container began.
     Cancelled,
-    /// The container was told to end from outside (SIGTERM).
+    /// The container was ended from outside (SIGTERM).
     Stopped,
     /// The simulator's server did not answer in time, or the agent's simulator did not come.
     NotReady,
+    /// The agent crashed, and at that moment the simulator's server did not answer any more.
+    ServerSilent,
+    /// Another process of the Pod listens on the port of the simulator's server.
+    PortTaken,
     /// The command could not be started, or the status folder could not be written.
     CannotStart,
-    /// Written first and replaced at the end: who reads it sees a runner that was killed without a word.
+    /// Written first and replaced at the end: it stays when the runner is killed.
     SilentDeath,
     /// The simulator's agent is done: the orderly end of a simulator.
     Finished,
 }
 
-/// The verdict.
+/// The verdict. Its fields are in the order of their importance, since a message that is too long loses its end.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Verdict {
     /// How it ended.
     pub what: What,
+    /// The round that ended: crashes of this side before it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub round: Option<u32>,
+    /// [`SCHEMA`].
+    #[serde(default = "first_schema")]
+    pub schema: u32,
     /// The command's exit code, 0–255, if it exited.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exit_code: Option<i32>,
     /// The signal the command died of, if it did.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signal: Option<i32>,
     /// The kernel killed a process of this container for lack of memory while the command ran.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub out_of_memory: bool,
     /// One sentence for people.
+    #[serde(default)]
     pub why: String,
+}
+
+fn first_schema() -> u32 {
+    1
 }
 
 /// A termination message that is no verdict.
 #[derive(Debug, Error)]
 pub enum NotAVerdict {
-    /// Longer than [`MAX_BYTES`].
+    /// Longer than any version writes.
     #[error("the termination message is longer than a verdict can be ({0} bytes)")]
     TooLong(usize),
+    /// Of a version that is not known here.
+    #[error("the verdict has schema {0}; this version reads up to {SCHEMA}")]
+    Schema(u32),
     /// Not the JSON of a verdict.
     #[error("the termination message is no verdict: {0}")]
     Malformed(#[from] serde_json::Error),
 }
 
 impl Verdict {
-    /// The verdict that stands until another replaces it.
-    pub fn silent_death() -> Self {
+    /// A verdict of this version without numbers.
+    pub fn new(what: What, round: u32, why: impl Into<String>) -> Self {
         Self {
-            what: What::SilentDeath,
+            what,
+            round: Some(round),
+            schema: SCHEMA,
             exit_code: None,
             signal: None,
             out_of_memory: false,
-            why: "the container was killed before its runner could say why".to_owned(),
+            why: why.into(),
         }
+    }
+
+    /// The verdict that stands until another replaces it.
+    pub fn silent_death(round: u32) -> Self {
+        let why = "the container was killed before its runner could report why";
+        Self::new(What::SilentDeath, round, why)
     }
 
     /// Its JSON, at most [`MAX_BYTES`]; a longer `why` is cut.
@@ -92,12 +124,30 @@ impl Verdict {
         }
     }
 
-    /// Parses a container's termination message.
+    /// Parses a container's termination message. One whose end is missing is read as far as it goes.
     pub fn parse(message: &str) -> Result<Self, NotAVerdict> {
-        if message.len() > MAX_BYTES {
+        if message.len() > MAX_READ_BYTES {
             return Err(NotAVerdict::TooLong(message.len()));
         }
-        Ok(serde_json::from_str(message)?)
+        let verdict: Self = match serde_json::from_str(message) {
+            Ok(verdict) => verdict,
+            Err(error) => Self::of_beginning(message).ok_or(error)?,
+        };
+        if verdict.schema > SCHEMA {
+            return Err(NotAVerdict::Schema(verdict.schema));
+        }
+        Ok(verdict)
+    }
+
+    /// What the beginning of a verdict holds. A number without its end may lack digits, so it does not count.
+    fn of_beginning(message: &str) -> Option<Self> {
+        let (what, rest) = message.strip_prefix(r#"{"what":""#)?.split_once('"')?;
+        let what: StrDeserializer<'_, ValueError> = what.into_deserializer();
+        let round = rest.strip_prefix(r#","round":"#).and_then(|rest| rest.split_once(','));
+        Some(Self {
+            round: round.and_then(|(round, _)| round.parse().ok()),
+            ..Self::new(What::deserialize(what).ok()?, 0, "")
+        })
     }
 }
 
@@ -105,39 +155,73 @@ impl Verdict {
 mod tests {
     use super::*;
 
-    #[test]
-    fn the_json_is_the_documented_one() {
-        let verdict = Verdict {
-            what: What::PeerCrashed,
-            exit_code: None,
+    /// What each version wrote. A line stays here as long as a controller may meet it.
+    const GOLDEN: [(u32, &str); 2] = [
+        (1, r#"{"what":"peerCrashed","exitCode":null,"signal":15,"why":"w"}"#),
+        (
+            2,
+            r#"{"what":"peerCrashed","round":12,"schema":2,"signal":15,"why":"w"}"#,
+        ),
+    ];
+
+    fn followed() -> Verdict {
+        Verdict {
             signal: Some(15),
-            out_of_memory: false,
-            why: "w".to_owned(),
-        };
-        assert_eq!(
-            verdict.to_json(),
-            r#"{"what":"peerCrashed","exitCode":null,"signal":15,"why":"w"}"#
-        );
-        assert_eq!(Verdict::parse(&verdict.to_json()).unwrap(), verdict);
+            ..Verdict::new(What::PeerCrashed, 12, "w")
+        }
+    }
+
+    #[test]
+    fn the_json_is_the_documented_one_and_the_version_before_is_read() {
+        assert_eq!(followed().to_json(), GOLDEN[1].1);
+        for (schema, json) in GOLDEN {
+            let expected = Verdict {
+                schema,
+                round: (schema > 1).then_some(12),
+                ..followed()
+            };
+            assert_eq!(Verdict::parse(json).unwrap(), expected);
+        }
         let out_of_memory = Verdict {
             out_of_memory: true,
-            ..verdict
+            ..followed()
         };
         assert!(out_of_memory.to_json().contains(r#""outOfMemory":true"#));
         assert_eq!(Verdict::parse(&out_of_memory.to_json()).unwrap(), out_of_memory);
+        let newer = GOLDEN[1].1.replace("\"schema\":2", "\"schema\":3");
+        assert!(matches!(Verdict::parse(&newer), Err(NotAVerdict::Schema(3))));
     }
 
     #[test]
     fn a_long_reason_is_cut_below_the_limit_whatever_its_characters() {
         for filler in ["a", "\u{1}", "é", "\"", "🚗"] {
             let verdict = Verdict {
-                why: filler.repeat(5000),
-                ..Verdict::silent_death()
+                exit_code: Some(255),
+                signal: Some(64),
+                out_of_memory: true,
+                ..Verdict::new(What::PeerCrashed, 1000, filler.repeat(5000))
             };
             let json = verdict.to_json();
             assert!(json.len() <= MAX_BYTES, "{} bytes", json.len());
             assert!(Verdict::parse(&json).unwrap().why.starts_with(filler));
         }
+    }
+
+    #[test]
+    fn a_cut_verdict_is_read_as_far_as_it_goes() {
+        let json = followed().to_json();
+        for (cut, round) in [
+            (r#"{"what":"peerCrashed","#, None),
+            (r#"{"what":"peerCrashed","round":1"#, None),
+            (r#"{"what":"peerCrashed","round":12"#, None),
+            (r#"{"what":"peerCrashed","round":12,"#, Some(12)),
+            (&json[..json.len() - 3], Some(12)),
+        ] {
+            assert!(json.starts_with(cut));
+            let verdict = Verdict::parse(cut).unwrap();
+            assert_eq!((verdict.what, verdict.round), (What::PeerCrashed, round), "{cut}");
+        }
+        assert!(Verdict::parse(r#"{"what":"peerCra"#).is_err());
     }
 
     #[test]
@@ -147,7 +231,7 @@ mod tests {
             "Error",
             "{}",
             r#"{"what":"won","why":""}"#,
-            r#"{"what":"idle"}"#,
+            r#"{"why":"idle"}"#,
             &"x".repeat(5000),
         ] {
             assert!(Verdict::parse(message).is_err(), "{message}");

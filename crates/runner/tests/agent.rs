@@ -121,6 +121,21 @@ fn an_agent_is_stopped_even_while_nobody_reads_its_output_and_none_of_it_is_lost
 }
 
 #[test]
+fn the_image_cannot_lead_the_verdict_elsewhere() {
+    let mut pod = pod();
+    let elsewhere = pod.path("elsewhere");
+    fs::write(&elsewhere, "").unwrap();
+    let variable = "LEADERBOARD_TERMINATION_LOG".to_owned();
+    pod.environment.push((variable, elsewhere.display().to_string()));
+    let forged = r#"{"what":"notReady","round":0,"why":""}"#;
+    let log = pod.path("agent-1.termination");
+    let mut agent = pod.agent(&format!("echo '{forged}' > {}; exit 3", log.display()));
+    assert_eq!(agent.code(), 1);
+    assert_eq!((agent.verdict().what, agent.verdict().round), (What::Exited, Some(0)));
+    assert_eq!(fs::read_to_string(elsewhere).unwrap(), "");
+}
+
+#[test]
 fn a_silent_agent_is_stopped_and_judged() {
     let pod = pod();
     let mut agent = pod.agent_running(&["sh", "-c", "echo hello; exec sleep 1000"], &["--idle-seconds=1"]);

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
-use super::{failure, reading};
+use super::{crashes, failure, reading};
 use crate::controller::archive::digest::ReportDigest;
 use crate::controller::view::{JobEnd, ReportSight, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
@@ -62,7 +62,7 @@ pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
         return cancelled(draft, reason, message);
     }
     let recorded = draft.status.failure.clone();
-    let recorded = recorded.filter(|found| !report.is_some_and(|r| failure::is_refusal(&draft.status, found, r)));
+    let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
     let found = recorded.unwrap_or_else(|| cause(draft, report, complete, job_end));
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
@@ -182,10 +182,10 @@ fn retry(draft: &mut Draft<'_>, found: &Failure) {
         pair.crashes = 0;
         pair.last = None;
     }
-    let what = failure::what_happened(found);
+    let what = &found.message;
     let message = format!("{what} It is tried again in {delay} s; this costs no attempt.");
     draft.moves();
-    draft.condition(conditions::RUNNING, Truth::False, &found.reason, &what);
+    draft.condition(conditions::RUNNING, Truth::False, &found.reason, what);
     draft.say(State::Pending, reasons::REPLACING, message);
     draft.requeue_at(at);
 }
@@ -199,6 +199,7 @@ fn finished(draft: &mut Draft<'_>, report: &ReportDigest) {
 
 /// Ends as Failed; nothing needs to be stopped any more.
 pub(super) fn failed(draft: &mut Draft<'_>, found: Failure) {
+    let found = failure::at_the_end(found);
     let (reason, message) = (found.reason.clone(), found.message.clone());
     draft.status.failure = Some(found);
     close(draft, State::Failed, &reason, &message);

@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 
 use super::draft::{Draft, after};
-use super::{Action, Tell, accept, end, failure, isolation, job_name, line, reading, start, stop};
+use super::{Action, Tell, accept, crashes, end, failure, isolation, job_name, line, reading, start, stop};
 use crate::controller::archive::digest::ReportDigest;
 use crate::controller::view::{JobSight, JobView, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
@@ -255,7 +255,8 @@ fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
     let times = &mut draft.status.times;
     times.scheduled = times.scheduled.take().or(pod.scheduled.map(Time));
     times.started = times.started.take().or(pod.agent_started.map(Time));
-    failure::note_ends(&mut draft.status, pod);
+    let now = draft.now();
+    crashes::note(&mut draft.status, pod, now);
 }
 
 fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
@@ -307,7 +308,7 @@ fn note_scores(draft: &mut Draft<'_>, report: &ReportDigest) {
 /// Limits of a run under way: disk, crashes, time.
 fn watch_run(draft: &mut Draft<'_>) {
     let evicted = draft.view.pod.as_ref().and_then(failure::disk_full);
-    if let Some(found) = evicted.or_else(|| failure::retries_used_up(draft)) {
+    if let Some(found) = evicted.or_else(|| crashes::too_many(draft)) {
         return draft.fail(found);
     }
     // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.

@@ -1,11 +1,14 @@
 //! What is to be done for one submission: a pure function from a `View` to a `Plan`.
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
-//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `failure`
-//! names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
+//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `blame`
+//! decides whose fault a crash was, `crashes` counts them, `failure` names the
+//! causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
 mod after;
+mod blame;
+mod crashes;
 mod draft;
 mod end;
 mod failure;

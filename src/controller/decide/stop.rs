@@ -76,13 +76,10 @@ fn show(draft: &mut Draft<'_>) {
     let failure = draft.status.failure.as_ref().filter(|_| !draft.is_cancelled());
     let message = match failure {
         Some(failure) if failure.reason == reasons::NODE_LOST => {
-            let what = failure::what_happened(failure);
+            let what = failure.message.clone();
             return start::replacing(draft, &what);
         }
-        Some(failure) => format!(
-            "{} It is being stopped; what it has reached is kept.",
-            failure::what_happened(failure)
-        ),
+        Some(failure) => format!("{} It is being stopped; what it has reached is kept.", failure.message),
         None => "It is being stopped as wished; what it has reached is kept.".to_owned(),
     };
     draft.say(draft.live_state(), reasons::STOPPING, message);
@@ -180,7 +177,7 @@ fn given_up_at(node: NodeSight, pod: &PodView) -> Option<Timestamp> {
 /// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
 pub(super) fn leave_lost_pod(draft: &mut Draft<'_>, job: &JobView, pod: &PodView) {
     let found = failure::node_lost(pod.node.as_deref(), draft.view.node);
-    start::replacing(draft, &failure::what_happened(&found));
+    start::replacing(draft, &found.message);
     draft.fail(found);
     if force(draft, pod) {
         draft.act(delete(job, 0));

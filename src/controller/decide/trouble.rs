@@ -108,14 +108,14 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     if !is_init {
         return None;
     }
-    if name == names::CONTAINER_WORKSPACE && end.what.as_deref() == Some(reasons::PREFIX_IN_USE) {
+    if name == names::CONTAINER_WORKSPACE && end.own_reason.as_deref() == Some(reasons::PREFIX_IN_USE) {
         let why = end.why.as_deref().unwrap_or(PREFIX_IN_USE);
         return Some(Trouble {
             is_hopeless: true,
             ..trouble(reasons::PREFIX_IN_USE, why, false)
         });
     }
-    if name == names::CONTAINER_WORKSPACE && end.what.as_deref() == Some(reasons::NOT_ISOLATED) {
+    if name == names::CONTAINER_WORKSPACE && end.own_reason.as_deref() == Some(reasons::NOT_ISOLATED) {
         // Another try of the same Pod would find the same; the next Pod may get another node.
         return Some(Trouble {
             is_hopeless: true,

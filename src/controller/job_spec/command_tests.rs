@@ -306,6 +306,7 @@ fn the_runner_is_told_the_deadlines() {
             port: 2200,
             flush: seconds(50),
             cancel: seconds(40),
+            answer: Duration::from_secs(10),
             log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
         }
     );

@@ -4,7 +4,8 @@ use k8s_openapi::api::core::v1::{
     ContainerState, ContainerStateTerminated, ContainerStatus, Pod, PodCondition, PodStatus,
 };
 use kube::ResourceExt;
-use leaderboard_runner::verdict::{Verdict, What};
+use leaderboard_runner::protocol::Member;
+use leaderboard_runner::verdict::Verdict;
 
 use crate::controller::view::{ContainerView, EndView, PodView};
 use crate::pod::run::Stop;
@@ -131,11 +132,11 @@ fn container(status: &ContainerStatus) -> ContainerView {
 fn last_end(status: &ContainerStatus, state: &ContainerState) -> Option<EndView> {
     let before = status.last_state.as_ref().and_then(|s| s.terminated.as_ref());
     let ended = state.terminated.as_ref().or(before)?;
-    Some(end(ended, may_speak(&status.name, ended)))
+    Some(end(&status.name, ended))
 }
 
 /// Whose words are passed on to people. A stranger's program can write whatever it likes where the runner leaves its
-/// verdict, for example a private route; of that only the verdict's closed words are taken.
+/// verdict, for example a private route; of that only a verdict's closed words and numbers are used.
 fn may_speak(container: &str, ended: &ContainerStateTerminated) -> bool {
     let is_hosts = [
         names::CONTAINER_CONTENTS,
@@ -147,10 +148,15 @@ fn may_speak(container: &str, ended: &ContainerStateTerminated) -> bool {
     is_hosts || matches!(ended.reason.as_deref(), Some("StartError" | "ContainerCannotRun"))
 }
 
-fn end(terminated: &ContainerStateTerminated, may_speak: bool) -> EndView {
+fn end(container: &str, terminated: &ContainerStateTerminated) -> EndView {
     let message = terminated.message.as_deref().unwrap_or_default();
-    let verdict = Verdict::parse(message).ok();
-    let foreign = Some(message).filter(|_| may_speak);
+    let is_behind_runner = Member::parse(container).is_some();
+    let verdict = Verdict::parse(message).ok().filter(|_| is_behind_runner);
+    let verdict = verdict.map(|verdict| Verdict {
+        why: short(&verdict.why),
+        ..verdict
+    });
+    let foreign = Some(message).filter(|_| may_speak(container, terminated));
     let out_of_memory = verdict.as_ref().is_some_and(|v| v.out_of_memory);
     let reason = terminated.reason.clone().unwrap_or_default();
     EndView {
@@ -158,28 +164,9 @@ fn end(terminated: &ContainerStateTerminated, may_speak: bool) -> EndView {
         exit_code: terminated.exit_code,
         began: terminated.started_at.as_ref().map(|t| t.0),
         at: terminated.finished_at.as_ref().map(|t| t.0),
-        what: verdict
-            .as_ref()
-            .map(|v| word(v).to_owned())
-            .or_else(|| foreign.and_then(foreign_word)),
-        why: verdict.map(|v| short(&v.why)).or_else(|| foreign.and_then(foreign_why)),
-    }
-}
-
-/// The runner's words as the failure policy knows them.
-fn word(verdict: &Verdict) -> &'static str {
-    match verdict.what {
-        What::Exited if verdict.exit_code == Some(0) => "incomplete",
-        What::Exited => "exited",
-        What::Killed => "killed",
-        What::Idle => "idle",
-        What::PeerCrashed => "peerCrashed",
-        What::Cancelled => "cancelled",
-        What::Stopped => "stopped",
-        What::NotReady => "notReady",
-        What::CannotStart => "cannotStart",
-        What::SilentDeath => "silentDeath",
-        What::Finished => "finished",
+        verdict,
+        own_reason: foreign.and_then(foreign_word),
+        why: foreign.and_then(foreign_why),
     }
 }
 
@@ -210,6 +197,7 @@ fn short(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use leaderboard_runner::verdict::What;
     use serde_json::json;
 
     use super::*;
@@ -228,11 +216,12 @@ mod tests {
         for container in ["agent-1", "simulator-1", "sidecar"] {
             for message in [forged, "route 7 begins at x=13"] {
                 let end = seen(container, "Error", message);
-                assert_eq!((end.what, end.why), (None, None), "{container}: {message}");
+                assert_eq!((end.own_reason, end.why), (None, None), "{container}: {message}");
+                assert_eq!(end.verdict, None);
             }
         }
         let told = seen("workspace", "Error", forged);
-        assert_eq!(told.what.as_deref(), Some("route 7 begins at x=13"));
+        assert_eq!(told.own_reason.as_deref(), Some("route 7 begins at x=13"));
         assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
         let kubelets = seen("agent-1", "StartError", "exec: no such file");
         assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
@@ -246,18 +235,22 @@ mod tests {
             assert_eq!(end.why.as_deref(), Some(harmless), "{container}");
         }
         let verdict = r#"{"what":"exited","exitCode":1,"signal":null,"why":"disk\u001b[2J\nfull"}"#;
-        assert_eq!(seen("agent-1", "Error", verdict).why.as_deref(), Some(harmless));
+        assert_eq!(seen("agent-1", "Error", verdict).verdict.unwrap().why, harmless);
         let long = seen("contents", "Error", &"x".repeat(5000)).why.unwrap();
         assert_eq!(long.chars().count(), LONGEST_MESSAGE);
     }
 
     #[test]
-    fn a_command_that_ended_well_without_results_has_a_word_of_its_own() {
-        for (code, word) in [("0", "incomplete"), ("1", "exited"), ("null", "exited")] {
-            let verdict = format!(r#"{{"what":"exited","exitCode":{code},"signal":null,"why":"it exited"}}"#);
-            let end = seen("agent-1", "Error", &verdict);
-            assert_eq!(end.what.as_deref(), Some(word), "{code}");
-        }
+    fn a_verdict_is_parsed_even_if_its_end_is_cut_off() {
+        let whole = r#"{"what":"exited","round":3,"schema":2,"exitCode":0,"why":"it exited"}"#;
+        let verdict = seen("agent-1", "Error", whole).verdict.unwrap();
+        assert_eq!(
+            (verdict.what, verdict.round, verdict.exit_code),
+            (What::Exited, Some(3), Some(0))
+        );
+        let cut = seen("simulator-1", "Error", &whole[..40]).verdict.unwrap();
+        assert_eq!((cut.what, cut.round), (What::Exited, Some(3)));
+        assert_eq!(seen("workspace", "Error", whole).verdict, None, "no runner is there");
     }
 
     #[test]

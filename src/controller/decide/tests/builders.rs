@@ -8,6 +8,7 @@ use serde_json::json;
 
 use super::rules;
 use crate::controller::archive::digest::ReportDigest;
+use crate::controller::decide::blame::is_crash;
 use crate::controller::decide::{Action, Plan, Tell, decide, job_name};
 use crate::controller::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobSight, JobView, NodeSight, ObservedFence,
@@ -17,6 +18,7 @@ use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::conditions;
 use leaderboard_api::{Leaderboard, LeaderboardSpec, State, Submission, SubmissionStatus, names};
+use leaderboard_runner::verdict::{Verdict, What};
 
 /// UID of every submission here.
 pub const UID: &str = "uid-1";
@@ -185,8 +187,25 @@ impl World {
             .to_vec();
     }
 
-    /// Puts one container in place of what the Pod has by its name.
+    /// Puts one container in place of what the Pod has by its name. A simulator that runs follows its agent's crash, as its
+    /// runner does.
     pub fn see(&mut self, container: ContainerView) {
+        let simulator = container.name.replace("agent-", "simulator-");
+        let follows = |c: &&ContainerView| c.name == simulator && c.name != container.name && c.running;
+        let runs = self.pod().containers.iter().any(|c| follows(&c));
+        let crash = container
+            .last
+            .as_ref()
+            .filter(|end| !container.running && is_crash(end));
+        if let Some(end) = crash.filter(|_| runs) {
+            let at = end.at.map_or(0, |at| at.as_second() - BEGIN);
+            self.see_alone(ended(&simulator, container.restarts, "peerCrashed", 1, at));
+        }
+        self.see_alone(container);
+    }
+
+    /// The same without what follows from it.
+    pub fn see_alone(&mut self, container: ContainerView) {
         let containers = &mut self.pod().containers;
         containers.retain(|c| c.name != container.name);
         containers.push(container);
@@ -301,8 +320,10 @@ pub fn waiting(name: &str, reason: &str, message: &str) -> ContainerView {
     }
 }
 
-/// A container that has ended after `restarts`, at this second, with this word of its runner.
+/// A container that has ended after `restarts`, at this second, with this verdict of its runner, or, before the agents, with
+/// this reason of its own. Each life of it had one round.
 pub fn ended(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64) -> ContainerView {
+    let verdict = verdict(what, u32::try_from(restarts).unwrap());
     ContainerView {
         name: name.into(),
         restarts,
@@ -311,11 +332,33 @@ pub fn ended(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64)
             exit_code,
             began: Some(at(second - 50)),
             at: Some(at(second)),
-            what: (!what.is_empty()).then(|| what.into()),
+            own_reason: (verdict.is_none() && !what.is_empty()).then(|| what.into()),
+            verdict,
             why: None,
         }),
         ..ContainerView::default()
     }
+}
+
+/// A container that runs again after so many restarts; its last life ended like this.
+pub fn restarted(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64) -> ContainerView {
+    ContainerView {
+        restarts,
+        running: true,
+        ..ended(name, restarts - 1, what, exit_code, second)
+    }
+}
+
+/// A verdict by its name; `incomplete` is a command that ended well by itself.
+fn verdict(what: &str, round: u32) -> Option<Verdict> {
+    if what == "incomplete" {
+        return Some(Verdict {
+            exit_code: Some(0),
+            ..Verdict::new(What::Exited, round, "")
+        });
+    }
+    let what = serde_json::from_value(json!(what)).ok()?;
+    Some(Verdict::new(what, round, ""))
 }
 
 /// A report of the present Pod with this many of the four routes done.

@@ -86,9 +86,10 @@ fn a_pair_that_always_fails_ends_the_run_by_its_cause() {
         let mut world = World::local().running();
         for (name, word) in [("agent-1", agent), ("simulator-1", simulator)] {
             if let Some(word) = word {
-                world.see(ended(name, 3, word, 1, 100));
+                world.see_alone(ended(name, 3, word, 1, 100));
             }
         }
+        world.go_to(221);
         let plan = world.pass_to(Running, reasons::STOPPING);
         let failure = plan.status.failure.clone().unwrap();
         assert_eq!((failure.reason.as_str(), failure.class), (reason, class), "{what}");
@@ -138,10 +139,8 @@ fn the_last_round_decides_whose_crash_it_was() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 1, "exited", 1, 100));
     world.pass();
-    let mut agent = ended("agent-1", 2, "exited", 1, 100);
-    agent.running = true;
-    world.see(agent);
-    world.see(ended("simulator-1", 3, "exited", 1, 900));
+    world.see_alone(restarted("agent-1", 2, "exited", 1, 100));
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 900));
     let failure = world.pass().status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
 }
@@ -149,50 +148,53 @@ fn the_last_round_decides_whose_crash_it_was() {
 #[test]
 fn a_simulators_crash_of_an_earlier_round_does_not_excuse_the_agent() {
     let mut world = World::local().running();
-    let mut simulator = ended("simulator-1", 1, "exited", 1, 100);
-    simulator.running = true;
-    world.see(simulator);
-    world.see(ended("agent-1", 3, "exited", 1, 900));
-    let failure = world.pass().status.failure.unwrap();
+    world.see_alone(restarted("simulator-1", 1, "exited", 1, 100));
+    // The agent waited for its simulator and then ran for hours, in one life.
+    let mut agent = ended("agent-1", 3, "exited", 1, 9000);
+    agent.last.as_mut().unwrap().began = Some(at(60));
+    world.see_alone(agent);
+    world.go_to(9001);
+    world.pass_to(Running, reasons::RUNNING);
+    world.go_to(9120);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::AGENT_CRASHED);
 }
 
+/// Whatever an agent leaves as its verdict, and whenever its simulator hears of it.
 #[test]
-fn ends_of_different_rounds_explain_nothing_of_each_other() {
-    for (agent, simulator, reason) in [
-        (("exited", 900), ("exited", 100), reasons::AGENT_CRASHED),
-        (("exited", 140), ("exited", 100), reasons::SIMULATION_CRASHED),
-        (("exited", 160), ("exited", 100), reasons::AGENT_CRASHED),
-    ] {
+fn an_agent_that_blames_its_simulator_is_charged() {
+    for word in ["notReady", "peerCrashed", "serverSilent", "portTaken"] {
         let mut world = World::local().running();
-        world.see(ended("agent-1", 3, agent.0, 1, agent.1));
-        world.see(ended("simulator-1", 3, simulator.0, 1, simulator.1));
-        let failure = world.pass().status.failure.unwrap();
-        assert_eq!(failure.reason, reason, "{agent:?} {simulator:?}");
+        world.see_alone(ended("agent-1", 3, word, 1, 100));
+        world.go_to(101);
+        let plan = world.pass_to(Running, reasons::RUNNING);
+        assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None), "{word}");
+        assert!(plan.requeue.unwrap().as_secs() <= 120, "{word}");
+        let mut alone = world.clone();
+        alone.go_to(220);
+        world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 101));
+        for mut world in [world, alone] {
+            let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+            let found = (failure.reason.as_str(), failure.charged);
+            assert_eq!(found, (reasons::AGENT_CRASHED, true), "{word}");
+            assert!(
+                failure.message.contains("blamed its simulator, which had not failed"),
+                "{word}"
+            );
+        }
     }
-    // The agent waited for its simulator and then ran for hours, in one life.
-    let mut world = World::local().running();
-    let mut booted = ended("simulator-1", 3, "exited", 1, 100);
-    booted.running = true;
-    world.see(booted);
-    let mut agent = ended("agent-1", 3, "exited", 1, 9000);
-    agent.last.as_mut().unwrap().began = Some(at(60));
-    world.see(agent);
-    assert_eq!(world.pass().status.failure.unwrap().reason, reasons::AGENT_CRASHED);
 }
 
-/// Its simulator, which obeys at once, may run again before the agent has ended.
 #[test]
-fn a_forger_that_takes_its_time_to_end_is_found_out_all_the_same() {
-    let mut simulator = ended("simulator-1", 4, "peerCrashed", 1, 80);
-    simulator.running = true;
+fn a_port_that_an_agent_has_taken_is_the_participants() {
     let mut world = World::local().running();
-    world.see(simulator);
-    world.see(ended("agent-1", 3, "peerCrashed", 1, 100));
+    world.see_alone(ended("simulator-2", 3, "portTaken", 1, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
     assert_eq!(
-        (failure.reason.as_str(), failure.charged),
-        (reasons::AGENT_CRASHED, true)
+        failure.message,
+        "Another container of the Pod listened on the port of simulator 2, which failed 4 times. Let the agents listen on no \
+         port of a simulator, and submit again."
     );
 }
 
@@ -200,74 +202,46 @@ fn a_forger_that_takes_its_time_to_end_is_found_out_all_the_same() {
 #[test]
 fn a_simulator_that_was_killed_without_a_word_long_before_its_agent_noticed_is_the_cause() {
     let mut world = World::local().running();
-    world.see(ended("simulator-1", 3, "silentDeath", 137, 100));
+    world.see_alone(restarted("simulator-1", 4, "silentDeath", 137, 100));
     let mut agent = ended("agent-1", 3, "peerCrashed", 1, 400);
     agent.last.as_mut().unwrap().began = Some(at(60));
-    world.see(agent);
+    world.see_alone(agent);
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
 }
 
 #[test]
-fn an_end_of_an_earlier_round_is_not_the_word_that_is_waited_for() {
-    let mut agent = ended("agent-1", 3, "peerCrashed", 1, 100);
-    agent.running = true;
+fn an_end_of_an_earlier_round_is_not_the_verdict_that_is_waited_for() {
     let mut world = World::local().running();
-    world.see(agent);
-    world.see(ended("simulator-1", 3, "peerCrashed", 1, 400));
+    world.see_alone(restarted("agent-1", 3, "peerCrashed", 1, 100));
+    world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 400));
     world.go_to(401);
     let plan = world.pass_to(Running, reasons::RUNNING);
     assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
-    world.see(ended("agent-1", 3, "idle", 1, 401));
+    world.see_alone(ended("agent-1", 3, "idle", 1, 401));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::IDLE);
 }
 
 #[test]
-fn a_word_that_has_not_come_until_the_next_crash_is_waited_for_no_longer() {
+fn a_simulator_that_is_ended_from_outside_each_time_is_the_cause() {
     let mut world = World::local().running();
-    for (restarts, second, reason) in [(3, 100, reasons::RUNNING), (4, 130, reasons::STOPPING)] {
-        world.see(ended("simulator-1", restarts, "stopped", 143, second));
-        world.see(ended("agent-1", restarts, "peerCrashed", 1, second));
-        world.go_to(second + 1);
-        world.pass_to(Running, reason);
-    }
-    assert_eq!(world.status().failure.unwrap().reason, reasons::SIMULATION_CRASHED);
+    world.see_alone(ended("simulator-1", 3, "stopped", 143, 100));
+    world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
 }
 
 #[test]
-fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_word() {
-    let mut old = ended("simulator-1", 2, "peerCrashed", 1, 60);
-    old.running = true;
+fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
     let mut world = World::local().running();
-    world.see(old);
-    world.see(ended("agent-1", 3, "peerCrashed", 1, 100));
+    world.see_alone(restarted("simulator-1", 3, "peerCrashed", 1, 40));
+    world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
     let plan = world.pass_to(Running, reasons::RUNNING);
     assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
-    let mut silent = world.clone();
-    world.see(ended("simulator-1", 3, "exited", 1, 100));
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
-
-    // It never comes: somebody from outside ends the simulator each time.
-    let mut stopped = silent.clone();
-    stopped.see(ended("simulator-1", 3, "stopped", 143, 100));
-    stopped.go_to(219);
-    stopped.pass_to(Running, reasons::RUNNING);
-    stopped.go_to(220);
-    let failure = stopped.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
-
-    // Or the Pod has gone with it.
-    silent.view.pod = None;
-    silent.leaderboard().retries.infrastructure = 0;
-    silent.job().end = Some(JobEnd::Failed {
-        at: None,
-        reason: "BackoffLimitExceeded".into(),
-        message: "no more".into(),
-    });
-    silent.view.report = ReportSight::Absent;
-    silent.pass_to(Failed, reasons::SIMULATION_CRASHED);
 }
 
 #[test]
@@ -284,11 +258,11 @@ fn a_count_without_a_cause_waits_for_it() {
 #[test]
 fn a_crash_that_only_the_simulator_has_told_of_waits_for_the_agents_own_word() {
     let mut world = World::local().running();
-    world.see(ended("simulator-1", 3, "peerCrashed", 1, 100));
+    world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 100));
     let plan = world.pass_to(Running, reasons::RUNNING);
     assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
     let mut late = world.clone();
-    world.see(ended("agent-1", 3, "idle", 1, 100));
+    world.see_alone(ended("agent-1", 3, "idle", 1, 100));
     let plan = world.pass_to(Running, reasons::STOPPING);
     assert_eq!(plan.status.failure.unwrap().reason, reasons::IDLE);
 

@@ -1,13 +1,13 @@
 //! Sentences: each failure has its own, with a next step that a retry leaves out.
 
 use super::builders::*;
-use crate::controller::decide::failure::{infrastructure, invalid_results, participant, what_happened};
+use crate::controller::decide::failure::{at_the_end, infrastructure, invalid_results, participant};
 use crate::controller::decide::next_steps::for_both;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, reasons};
 
 #[test]
-fn a_next_step_is_added_and_taken_off_again() {
+fn a_next_step_is_added_at_the_end() {
     for reason in [
         reasons::NODE_LOST,
         reasons::SIMULATION_CRASHED,
@@ -15,17 +15,17 @@ fn a_next_step_is_added_and_taken_off_again() {
         reasons::IMAGE_PULL,
     ] {
         let failure = infrastructure(reason, "It broke.");
-        assert!(failure.message.len() > "It broke. ".len(), "{reason}");
-        assert_eq!(what_happened(&failure), "It broke.");
+        assert_eq!(failure.message, "It broke.");
+        let ended = at_the_end(failure).message;
+        assert!(
+            ended.starts_with("It broke. ") && ended.contains("resume the submission"),
+            "{reason}: {ended}"
+        );
     }
-    assert_eq!(
-        infrastructure(reasons::PREFIX_IN_USE, "Taken. Empty it.").message,
-        "Taken. Empty it."
-    );
-    assert_eq!(
-        what_happened(&participant(reasons::IDLE, "Slow.", &for_both("Hurry."))),
-        "Slow. Hurry."
-    );
+    let taken = infrastructure(reasons::PREFIX_IN_USE, "Taken. Empty it.");
+    assert_eq!(at_the_end(taken).message, "Taken. Empty it.");
+    let slow = participant(reasons::IDLE, "Slow.", &for_both("Hurry."));
+    assert_eq!(at_the_end(slow).message, "Slow. Hurry.");
 }
 
 #[test]

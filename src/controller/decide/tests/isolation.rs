@@ -5,7 +5,7 @@ use std::sync::Arc;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use leaderboard_api::State::{Pending, Running};
+use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::{self, ACCEPTED, ISOLATED, STALLED, Truth};
 use leaderboard_api::{PolicySource, reasons};
 
@@ -117,12 +117,14 @@ fn a_pod_that_was_not_isolated_ends_at_once_and_is_tried_again_uncharged() {
     let failure = world.status().failure.unwrap();
     assert_eq!(
         (failure.reason.as_str(), failure.message.as_str()),
-        (
-            reasons::NOT_ISOLATED,
-            format!("{why} Then resume the submission.").as_str()
-        )
+        (reasons::NOT_ISOLATED, why)
     );
     assert!(!failure.charged);
+    let mut last = world.clone();
+    last.leaderboard().retries.infrastructure = 0;
+    last.job_gone();
+    let failure = last.pass_to(Failed, reasons::NOT_ISOLATED).status.failure.unwrap();
+    assert_eq!(failure.message, format!("{why} Then resume the submission."));
     world.job_gone();
     let plan = world.pass_to(Pending, reasons::REPLACING);
     assert_eq!(plan.status.retry, 1);

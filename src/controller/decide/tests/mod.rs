@@ -2,6 +2,7 @@
 
 mod accept;
 mod after;
+mod blame;
 mod builders;
 mod crashes;
 mod end;
