@@ -109,6 +109,7 @@ async fn bench(state: State) -> Bench {
         record: Some(RecordView::default()),
         partial_told: None,
         rerun_as: None,
+        simulator_failures_of_team: 0,
         evalai_writes_from: None,
     };
     Bench {

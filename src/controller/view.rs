@@ -40,6 +40,8 @@ pub struct View {
     pub partial_told: Option<u32>,
     /// The submission that re-runs this one, as its status says.
     pub rerun_as: Option<Rerun>,
+    /// Ended submissions of the same team and Leaderboard whose simulators failed within a day; counted only once this one crashes.
+    pub simulator_failures_of_team: usize,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
 }

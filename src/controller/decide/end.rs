@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after};
-use super::{crashes, failure, reading};
+use super::{allowance, crashes, failure, reading};
 use crate::controller::archive::digest::ReportDigest;
 use crate::controller::view::{JobEnd, ReportSight, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
@@ -67,6 +67,7 @@ pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
     }
+    let found = allowance::counted(draft, found);
     failed(draft, found);
 }
 
@@ -164,7 +165,10 @@ fn may_retry(draft: &Draft<'_>, found: &Failure) -> bool {
     let is_mendable = !NOT_MENDABLE.contains(&found.reason.as_str());
     // A higher attempt that is wished already takes the place of a retry.
     let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
-    is_mendable && is_latest && draft.status.retry < draft.retries().infrastructure
+    is_mendable
+        && is_latest
+        && !allowance::is_used_up(draft, found)
+        && draft.status.retry < draft.retries().infrastructure
 }
 
 fn retry(draft: &mut Draft<'_>, found: &Failure) {

@@ -2,11 +2,12 @@
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `blame`
-//! decides whose fault a crash was, `crashes` counts them, `failure` names the
+//! decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `failure` names the
 //! causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
 mod after;
+mod allowance;
 mod blame;
 mod crashes;
 mod draft;

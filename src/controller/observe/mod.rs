@@ -4,6 +4,7 @@ pub mod job;
 pub mod lookups;
 pub mod node;
 pub mod pod;
+pub mod team;
 
 use std::sync::Arc;
 
@@ -54,6 +55,12 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let known = |name: &str| context.stores.submissions.get(&ObjectRef::new(name).within(&namespace));
     let evalai = context.sync.evalai_view(leaderboard.as_deref(), &submission, known);
     let turn = context.slots.turn(&submission, leaderboard.as_deref());
+    let simulator_failures_of_team = if may_end(&submission, &job) {
+        let all = context.stores.submissions.state();
+        team::simulator_failures(all.iter().map(AsRef::as_ref), &submission, now)
+    } else {
+        0
+    };
     let partial_told = context.memory.partial_told(&submission);
     let rerun_as = context.reruns.of(&submission);
     let evalai_writes_from = context.sync.hub.writes_from();
@@ -76,8 +83,17 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
         record,
         partial_told,
         rerun_as,
+        simulator_failures_of_team,
         evalai_writes_from,
     }
+}
+
+/// Whether this may be the reconcile that ends it. Only then what other submissions came to is looked up.
+fn may_end(submission: &Submission, job: &JobSight) -> bool {
+    let is_under_way = matches!(job, JobSight::Ours(job) if job.end.is_none());
+    let Some(status) = &submission.status else { return false };
+    let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
+    status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
 }
 
 fn leaderboard(context: &Context, submission: &Submission, namespace: &str) -> Option<Arc<Leaderboard>> {

@@ -115,6 +115,7 @@ impl World {
                 record: Some(RecordView::default()),
                 partial_told: None,
                 rerun_as: None,
+                simulator_failures_of_team: 0,
                 evalai_writes_from: None,
             },
         }

@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::controller::view::{JobEnd, ReportSight};
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
-use leaderboard_api::State::{Failed, Finished, Running};
+use leaderboard_api::State::{Failed, Finished, Pending, Running};
 use leaderboard_api::reasons;
 
 /// How often each side of pair 1 ends how, and what comes of it.
@@ -242,6 +242,66 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
     world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn simulators_that_fail_in_each_job_are_counted_by_team() {
+    let mut world = World::local().running();
+    world.view.simulator_failures_of_team = 2;
+    for (retry, pause) in [(1, 10), (2, 20)] {
+        world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+        world.pass_to(Running, reasons::STOPPING);
+        world.complete();
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        assert_eq!(plan.status.retry, retry);
+        let message = plan.status.message.unwrap();
+        assert!(
+            message.ends_with(&format!("It is tried again in {pause} s; this costs no attempt.")),
+            "{message}"
+        );
+        world.job_gone();
+        world.wait(pause);
+        world.pass_to(Pending, reasons::PREPARING);
+        world.see_job();
+        world.view.pod = Some(pod(100));
+        world.see_agents();
+        world.view.report = ReportSight::NotRead;
+        world.pass_to(Running, reasons::RUNNING);
+    }
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    world.pass_to(Running, reasons::STOPPING);
+    world.complete();
+    let failure = world
+        .pass_to(Failed, reasons::SIMULATION_CRASHED)
+        .status
+        .failure
+        .unwrap();
+    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    assert_eq!(
+        failure.message,
+        "The simulator of pair 1 failed 4 times: it crashed. The attempt had 3 Jobs. Within a day 3 submissions of team t1 ended like this in \
+         this Leaderboard; after 3 of them a submission gets one Job only. Look at the simulator's log, then resume the submission; it \
+         repeats the route it was at."
+    );
+    assert!(!failure.participant_message.unwrap().contains("t1"));
+
+    let mut often = World::local().running();
+    often.view.simulator_failures_of_team = 3;
+    often.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    often.pass_to(Running, reasons::STOPPING);
+    often.complete();
+    let failure = often
+        .pass_to(Failed, reasons::SIMULATION_CRASHED)
+        .status
+        .failure
+        .unwrap();
+    assert!(
+        failure
+            .message
+            .contains("The attempt had 1 Job. Within a day 4 submissions of team t1"),
+        "{}",
+        failure.message
+    );
 }
 
 #[test]
