@@ -84,6 +84,18 @@ fn simulator(knobs: &str) -> Value {
     json!({"simulator": {"env": [{"name": "SIM_KNOBS", "value": knobs}]}})
 }
 
+/// The second pair's simulator crashes once, and the first pair's agent, which drives on, listens on its port from then on.
+fn taken_port() -> Value {
+    let agent = json!([
+        {"name": "AGENT_KNOBS", "value": "pair=1,take-port=2100"},
+        {"name": "ROUTE_MS", "value": "30000"},
+    ]);
+    with(
+        simulator("pair=2,crash@1"),
+        json!({"pairs": 2, "agent": {"env": agent}}),
+    )
+}
+
 fn with(mut change: Value, more: Value) -> Value {
     lay_over(&mut change, more);
     change
@@ -139,6 +151,16 @@ fn of_agents() -> Vec<Row> {
             "Failed InvalidResults (participant, charged); EvalAI failed",
         ),
         row(
+            "agent forges its verdict",
+            agent("forge-verdict@1"),
+            "Failed AgentCrashed (participant, charged); EvalAI failed",
+        ),
+        row(
+            "agent takes the port of another simulator",
+            taken_port(),
+            "Failed AgentCrashed (participant, charged); EvalAI failed",
+        ),
+        row(
             "sensors refused",
             agent("reject@2"),
             "Failed NotEligible (participant, charged); EvalAI failed",
@@ -170,6 +192,14 @@ fn of_simulators() -> Vec<Row> {
             "Finished; EvalAI finished",
         ),
         row("simulator crashes always", simulator("crash@1"), crashed),
+        row(
+            "simulator hangs",
+            with(
+                simulator("hang@2"),
+                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 1}}),
+            ),
+            "Failed SimulationCrashed (infrastructure, not charged); 1/2 routes; EvalAI failed",
+        ),
         row(
             "simulator never ready",
             with(simulator("never-ready"), json!({"deadlines": {"readySeconds": 5}})),

@@ -3,6 +3,7 @@
 
 use std::{
     fs, io,
+    net::{Ipv4Addr, TcpListener},
     os::unix::fs::{FileTypeExt, PermissionsExt, symlink},
     path::{Path, PathBuf},
     thread,
@@ -41,9 +42,15 @@ pub const KNOBS: &[Known] = &[
     ("spam", Shape::Value),
     ("print-env", Shape::Plain),
     ("noexit", Shape::Plain),
+    ("forge-verdict", Shape::At),
+    ("take-port", Shape::Value),
     ("ignore-term", Shape::Plain),
 ];
 
+/// Where the kubelet reads the last message of a container.
+const TERMINATION_LOG: &str = "/dev/termination-log";
+/// Between two tries of a port that somebody else has.
+const PORT_PAUSE: Duration = Duration::from_millis(1);
 /// Between two pieces of a checkpoint.
 const BETWEEN_PIECES: Duration = Duration::from_millis(2);
 const OOM_STEP: usize = 16 << 20;
@@ -84,6 +91,9 @@ impl Faults {
                 println!("{}={}", name.display(), value.display());
             }
         }
+        if let Some(port) = self.knobs.value("take-port").and_then(|port| port.parse().ok()) {
+            thread::spawn(move || take_port(port));
+        }
         let bytes: usize = self
             .knobs
             .value("spam")
@@ -104,6 +114,9 @@ impl Faults {
         }
         if fires("crash") {
             abort("Segmentation fault (core dumped)");
+        }
+        if fires("forge-verdict") {
+            forge_verdict();
         }
         if fires("oom") {
             exhaust_memory();
@@ -198,6 +211,28 @@ fn remove(path: &Path) -> io::Result<()> {
 fn abort(last_words: &str) -> ! {
     eprintln!("{last_words}");
     std::process::abort()
+}
+
+/// Claims that the simulator was not ready, and keeps the runner from replacing that. Without the capability to pass over
+/// permissions even root's runner cannot write to the file then.
+fn forge_verdict() -> ! {
+    let forged = r#"{"what":"notReady","why":"the simulator was not ready in time"}"#;
+    let written = fs::write(TERMINATION_LOG, forged)
+        .and_then(|()| fs::set_permissions(TERMINATION_LOG, fs::Permissions::from_mode(0o444)));
+    if let Err(error) = written {
+        eprintln!("the forged verdict cannot be written: {error}");
+    }
+    std::process::exit(1);
+}
+
+/// Listens on another pair's port as soon as its simulator is down, and answers nobody.
+fn take_port(port: u16) -> ! {
+    loop {
+        match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
+            Ok(_listener) => forever(),
+            Err(_) => thread::sleep(PORT_PAUSE),
+        }
+    }
 }
 
 fn exhaust_memory() -> ! {

@@ -7,7 +7,10 @@ use std::{
     io::{self, BufRead, BufReader, Write},
     net::{Ipv4Addr, TcpListener, TcpStream},
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, PoisonError},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
     thread,
     time::Duration,
 };
@@ -44,6 +47,8 @@ struct World {
     saved: PathBuf,
     /// Routes begun since this process started, over all connections.
     routes: Mutex<usize>,
+    /// The main loop hangs: nobody is answered any more, on no connection.
+    hangs: AtomicBool,
     log: Mutex<Option<File>>,
 }
 
@@ -61,6 +66,7 @@ pub fn run(arguments: &[String]) -> Result<(), SimulatorError> {
         knobs,
         saved,
         routes: Mutex::new(0),
+        hangs: AtomicBool::new(false),
         log,
     });
     world.say(&format!(
@@ -93,6 +99,9 @@ pub fn run(arguments: &[String]) -> Result<(), SimulatorError> {
 
 impl World {
     fn converse(&self, mut stream: &TcpStream) -> io::Result<()> {
+        if self.hangs.load(Ordering::Relaxed) {
+            forever();
+        }
         writeln!(stream, "carla {VERSION}")?;
         for line in BufReader::new(stream).lines() {
             if let Some(route) = line?.strip_prefix("route ") {
@@ -115,6 +124,7 @@ impl World {
             std::process::exit(1);
         }
         if self.knobs.fires("hang", number, &self.saved) {
+            self.hangs.store(true, Ordering::Relaxed);
             forever();
         }
     }
