@@ -39,7 +39,7 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
     }
 }
 
-/// The message of a failure without the next step, for as long as it may mend itself.
+/// The message of a failure without the next step, for as long as a retry may fix it.
 pub(super) fn what_happened(failure: &Failure) -> String {
     let message = failure.message.as_str();
     let next = of_infrastructure(&failure.reason);
@@ -56,10 +56,7 @@ pub(super) fn image_invalid(what: &str) -> Failure {
 }
 
 pub(super) fn job_deleted() -> Failure {
-    infrastructure(
-        reasons::JOB_DELETED,
-        "Its Job was deleted again and again by somebody else.",
-    )
+    infrastructure(reasons::JOB_DELETED, "The Job was deleted repeatedly by somebody else.")
 }
 
 pub(super) fn node_lost(node: Option<&str>, sight: NodeSight) -> Failure {

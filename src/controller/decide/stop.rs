@@ -83,7 +83,7 @@ fn show(draft: &mut Draft<'_>) {
             "{} It is being stopped; what it has reached is kept.",
             failure::what_happened(failure)
         ),
-        None => "It is being stopped as wished; what it has reached is kept.".to_owned(),
+        None => "Stopping as requested; completed routes are kept.".to_owned(),
     };
     draft.say(draft.live_state(), reasons::STOPPING, message);
 }
@@ -132,7 +132,7 @@ pub(super) fn being_deleted(draft: &mut Draft<'_>) {
         stopping_since(draft);
         show(draft);
     } else {
-        start::replacing(draft, "Its Job is being deleted by somebody else; it is made again.");
+        start::replacing(draft, "The Job is being deleted by somebody else; it is created again.");
     }
     remove_overdue_pod(draft);
     draft.requeue_in(Duration::from_secs(5));
