@@ -1,4 +1,4 @@
-//! Carries a plan out: finalizer, status, children, wishes, events, in this order. Decides nothing.
+//! Carries a plan out: finalizer, status, children, requests, events, in this order. Decides nothing.
 //!
 //! Every step is safe to repeat. A failed status write ends the pass, because what follows would not be remembered.
 

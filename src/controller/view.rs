@@ -164,7 +164,7 @@ pub enum Stage {
     Live,
     /// Its agents and simulators had ended.
     RunEnded,
-    /// Its Job had ended, or was gone.
+    /// The Job had ended, or was gone.
     JobEnded,
 }
 

@@ -178,7 +178,7 @@ impl World {
         Archive::of_run(&self.aws.aws, &storage, &run.to_string())
     }
 
-    /// Its Job runs, its agent prints the routes and crashes, logcopy stores the log, and the Job goes as it is told.
+    /// The Job runs, its agent prints the routes and crashes, logcopy stores the log, and the Job ends as requested.
     async fn run_that_crashes(&self, pk: u64, name: &str) {
         let job = self.job(name, 0).await;
         let log = format!("\u{1b}[32mloading routes\u{1b}[0m\n{ROUTE}\nTraceback: boom\n");
@@ -188,7 +188,7 @@ impl World {
         let pod = self.pod(&job, &crashed()).await;
         let is_told = |pod: Option<&Pod>| pod.is_some_and(|p| p.annotations().contains_key(names::ANNOTATION_STOP));
         let told = timeout(LIMIT, await_condition(self.api(), &pod, is_told)).await;
-        told.expect("the Pod is told to stop").unwrap();
+        told.expect("the Pod is asked to stop").unwrap();
         let jobs = self.api::<Job>();
         jobs.delete(&job.name_any(), &DeleteParams::background()).await.unwrap();
     }

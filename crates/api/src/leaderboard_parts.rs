@@ -196,7 +196,7 @@ pub struct Retries {
     reason = "the unit belongs into the name of every duration of the API"
 )]
 pub struct Deadlines {
-    /// Until a node is found; 0 waits for ever and says why.
+    /// Until a node is found; 0 waits without an end and shows why.
     #[serde(default = "defaults::schedule_seconds")]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub schedule_seconds: i64,

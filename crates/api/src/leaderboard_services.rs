@@ -120,7 +120,7 @@ pub enum Foreign {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.deadLetterURL) || self.deadLetterURL != self.url").message("queue.deadLetterURL is the queue itself: a bad message would come back for ever"),
+    validation = Rule::new("!has(self.deadLetterURL) || self.deadLetterURL != self.url").message("queue.deadLetterURL is the queue itself: a bad message would come back endlessly"),
     validation = Rule::new("!has(self.deadLetterURL) || self.url.endsWith('.fifo') == self.deadLetterURL.endsWith('.fifo')").message("a FIFO queue needs a FIFO dead-letter queue, a standard queue a standard one")
 )]
 pub struct Queue {

@@ -192,7 +192,7 @@ impl Faults {
     }
 }
 
-/// SIGTERM stays pending for ever. Must be called before any thread starts.
+/// SIGTERM stays pending permanently. Must be called before any thread starts.
 pub fn ignore_term() {
     let mut set = SigSet::empty();
     set.add(Signal::SIGTERM);

@@ -75,7 +75,7 @@ impl<'a> Draft<'a> {
         finalizers.iter().any(|f| f == names::FINALIZER_SUBMISSION)
     }
 
-    /// A wish to stop that is not a failure: a person's, EvalAI's, or the object's deletion. It holds for the whole
+    /// A request to stop that is not a failure: a person's, EvalAI's, or the object's deletion. It holds for the whole
     /// attempt: a higher attempt takes `spec.cancel` back while the present one is still being stopped.
     pub(super) fn is_cancelled(&self) -> bool {
         let is_stopping = self.status.times.stopping.is_some() && self.status.failure.is_none();
@@ -117,7 +117,7 @@ impl<'a> Draft<'a> {
             .unwrap_or(State::Pending)
     }
 
-    /// Begins an attempt if a new one is wished: a first one, or a higher one after an end that is not Finished.
+    /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished.
     /// True if what this pass has seen speaks of another attempt and can't be used.
     pub(super) fn begin_attempt(&mut self) -> bool {
         let wanted = self.spec().attempt;
@@ -181,7 +181,7 @@ impl<'a> Draft<'a> {
         self.actions.push(action);
     }
 
-    /// Whether EvalAI is told how far it is.
+    /// Whether EvalAI receives its progress.
     pub(super) fn tells_progress(&self) -> bool {
         let is_progress = |action: &Action| matches!(action, Action::Tell(Tell::Queued | Tell::Running));
         self.actions.iter().any(is_progress)

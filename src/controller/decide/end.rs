@@ -146,7 +146,7 @@ fn cause(
     complete: Option<&ReportDigest>,
     job_end: Option<&JobEnd>,
 ) -> Failure {
-    // A refused checkpoint may still be mended while the run goes on; only the last word counts.
+    // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
     if let Some(why) = report.filter(|r| r.is_final).and_then(|r| r.why.as_deref()) {
         return failure::invalid_results(why);
     }
@@ -159,11 +159,11 @@ fn cause(
     }
 }
 
-/// Failures that a second try may mend.
+/// Failures that a second try may fix.
 fn may_retry(draft: &Draft<'_>, found: &Failure) -> bool {
     const NOT_MENDABLE: [&str; 3] = [reasons::PREFIX_IN_USE, reasons::JOB_DELETED, reasons::SCHEDULE_DEADLINE];
     let is_mendable = !NOT_MENDABLE.contains(&found.reason.as_str());
-    // A higher attempt that is wished already takes the place of a retry.
+    // A higher attempt that is already requested takes the place of a retry.
     let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
     is_mendable
         && is_latest

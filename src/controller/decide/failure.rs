@@ -56,10 +56,7 @@ pub(super) fn image_invalid(what: &str) -> Failure {
 }
 
 pub(super) fn job_deleted() -> Failure {
-    infrastructure(
-        reasons::JOB_DELETED,
-        "Its Job was deleted again and again by somebody else.",
-    )
+    infrastructure(reasons::JOB_DELETED, "The Job was deleted repeatedly by somebody else.")
 }
 
 pub(super) fn node_lost(node: Option<&str>, sight: NodeSight) -> Failure {

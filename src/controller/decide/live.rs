@@ -37,7 +37,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
     follow(draft);
 }
 
-/// Looks for its end in EvalAI also while it waits and EvalAI is told nothing, whatever it waits for.
+/// Looks for its end in EvalAI also while it waits and nothing is sent to EvalAI, whatever it waits for.
 fn follow(draft: &mut Draft<'_>) {
     let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
     // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
@@ -128,14 +128,14 @@ fn start_job(draft: &mut Draft<'_>) {
     draft.act(Action::CreateJob { attempt, retry });
     draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
     if draft.is_running() {
-        let message = "Its Job was deleted by somebody else; the new one goes on from S3.";
+        let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
         start::replacing(draft, message);
     } else {
         draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
         draft.say(State::Pending, reasons::PREPARING, start::PREPARED);
     }
     if is_new {
-        draft.event(false, reasons::JOB_CREATED, format!("Its Job is {name}."));
+        draft.event(false, reasons::JOB_CREATED, format!("Created Job {name}."));
     }
     tell(draft);
     record(draft);
@@ -198,7 +198,7 @@ fn without_its_job(draft: &mut Draft<'_>) {
         draft.event(
             true,
             reasons::JOB_RECREATED,
-            "Its Job was deleted by somebody else; it is made again.",
+            "The Job was deleted by somebody else; it is created again.",
         );
     }
     start_job(draft);
@@ -334,7 +334,7 @@ fn run_since(draft: &Draft<'_>) -> Option<jiff::Timestamp> {
     }
 }
 
-/// What EvalAI hears of a live submission; it is told once, however often it is wished.
+/// What EvalAI hears of a live submission; it is sent once, however often it is requested.
 fn tell(draft: &mut Draft<'_>) {
     if draft.spec().evalai.is_none() {
         return;

@@ -79,7 +79,7 @@ pub enum Action {
     ReadTexts { of: ReportId },
     /// Ask EvalAI for the submission.
     AskEvalai,
-    /// Look for its end in EvalAI from now on, although EvalAI is told nothing of it yet.
+    /// Look for its end in EvalAI from now on, although nothing was sent to EvalAI yet.
     FollowEvalai,
     /// Tell EvalAI.
     Tell(Tell),
@@ -91,7 +91,7 @@ pub enum Action {
     Record { end: bool },
 }
 
-/// What EvalAI is told.
+/// What is sent to EvalAI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tell {
     Queued,

@@ -76,7 +76,7 @@ fn left_by_node(draft: &Draft<'_>, pod: &PodView) -> Option<String> {
     let node = pod.node.as_deref().filter(|_| draft.is_running())?;
     match draft.view.node {
         NodeSight::Gone => Some(format!(
-            "The Pod was lost with its node {node}. A new Pod will resume from the results in S3."
+            "Node {node} is gone, and the Pod with it. A new Pod will resume from the results in S3."
         )),
         NodeSight::Silent { since } => Some(format!(
             "Node {node} has been silent since {since:.0}. If that lasts, the Pod is given up, and a new Pod will resume from the results in S3."

@@ -79,8 +79,8 @@ fn show(draft: &mut Draft<'_>) {
             let what = failure.message.clone();
             return start::replacing(draft, &what);
         }
-        Some(failure) => format!("{} It is being stopped; what it has reached is kept.", failure.message),
-        None => "It is being stopped as wished; what it has reached is kept.".to_owned(),
+        Some(failure) => format!("{} The run is being stopped; completed routes are kept.", failure.message),
+        None => "Stopping as requested; completed routes are kept.".to_owned(),
     };
     draft.say(draft.live_state(), reasons::STOPPING, message);
 }
@@ -129,7 +129,7 @@ pub(super) fn being_deleted(draft: &mut Draft<'_>) {
         stopping_since(draft);
         show(draft);
     } else {
-        start::replacing(draft, "Its Job is being deleted by somebody else; it is made again.");
+        start::replacing(draft, "The Job is being deleted by somebody else; it is created again.");
     }
     remove_overdue_pod(draft);
     draft.requeue_in(Duration::from_secs(5));

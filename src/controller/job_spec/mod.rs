@@ -134,7 +134,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     }
 }
 
-/// What the Pod is told, as `LEADERBOARD_RUN`.
+/// What the Pod receives as `LEADERBOARD_RUN`.
 pub fn run_document(input: &JobInput<'_>) -> Run {
     let unsigned = |seconds: i64| u64::try_from(seconds).unwrap_or_default();
     let (spec, meta) = (input.spec(), &input.submission.metadata);

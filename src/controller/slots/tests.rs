@@ -269,7 +269,7 @@ fn a_pause_or_a_lower_limit_takes_back_what_was_not_used() {
     let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
     let mut world = World::new(two(), &[&a, &b]);
     assert_eq!((world.asks(&a), world.asks(&b)), (Turn::Go, Turn::Go));
-    // Its Job is being created when the pause comes.
+    // The Job is being created when the pause comes.
     world.slots.starts(&a);
     world.becomes(leaderboard(&json!({"total": 2}), true));
     assert_eq!((world.turn(&a), world.turn(&b)), (Turn::Go, Turn::NotInLine));

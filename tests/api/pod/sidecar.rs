@@ -224,7 +224,7 @@ async fn a_killed_logcopy_goes_on_where_it_was() {
     assert_eq!((report.done, report.stopped), (4, Some(Stop::Cancel)));
     assert!(pod.has(StatusFile::Cancel));
     logcopy.kill().await;
-    // The next one finds everything done, and ends when it is told to.
+    // The next one finds everything done, and ends when it is asked to.
     let etag = pod.archive.get(REPORT_KEY, LIMIT).await.unwrap().unwrap().etag;
     pod.logcopy().end().await;
     let after = pod

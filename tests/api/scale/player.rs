@@ -1,6 +1,6 @@
 //! Plays what a cluster has besides its API server: the Job controller, kubelets, and the programs in the Pods as S3 and the
 //! controller see them. Each Job gets a Pod that runs at once, reports a route more in every round, and ends when the curtain
-//! falls or when its Pod is told to stop.
+//! falls or when its Pod is asked to stop.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -56,7 +56,7 @@ pub struct Player {
 struct Stage {
     props: Props,
     curtain: watch::Sender<bool>,
-    /// Who is told of a stop, by name of the Pod.
+    /// Receivers of a stop, by name of the Pod.
     cues: Mutex<BTreeMap<String, oneshot::Sender<()>>>,
     seen: Mutex<Seen>,
 }
@@ -104,7 +104,7 @@ where
     events.applied_objects().filter_map(async |event| event.ok())
 }
 
-/// A node whose kubelet speaks. It stays for whoever plays next.
+/// A node whose kubelet speaks. It stays for the next player.
 async fn make_node(client: &Client) {
     let node = json!({
         "metadata": {"name": NODE},

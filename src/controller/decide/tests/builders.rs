@@ -131,7 +131,7 @@ impl World {
         Self::new(true)
     }
 
-    /// Its Job was asked for and is there, without a Pod.
+    /// The Job was requested and is there, without a Pod.
     pub fn with_job(self) -> Self {
         let mut world = self;
         world.pass();
@@ -139,7 +139,7 @@ impl World {
         world
     }
 
-    /// Its Pod is on a node; nothing runs yet.
+    /// The Pod is on a node; nothing runs yet.
     pub fn with_pod(self) -> Self {
         let mut world = self.with_job();
         world.view.pod = Some(pod(0));
@@ -430,7 +430,7 @@ pub fn events(plan: &Plan) -> Vec<&str> {
     plan.events.iter().map(|e| e.reason.as_str()).collect()
 }
 
-/// The stop that the Pod is told of.
+/// The stop that the Pod is asked for.
 pub fn annotated(plan: &Plan) -> Option<Stop> {
     plan.actions.iter().find_map(|a| match a {
         Action::AnnotateStop { stop, .. } => Some(*stop),

@@ -326,7 +326,7 @@ fn a_crash_that_only_the_simulator_has_told_of_waits_for_the_agents_own_word() {
     let plan = world.pass_to(Running, reasons::STOPPING);
     assert_eq!(plan.status.failure.unwrap().reason, reasons::IDLE);
 
-    // Its Pod has gone with it: that it crashed is all that will ever be known.
+    // The Pod is gone with it: that it crashed is all that will ever be known.
     late.view.pod = None;
     late.job().end = Some(JobEnd::Failed {
         at: None,

@@ -65,7 +65,7 @@ fn a_participant_is_sent_to_nothing_that_only_hosts_can_read() {
     .map(|reason| {
         infrastructure(
             reason,
-            "Its Job on node gpu-3 broke: see logcopy/report.json in s3://results.",
+            "The Job on node gpu-3 broke: see logcopy/report.json in s3://results.",
         )
     });
     let agents = [

@@ -7,15 +7,15 @@ use crate::pod::report::Report;
 use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
 use leaderboard_api::reasons;
 
-/// The places of a wish, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
+/// The places of a request, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
 fn places(plan: &Plan) -> Vec<String> {
-    let wishes = plan.actions.iter().filter_map(|a| match a {
+    let requests = plan.actions.iter().filter_map(|a| match a {
         Action::KeepLog { places } => Some(places),
         _ => None,
     });
-    let wishes: Vec<_> = wishes.collect();
-    assert!(wishes.len() <= 1, "{wishes:?}");
-    wishes.into_iter().flatten().map(short).collect()
+    let requests: Vec<_> = requests.collect();
+    assert!(requests.len() <= 1, "{requests:?}");
+    requests.into_iter().flatten().map(short).collect()
 }
 
 fn short(place: &LogPlace) -> String {

@@ -84,7 +84,7 @@ fn one_job(view: &View, plan: &Plan) {
     }
 }
 
-/// The log of a failure is kept before anything takes it away, and before EvalAI is told.
+/// The log of a failure is kept before anything takes it away, and before the end is sent to EvalAI.
 fn logs_come_first(plan: &Plan) {
     let place = plan.actions.iter().position(|a| matches!(a, Action::KeepLog { .. }));
     let Some(place) = place else { return };

@@ -90,7 +90,7 @@ fn a_run_outlives_its_leaderboard() {
     let leaderboard = world.view.leaderboard.take();
     world.view.record = None;
     world.pass_to(Running, reasons::RUNNING);
-    // Its Job can't be made again without, and is when it is back.
+    // The Job can't be made again without, and is when it is back.
     world.job_gone();
     assert!(!creates(&world.pass_to(Running, reasons::LEADERBOARD_NOT_FOUND)));
     world.view.leaderboard = leaderboard;

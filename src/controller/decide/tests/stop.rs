@@ -10,7 +10,7 @@ use leaderboard_api::{names, reasons};
 
 type Wish = fn(&mut World);
 
-/// Who wishes the end, and which reason it gets.
+/// Who requests the end, and which reason it gets.
 const WISHES: [(Wish, &str); 3] = [
     (|world| world.submission().spec.cancel = true, reasons::CANCELLED),
     (World::delete, reasons::DELETED),
@@ -88,7 +88,7 @@ fn between_two_tries_it_ends_at_once() {
     }
 }
 
-/// What a cancel does at once: nothing is to be stopped, the Job is deleted, or its Pod is told.
+/// What a cancel does at once: nothing is to be stopped, the Job is deleted, or its Pod is asked to stop.
 #[derive(Debug, PartialEq)]
 enum Done {
     Ended,
