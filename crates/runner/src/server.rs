@@ -129,7 +129,8 @@ impl Question {
     pub(crate) fn is_answered(&mut self) -> bool {
         let mut byte = [0];
         match self.0.read(&mut byte) {
-            Ok(_) => true,
+            // A byte, or the end of the connection.
+            Ok(0..) => true,
             Err(error) => !matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted),
         }
     }
