@@ -150,10 +150,14 @@ impl SubmissionStatus {
         });
         let of_conditions = self.conditions.iter_mut().map(|condition| &mut condition.message);
         for text in self.message.iter_mut().chain(of_failure).chain(of_conditions) {
-            if let Some((end, _)) = text.char_indices().nth(MAX_MESSAGE) {
-                text.truncate(end);
-            }
+            cut(text, MAX_MESSAGE);
         }
+    }
+}
+
+fn cut(text: &mut String, longest: usize) {
+    if let Some((end, _)) = text.char_indices().nth(longest) {
+        text.truncate(end);
     }
 }
 
