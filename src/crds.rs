@@ -87,6 +87,7 @@ fn definition(
 ) -> Result<Definition, CrdError> {
     let mut value = serde_json::to_value(derived).map_err(|source| CrdError::Build { kind, source })?;
     whole_numbers(&mut value);
+    whole_lists(&mut value);
     if let Some(versions) = value.pointer_mut("/spec/versions").and_then(Value::as_array_mut) {
         for status in versions
             .iter_mut()
@@ -105,6 +106,22 @@ fn without_rules(value: &mut Value) {
         Value::Object(object) => {
             object.remove("x-kubernetes-validations");
             object.values_mut().for_each(without_rules);
+        }
+        _ => {}
+    }
+}
+
+/// Lists without a key are replaced as a whole by who applies them. The types say which ones have a key.
+fn whole_lists(value: &mut Value) {
+    match value {
+        Value::Array(list) => list.iter_mut().for_each(whole_lists),
+        Value::Object(object) => {
+            if object.get("type").is_some_and(|type_| type_ == "array") {
+                object
+                    .entry("x-kubernetes-list-type")
+                    .or_insert_with(|| "atomic".into());
+            }
+            object.values_mut().for_each(whole_lists);
         }
         _ => {}
     }
@@ -177,6 +194,50 @@ mod tests {
                 .pointer("/spec/versions/0/schema/openAPIV3Schema/properties/status")
                 .unwrap();
             assert!(!status.to_string().contains("x-kubernetes-validations"));
+        }
+    }
+
+    /// Calls `each` with the path of every schema below this one.
+    fn walk(path: &str, schema: &Value, each: &mut impl FnMut(&str, &Value)) {
+        each(path, schema);
+        for (name, inner) in schema["properties"].as_object().into_iter().flatten() {
+            walk(&format!("{path}.{name}"), inner, each);
+        }
+        for key in ["items", "additionalProperties"] {
+            if schema[key].is_object() {
+                walk(&format!("{path}[]"), &schema[key], each);
+            }
+        }
+    }
+
+    #[test]
+    fn every_list_has_a_type_and_every_text_of_the_status_an_end() {
+        let mut keyed = Vec::new();
+        for definition in definitions().unwrap() {
+            let root = definition.json().pointer("/spec/versions/0/schema/openAPIV3Schema");
+            walk(definition.kind, root.unwrap(), &mut |path, schema| {
+                let list_type = schema["x-kubernetes-list-type"].as_str();
+                assert_eq!(schema["type"] == "array", list_type.is_some(), "{path}");
+                if list_type == Some("map") {
+                    keyed.push(path.to_owned());
+                }
+                let is_free = schema["type"] == "string" && schema["enum"].is_null() && schema["format"].is_null();
+                let is_ours = path.contains(".status.") && !path.contains(".conditions[]");
+                assert!(
+                    !(is_free && is_ours) || schema["maxLength"].is_u64(),
+                    "{path} has no maxLength"
+                );
+            });
+        }
+        for path in [
+            "Leaderboard.spec.tracks",
+            "Leaderboard.spec.agent.env",
+            "Leaderboard.status.tracks",
+        ] {
+            assert!(keyed.iter().any(|found| found == path), "{path}: {keyed:?}");
+        }
+        for path in ["Submission.status.pairs", "Submission.status.conditions"] {
+            assert!(keyed.iter().any(|found| found == path), "{path}: {keyed:?}");
         }
     }
 

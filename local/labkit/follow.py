@@ -16,7 +16,7 @@ CONDITION = '{{.status.conditions[?(@.type=="{}")].status}}'
 FIELDS = (
     "{.status.state}",
     "{.status.progress.text}",
-    "{.status.score}",
+    "{.status.score.text}",
     "{.status.reason}",
     "{.status.nodeName}",
     CONDITION.format("Published"),

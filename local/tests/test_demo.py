@@ -36,7 +36,7 @@ def good() -> Findings:
             },
             "status": {
                 "state": "Finished",
-                "score": "69.41",
+                "score": {"text": "69.41"},
                 "progress": {"done": 20, "total": 20, "text": "20/20"},
                 "conditions": conditions,
                 "times": {"submitted": "2026-11-20T10:00:00Z", "started": "2026-11-20T10:00:05Z"},

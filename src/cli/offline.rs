@@ -169,9 +169,11 @@ impl Results {
         };
         let plan = Plan {
             pairs: effective::slices(routes_in_all, workers)
-                .iter()
-                .filter_map(|slice| effective::slice_bounds(slice))
-                .map(|(first, last)| leaderboard_results::Slice { first, last })
+                .into_iter()
+                .map(|slice| leaderboard_results::Slice {
+                    first: slice.first,
+                    last: slice.last,
+                })
                 .collect(),
             routes,
             repetitions: self.repetitions.unwrap_or(usual),

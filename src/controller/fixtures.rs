@@ -244,7 +244,7 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     submission.status = Some(SubmissionStatus {
         state: Some(State::Pending),
         attempt: Some(1),
-        team: submission.spec.team.clone(),
+        team: submission.spec.team.clone().map(Into::into),
         plan: Some(plan),
         job_name: Some(job_name.clone()),
         times: Times {

@@ -170,7 +170,7 @@ mod tests {
 
     fn plan() -> Value {
         json!({
-            "runId": "7", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-3"], "routes": 4,
+            "runId": "7", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": [{"first": 0, "last": 3}], "routes": 4,
             "repetitions": 1, "storage": {"bucket": "b"}, "image": "i", "contentsImage": "c", "simulatorImage": "s",
         })
     }

@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use leaderboard_api::{LeaderboardSpec, SubmissionStatus};
+use leaderboard_api::{LeaderboardSpec, PairState, SubmissionStatus};
 
 /// Longest wait of progress.
 const LONGEST: Duration = Duration::from_secs(30);
@@ -61,7 +61,7 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
     };
     for pair in &mut steady.pairs {
         pair.done = 0;
-        pair.state = String::new();
+        pair.state = PairState::default();
     }
     // A pair that has not crashed carries nothing that would be missed.
     steady.pairs.retain(|pair| pair.crashes > 0 || pair.last.is_some());
@@ -100,7 +100,7 @@ mod tests {
     #[test]
     fn a_step_forward_is_a_place_and_the_first_place_is_not() {
         let waiting = |position| SubmissionStatus {
-            waiting: Some(leaderboard_api::Waiting { position, eta: None }),
+            waiting: Some(leaderboard_api::Waiting::new(position, None)),
             ..SubmissionStatus::default()
         };
         assert_eq!(change(&waiting(3), &waiting(2)), Change::Place);
@@ -120,7 +120,7 @@ mod tests {
             done: 0,
             total: 5,
             crashes: 1,
-            state: "Crashed".into(),
+            state: PairState::Crashed,
             last: None,
         };
         let status = SubmissionStatus {

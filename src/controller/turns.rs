@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
 use jiff::Timestamp;
+use leaderboard_api::Eta;
 
 #[cfg(test)]
 mod day;
@@ -23,7 +24,7 @@ pub enum Turn {
     Go,
     Wait {
         position: i32,
-        eta: Option<String>,
+        eta: Option<Eta>,
     },
     Paused {
         position: i32,
@@ -203,28 +204,12 @@ impl Quartiles {
     }
 
     /// The wait of a place in line: the median times position over slots, a fifth to either side, or more where runs differ.
-    fn band(self, position: i32, slots: i64) -> String {
+    fn band(self, position: i32, slots: i64) -> Eta {
         let wait = |seconds: i64| seconds.saturating_mul(position.into()) / slots.max(1);
         let low = wait(self.lower).min(wait(self.median) * 4 / 5);
         let high = wait(self.upper).max(wait(self.median).saturating_mul(6) / 5);
-        band(low, high)
+        Eta::between(low, high)
     }
-}
-
-/// Seconds as people say them: in minutes, hours or days, no finer than an estimate can be.
-fn band(low: i64, high: i64) -> String {
-    const MINUTE: i64 = 60;
-    const HOUR: i64 = 60 * MINUTE;
-    const DAY: i64 = 24 * HOUR;
-    let (unit, step, word) = match high {
-        ..=600 => (MINUTE, MINUTE, "min"),
-        601..=5_400 => (MINUTE, 5 * MINUTE, "min"),
-        5_401..=172_800 => (HOUR, HOUR, "h"),
-        _ => (DAY, DAY, "d"),
-    };
-    let low = low / step * step / unit;
-    let high = (high.max(1) + step - 1) / step * step / unit;
-    format!("{low}-{high} {word}")
 }
 
 #[cfg(test)]
@@ -354,7 +339,7 @@ mod tests {
             let mut past = occupied(&["y"].repeat(slots));
             past.runs = [runs("sensors", seconds), runs("map", &[1])].into();
             match turns(&line, &past, limits(slots)).remove(&place.to_string()) {
-                Some(Turn::Wait { eta, .. }) => eta,
+                Some(Turn::Wait { eta, .. }) => eta.map(|eta| eta.to_string()),
                 other => panic!("{other:?}"),
             }
         };

@@ -6,7 +6,7 @@ use std::path::Path;
 use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
 
 use super::run::{Run, SCHEMA, STATUS_FOLDER};
-use leaderboard_api::{ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
+use leaderboard_api::{ByteQuantity, LeaderboardVersion, RouteSlice, RunPlan, Storage, Verify};
 
 /// Two pairs of two routes each, once.
 pub(crate) fn run() -> Run {
@@ -22,7 +22,7 @@ pub(crate) fn run() -> Run {
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),
             phase: None,
-            slices: vec!["0-1".to_owned(), "2-3".to_owned()],
+            slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
             routes: 4,
             repetitions: 1,
             storage: Storage {

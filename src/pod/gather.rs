@@ -15,7 +15,7 @@ use super::report::{ReportPair, StoredFile};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Stamp, Tree, TreeError};
 use super::upload::Object;
-use leaderboard_api::{LeaderboardVersion, Verify, effective};
+use leaderboard_api::{LeaderboardVersion, PairState, Verify};
 
 /// Key of the merged file.
 pub const MERGED: &str = "agent/agent_results.json";
@@ -28,14 +28,13 @@ const METADATA: &str = "evalai/metadata.json";
 
 /// The plan of the results, from the plan of the run.
 pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
-    let bad = |slice: &String| Refusal::Plan {
-        problem: format!("\"{slice}\" is not a slice such as 5-9"),
-    };
-    let slices = run.plan.slices.iter().map(|slice| {
-        let (first, last) = effective::slice_bounds(slice).ok_or_else(|| bad(slice))?;
-        Ok(Slice { first, last })
-    });
-    let pairs: Vec<Slice> = slices.collect::<Result<_, _>>()?;
+    let slices = run.plan.slices.iter();
+    let pairs: Vec<Slice> = slices
+        .map(|slice| Slice {
+            first: slice.first,
+            last: slice.last,
+        })
+        .collect();
     let plan = Plan {
         format: match run.plan.leaderboard_version {
             LeaderboardVersion::V1 => Format::V1,
@@ -90,12 +89,12 @@ impl PairSeen {
     }
 
     /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
-    pub fn state(&self) -> &'static str {
+    pub fn state(&self) -> PairState {
         match self {
-            Self { agent, .. } if agent.done => "Done",
-            Self { agent, simulator } if agent.started || simulator.started => "Running",
-            _ if self.crashes() > 0 => "Crashed",
-            _ => "Waiting",
+            Self { agent, .. } if agent.done => PairState::Done,
+            Self { agent, simulator } if agent.started || simulator.started => PairState::Running,
+            _ if self.crashes() > 0 => PairState::Crashed,
+            _ => PairState::Waiting,
         }
     }
 
@@ -368,7 +367,7 @@ impl Gatherer {
                     done: done.min(total),
                     total,
                     crashes: seen.crashes(),
-                    state: seen.state().to_owned(),
+                    state: seen.state(),
                 }
             })
             .collect()

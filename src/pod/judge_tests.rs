@@ -129,6 +129,7 @@ mod seen_on_a_volume {
     use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
     use crate::pod::gather::{EVALAI, Gatherer, MERGED, results_plan};
     use crate::pod::tree::Tree;
+    use leaderboard_api::{PairState, RouteSlice};
 
     struct Volume {
         folder: tempfile::TempDir,
@@ -179,12 +180,12 @@ mod seen_on_a_volume {
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
         let (gathered, seen) = volume.round();
         assert_eq!(
-            (gathered.pairs[0].done, gathered.pairs[0].state.as_str()),
-            (1, "Running")
+            (gathered.pairs[0].done, gathered.pairs[0].state),
+            (1, PairState::Running)
         );
         assert_eq!(
-            (gathered.pairs[1].done, gathered.pairs[1].state.as_str()),
-            (0, "Waiting")
+            (gathered.pairs[1].done, gathered.pairs[1].state),
+            (0, PairState::Waiting)
         );
         assert!(seen.any_started && seen.complete.is_none());
         assert!(text(&gathered, "evalai/stdout.txt").contains("Completed 1 out of the 4 routes"));
@@ -310,7 +311,12 @@ mod seen_on_a_volume {
     fn the_checkpoints_of_all_pairs_share_one_bound() {
         for pairs in [1_u32, 4, 16] {
             let mut run = run();
-            run.plan.slices = (0..pairs).map(|pair| format!("{pair}-{pair}")).collect();
+            run.plan.slices = (0..pairs)
+                .map(|pair| RouteSlice {
+                    first: pair,
+                    last: pair,
+                })
+                .collect();
             let plan = results_plan(&run).unwrap();
             let bytes: usize = (0..plan.pairs.len()).map(|pair| plan.limits_of(pair).bytes).sum();
             assert!(bytes <= 48 << 20, "{pairs} pairs may hold {bytes} bytes");
@@ -393,14 +399,15 @@ mod seen_on_a_volume {
             put_status(&folder, side, 1, mark);
         }
         let pair = volume.round().0.pairs[0].clone();
-        assert_eq!((pair.crashes, pair.state.as_str()), (2, "Crashed"));
+        assert_eq!((pair.crashes, pair.state), (2, PairState::Crashed));
     }
 
     #[test]
     fn a_plan_that_does_not_hold_is_refused() {
-        for slices in [vec![], vec!["0-2", "2-3"], vec!["x"]] {
+        let slice = |first, last| RouteSlice { first, last };
+        for slices in [vec![], vec![slice(0, 2), slice(2, 3)], vec![slice(3, 0)]] {
             let mut run = run();
-            run.plan.slices = slices.into_iter().map(str::to_owned).collect();
+            run.plan.slices = slices;
             assert!(results_plan(&run).is_err(), "{:?}", run.plan.slices);
         }
     }

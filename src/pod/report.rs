@@ -8,6 +8,7 @@ use leaderboard_api::text::one_line;
 use serde::{Deserialize, Serialize};
 
 use super::schema::is_read;
+use leaderboard_api::PairState;
 
 /// Key of the report below the run's prefix.
 pub const REPORT_KEY: &str = "logcopy/report.json";
@@ -82,6 +83,12 @@ pub struct Report {
     /// Mean driving score: over the finished routes, or of the whole run when final.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub score: Option<f64>,
+    /// Mean route completion in percent, over the same routes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub route_completion: Option<f64>,
+    /// Mean infraction penalty, 0 to 1, over the same routes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub infraction_penalty: Option<f64>,
     /// True when the merge is complete against the plan and nothing more will come.
     #[serde(rename = "final")]
     pub is_final: bool,
@@ -120,8 +127,8 @@ pub struct ReportPair {
     pub total: u32,
     /// Crashes of the agent's or simulator's side, whichever is more.
     pub crashes: u32,
-    /// `Waiting`, `Running`, `Done`, `Crashed`.
-    pub state: String,
+    /// What it does.
+    pub state: PairState,
 }
 
 /// Size and digest of a stored file.
@@ -185,6 +192,12 @@ impl Report {
         }
         if self.score.is_some_and(|s| !(0.0..=100.0).contains(&s)) {
             return implausible("a score outside 0 to 100");
+        }
+        if self.route_completion.is_some_and(|c| !(0.0..=100.0).contains(&c)) {
+            return implausible("a route completion outside 0 to 100");
+        }
+        if self.infraction_penalty.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
+            return implausible("an infraction penalty outside 0 to 1");
         }
         if self.pairs.len() > 64 || self.pairs.iter().any(|p| p.done > p.total) {
             return implausible("a pair that did more than its slice");

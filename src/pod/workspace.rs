@@ -24,8 +24,8 @@ use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, ReportPair,
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError};
-use leaderboard_api::Enforcement;
 use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_api::{Enforcement, PairState};
 
 /// Folders that no mount makes. The others are the kubelet's.
 const FOLDERS: [&str; 3] = ["agent", STATUS_FOLDER, "logcopy"];
@@ -287,7 +287,7 @@ fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
         done: 0,
         total: slice.routes().saturating_mul(plan.repetitions),
         crashes: 0,
-        state: "Waiting".to_owned(),
+        state: PairState::Waiting,
     });
     Ok(Report {
         schema: SCHEMA,
@@ -299,6 +299,8 @@ fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
         total: plan.routes.saturating_mul(plan.repetitions),
         pairs: pairs.collect(),
         score: None,
+        route_completion: None,
+        infraction_penalty: None,
         is_final: false,
         eligible: false,
         entry_status: "Started".to_owned(),

@@ -14,6 +14,7 @@ const AS_TABLE: &str = "application/json;as=Table;g=meta.k8s.io;v=v1";
 /// A status with every field.
 pub fn full_status() -> Value {
     let time = "2026-11-01T10:00:00Z";
+    let condition = |type_: &str| json!({"type": type_, "status": "True", "reason": "Resumed", "message": "", "lastTransitionTime": time});
     json!({
         "state": "Running",
         "observedGeneration": 1,
@@ -23,7 +24,8 @@ pub fn full_status() -> Value {
         "nextRetryTime": time,
         "reason": "Resumed",
         "message": "The second attempt runs.",
-        "team": {"id": "7", "name": "Team Seven"},
+        "team": {"id": "7", "name": "Team Seven", "displayName": "Team Seven"},
+        "blockedSince": {"reason": "Unschedulable", "time": time},
         "track": "sensors",
         "plan": {
             "runId": "42",
@@ -31,7 +33,7 @@ pub fn full_status() -> Value {
             "track": "sensors",
             "codename": "SENSORS",
             "phase": 7,
-            "slices": ["0-9", "10-19"],
+            "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}],
             "routes": 20,
             "repetitions": 1,
             "storage": {"bucket": "results", "prefix": "a/", "sizeLimit": "20Gi"},
@@ -47,10 +49,13 @@ pub fn full_status() -> Value {
             "total": 10,
             "crashes": 1,
             "state": "Running",
-            "last": {"reason": "idle", "exitCode": 1, "time": time},
+            "last": {"reason": "Idle", "exitCode": 1, "time": time},
         }],
-        "score": "~41.20",
-        "waiting": {"position": 1, "eta": "20m-40m"},
+        "score": {
+            "driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20",
+        },
+        "duration": "1h25m",
+        "waiting": {"position": 1, "etaMinSeconds": 1200, "etaMaxSeconds": 2400, "text": "1st, 20-40 min"},
         "times": {
             "submitted": time, "accepted": time, "scheduled": time, "started": time, "stopping": time, "finished": time,
             "published": time,
@@ -58,14 +63,9 @@ pub fn full_status() -> Value {
         "jobName": "a-2",
         "nodeName": "node-1",
         "resultsURL": "s3://results/a/42",
-        "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": "The node is gone.", "charged": false},
-        "conditions": [{
-            "type": "Running",
-            "status": "True",
-            "reason": "Resumed",
-            "message": "",
-            "lastTransitionTime": time,
-        }],
+        "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": "The node is gone. Look at it.",
+                    "nextStep": "Look at it.", "charged": false},
+        "conditions": [condition("Running"), condition("Published")],
     })
 }
 
@@ -127,17 +127,17 @@ async fn submissions_in_the_table() {
     assert_eq!(
         table(&client, Kind::Submission, &namespace, false).await,
         "\
-NAME            LEADERBOARD   TRACK     STATE     PROGRESS   SCORE    AGE
-new             local         <none>    <none>    <none>     <none>   <age>
-submission-42   local         sensors   Running   12/20      ~41.20   <age>
+NAME            LEADERBOARD   TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE
+new             local         <none>    <none>    <none>    <none>     <none>   <none>           <age>
+submission-42   local         sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>
 "
     );
     assert_eq!(
         table(&client, Kind::Submission, &namespace, true).await,
         "\
-NAME            LEADERBOARD   TRACK     STATE     PROGRESS   SCORE    AGE     TEAM         ATTEMPT   REASON    NODE     RESULTS
-new             local         <none>    <none>    <none>     <none>   <age>   <none>       <none>    <none>    <none>   <none>
-submission-42   local         sensors   Running   12/20      ~41.20   <age>   Team Seven   2         Resumed   node-1   s3://results/a/42
+NAME            LEADERBOARD   TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE     TEAM         ATTEMPT   FAILURE          PUBLISHED   DURATION   NODE     RESULTS
+new             local         <none>    <none>    <none>    <none>     <none>   <none>           <age>   <none>       <none>    <none>           <none>      <none>     <none>   <none>
+submission-42   local         sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>   Team Seven   2         Infrastructure   True        1h25m      node-1   s3://results/a/42
 "
     );
 }
@@ -158,8 +158,8 @@ async fn leaderboards_in_the_table() {
     let status = json!({
         "observedGeneration": 1,
         "counts": {"pending": 3, "running": 2, "finished": 40, "failed": 1, "cancelled": 0},
-        "budget": "12/54",
-        "tracks": {"sensors": "4 x 20 x 1"},
+        "evalai": {"requestsLastMinute": 12, "requestsPerMinute": 54},
+        "tracks": [{"name": "sensors", "pairs": 4, "routes": 20, "repetitions": 1}],
         "conditions": [condition("Terminating", "InUse"), condition("Ready", "TokenRefused")],
     });
     let patch = Patch::Merge(json!({ "status": status }));
@@ -171,9 +171,9 @@ async fn leaderboards_in_the_table() {
     assert_eq!(
         table(&client, Kind::Leaderboard, &namespace, false).await,
         "\
-NAME       READY    REASON         PENDING   RUNNING   FINISHED   FAILED   CANCELLED   BUDGET   AGE
-carla-20   False    TokenRefused   3         2         40         1        0           12/54    <age>
-new        <none>   <none>         <none>    <none>    <none>     <none>   <none>      <none>   <age>
+NAME       READY    REASON         PAUSED   PENDING   RUNNING   FINISHED   FAILED   CANCELLED   AGE
+carla-20   False    TokenRefused   false    3         2         40         1        0           <age>
+new        <none>   <none>         false    <none>    <none>    <none>     <none>   <none>      <age>
 "
     );
 }

@@ -74,13 +74,13 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "agent": {"logSizeLimit": "2Gi"},
         "pairs": 4,
         "routes": 20,
-        "retries": {"perPair": 4, "infrastructure": 2},
+        "retries": {"perPair": 3, "infrastructure": 2},
         "deadlines": {
             "scheduleSeconds": 0,
             "startSeconds": 1800,
             "readySeconds": 3600,
             "idleSeconds": 800,
-            "runSeconds": 86400,
+            "runSeconds": 0,
             "cancelSeconds": 120,
             "flushSeconds": 1800,
             "finalizeSeconds": 900,
@@ -133,7 +133,7 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         (
             "retries",
             json!({"infrastructure": 0}),
-            json!({"perPair": 4, "infrastructure": 0}),
+            json!({"perPair": 3, "infrastructure": 0}),
         ),
         (
             "deadlines",
@@ -163,6 +163,13 @@ fn half_filled_runs() -> Vec<HalfFilled> {
             "network",
             json!({"dns": false, "policy": "External"}),
             json!({"dns": false, "policy": "External", "enforcement": "Warn"}),
+        ),
+        (
+            "tracks",
+            json!([{"name": "sensors", "codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"],
+                    "deadlines": {"runSeconds": 0}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
+            json!([{"name": "sensors", "codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"],
+                    "deadlines": {"runSeconds": 0}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
         ),
         ("concurrency", json!({"total": 3}), json!({"total": 3})),
     ]

@@ -21,7 +21,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{LeaderboardVersion, LogGroup, RunPlan, Storage, Verify};
+use leaderboard_api::{LeaderboardVersion, LogGroup, RouteSlice, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::logcopy::{self, LogcopyError};
 use leaderboard_operator::pod::places::{Pace, Places, Setting};
 use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
@@ -242,7 +242,7 @@ fn run(bucket: &str) -> Run {
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),
             phase: None,
-            slices: vec!["0-1".to_owned(), "2-3".to_owned()],
+            slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
             routes: 4,
             repetitions: 1,
             storage: Storage {

@@ -230,6 +230,18 @@ fn times() -> Vec<Case> {
         ),
         create(
             Leaderboard,
+            "a track's deadlines.runSeconds must be longer",
+            &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": 3601}}))]}),
+            &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": 3600}}))]}),
+        ),
+        create(
+            Leaderboard,
+            "a track's deadlines.runSeconds must be longer",
+            &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": 0}}))]}),
+            &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": 800}}))], "deadlines": {"readySeconds": 1}}),
+        ),
+        create(
+            Leaderboard,
             "cancelSeconds may not be longer than flushSeconds",
             &deadlines(json!({"cancelSeconds": 60, "flushSeconds": 60})),
             &deadlines(json!({"flushSeconds": 59})),
@@ -328,6 +340,21 @@ fn pods_and_tables() -> Vec<Case> {
             "roleARN needs serviceAccountName",
             &assumed,
             &identity(json!({"serviceAccountName": null})),
+        ),
+        case(
+            "storage.sizeLimit must be",
+            &json!({"storage": {"sizeLimit": "1Ti"}}),
+            &json!({"storage": {"sizeLimit": "2Ti"}}),
+        ),
+        case(
+            "storage.sizeLimit must be",
+            &json!({"storage": {"sizeLimit": "16777216"}}),
+            &json!({"storage": {"sizeLimit": "16M"}}),
+        ),
+        case(
+            "agent.logSizeLimit must be",
+            &json!({"agent": {"logSizeLimit": "1Mi"}}),
+            &json!({"agent": {"logSizeLimit": "1M"}}),
         ),
         case("are set together", &both, &table(&Value::Null)),
         case("are the same key", &both, &table(&json!("team_id"))),

@@ -133,7 +133,7 @@ fn of_agents() -> Vec<Row> {
             "agent idle",
             with(
                 agent("hang@2"),
-                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 1}}),
+                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 0}}),
             ),
             "Failed Idle (participant, charged); 1/2 routes; EvalAI failed",
         ),
@@ -147,7 +147,7 @@ fn of_agents() -> Vec<Row> {
         },
         row(
             "results malformed",
-            with(agent("nonsense@1"), json!({"retries": {"perPair": 1}})),
+            with(agent("nonsense@1"), json!({"retries": {"perPair": 0}})),
             "Failed InvalidResults (participant, charged); EvalAI failed",
         ),
         row(
@@ -238,7 +238,7 @@ async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) -> Str
     let base = json!({
         "pairs": 1,
         "routes": 2,
-        "retries": {"perPair": 2, "infrastructure": 0},
+        "retries": {"perPair": 1, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 20},
         "evalai": {"requestsPerMinute": 600},
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],

@@ -101,7 +101,10 @@ async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys
     let (sink, endpoint, serving) = serve().await;
     let mut submission = Submission::on(&endpoint, "bucket", LeaderboardVersion::V2, &mut Rng::new()).await;
     submission.run.plan.slices = (0..PAIRS)
-        .map(|pair| format!("{}-{}", 2 * pair, 2 * pair + 1))
+        .map(|pair| leaderboard_api::RouteSlice {
+            first: u32::try_from(2 * pair).unwrap(),
+            last: u32::try_from(2 * pair + 1).unwrap(),
+        })
         .collect();
     submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
     let most = results_plan(&submission.run).unwrap().limits_of(0).bytes;

@@ -213,7 +213,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),
             phase: None,
-            slices: ["0-4", "5-9", "10-14", "15-19"].map(str::to_owned).into(),
+            slices: leaderboard_api::effective::slices(20, 4),
             routes: 20,
             repetitions: 1,
             storage: Storage {

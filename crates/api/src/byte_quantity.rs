@@ -3,7 +3,6 @@
 //! Pure. The one place that reads such a text.
 
 use std::borrow::Cow;
-use std::fmt;
 use std::str::FromStr;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -32,21 +31,11 @@ pub struct ByteQuantity {
 }
 
 /// A text that is no [`ByteQuantity`].
-#[derive(Debug, PartialEq, Eq)]
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
+#[error(
+    "{0:?} is not a number of bytes; write a whole number with a suffix of Ki, Mi, Gi, Ti, k, M, G or T, for example 20Gi"
+)]
 pub struct NotBytes(String);
-
-impl fmt::Display for NotBytes {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            out,
-            "{:?} is not a number of bytes; write a whole number with a suffix of Ki, Mi, Gi, Ti, k, M, G or T, for \
-             example 20Gi",
-            self.0
-        )
-    }
-}
-
-impl std::error::Error for NotBytes {}
 
 impl ByteQuantity {
     /// As a number of bytes.

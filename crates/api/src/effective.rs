@@ -2,9 +2,11 @@
 //!
 //! Pure. Called by the controller (plans, Jobs) and by the commands that run without a cluster.
 
-use super::leaderboard_parts::{LeaderboardVersion, Storage, Track};
+use k8s_openapi::api::core::v1::ResourceRequirements;
+
+use super::leaderboard_parts::{Deadlines, LeaderboardVersion, Storage, Track, TrackContainer};
 use super::submission::Submission;
-use super::{LeaderboardSpec, RunPlan};
+use super::{LeaderboardSpec, RouteSlice, RunPlan};
 
 /// How many of what one track runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -16,7 +18,7 @@ pub struct Shape {
     /// Repetitions of each route.
     pub repetitions: usize,
     /// ROUTES_SUBSET of each pair.
-    pub slices: Vec<String>,
+    pub slices: Vec<RouteSlice>,
 }
 
 /// What a track of this Leaderboard runs.
@@ -32,7 +34,11 @@ pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
                 LeaderboardVersion::V2 => 1,
             }),
     );
-    let slices = track.route_subsets.clone().unwrap_or_else(|| slices(routes, pairs));
+    let subsets = track.route_subsets.as_ref();
+    let slices = subsets.map_or_else(
+        || slices(routes, pairs),
+        |subsets| subsets.iter().map(|subset| subset.0).collect(),
+    );
     Shape {
         pairs: slices.len(),
         routes,
@@ -43,19 +49,33 @@ pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
 
 /// Shares `routes` out over `pairs` as `ceil(k*R/N) .. ceil((k+1)*R/N)-1`; a pair without a route is left out,
 /// because an empty ROUTES_SUBSET would run all of them.
-pub fn slices(routes: usize, pairs: usize) -> Vec<String> {
+pub fn slices(routes: usize, pairs: usize) -> Vec<RouteSlice> {
     (0..pairs)
         .map(|k| ((k * routes).div_ceil(pairs), ((k + 1) * routes).div_ceil(pairs)))
         .filter(|(first, end)| first < end)
-        .map(|(first, end)| format!("{first}-{}", end - 1))
+        .filter_map(|(first, end)| {
+            let (first, last) = (u32::try_from(first).ok()?, u32::try_from(end - 1).ok()?);
+            Some(RouteSlice { first, last })
+        })
         .collect()
 }
 
-/// First and last route of a slice such as `5-9`.
-pub fn slice_bounds(slice: &str) -> Option<(u32, u32)> {
-    let (first, last) = slice.split_once('-')?;
-    let (first, last) = (first.parse().ok()?, last.parse().ok()?);
-    (first <= last).then_some((first, last))
+/// The deadlines of a track's runs.
+pub fn deadlines(spec: &LeaderboardSpec, track: Option<&Track>) -> Deadlines {
+    let own = track.and_then(|track| track.deadlines).unwrap_or_default();
+    Deadlines {
+        start_seconds: own.start_seconds.unwrap_or(spec.deadlines.start_seconds),
+        run_seconds: own.run_seconds.unwrap_or(spec.deadlines.run_seconds),
+        ..spec.deadlines
+    }
+}
+
+/// Requests and limits of a track's simulators or agents: the track's own, else those of the Leaderboard.
+pub fn resources(
+    own: Option<&TrackContainer>,
+    leaderboards: Option<&ResourceRequirements>,
+) -> Option<ResourceRequirements> {
+    own.and_then(|own| own.resources.as_ref()).or(leaderboards).cloned()
 }
 
 /// Run id of a Submission: its id in EvalAI, else its name.
@@ -110,7 +130,8 @@ mod tests {
 
     #[test]
     fn twenty_routes_over_four_pairs_are_the_original_table() {
-        assert_eq!(slices(20, 4), ["0-4", "5-9", "10-14", "15-19"]);
+        let texts: Vec<String> = slices(20, 4).iter().map(RouteSlice::to_string).collect();
+        assert_eq!(texts, ["0-4", "5-9", "10-14", "15-19"]);
     }
 
     #[test]
@@ -119,10 +140,7 @@ mod tests {
             for pairs in 1..20 {
                 let all: Vec<u32> = slices(routes, pairs)
                     .iter()
-                    .flat_map(|s| {
-                        let (first, last) = slice_bounds(s).unwrap();
-                        first..=last
-                    })
+                    .flat_map(|slice| slice.first..=slice.last)
                     .collect();
                 assert_eq!(
                     all,
@@ -135,9 +153,9 @@ mod tests {
 
     #[test]
     fn a_slice_must_be_two_numbers_in_order() {
-        assert_eq!(slice_bounds("5-9"), Some((5, 9)));
+        assert_eq!("5-9".parse(), Ok(RouteSlice { first: 5, last: 9 }));
         for bad in ["", "5", "9-5", "a-b", "-1-2"] {
-            assert_eq!(slice_bounds(bad), None, "{bad}");
+            assert!(bad.parse::<RouteSlice>().is_err(), "{bad}");
         }
     }
 }

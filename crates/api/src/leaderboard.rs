@@ -3,8 +3,6 @@
 //! Owns the top level of the spec, its cross-field rules and the status. The parts are in `leaderboard_parts`.
 //! What depends on another field has no schema default: `api::effective` computes it.
 
-use std::collections::BTreeMap;
-
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::CustomResource;
@@ -35,12 +33,12 @@ use super::leaderboard_parts::{LeaderboardVersion, Verify};
     validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes a label and part of other names"),
     printcolumn = r#"{"name":"Ready","type":"string","jsonPath":".status.conditions[?(@.type==\"Ready\")].status"}"#,
     printcolumn = r#"{"name":"Reason","type":"string","jsonPath":".status.conditions[?(@.type==\"Ready\")].reason"}"#,
+    printcolumn = r#"{"name":"Paused","type":"boolean","jsonPath":".spec.paused"}"#,
     printcolumn = r#"{"name":"Pending","type":"integer","jsonPath":".status.counts.pending"}"#,
     printcolumn = r#"{"name":"Running","type":"integer","jsonPath":".status.counts.running"}"#,
     printcolumn = r#"{"name":"Finished","type":"integer","jsonPath":".status.counts.finished"}"#,
     printcolumn = r#"{"name":"Failed","type":"integer","jsonPath":".status.counts.failed"}"#,
     printcolumn = r#"{"name":"Cancelled","type":"integer","jsonPath":".status.counts.cancelled"}"#,
-    printcolumn = r#"{"name":"Budget","type":"string","jsonPath":".status.budget"}"#,
     printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#
 )]
 #[serde(rename_all = "camelCase")]
@@ -58,6 +56,7 @@ use super::leaderboard_parts::{LeaderboardVersion, Verify};
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || size(t.routeSubsets) == (has(t.pairs) ? t.pairs : self.pairs))").message("a track's routeSubsets must have one entry for each of its pairs"),
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || t.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.routes) ? t.routes : self.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
     validation = Rule::new("self.leaderboardVersion == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
+    validation = Rule::new("self.tracks.all(t, !has(t.deadlines) || !has(t.deadlines.runSeconds) || t.deadlines.runSeconds == 0 || (self.deadlines.idleSeconds < t.deadlines.runSeconds && self.deadlines.readySeconds < t.deadlines.runSeconds))").message("a track's deadlines.runSeconds must be longer than deadlines.idleSeconds and deadlines.readySeconds: the run would end before they could be reached"),
     validation = Rule::new("self.deadlines.idleSeconds > self.syncPeriodSeconds").message("deadlines.idleSeconds must be longer than syncPeriodSeconds: an agent would be stopped before its first report")
 )]
 pub struct LeaderboardSpec {
@@ -153,8 +152,8 @@ impl Leaderboard {
     }
 }
 
-/// What the operator last saw of a Leaderboard.
-#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, Default, PartialEq)]
+/// What the operator last observed of a Leaderboard.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct LeaderboardStatus {
     /// Generation of the spec that this status speaks of.
@@ -163,16 +162,42 @@ pub struct LeaderboardStatus {
     /// Submissions by state.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub counts: Option<Counts>,
-    /// Requests to EvalAI in the last minute and the limit, as `12/54`.
+    /// Use of EvalAI; absent for a local leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub budget: Option<String>,
-    /// What each track effectively runs, as `pairs x routes x repetitions`.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub tracks: BTreeMap<String, String>,
+    pub evalai: Option<EvalaiUse>,
+    /// What each track effectively runs.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
+    #[schemars(length(max = 32))]
+    pub tracks: Vec<TrackStatus>,
     /// `Ready`, `Isolated`, `Terminating`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]
     pub conditions: Vec<Condition>,
+}
+
+/// Requests to EvalAI with this Leaderboard's token.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct EvalaiUse {
+    /// Sent in the last minute.
+    pub requests_last_minute: i32,
+    /// The limit, `spec.evalai.requestsPerMinute`.
+    pub requests_per_minute: i32,
+}
+
+/// What a track effectively runs.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
+pub struct TrackStatus {
+    /// Name of the track.
+    #[schemars(length(max = 32))]
+    pub name: String,
+    /// Simulator-agent pairs.
+    pub pairs: i32,
+    /// Routes, not counting repetitions.
+    pub routes: i32,
+    /// Repetitions of each route.
+    pub repetitions: i32,
 }
 
 /// Submissions of a Leaderboard by state; `resumed` counts as running.

@@ -8,6 +8,7 @@
     reason = "durations are named by their unit; the derived schema repeats the struct without its attributes"
 )]
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext, Toleration};
@@ -17,6 +18,7 @@ use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
 pub use super::leaderboard_services::*;
+use super::submission_status::{NotASlice, RouteSlice};
 
 /// A version of CARLA Leaderboard: it chooses the format of the checkpoints, the flags of the programs and some defaults.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
@@ -68,11 +70,8 @@ pub struct Track {
     pub pairs: Option<i32>,
     /// ROUTES_SUBSET of each pair in place of equal slices, each as `first-last`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(
-        length(min = 1, max = 16),
-        inner(length(max = 16), regex(pattern = r"^[0-9]{1,5}-[0-9]{1,5}$"))
-    )]
-    pub route_subsets: Option<Vec<String>>,
+    #[schemars(length(min = 1, max = 16))]
+    pub route_subsets: Option<Vec<RouteSubset>>,
     /// File of the routes in the contents.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^/[A-Za-z0-9_./-]+$"))]
@@ -81,6 +80,15 @@ pub struct Track {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^/[A-Za-z0-9_./-]+$"))]
     pub scenarios_file: Option<String>,
+    /// Overrides deadlines of the Leaderboard.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deadlines: Option<TrackDeadlines>,
+    /// Overrides of the Leaderboard's simulator.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub simulator: Option<TrackContainer>,
+    /// Overrides of the Leaderboard's agent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub agent: Option<TrackContainer>,
     /// Nodes that may run this track.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[schemars(extend("maxProperties" = 32))]
@@ -89,6 +97,61 @@ pub struct Track {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(length(max = 32))]
     pub tolerations: Vec<Toleration>,
+}
+
+/// An entry of `routeSubsets`, such as `5-9`.
+#[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq)]
+#[serde(try_from = "String", into = "String")]
+pub struct RouteSubset(pub RouteSlice);
+
+impl TryFrom<String> for RouteSubset {
+    type Error = NotASlice;
+
+    fn try_from(text: String) -> Result<Self, NotASlice> {
+        text.parse().map(Self)
+    }
+}
+
+impl From<RouteSubset> for String {
+    fn from(subset: RouteSubset) -> Self {
+        subset.0.to_string()
+    }
+}
+
+impl JsonSchema for RouteSubset {
+    fn schema_name() -> Cow<'static, str> {
+        "RouteSubset".into()
+    }
+
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "type": "string", "maxLength": 16, "pattern": "^[0-9]{1,5}-[0-9]{1,5}$" })
+    }
+}
+
+/// Deadlines of one track's runs in place of the Leaderboard's.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct TrackDeadlines {
+    /// From the Pod's scheduling to its first agent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub start_seconds: Option<i64>,
+    /// Of a run, from its first agent; 0 is no limit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0, max = 31_536_000))]
+    pub run_seconds: Option<i64>,
+}
+
+/// What one track needs in place of the Leaderboard's.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq)]
+pub struct TrackContainer {
+    /// Requests and limits, in place of all of the Leaderboard's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resources: Option<ResourceRequirements>,
 }
 
 /// The init container that copies the private contents into shared volumes.
@@ -107,6 +170,7 @@ pub struct ContentsContainer {
     pub args: Option<Vec<String>>,
     /// Further environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub env: Vec<EnvVar>,
     /// Requests and limits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -132,6 +196,7 @@ pub struct SimulatorContainer {
     pub args: Option<Vec<String>>,
     /// Further environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub env: Vec<EnvVar>,
     /// Requests and limits, for example one `nvidia.com/gpu`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -157,6 +222,7 @@ pub struct AgentContainer {
     pub args: Option<Vec<String>>,
     /// Further environment.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub env: Vec<EnvVar>,
     /// Requests and limits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -173,7 +239,7 @@ pub struct AgentContainer {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Retries {
-    /// Crashes a pair may have.
+    /// How often a pair may be started again after a crash; 0 ends the run at the first one.
     #[serde(default = "defaults::retries_per_pair")]
     #[schemars(range(min = 0, max = 100))]
     pub per_pair: i32,
@@ -187,8 +253,8 @@ pub struct Retries {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds must be shorter than runSeconds: it could never be reached"),
-    validation = Rule::new("self.readySeconds < self.runSeconds").message("deadlines.readySeconds must be shorter than runSeconds: the run would end before a simulator may be ready"),
+    validation = Rule::new("self.runSeconds == 0 || self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds must be shorter than runSeconds: it could never be reached"),
+    validation = Rule::new("self.runSeconds == 0 || self.readySeconds < self.runSeconds").message("deadlines.readySeconds must be shorter than runSeconds: the run would end before a simulator may be ready"),
     validation = Rule::new("self.cancelSeconds <= self.flushSeconds").message("deadlines.cancelSeconds may not be longer than flushSeconds: a cancelled run would be given more time for its results than a finished one")
 )]
 #[allow(
@@ -212,9 +278,9 @@ pub struct Deadlines {
     #[serde(default = "defaults::idle_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub idle_seconds: i64,
-    /// Of a run, from its first agent.
+    /// Of a run, from its first agent; 0 is no limit. A stranger's agent without a limit may keep its nodes until somebody cancels it.
     #[serde(default = "defaults::run_seconds")]
-    #[schemars(range(min = 1, max = 31_536_000))]
+    #[schemars(range(min = 0, max = 31_536_000))]
     pub run_seconds: i64,
     /// From a cancel to the end of the Pod.
     #[serde(default = "defaults::cancel_seconds")]
@@ -393,7 +459,7 @@ mod defaults {
         ByteQuantity::gibibytes(2)
     }
     pub(super) fn retries_per_pair() -> i32 {
-        4
+        3
     }
     pub(super) fn retries_infrastructure() -> i32 {
         2
@@ -411,7 +477,7 @@ mod defaults {
         800
     }
     pub(super) fn run_seconds() -> i64 {
-        86_400
+        0
     }
     pub(super) fn cancel_seconds() -> i64 {
         120

@@ -30,12 +30,16 @@ use super::submission_status::SubmissionStatus;
     printcolumn = r#"{"name":"Leaderboard","type":"string","jsonPath":".spec.leaderboardName"}"#,
     printcolumn = r#"{"name":"Track","type":"string","jsonPath":".status.track"}"#,
     printcolumn = r#"{"name":"State","type":"string","jsonPath":".status.state"}"#,
+    printcolumn = r#"{"name":"Reason","type":"string","jsonPath":".status.reason"}"#,
     printcolumn = r#"{"name":"Progress","type":"string","jsonPath":".status.progress.text"}"#,
-    printcolumn = r#"{"name":"Score","type":"string","jsonPath":".status.score"}"#,
+    printcolumn = r#"{"name":"Score","type":"string","jsonPath":".status.score.text"}"#,
+    printcolumn = r#"{"name":"Queue","type":"string","jsonPath":".status.waiting.text"}"#,
     printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#,
-    printcolumn = r#"{"name":"Team","type":"string","jsonPath":".status.team.name","priority":1}"#,
+    printcolumn = r#"{"name":"Team","type":"string","jsonPath":".status.team.displayName","priority":1}"#,
     printcolumn = r#"{"name":"Attempt","type":"integer","jsonPath":".status.attempt","priority":1}"#,
-    printcolumn = r#"{"name":"Reason","type":"string","jsonPath":".status.reason","priority":1}"#,
+    printcolumn = r#"{"name":"Failure","type":"string","jsonPath":".status.failure.class","priority":1}"#,
+    printcolumn = r#"{"name":"Published","type":"string","jsonPath":".status.conditions[?(@.type==\"Published\")].status","priority":1}"#,
+    printcolumn = r#"{"name":"Duration","type":"string","jsonPath":".status.duration","priority":1}"#,
     printcolumn = r#"{"name":"Node","type":"string","jsonPath":".status.nodeName","priority":1}"#,
     printcolumn = r#"{"name":"Results","type":"string","jsonPath":".status.resultsURL","priority":1}"#
 )]
@@ -80,6 +84,16 @@ pub struct SubmissionSpec {
     /// Stops the present attempt and keeps its results; manifests in git leave it out.
     #[serde(default)]
     pub cancel: bool,
+}
+
+impl Submission {
+    /// Id of the team as it was accepted, else as it was submitted; the name where there is no id.
+    pub fn team(&self) -> Option<&str> {
+        let accepted = self.status.as_ref().and_then(|status| status.team.as_ref());
+        let accepted = accepted.and_then(|team| team.id.as_deref().or(team.name.as_deref()));
+        let given = self.spec.team.as_ref();
+        accepted.or_else(|| given.and_then(|team| team.id.as_deref().or(team.name.as_deref())))
+    }
 }
 
 /// A submission's ids in EvalAI.

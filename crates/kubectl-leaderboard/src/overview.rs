@@ -115,8 +115,7 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
         Some(State::Pending) => Some(match &status.waiting {
             Some(waiting) => {
                 let eta = waiting
-                    .eta
-                    .as_ref()
+                    .eta()
                     .map(|eta| format!(", starts in {eta}"))
                     .unwrap_or_default();
                 format!("{reason}: position {}{eta}", waiting.position)

@@ -12,7 +12,10 @@ use super::text::{Page, join, span, when};
 use leaderboard_api::conditions;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, PairStatus, Rerun, State, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{
+    EndReason, Failure, FailureClass, LastEnd, PairStatus, Rerun, State, Submission, SubmissionStatus, TeamStatus,
+    reasons,
+};
 
 /// What is known, and the lines about it so far.
 struct Explanation<'a> {
@@ -126,7 +129,8 @@ impl Explanation<'_> {
     fn belongs_to(&mut self) {
         let spec = &self.submission.spec;
         let track = self.status.track.as_deref().or(spec.track.as_deref());
-        let team = self.status.team.as_ref().or(spec.team.as_ref());
+        let given = spec.team.clone().map(TeamStatus::from);
+        let team = self.status.team.as_ref().or(given.as_ref());
         let team = team.and_then(|team| team.name.as_deref().or(team.id.as_deref()));
         let mut text = match track {
             Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
@@ -202,7 +206,7 @@ impl Explanation<'_> {
             self.page.row("Next try", &text);
         }
         let Some(waiting) = &self.status.waiting else { return };
-        let eta = match &waiting.eta {
+        let eta = match waiting.eta() {
             Some(eta) => format!("starts in about {eta}"),
             None if self.leaderboard.is_paused() => "no estimate while the Leaderboard is paused".to_owned(),
             None => "no estimate until runs of this track have ended".to_owned(),
@@ -250,8 +254,8 @@ impl Explanation<'_> {
         let status = self.status;
         let progress = status.progress.as_ref().map(|p| format!("{} done", p.text));
         let score = status.score.as_ref().map(|score| {
-            let so_far = if score.starts_with('~') { " so far" } else { "" };
-            format!("driving score {score}{so_far}")
+            let so_far = if score.is_final { "" } else { " so far" };
+            format!("driving score {}{so_far}", score.text)
         });
         let parts: Vec<String> = [progress, score].into_iter().flatten().collect();
         self.page.row("Routes", &sentence(&parts.join(", ")));
@@ -334,9 +338,6 @@ fn of_pair(text: &str, pair: Option<i32>) -> String {
     pair.map_or(text.clone(), |pair| text.replace("<n>", &pair.to_string()))
 }
 
-/// The reason of an end whose cause is not known.
-const UNKNOWN_END: &str = "unseen";
-
 /// How a pair crashed. The message of a failure has the count at which the pair failed; its containers may end once more before
 /// the Job is gone, so that the count is left out where both are shown.
 fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
@@ -345,7 +346,8 @@ fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
         1 => ", crashed once".to_owned(),
         count => format!(", crashed {count} times"),
     };
-    let known = pair.last.as_ref().filter(|last| last.reason != UNKNOWN_END);
+    let is_known = |last: &&LastEnd| ![EndReason::Unseen, EndReason::Unknown].contains(&last.reason);
+    let known = pair.last.as_ref().filter(is_known);
     let last = known.map(|last| {
         let code = last.exit_code.map(|code| format!(" (exit code {code})"));
         let ago = last.time.as_ref().map(|time| {

@@ -48,6 +48,23 @@ pub struct Merged {
     pub(crate) view: View,
 }
 
+impl Merged {
+    /// Mean route completion in percent, over all routes once the run is final, before over those that are done.
+    pub fn route_completion(&self) -> Option<f64> {
+        self.mean(Score::Route)
+    }
+
+    /// Mean infraction penalty, a factor, over the same routes.
+    pub fn infraction_penalty(&self) -> Option<f64> {
+        self.mean(Score::Penalty)
+    }
+
+    fn mean(&self, score: Score) -> Option<f64> {
+        let global = self.view.global.as_ref().or(self.view.so_far.as_ref())?;
+        Some(global.mean(score).as_f64()).filter(|mean| mean.is_finite())
+    }
+}
+
 /// What the renderers need of the merged file.
 #[derive(Clone, Debug)]
 pub(crate) struct View {

@@ -25,6 +25,8 @@ pub struct ReportDigest {
     pub total: u32,
     pub pairs: Vec<ReportPair>,
     pub score: Option<f64>,
+    pub route_completion: Option<f64>,
+    pub infraction_penalty: Option<f64>,
     pub is_final: bool,
     pub eligible: bool,
     pub entry_status: String,
@@ -60,8 +62,10 @@ impl ReportDigest {
             pod_uid: cut(&report.pod_uid),
             done: report.done,
             total: report.total,
-            pairs: report.pairs.iter().map(bounded).collect(),
+            pairs: report.pairs.clone(),
             score: report.score,
+            route_completion: report.route_completion,
+            infraction_penalty: report.infraction_penalty,
             is_final: report.is_final,
             eligible: report.eligible,
             entry_status: cut(&report.entry_status),
@@ -80,13 +84,6 @@ fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
     let columns = [Format::V1, Format::V2].into_iter().flat_map(metrics);
     let kept = columns.filter_map(|metric| all.remove_entry(metric.name));
     Some(Box::new(kept.collect()))
-}
-
-fn bounded(pair: &ReportPair) -> ReportPair {
-    ReportPair {
-        state: cut(&pair.state),
-        ..pair.clone()
-    }
 }
 
 fn cut(text: &str) -> String {

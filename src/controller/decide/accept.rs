@@ -11,7 +11,7 @@ use super::{Action, end, isolation};
 use crate::controller::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{ImageReference, LeaderboardSpec, State, Team, Track, effective, reasons};
+use leaderboard_api::{ImageReference, LeaderboardSpec, State, Team, TeamStatus, Track, effective, reasons};
 
 /// How long EvalAI may take before its silence is shown.
 const RETRY: Duration = Duration::from_secs(30);
@@ -272,12 +272,10 @@ fn take_team(draft: &mut Draft<'_>, info: Option<&EvalaiInfo>) {
         // A row that is edited later changes neither the run's place in line nor its row of the table.
     } else if let Some(info) = info {
         let name = given.and_then(|t| t.name).or_else(|| info.team_name.clone());
-        draft.status.team = Some(Team {
-            id: Some(info.team_id.clone()),
-            name,
-        });
+        let id = Some(info.team_id.clone());
+        draft.status.team = Some(Team { id, name }.into());
     } else if given.is_some() {
-        draft.status.team = given;
+        draft.status.team = given.map(TeamStatus::from);
     }
     let submitted = info.and_then(|info| info.submitted_at).map(Time);
     draft.status.times.submitted = draft.status.times.submitted.take().or(submitted);

@@ -8,78 +8,16 @@
 use jiff::Timestamp;
 
 use crate::controller::view::{ContainerView, EndView};
+use leaderboard_api::EndReason;
 use leaderboard_runner::verdict::What;
 
 /// How long the other side's end of a round is waited for. A runner ends within moments of its peer.
 pub(super) const PEER_SECONDS: i64 = 120;
 
-/// What ended a round of a pair. The texts stand in `status.pairs[].last.reason`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Cause {
-    /// The agent's command ended by itself.
-    Exited,
-    Killed,
-    /// The agent's runner was killed, too.
-    SilentDeath,
-    /// The agent's command ended well, without complete results.
-    Incomplete,
-    Idle,
-    OutOfMemory,
-    CannotStart,
-    /// The kubelet could not start the agent's container.
-    StartError,
-    /// The agent's verdict blames a simulator that has not failed.
-    BlamesSimulator,
-    /// The simulator followed its agent, whose own end is not known.
-    Unseen,
-    /// Another container of the Pod listened on the simulator's port.
-    PortTaken,
-    SimulatorCrashed,
-    SimulatorNotReady,
-    SimulatorSilent,
-    /// The kubelet could not start the simulator's container.
-    SimulatorNotStarted,
-}
-
-impl Cause {
-    const ALL: [(Self, &str); 15] = [
-        (Self::Exited, "exited"),
-        (Self::Killed, "killed"),
-        (Self::SilentDeath, "silentDeath"),
-        (Self::Incomplete, "incomplete"),
-        (Self::Idle, "idle"),
-        (Self::OutOfMemory, "OOMKilled"),
-        (Self::CannotStart, "cannotStart"),
-        (Self::StartError, "startError"),
-        (Self::BlamesSimulator, "blamesSimulator"),
-        (Self::Unseen, "unseen"),
-        (Self::PortTaken, "portTaken"),
-        (Self::SimulatorCrashed, "simulator"),
-        (Self::SimulatorNotReady, "notReady"),
-        (Self::SimulatorSilent, "serverSilent"),
-        (Self::SimulatorNotStarted, "simulatorNotStarted"),
-    ];
-
-    pub(super) fn as_str(self) -> &'static str {
-        Self::ALL
-            .iter()
-            .find(|(cause, _)| *cause == self)
-            .map_or("", |(_, text)| text)
-    }
-
-    /// Reads it back from a status; a text of another version says no more than that the pair crashed.
-    pub(super) fn parse(text: &str) -> Self {
-        Self::ALL
-            .iter()
-            .find(|(_, known)| *known == text)
-            .map_or(Self::Unseen, |(cause, _)| *cause)
-    }
-}
-
 /// The last crash of a pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Crash {
-    pub(super) cause: Cause,
+    pub(super) cause: EndReason,
     pub(super) exit_code: i32,
     pub(super) at: Option<Timestamp>,
     /// Nothing that may still be seen changes it.
@@ -162,7 +100,7 @@ fn of_simulator_alone(end: &EndView, now: Timestamp) -> Crash {
     match what(end) {
         Some(What::PeerCrashed) => Crash {
             is_settled: !is_awaited(end, now),
-            ..crash(Cause::Unseen, end)
+            ..crash(EndReason::Unseen, end)
         },
         _ => crash(of_simulator(end), end),
     }
@@ -170,7 +108,7 @@ fn of_simulator_alone(end: &EndView, now: Timestamp) -> Crash {
 
 fn of_agent_alone(simulator: Option<&ContainerView>, agent: &EndView, now: Timestamp) -> Crash {
     if simulator.is_none_or(cannot_be_started) {
-        return crash(Cause::SimulatorNotStarted, agent);
+        return crash(EndReason::SimulatorNotStarted, agent);
     }
     Crash {
         is_settled: !is_awaited(agent, now),
@@ -191,7 +129,7 @@ fn is_awaited(end: &EndView, now: Timestamp) -> bool {
         .is_some_and(|at| now.duration_since(at).as_secs().abs() < PEER_SECONDS)
 }
 
-fn crash(cause: Cause, end: &EndView) -> Crash {
+fn crash(cause: EndReason, end: &EndView) -> Crash {
     Crash {
         cause,
         exit_code: end.exit_code,
@@ -200,29 +138,29 @@ fn crash(cause: Cause, end: &EndView) -> Crash {
     }
 }
 
-fn of_simulator(end: &EndView) -> Cause {
+fn of_simulator(end: &EndView) -> EndReason {
     match what(end) {
-        Some(What::NotReady) => Cause::SimulatorNotReady,
-        Some(What::ServerSilent) => Cause::SimulatorSilent,
-        Some(What::PortTaken) => Cause::PortTaken,
-        None if is_start_error(end) => Cause::SimulatorNotStarted,
-        _ => Cause::SimulatorCrashed,
+        Some(What::NotReady) => EndReason::SimulatorNotReady,
+        Some(What::ServerSilent) => EndReason::SimulatorSilent,
+        Some(What::PortTaken) => EndReason::PortTaken,
+        None if is_start_error(end) => EndReason::SimulatorNotStarted,
+        _ => EndReason::SimulatorCrashed,
     }
 }
 
 /// What the agent's own end says; all of it is the agent's fault.
-fn of_agent(end: &EndView) -> Cause {
+fn of_agent(end: &EndView) -> EndReason {
     let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
     match what(end) {
-        Some(What::PeerCrashed | What::NotReady | What::ServerSilent | What::PortTaken) => Cause::BlamesSimulator,
-        Some(What::Idle) => Cause::Idle,
-        Some(What::CannotStart) => Cause::CannotStart,
-        _ if end.reason == "OOMKilled" => Cause::OutOfMemory,
-        Some(What::Exited) if exit_code == Some(0) => Cause::Incomplete,
-        Some(What::Exited) => Cause::Exited,
-        Some(What::SilentDeath) => Cause::SilentDeath,
-        None if is_start_error(end) => Cause::StartError,
-        _ => Cause::Killed,
+        Some(What::PeerCrashed | What::NotReady | What::ServerSilent | What::PortTaken) => EndReason::BlamesSimulator,
+        Some(What::Idle) => EndReason::Idle,
+        Some(What::CannotStart) => EndReason::CannotStart,
+        _ if end.reason == "OOMKilled" => EndReason::OutOfMemory,
+        Some(What::Exited) if exit_code == Some(0) => EndReason::Incomplete,
+        Some(What::Exited) => EndReason::Exited,
+        Some(What::SilentDeath) => EndReason::SilentDeath,
+        None if is_start_error(end) => EndReason::StartError,
+        _ => EndReason::Killed,
     }
 }
 

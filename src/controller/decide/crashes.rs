@@ -6,13 +6,13 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use leaderboard_runner::protocol::{Member, Pair, Side};
 
-use super::blame::{self, Cause, Crash};
+use super::blame::{self, Crash};
 use super::draft::{Draft, after};
 use super::failure::{infrastructure, participant};
 use super::next_steps::{Steps, for_both, in_the_log_of, smaller};
 use crate::controller::archive::digest::ReportDigest;
 use crate::controller::view::{ContainerView, PodView};
-use leaderboard_api::{Failure, LastEnd, PairStatus, SubmissionStatus, reasons};
+use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
 
 /// Counts the crashes of each pair and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
@@ -29,7 +29,7 @@ pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp)
     for pair in &mut status.pairs {
         if let Some(crash) = last_crash(pod, pair.id, now) {
             pair.last = Some(LastEnd {
-                reason: crash.cause.as_str().into(),
+                reason: crash.cause,
                 exit_code: Some(crash.exit_code),
                 time: crash.at.map(Time),
             });
@@ -66,7 +66,7 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
         done: 0,
         total: pair_total(status, id),
         crashes: 0,
-        state: "Waiting".into(),
+        state: PairState::Waiting,
         last: None,
     };
     let at = status.pairs.partition_point(|p| p.id < id);
@@ -85,9 +85,9 @@ fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
 pub(super) fn too_many(draft: &mut Draft<'_>) -> Option<Failure> {
-    let limit = draft.retries().per_pair.max(1);
+    let limit = draft.retries().per_pair.saturating_add(1);
     let is_too_many =
-        |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair) == Some(Cause::CannotStart));
+        |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair) == Some(EndReason::CannotStart));
     let mut awaited = None;
     for pair in draft.status.pairs.iter().filter(is_too_many) {
         let Some(cause) = cause(pair) else { continue };
@@ -114,16 +114,16 @@ pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
 /// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
 /// results that can be read is tried again as one that crashed.
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
-    let by_itself = |pair: &PairStatus| matches!(cause(pair), Some(Cause::Exited | Cause::Incomplete));
+    let by_itself = |pair: &PairStatus| matches!(cause(pair), Some(EndReason::Exited | EndReason::Incomplete));
     let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
     is_of_results && status.pairs.iter().any(by_itself) && report.is_final && report.why.is_some()
 }
 
-fn cause(pair: &PairStatus) -> Option<Cause> {
-    pair.last.as_ref().map(|last| Cause::parse(&last.reason))
+fn cause(pair: &PairStatus) -> Option<EndReason> {
+    pair.last.as_ref().map(|last| last.reason)
 }
 
-fn of_pair(id: i32, crashes: i32, cause: Cause) -> Failure {
+fn of_pair(id: i32, crashes: i32, cause: EndReason) -> Failure {
     let times = if crashes == 1 {
         "once".to_owned()
     } else {
@@ -143,29 +143,29 @@ fn of_pair(id: i32, crashes: i32, cause: Cause) -> Failure {
 }
 
 /// What a simulator did, if it was the cause.
-fn of_simulator(cause: Cause) -> Option<&'static str> {
+fn of_simulator(cause: EndReason) -> Option<&'static str> {
     match cause {
-        Cause::SimulatorCrashed => Some("it crashed"),
-        Cause::SimulatorNotReady => Some("it was not ready in time"),
-        Cause::SimulatorSilent => Some("its server did not answer any more"),
-        Cause::SimulatorNotStarted => Some("its container could not be started"),
+        EndReason::SimulatorCrashed => Some("it crashed"),
+        EndReason::SimulatorNotReady => Some("it was not ready in time"),
+        EndReason::SimulatorSilent => Some("its server did not answer any more"),
+        EndReason::SimulatorNotStarted => Some("its container could not be started"),
         _ => None,
     }
 }
 
-fn of_agent(id: i32, times: &str, cause: Cause) -> (&'static str, String, Steps) {
+fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, Steps) {
     match cause {
-        Cause::OutOfMemory => (
+        EndReason::OutOfMemory => (
             reasons::OUT_OF_MEMORY,
             format!("Agent {id} crashed {times}, the last time for lack of memory."),
             smaller(),
         ),
-        Cause::Idle => (
+        EndReason::Idle => (
             reasons::IDLE,
             format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
             in_the_log_of(id),
         ),
-        Cause::Incomplete => (
+        EndReason::Incomplete => (
             reasons::INVALID_RESULTS,
             format!(
                 "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
@@ -173,17 +173,17 @@ fn of_agent(id: i32, times: &str, cause: Cause) -> (&'static str, String, Steps)
             ),
             in_the_log_of(id),
         ),
-        Cause::CannotStart | Cause::StartError => (
+        EndReason::CannotStart | EndReason::StartError => (
             reasons::CANNOT_START,
             format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
             for_both("Rebuild the image for linux/amd64."),
         ),
-        Cause::BlamesSimulator => (
+        EndReason::BlamesSimulator => (
             reasons::AGENT_CRASHED,
             format!("Agent {id} ended {times} and blamed its simulator, which had not failed."),
             for_both("Leave the files of the evaluator's runner alone, and submit again."),
         ),
-        Cause::PortTaken => (
+        EndReason::PortTaken => (
             reasons::AGENT_CRASHED,
             format!("Another container of the Pod listened on the port of simulator {id}, which failed {times}."),
             for_both("Let the agents listen on no port of a simulator, and submit again."),

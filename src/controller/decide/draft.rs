@@ -9,8 +9,8 @@ use super::{Action, Event, Plan, Tell, reading};
 use crate::controller::view::View;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    Deadlines, Failure, Ingested, LeaderboardSpec, Retries, State, Submission, SubmissionSpec, SubmissionStatus, names,
-    reasons,
+    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
+    SubmissionStatus, effective, names, reasons,
 };
 
 /// A plan in the making.
@@ -51,7 +51,10 @@ impl<'a> Draft<'a> {
     }
 
     pub(super) fn deadlines(&self) -> Deadlines {
-        self.leaderboard().map(|l| l.deadlines).unwrap_or_default()
+        let track = self.status.track.as_deref().or(self.spec().track.as_deref());
+        let of =
+            |l: &LeaderboardSpec| effective::deadlines(l, l.tracks.iter().find(|t| Some(t.name.as_str()) == track));
+        self.leaderboard().map(of).unwrap_or_default()
     }
 
     pub(super) fn retries(&self) -> Retries {
@@ -152,7 +155,7 @@ impl<'a> Draft<'a> {
             track: old.track,
             plan: old.plan.map(|plan| leaderboard_api::RunPlan { resume: true, ..plan }),
             progress: old.progress,
-            score: old.score.map(|s| if s.starts_with('~') { s } else { format!("~{s}") }),
+            score: old.score.map(Score::so_far),
             results_url: old.results_url,
             rerun_of: old.rerun_of,
             times: leaderboard_api::Times {
@@ -207,6 +210,9 @@ impl<'a> Draft<'a> {
     }
 
     pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: &str, message: &str) {
+        if type_ == conditions::STALLED {
+            self.note_blocked(truth, reason);
+        }
         let now = self.time();
         let generation = self.status.observed_generation;
         conditions::set(
@@ -218,6 +224,19 @@ impl<'a> Draft<'a> {
             generation,
             &now,
         );
+    }
+
+    /// Remembers since when it has been stalled for one reason: the condition's own time moves with its status alone.
+    fn note_blocked(&mut self, truth: Truth, reason: &str) {
+        if truth != Truth::True {
+            self.status.blocked_since = None;
+        } else if self.stalled_since(reason).is_none_or(|since| since > self.now()) {
+            // Also after a clock was set back: what is counted from this time would not end.
+            self.status.blocked_since = Some(BlockedSince {
+                reason: reason.to_owned(),
+                time: self.time(),
+            });
+        }
     }
 
     /// Shows a state with its reason, and tells the event of a transition once.
@@ -244,10 +263,6 @@ impl<'a> Draft<'a> {
     /// Shows that nothing moves. The first words stand while the reason does, so that a changing detail of an error
     /// (a time, a request id) is not a write to the API each pass.
     pub(super) fn stall(&mut self, reason: &str, message: &str) -> String {
-        // A clock that was set back: what is counted from the condition begins anew, or it would not end.
-        if self.stalled_since(reason).is_some_and(|since| since > self.now()) {
-            conditions::remove(&mut self.status.conditions, conditions::STALLED);
-        }
         let known = conditions::get(&self.status.conditions, conditions::STALLED)
             .filter(|c| c.status == "True" && c.reason == reason)
             .map(|c| c.message.clone());
@@ -268,9 +283,10 @@ impl<'a> Draft<'a> {
 
     /// Since when it is stalled for this reason.
     pub(super) fn stalled_since(&self, reason: &str) -> Option<Timestamp> {
-        conditions::get(&self.status.conditions, conditions::STALLED)
-            .filter(|c| c.status == "True" && c.reason == reason)
-            .map(|c| c.last_transition_time.0)
+        let blocked = self.status.blocked_since.as_ref();
+        blocked
+            .filter(|blocked| blocked.reason == reason)
+            .map(|blocked| blocked.time.0)
     }
 
     /// Shows nothing new: the status stays as it was observed, and nothing is published.
@@ -286,7 +302,8 @@ impl<'a> Draft<'a> {
         }
     }
 
-    pub(super) fn into_plan(self) -> Plan {
+    pub(super) fn into_plan(mut self) -> Plan {
+        self.status.fit();
         Plan {
             report: reading::demand(&self),
             status: self.status,

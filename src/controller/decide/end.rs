@@ -154,7 +154,7 @@ fn cause(
         return failure::not_eligible(&report.entry_status);
     }
     match job_end {
-        Some(end) => failure::of_job(&draft.status, end, draft.view.pod.as_ref()),
+        Some(end) => failure::of_job(draft, end),
         None => failure::job_deleted(),
     }
 }
@@ -196,7 +196,7 @@ fn retry(draft: &mut Draft<'_>, found: &Failure) {
 
 fn finished(draft: &mut Draft<'_>, report: &ReportDigest) {
     draft.status.failure = None;
-    let score = draft.status.score.clone().unwrap_or_default();
+    let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
     let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
     close(draft, State::Finished, reasons::FINISHED, &message);
 }
@@ -211,7 +211,10 @@ pub(super) fn failed(draft: &mut Draft<'_>, found: Failure) {
 
 fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
     let ended = draft.view.ended_at().unwrap_or(draft.now());
-    draft.status.times.finished = Some(Time(ended.min(draft.now())));
+    let ended = ended.min(draft.now());
+    draft.status.times.finished = Some(Time(ended));
+    let started = draft.status.times.started.as_ref();
+    draft.status.duration = started.map(|started| duration(ended.duration_since(started.0).as_secs()));
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
     let stored = draft.view.report.ours().is_some_and(|r| r.is_final);
@@ -231,6 +234,17 @@ fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     }
     draft.say(state, reason, message);
+}
+
+/// A time span in its two largest units.
+fn duration(seconds: i64) -> String {
+    let minutes = seconds.max(0) / 60;
+    match (minutes / 1440, minutes / 60 % 24, minutes % 60) {
+        (0, 0, 0) => format!("{}s", seconds.max(0)),
+        (0, 0, minutes) => format!("{minutes}m"),
+        (0, hours, minutes) => format!("{hours}h{minutes}m"),
+        (days, hours, _) => format!("{days}d{hours}h"),
+    }
 }
 
 impl View {

@@ -4,11 +4,12 @@
 //! pairs are in `crashes`.
 
 use super::crashes;
+use super::draft::Draft;
 use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure};
 use crate::controller::view::{JobEnd, NodeSight, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, SubmissionStatus, reasons};
+use leaderboard_api::{Failure, FailureClass, reasons};
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
 pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
@@ -19,6 +20,7 @@ pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
         reason: reason.into(),
         participant_message: Some(for_participants).filter(|text| *text != message),
         message,
+        next_step: Some(next.hosts.clone()),
         charged: true,
         pair: None,
     }
@@ -30,6 +32,7 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
         class: FailureClass::Infrastructure,
         reason: reason.into(),
         message: what.to_owned(),
+        next_step: None,
         participant_message: Some(infrastructure_for_participants(reason)),
         charged: false,
         pair: None,
@@ -40,12 +43,14 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
 pub(super) fn at_the_end(found: Failure) -> Failure {
     match found.class {
         FailureClass::Participant => found,
-        FailureClass::Infrastructure => Failure {
-            message: format!("{} {}", found.message, of_infrastructure(&found.reason))
-                .trim_end()
-                .to_owned(),
-            ..found
-        },
+        FailureClass::Infrastructure => {
+            let step = of_infrastructure(&found.reason);
+            Failure {
+                message: format!("{} {step}", found.message).trim_end().to_owned(),
+                next_step: Some(step.to_owned()).filter(|step| !step.is_empty()),
+                ..found
+            }
+        }
     }
 }
 
@@ -144,18 +149,21 @@ pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
 }
 
 /// The failure of a Job that ended without final results.
-pub(super) fn of_job(status: &SubmissionStatus, end: &JobEnd, pod: Option<&PodView>) -> Failure {
-    if let Some(failure) = pod.and_then(disk_full) {
+pub(super) fn of_job(draft: &Draft<'_>, end: &JobEnd) -> Failure {
+    if let Some(failure) = draft.view.pod.as_ref().and_then(disk_full) {
         return failure;
     }
     match end {
         JobEnd::Complete { .. } => results_not_stored(),
-        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" => participant(
-            reasons::TIME_LIMIT,
-            "The Pod reached its time limit; finished routes are kept.",
-            &faster(),
-        ),
-        JobEnd::Failed { reason, message, .. } => crashes::worst(status).unwrap_or_else(|| {
+        // Without a limit on the run the deadline is not ours.
+        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds > 0 => {
+            participant(
+                reasons::TIME_LIMIT,
+                "The Pod reached its time limit; finished routes are kept.",
+                &faster(),
+            )
+        }
+        JobEnd::Failed { reason, message, .. } => crashes::worst(&draft.status).unwrap_or_else(|| {
             let what = format!("Its Job failed with {reason}: {}", sentence(message));
             infrastructure(reasons::JOB_FAILED, &what)
         }),

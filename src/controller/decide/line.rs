@@ -3,7 +3,7 @@
 use super::Action;
 use super::draft::Draft;
 use crate::controller::turns::{InLine, Turn};
-use leaderboard_api::{State, Waiting, reasons};
+use leaderboard_api::{Eta, State, Waiting, reasons};
 
 /// What follows from its turn.
 pub(super) enum Step {
@@ -38,7 +38,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> Step {
             "The Leaderboard is paused; it starts again with paused: false.",
         ),
     };
-    draft.status.waiting = Some(Waiting { position, eta });
+    draft.status.waiting = Some(Waiting::new(position, eta));
     draft.moves();
     draft.say(State::Pending, reason, message);
     // Its priority may have been edited since.
@@ -61,7 +61,7 @@ fn join(draft: &mut Draft<'_>) {
 }
 
 /// The wait that is shown of this place. One that is only estimated anew is not worth a write; it follows the place.
-fn known_eta(draft: &Draft<'_>, position: i32) -> Option<String> {
+fn known_eta(draft: &Draft<'_>, position: i32) -> Option<Eta> {
     let known = draft.status.waiting.as_ref().filter(|known| known.position == position);
-    known.and_then(|known| known.eta.clone())
+    known.and_then(Waiting::eta)
 }

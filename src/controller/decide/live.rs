@@ -10,7 +10,7 @@ use crate::controller::archive::digest::ReportDigest;
 use crate::controller::view::{JobSight, JobView, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{PairStatus, Progress, State, reasons};
+use leaderboard_api::{PairStatus, Progress, Score, State, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
@@ -264,11 +264,8 @@ fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
     draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
     if let Some(score) = report.score {
         let complete = report.is_final && report.done == report.total;
-        draft.status.score = Some(if complete {
-            format!("{score:.2}")
-        } else {
-            format!("~{score:.2}")
-        });
+        let (completion, penalty) = (report.route_completion, report.infraction_penalty);
+        draft.status.score = Some(Score::new(score, completion, penalty, complete));
     }
     // Until the present Pod's first round the report is its predecessor's, whose crashes are forgiven or counted already.
     let is_present = draft.view.pod.as_ref().is_some_and(|p| p.uid == report.pod_uid);
@@ -284,7 +281,7 @@ fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
                 done: clamp(pair.done),
                 total: clamp(pair.total),
                 crashes: told.max(known.map_or(0, |k| k.crashes)),
-                state: pair.state.clone(),
+                state: pair.state,
                 last: known.and_then(|k| k.last.clone()),
             }
         })
@@ -315,9 +312,13 @@ fn watch_run(draft: &mut Draft<'_>) {
     let Some(since) = run_since(draft).filter(|_| draft.leaderboard().is_some()) else {
         return;
     };
-    let deadline = after(since, draft.deadlines().run_seconds);
+    let limit = draft.deadlines().run_seconds;
+    if limit == 0 {
+        return;
+    }
+    let deadline = after(since, limit);
     if draft.now() >= deadline {
-        draft.fail(failure::time_limit(draft.deadlines().run_seconds));
+        draft.fail(failure::time_limit(limit));
     } else {
         draft.requeue_at(deadline);
     }

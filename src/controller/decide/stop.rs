@@ -79,7 +79,10 @@ fn show(draft: &mut Draft<'_>) {
             let what = failure.message.clone();
             return start::replacing(draft, &what);
         }
-        Some(failure) => format!("{} The run is being stopped; completed routes are kept.", failure.message),
+        Some(failure) => format!(
+            "{} The run is being stopped; completed routes are kept.",
+            failure.message
+        ),
         None => "Stopping as requested; completed routes are kept.".to_owned(),
     };
     draft.say(draft.live_state(), reasons::STOPPING, message);

@@ -29,8 +29,8 @@ use serde_json::{Value, json};
 use super::pod_overlay;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 use leaderboard_api::{
-    Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions, names,
-    reasons,
+    Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions,
+    effective, names, reasons,
 };
 
 pub(super) use pairs::FIXED_ENV;
@@ -78,8 +78,8 @@ impl JobInput<'_> {
         &self.leaderboard.spec
     }
 
-    fn deadlines(&self) -> &Deadlines {
-        &self.leaderboard.spec.deadlines
+    fn deadlines(&self) -> Deadlines {
+        effective::deadlines(self.spec(), self.track())
     }
 
     fn pairs(&self) -> usize {
@@ -231,21 +231,25 @@ fn backoff_limit(input: &JobInput<'_>) -> i32 {
     let pairs = i32::try_from(input.pairs()).unwrap_or(i32::MAX);
     pairs
         .saturating_mul(2)
-        .saturating_mul(input.spec().retries.per_pair)
+        .saturating_mul(input.spec().retries.per_pair.saturating_add(1))
         .saturating_add(SPARE_RESTARTS)
 }
 
-/// The net for an absent controller. It belongs to the Pod and not to the Job, whose own would count the wait for a node.
-fn active_deadline(deadlines: &Deadlines) -> i64 {
-    [
+/// The net for an absent controller; none without a limit on the run. It belongs to the Pod and not to the Job, whose own
+/// would count the wait for a node.
+fn active_deadline(deadlines: &Deadlines) -> Option<i64> {
+    if deadlines.run_seconds == 0 {
+        return None;
+    }
+    let seconds = [
         deadlines.start_seconds,
         deadlines.run_seconds,
         deadlines.cancel_seconds,
         deadlines.flush_seconds,
     ]
     .into_iter()
-    .fold(NET_SECONDS, i64::saturating_add)
-    .min(i32::MAX.into())
+    .fold(NET_SECONDS, i64::saturating_add);
+    Some(seconds.min(i32::MAX.into()))
 }
 
 fn template(input: &JobInput<'_>) -> PodTemplateSpec {
@@ -288,7 +292,7 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
             .chain(pairs.map(|pair| pairs::agent(input, pair)))
             .collect(),
         volumes: Some(volumes::all(input)),
-        active_deadline_seconds: Some(active_deadline(input.deadlines())),
+        active_deadline_seconds: active_deadline(&input.deadlines()),
         termination_grace_period_seconds: Some(GRACE_SECONDS),
         service_account_name: identity.and_then(|identity| identity.service_account_name.clone()),
         automount_service_account_token: Some(false),

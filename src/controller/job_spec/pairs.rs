@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{Container, EnvVar};
 
 use super::{JobInput, commands, init, variable, volumes};
 use crate::pod::run::{RUNNER, TOOLS, console_name};
-use leaderboard_api::{LeaderboardVersion, names};
+use leaderboard_api::{LeaderboardVersion, effective, names};
 
 pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
 pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
@@ -48,6 +48,7 @@ pub(super) fn python_path() -> String {
 /// The simulator of a pair.
 pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
     let (spec, deadlines) = (&input.spec().simulator, input.deadlines());
+    let own = input.track().and_then(|track| track.simulator.as_ref());
     let name = names::simulator_container(pair);
     let flags = [
         format!("--port={}", port(pair)),
@@ -66,7 +67,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         image: Some(input.plan.simulator_image.clone()),
         command: Some(behind_runner("simulator", pair, flags, words)),
         env: Some(merged(simulator_env(pair), &spec.env)),
-        resources: spec.resources.clone(),
+        resources: effective::resources(own, spec.resources.as_ref()),
         security_context: Some(spec.security_context.clone().unwrap_or_else(init::confined)),
         volume_mounts: Some(volumes::of_simulator(&name)),
         name,
@@ -77,6 +78,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
 /// The agent of a pair.
 pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
     let (spec, deadlines) = (&input.spec().agent, input.deadlines());
+    let own = input.track().and_then(|track| track.agent.as_ref());
     let name = names::agent_container(pair);
     let flags = [
         format!("--work={}", volumes::AGENT),
@@ -97,7 +99,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         image: Some(input.plan.image.clone()),
         command: Some(behind_runner("agent", pair, flags, words)),
         env: Some(merged(agent_env(input, pair), &spec.env)),
-        resources: spec.resources.clone(),
+        resources: effective::resources(own, spec.resources.as_ref()),
         security_context: Some(spec.security_context.clone().unwrap_or_else(init::confined)),
         volume_mounts: Some(volumes::of_agent(&name, pair)),
         name,
@@ -140,7 +142,7 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
     let scenarios = track
         .and_then(|track| track.scenarios_file.as_deref())
         .unwrap_or(SCENARIOS_FILE);
-    let slice = plan.slices.get(pair - 1).map_or("", String::as_str);
+    let slice = plan.slices.get(pair - 1).map(ToString::to_string).unwrap_or_default();
     // The evaluator takes any text for a yes.
     let resume = if plan.resume || input.attempt > 1 { "1" } else { "" };
     let mut env = vec![
@@ -148,7 +150,7 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         variable("CARLA_TM_PORT", &(port(pair) + 10).to_string()),
         variable("CHALLENGE_TRACK_CODENAME", &plan.codename),
         variable("ROUTES", routes),
-        variable("ROUTES_SUBSET", slice),
+        variable("ROUTES_SUBSET", &slice),
         variable("REPETITIONS", &plan.repetitions.to_string()),
         variable("RESUME", resume),
         variable("CHECKPOINT_ENDPOINT", CHECKPOINT),

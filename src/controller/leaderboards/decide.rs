@@ -1,6 +1,5 @@
 //! What a Leaderboard's status says, and when it may go: a pure function of what one pass saw.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use jiff::Timestamp;
@@ -13,7 +12,9 @@ use crate::controller::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{Evalai, Leaderboard, LeaderboardStatus, effective, names, reasons};
+use leaderboard_api::{
+    Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
+};
 
 /// What one pass saw of a Leaderboard.
 #[derive(Clone, Debug)]
@@ -73,11 +74,14 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let generation = leaderboard.metadata.generation;
     status.observed_generation = generation;
     status.counts = Some(view.counts);
-    status.budget = view.budget.map(|(used, limit)| format!("{used}/{limit}"));
+    status.evalai = view.budget.map(|(used, limit)| EvalaiUse {
+        requests_last_minute: i32::try_from(used).unwrap_or(i32::MAX),
+        requests_per_minute: i32::try_from(limit).unwrap_or(i32::MAX),
+    });
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
-    let ready = with_delay(view, ready(view));
+    let ready = with_note(view, with_delay(view, ready(view)));
     for (type_, (truth, reason, message)) in [(conditions::READY, ready), (conditions::ISOLATED, isolated)] {
         conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
     }
@@ -244,20 +248,48 @@ fn qualified(leaderboard: &Leaderboard) -> String {
     )
 }
 
-fn tracks(leaderboard: &Leaderboard) -> BTreeMap<String, String> {
-    let shape = |track| {
+fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
+    let number = |count| i32::try_from(count).unwrap_or(i32::MAX);
+    let status = |track: &Track| {
         let shape = effective::shape(&leaderboard.spec, track);
-        format!(
-            "{} pairs, {} routes, {} repetitions",
-            shape.pairs, shape.routes, shape.repetitions
-        )
+        TrackStatus {
+            name: track.name.clone(),
+            pairs: number(shape.pairs),
+            routes: number(shape.routes),
+            repetitions: number(shape.repetitions),
+        }
     };
-    leaderboard
-        .spec
+    leaderboard.spec.tracks.iter().map(status).collect()
+}
+
+/// Tracks whose runs have no time limit, as a note.
+fn without_limit(leaderboard: &Leaderboard) -> Option<String> {
+    let spec = &leaderboard.spec;
+    let has_none = |track: &&Track| effective::deadlines(spec, Some(*track)).run_seconds == 0;
+    let names: Vec<&str> = spec
         .tracks
         .iter()
-        .map(|t| (t.name.clone(), shape(t)))
-        .collect()
+        .filter(has_none)
+        .map(|track| track.name.as_str())
+        .collect();
+    let (runs, names) = match names.as_slice() {
+        [] => return None,
+        [one] => ("Runs of the track", (*one).to_owned()),
+        several => ("Runs of the tracks", several.join(", ")),
+    };
+    Some(format!(
+        "{runs} {names} have no time limit: an agent that does not end keeps its nodes until it is cancelled; set \
+         deadlines.runSeconds."
+    ))
+}
+
+/// A Leaderboard that is ready shows what its host should know all the same.
+fn with_note(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
+    let (truth, reason, message) = ready;
+    match without_limit(&view.leaderboard).filter(|_| truth == Truth::True) {
+        Some(note) => (truth, reason, format!("{message} {note}").trim_start().to_owned()),
+        None => (truth, reason, message),
+    }
 }
 
 #[cfg(test)]
@@ -270,7 +302,7 @@ mod tests {
             "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
             "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
-            "storage": {"bucket": "bucket", "prefix": prefix},
+            "storage": {"bucket": "bucket", "prefix": prefix}, "deadlines": {"runSeconds": 86400},
         });
         let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
         object.metadata.namespace = Some("ns".into());
@@ -436,6 +468,31 @@ mod tests {
                 (ready, message)
             );
         }
+    }
+
+    #[test]
+    fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
+        let mut one = leaderboard("one", 1, 7, "https://e", "a/");
+        let spec = &mut Arc::make_mut(&mut one).spec;
+        spec.deadlines.run_seconds = 0;
+        let plan = decide(&view(&one, &[]));
+        let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+        assert_eq!(
+            ready.message,
+            "Runs of the track sensors have no time limit: an agent that does not end keeps its nodes until it is cancelled; \
+             set deadlines.runSeconds."
+        );
+        Arc::make_mut(&mut one).spec.tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
+            run_seconds: Some(7200),
+            start_seconds: None,
+        });
+        let plan = decide(&view(&one, &[]));
+        assert_eq!(
+            conditions::get(&plan.status.conditions, conditions::READY)
+                .unwrap()
+                .message,
+            ""
+        );
     }
 
     #[test]

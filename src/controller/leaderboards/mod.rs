@@ -191,7 +191,7 @@ async fn write_status(
     }
     let only_numbers = leaderboard_api::LeaderboardStatus {
         counts: old.counts,
-        budget: old.budget.clone(),
+        evalai: old.evalai,
         ..plan.status.clone()
     } == old;
     let uid = uid_of(leaderboard);

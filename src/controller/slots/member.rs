@@ -54,11 +54,9 @@ impl Member {
         let began = times.scheduled.as_ref().or(times.started.as_ref());
         // What never ran says nothing of how long a run takes.
         let ended = times.started.as_ref().and(times.finished.as_ref());
-        let team = status.team.as_ref().or(spec.team.as_ref());
-        let team = team.and_then(|team| team.id.as_deref().or(team.name.as_deref()));
         let is_deleting = submission.metadata.deletion_timestamp.is_some();
         Self {
-            team: team.unwrap_or_default().to_owned(),
+            team: submission.team().unwrap_or_default().to_owned(),
             track: status.track.clone().or(spec.track.clone()).unwrap_or_default(),
             attempt,
             job: names::job(&name, attempt, retry),

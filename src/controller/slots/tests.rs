@@ -3,6 +3,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
 use serde_json::{Value, json};
 
 use super::*;
+use leaderboard_api::Eta;
 use leaderboard_api::LeaderboardSpec;
 
 fn leaderboard(running: &Value, paused: bool) -> Leaderboard {
@@ -298,15 +299,15 @@ fn the_line_knows_who_was_served_and_how_long_runs_take() {
         submission("y-next", "y", 4, json!({})),
     ];
     let world = World::new(one(), &[&all[0], &all[1], &all[2], &all[3]]);
-    let expected = |position, eta: &str| Turn::Wait {
+    let expected = |position, [low, high]: [i64; 2]| Turn::Wait {
         position,
-        eta: Some(eta.into()),
+        eta: Some(Eta::between(low * 60, high * 60)),
     };
     world.joins(&all[2]);
     world.joins(&all[3]);
     assert_eq!(world.woken(), ["x-next", "y-next"]);
-    assert_eq!(world.turn(&all[3]), expected(1, "20-30 min"));
-    assert_eq!(world.turn(&all[2]), expected(2, "40-60 min"));
+    assert_eq!(world.turn(&all[3]), expected(1, [20, 30]));
+    assert_eq!(world.turn(&all[2]), expected(2, [40, 60]));
     // With the one that has ended goes what was known of runs.
     world.slots.submission(&all[0], true);
     world.slots.allocate();
@@ -345,7 +346,7 @@ fn only_those_whose_turn_has_changed_are_woken() {
             Turn::Go,
             Turn::Wait {
                 position: 1,
-                eta: Some("20-30 min".into())
+                eta: Some(Eta::between(20 * 60, 30 * 60))
             },
             turn(299)
         )

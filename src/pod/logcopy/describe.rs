@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use leaderboard_results::Merged;
+
 use crate::pod::gather::Gathered;
 use crate::pod::judge::Ending;
 use crate::pod::places::Setting;
@@ -41,6 +43,12 @@ pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&E
         total,
         pairs: gathered.pairs.clone(),
         score: score.filter(|score| (0.0..=100.0).contains(score)),
+        route_completion: merged
+            .and_then(Merged::route_completion)
+            .filter(|percent| (0.0..=100.0).contains(percent)),
+        infraction_penalty: merged
+            .and_then(Merged::infraction_penalty)
+            .filter(|factor| (0.0..=1.0).contains(factor)),
         is_final: ending.is_some(),
         eligible: counts && merged.is_some_and(|merged| merged.eligible),
         entry_status: merged.map_or("Started", |merged| merged.ended_as()).to_owned(),

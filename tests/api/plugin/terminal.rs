@@ -202,7 +202,7 @@ pub fn evalai(submission: i64) -> Value {
 pub fn waiting() -> Value {
     json!({
         "state": "Pending", "attempt": 1, "reason": "WaitingForSlot", "message": "All slots are in use.",
-        "track": "sensors", "waiting": {"position": 3, "eta": "20-35 min"},
+        "track": "sensors", "waiting": {"position": 3, "etaMinSeconds": 1200, "etaMaxSeconds": 2100, "text": "3rd, 20-35 min"},
         "conditions": [condition("Finished", "False", "Preparing")],
     })
 }
@@ -235,7 +235,7 @@ pub fn finished() -> Value {
     let mut status = end("Finished", "Finished");
     merge(
         &mut status,
-        &json!({"score": "43.13", "progress": {"done": 20, "total": 20, "text": "20/20"}}),
+        &json!({"score": {"driving": "43.13", "final": true, "text": "43.13"}, "progress": {"done": 20, "total": 20, "text": "20/20"}}),
     );
     status
 }

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use leaderboard_api::Enforcement;
+use leaderboard_api::{Enforcement, RouteSlice};
 use leaderboard_operator::pod::run::Isolation;
 use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};
@@ -139,7 +139,7 @@ async fn a_resume_takes_up_what_has_no_report() {
 #[tokio::test]
 async fn a_failure_is_said_in_the_termination_log() {
     let mut pod = Pod::new().await;
-    pod.setting.run.plan.slices = vec!["0-1".to_owned(), "1-2".to_owned()];
+    pod.setting.run.plan.slices = vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 1, last: 2 }];
     // It never asks S3, so that no credentials are needed.
     workspace::main(pod.setting.clone()).await.unwrap_err();
     let said = fs::read_to_string(&pod.setting.places.termination_log).unwrap();

@@ -13,7 +13,7 @@ use k8s_openapi::api::core::v1::{Node, Pod};
 use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
-use leaderboard_api::names;
+use leaderboard_api::{PairState, names};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
 use leaderboard_operator::pod::run::Stop;
 use leaderboard_operator::services::archive::Archive;
@@ -262,6 +262,8 @@ fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
         total: ROUTES,
         pairs: Vec::new(),
         score: None,
+        route_completion: None,
+        infraction_penalty: None,
         is_final: false,
         eligible: true,
         entry_status: "Started".into(),
@@ -287,7 +289,7 @@ async fn put(stage: &Stage, archive: &Archive, report: &mut Report) {
         done: report.done,
         total: ROUTES,
         crashes: 0,
-        state: "Running".into(),
+        state: PairState::Running,
     }];
     if report.is_final && report.stopped.is_none() {
         report.entry_status = "Finished".into();

@@ -23,7 +23,8 @@ pub fn score(submission: &Submission) -> &str {
     submission
         .status
         .as_ref()
-        .and_then(|status| status.score.as_deref())
+        .and_then(|status| status.score.as_ref())
+        .map(|score| score.text.as_str())
         .unwrap_or_default()
 }
 

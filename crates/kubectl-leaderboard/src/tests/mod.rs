@@ -60,7 +60,7 @@ fn waiting() -> Value {
     json!({
         "state": "Pending", "attempt": 1, "reason": "WaitingForSlot", "track": "sensors",
         "message": "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
-        "team": {"id": "7", "name": "Team Seven"}, "waiting": {"position": 3, "eta": "20-35 min"},
+        "team": {"id": "7", "name": "Team Seven"}, "waiting": {"position": 3, "etaMinSeconds": 1200, "etaMaxSeconds": 2100, "text": "3rd, 20-35 min"},
         "conditions": [condition("Finished", "False", "Preparing", ""), condition("Accepted", "True", "Accepted", "")],
     })
 }
@@ -69,7 +69,7 @@ fn waiting() -> Value {
 fn running() -> Value {
     json!({
         "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
-        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "jobName": "submission-42-1",
+        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": {"driving": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
         "nodeName": "gpu-3", "resultsURL": "s3://results/v2/42", "times": {"started": "2026-11-01T11:00:00Z"},
         "conditions": [condition("Finished", "False", "Preparing", ""), condition("Running", "True", "Running", ""),
                        condition("Stalled", "False", "NotStalled", "")],
@@ -82,13 +82,13 @@ fn crashed() -> Value {
                    agent and submits again.";
     json!({
         "state": "Failed", "attempt": 1, "reason": "AgentCrashed", "message": message, "track": "sensors",
-        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": "~41.20", "jobName": "submission-42-1",
+        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": {"driving": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
         "failure": {"class": "Participant", "reason": "AgentCrashed", "message": message, "charged": true, "pair": 2},
         "pairs": [
             {"id": 1, "done": 10, "total": 10, "crashes": 0, "state": "Done"},
             {"id": 2, "done": 2, "total": 10, "crashes": 4, "state": "Crashed",
-             "last": {"reason": "exited", "exitCode": 1, "time": "2026-11-01T11:55:00Z"}},
+             "last": {"reason": "Exited", "exitCode": 1, "time": "2026-11-01T11:55:00Z"}},
         ],
         "conditions": [
             condition("Finished", "True", "AgentCrashed", message), condition("Archived", "True", "Stored", ""),
@@ -113,7 +113,7 @@ fn node_lost() -> Value {
 /// All is done.
 fn finished() -> Value {
     json!({
-        "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": "43.13",
+        "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": {"driving": "43.13", "final": true, "text": "43.13"},
         "message": "20 of 20 routes, driving score 43.13.", "progress": {"done": 20, "total": 20, "text": "20/20"},
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
         "conditions": [

@@ -59,7 +59,7 @@ Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of th
 Failure:     AgentCrashed in pair 2: participant failure, counts as an attempt.
 Attempt:     1.
 Routes:      12/20 done, driving score ~41.20 so far.
-Pair 2:      2 of 10 routes done; last end: exited (exit code 1), 5 min ago.
+Pair 2:      2 of 10 routes done; last end: Exited (exit code 1), 5 min ago.
 Results:     s3://results/v2/42
 S3:          Stored: The final results are in S3.
 EvalAI:      Waiting: EvalAI does not have the result yet. The last request failed: 503. Since
@@ -304,7 +304,7 @@ fn one_that_is_not_processed_yet_is_called_new() {
 fn the_log_is_read_where_the_run_was_stored() {
     let storage =
         json!({"bucket": "results", "prefix": "v2/", "region": "eu-west-1", "endpoint": "http://127.0.0.1:4566"});
-    let plan = json!({"runId": "42", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": ["0-9"],
+    let plan = json!({"runId": "42", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": [{"first": 0, "last": 9}],
                       "routes": 10, "repetitions": 1, "storage": storage, "image": "a:1", "contentsImage": "c:1",
                       "simulatorImage": "s:1"});
     let status = with(crashed(), &json!({"plan": plan}));

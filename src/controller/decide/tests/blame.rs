@@ -1,8 +1,9 @@
 //! The table of blame: a row for each case.
 
 use super::builders::*;
-use crate::controller::decide::blame::{Cause, last_crash};
+use crate::controller::decide::blame::last_crash;
 use crate::controller::view::ContainerView;
+use leaderboard_api::EndReason;
 
 struct Row {
     what: &'static str,
@@ -13,9 +14,9 @@ struct Row {
 
 #[derive(Debug, PartialEq)]
 enum Expected {
-    Settled(Cause),
+    Settled(EndReason),
     /// It is settled only 120 s after the end.
-    Awaited(Cause),
+    Awaited(EndReason),
     NoCrash,
 }
 
@@ -31,7 +32,7 @@ fn row(what: &'static str, simulator: ContainerView, agent: ContainerView, expec
 }
 
 /// Both sides ended in round 2, at the same second.
-fn both(what: &'static str, simulator: &str, agent: &str, cause: Cause) -> Row {
+fn both(what: &'static str, simulator: &str, agent: &str, cause: EndReason) -> Row {
     let simulator = ended("simulator-1", 2, simulator, 1, 100);
     row(what, simulator, ended("agent-1", 2, agent, 1, 100), Settled(cause))
 }
@@ -72,7 +73,7 @@ fn check(rows: Vec<Row>) {
 
 #[test]
 fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_says() {
-    use Cause::{SimulatorCrashed, SimulatorNotReady, SimulatorSilent};
+    use EndReason::{SimulatorCrashed, SimulatorNotReady, SimulatorSilent};
     check(vec![
         both("exited", "exited", "peerCrashed", SimulatorCrashed),
         both("the agent noticed first", "exited", "exited", SimulatorCrashed),
@@ -105,7 +106,9 @@ fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_says() {
 
 #[test]
 fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_word() {
-    use Cause::{BlamesSimulator, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen};
+    use EndReason::{
+        BlamesSimulator, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen,
+    };
     let killed = without_verdict(ended("agent-1", 2, "exited", 1, 100), "OOMKilled", 137);
     check(vec![
         both("exited", "peerCrashed", "exited", Exited),
@@ -146,7 +149,7 @@ fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_word() {
 
 #[test]
 fn a_simulator_that_the_kubelet_could_not_start_is_the_cause() {
-    use Cause::{SimulatorCrashed, SimulatorNotStarted};
+    use EndReason::{SimulatorCrashed, SimulatorNotStarted};
     let agent = || ended("agent-1", 0, "notReady", 1, 100);
     let start_error = without_verdict(ended("simulator-1", 1, "", 1, 100), "StartError", 128);
     let mut pulling = ended("simulator-1", 1, "peerCrashed", 1, 40);
@@ -183,7 +186,7 @@ fn a_simulator_that_the_kubelet_could_not_start_is_the_cause() {
 
 #[test]
 fn an_agent_that_ends_alone_is_the_cause_after_a_while() {
-    use Cause::{BlamesSimulator, Exited, SilentDeath};
+    use EndReason::{BlamesSimulator, Exited, SilentDeath};
     let round_2 = || restarted("simulator-1", 2, "peerCrashed", 1, 40);
     let later = |what| since(50, ended("agent-1", 2, what, 1, 100));
     let mut paused = ended("simulator-1", 2, "peerCrashed", 1, 40);

@@ -5,40 +5,34 @@ use crate::controller::decide::{Action, Tell};
 use crate::controller::turns::{InLine, Turn};
 use crate::controller::view::JobSight;
 use leaderboard_api::State::{Cancelled, Pending};
-use leaderboard_api::{SubmissionStatus, Waiting, reasons};
+use leaderboard_api::{Eta, SubmissionStatus, Waiting, reasons};
 
 #[test]
 fn who_waits_sees_place_and_time() {
     let mut world = World::local();
-    let eta = Some("20-35 min".to_owned());
-    world.view.turn = Turn::Wait {
-        position: 3,
-        eta: eta.clone(),
-    };
+    let eta = Some(Eta::between(20 * 60, 35 * 60));
+    world.view.turn = Turn::Wait { position: 3, eta };
     let plan = world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
-    assert_eq!(plan.status.waiting, Some(Waiting { position: 3, eta }));
+    assert_eq!(plan.status.waiting, Some(Waiting::new(3, eta)));
     assert!(!creates(&plan));
 
     let before = world.status();
     world.view.turn = Turn::Wait {
         position: 3,
-        eta: Some("25-40 min".into()),
+        eta: Some(Eta::between(25 * 60, 40 * 60)),
     };
     assert_eq!(world.pass().status, before, "another estimate is not another write");
 
-    let eta = Some("15-25 min".to_owned());
-    world.view.turn = Turn::Wait {
-        position: 2,
-        eta: eta.clone(),
-    };
+    let eta = Some(Eta::between(15 * 60, 25 * 60));
+    world.view.turn = Turn::Wait { position: 2, eta };
     let plan = world.pass();
-    assert_eq!(plan.status.waiting, Some(Waiting { position: 2, eta }));
+    assert_eq!(plan.status.waiting, Some(Waiting::new(2, eta)));
     assert!(plan.events.is_empty(), "a step forward is no transition");
 
     world.view.turn = Turn::Paused { position: 2 };
     let plan = world.pass_to(Pending, reasons::PAUSED);
     assert_eq!(events(&plan), [reasons::PAUSED]);
-    let place = Some(Waiting { position: 2, eta: None });
+    let place = Some(Waiting::new(2, None));
     assert_eq!(plan.status.waiting, place, "nobody knows for how long");
 
     world.view.turn = Turn::Go;

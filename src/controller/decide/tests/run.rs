@@ -18,7 +18,10 @@ fn progress_is_no_transition_and_is_told_once() {
     assert!(plan.events.is_empty());
     assert_eq!(tells(&plan), [Tell::Running, Tell::Partial]);
     assert_eq!(plan.status.progress.as_ref().unwrap().text, "1/4");
-    assert_eq!(plan.status.score.as_deref(), Some("~41.20"));
+    assert_eq!(
+        plan.status.score.as_ref().map(|score| score.text.as_str()),
+        Some("~41.20")
+    );
     assert_eq!(plan.status.message.as_deref(), Some("1/4 routes done."));
 
     world.view.partial_told = Some(1);
@@ -109,6 +112,35 @@ fn the_run_deadline_counts_from_the_first_agent_to_the_second() {
     world.complete();
     let failure = world.pass_to(Failed, reasons::TIME_LIMIT).status.failure.unwrap();
     assert!(failure.charged);
+}
+
+#[test]
+fn a_run_without_a_limit_goes_on_and_a_track_has_its_own() {
+    let mut world = World::local().running();
+    world.leaderboard().deadlines.run_seconds = 0;
+    world.go_to(400 * 86_400);
+    world.pass_to(Running, reasons::RUNNING);
+    world.leaderboard().tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
+        run_seconds: Some(86_400),
+        start_seconds: None,
+    });
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::TIME_LIMIT);
+}
+
+#[test]
+fn a_pair_is_started_again_as_often_as_the_leaderboard_allows() {
+    for (per_pair, crashes, fails) in [(0, 1, true), (1, 1, false), (1, 2, true), (3, 3, false), (3, 4, true)] {
+        let mut world = World::local().running();
+        world.leaderboard().retries.per_pair = per_pair;
+        world.see(ended("agent-1", crashes - 1, "exited", 1, 100));
+        let (state, reason) = if fails {
+            (Running, reasons::STOPPING)
+        } else {
+            (Running, reasons::RUNNING)
+        };
+        world.pass_to(state, reason);
+    }
 }
 
 #[test]
@@ -234,9 +266,9 @@ fn deadlines_and_retries_are_the_leaderboards_of_this_moment() {
 
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    world.leaderboard().retries.per_pair = 9;
+    world.leaderboard().retries.per_pair = 8;
     world.pass_to(Running, reasons::RUNNING);
-    world.leaderboard().retries.per_pair = 4;
+    world.leaderboard().retries.per_pair = 3;
     world.pass_to(Running, reasons::STOPPING);
 }
 
