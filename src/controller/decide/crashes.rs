@@ -77,8 +77,7 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
 fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
     let slice = status.plan.as_ref().and_then(|plan| {
         let slice = plan.slices.get(usize::try_from(id).ok()?.checked_sub(1)?)?;
-        let (first, last) = leaderboard_api::effective::slice_bounds(slice)?;
-        i32::try_from(last - first + 1).ok()?.checked_mul(plan.repetitions)
+        i32::try_from(slice.routes()).ok()?.checked_mul(plan.repetitions)
     });
     slice.unwrap_or(0)
 }

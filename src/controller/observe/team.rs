@@ -14,21 +14,15 @@ pub fn simulator_failures<'a>(
     submission: &Submission,
     now: Timestamp,
 ) -> usize {
-    let Some(team) = team(submission) else { return 0 };
+    let Some(team) = submission.team() else { return 0 };
     let is_counted = |other: &&Submission| {
         other.namespace() == submission.namespace()
             && other.spec.leaderboard_name == submission.spec.leaderboard_name
             && other.uid() != submission.uid()
-            && self::team(other) == Some(team)
+            && other.team() == Some(team)
             && ended_by_its_simulator(other, now)
     };
     all.into_iter().filter(is_counted).count()
-}
-
-fn team(submission: &Submission) -> Option<&str> {
-    let status = submission.status.as_ref().and_then(|status| status.team.as_ref());
-    let team = status.or(submission.spec.team.as_ref())?;
-    team.id.as_deref().or(team.name.as_deref())
 }
 
 fn ended_by_its_simulator(submission: &Submission, now: Timestamp) -> bool {
