@@ -1,5 +1,7 @@
 //! The sidecar, from the first round to SIGTERM.
 
+use leaderboard_api::PairState;
+
 use super::*;
 
 #[tokio::test]
