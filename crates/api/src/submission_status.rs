@@ -285,6 +285,7 @@ impl Score {
     }
 
     /// The same as the score of a run that goes on.
+    #[must_use]
     pub fn so_far(self) -> Self {
         Self {
             text: text_of(&self.driving, false),
