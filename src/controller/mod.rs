@@ -19,6 +19,7 @@ pub mod leaderboards;
 pub mod memory;
 pub mod network_policy;
 pub mod observe;
+mod pod_layout;
 pub mod pod_overlay;
 pub mod reruns;
 mod result_texts;
