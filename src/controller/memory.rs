@@ -9,7 +9,7 @@ use std::time::Duration;
 use kube::ResourceExt;
 use tokio::time::Instant;
 
-use super::observe::uid_of;
+use super::objects::uid_of;
 use leaderboard_api::{Submission, SubmissionStatus};
 
 /// Places in line that are written without waiting for their turn.

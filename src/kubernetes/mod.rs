@@ -2,6 +2,7 @@
 //!
 //! Imports the API types and `observability`; knows no policy, and no module that uses it.
 
+mod call;
 mod feed;
 pub mod preflight;
 mod watch;
@@ -16,6 +17,7 @@ use kube::core::{DeserializeGuard, NamespaceResourceScope};
 use kube::{Api, Client, Resource};
 use serde::de::DeserializeOwned;
 
+pub use call::{CALL_TIMEOUT, CallError, call};
 pub use feed::{WatchEvent, WatchEvents};
 pub use watch::{Synced, Unreadable, Watch, spawn_watch};
 

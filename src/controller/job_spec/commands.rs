@@ -3,7 +3,7 @@
 //! Kubernetes replaces `$(NAME)` in a container's words and variables when it starts; the runner does the same with an
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
-use super::pairs;
+use crate::controller::pod_layout::python_path;
 use leaderboard_api::LeaderboardVersion;
 
 /// A command with its arguments.
@@ -59,7 +59,7 @@ pub(super) fn simulator(format: LeaderboardVersion) -> Vec<String> {
 /// are what the participant's files make of them.
 pub(super) fn agent(format: LeaderboardVersion) -> Vec<String> {
     let flags: Vec<String> = agent_flags(format).iter().map(|flag| format!("  {flag}")).collect();
-    let front = pairs::python_path();
+    let front = python_path();
     // The image may put its own modules on the path, but not in front of the contents' leaderboard.
     let script = format!(
         r#"[ -f ~/.bashrc ] && source ~/.bashrc

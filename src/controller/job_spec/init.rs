@@ -2,14 +2,11 @@
 //!
 //! Only our own two ever get an identity towards AWS.
 
-use std::collections::BTreeMap;
-
 use k8s_openapi::api::core::v1::{
-    Capabilities, Container, EnvVar, EnvVarSource, ObjectFieldSelector, ResourceRequirements, SeccompProfile,
-    SecretKeySelector, SecurityContext,
+    Container, EnvVar, EnvVarSource, ObjectFieldSelector, SecretKeySelector, SecurityContext,
 };
-use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
+use super::security::{confined, resources};
 use super::{JobInput, commands, run_document, variable, volumes};
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 use leaderboard_api::names;
@@ -120,32 +117,5 @@ fn from_secret(secret: &str, key: &str, optional: bool) -> EnvVar {
             ..EnvVarSource::default()
         }),
         value: None,
-    }
-}
-
-/// No limit on local storage: Kubernetes would take it for the limit of the whole Pod and evict that.
-fn resources(requests: [&str; 2], memory: &str) -> ResourceRequirements {
-    let quantity = |text: &str| Quantity(text.into());
-    let [cpu, requested] = requests.map(quantity);
-    ResourceRequirements {
-        requests: Some(BTreeMap::from([("cpu".into(), cpu), ("memory".into(), requested)])),
-        limits: Some(BTreeMap::from([("memory".into(), quantity(memory))])),
-        ..ResourceRequirements::default()
-    }
-}
-
-/// The default for every container: no capability, no new privileges. The uid stays the image's.
-pub(super) fn confined() -> SecurityContext {
-    SecurityContext {
-        allow_privilege_escalation: Some(false),
-        capabilities: Some(Capabilities {
-            drop: Some(vec!["ALL".into()]),
-            add: None,
-        }),
-        seccomp_profile: Some(SeccompProfile {
-            type_: "RuntimeDefault".into(),
-            localhost_profile: None,
-        }),
-        ..SecurityContext::default()
     }
 }

@@ -6,6 +6,7 @@
 mod commands;
 mod init;
 mod pairs;
+mod security;
 mod volumes;
 
 #[cfg(test)]
@@ -26,18 +27,13 @@ use kube::Resource;
 use kube::api::{DynamicObject, TypeMeta};
 use serde_json::{Value, json};
 
+use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 use leaderboard_api::{
     Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions,
     effective, names, reasons,
 };
-
-pub(super) use pairs::FIXED_ENV;
-pub(super) use volumes::{CONTENTS_VOLUMES, OWN_VOLUMES, protected_mounts};
-
-/// Annotation that keeps EKS from putting the ServiceAccount's role into the containers it names.
-pub const ANNOTATION_SKIP_CONTAINERS: &str = "eks.amazonaws.com/skip-containers";
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;

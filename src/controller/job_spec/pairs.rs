@@ -4,13 +4,13 @@
 
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 
-use super::{JobInput, commands, init, variable, volumes};
+use super::security::confined;
+use super::{JobInput, commands, variable, volumes};
+use crate::controller::pod_layout::{
+    AGENT, CARLA_ROOT, FIXED_ENV, LEADERBOARD_ROOT, SAVED, SCENARIO_RUNNER_ROOT, STATUS, python_path,
+};
 use crate::pod::run::{RUNNER, TOOLS, console_name};
 use leaderboard_api::{LeaderboardVersion, effective, names};
-
-pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
-pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
-pub(super) const LEADERBOARD_ROOT: &str = "/workspace/leaderboard";
 
 const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
@@ -19,30 +19,9 @@ const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
 /// A server prints little; one that floods must not fill the disk. In bytes.
 const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
 
-/// Variables of simulators and agents that follow from the plan: nobody else may set them.
-pub(in crate::controller) const FIXED_ENV: [&str; 12] = [
-    "CARLA_PORT",
-    "CARLA_TM_PORT",
-    "CHALLENGE_TRACK_CODENAME",
-    "ROUTES",
-    "ROUTES_SUBSET",
-    "SCENARIOS",
-    "REPETITIONS",
-    "RESUME",
-    "CHECKPOINT_ENDPOINT",
-    "CARLA_ROOT",
-    "SCENARIO_RUNNER_ROOT",
-    "LEADERBOARD_ROOT",
-];
-
 /// Port of a pair's simulator; pairs count from 1.
 fn port(pair: usize) -> usize {
     2000 + 100 * (pair - 1)
-}
-
-/// Puts what the original's script put there in front of the image's own PYTHONPATH.
-pub(super) fn python_path() -> String {
-    format!("{CARLA_ROOT}/PythonAPI/carla:{SCENARIO_RUNNER_ROOT}:{LEADERBOARD_ROOT}")
 }
 
 /// The simulator of a pair.
@@ -55,7 +34,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         seconds("ready", deadlines.ready_seconds),
         seconds("flush", deadlines.flush_seconds),
         seconds("cancel", deadlines.cancel_seconds),
-        format!("--log={}/{}", volumes::SAVED, console_name(pair)),
+        format!("--log={}/{}", SAVED, console_name(pair)),
         format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
     ];
     let host = spec
@@ -68,7 +47,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         command: Some(behind_runner("simulator", pair, flags, words)),
         env: Some(merged(simulator_env(pair), &spec.env)),
         resources: effective::resources(own, spec.resources.as_ref()),
-        security_context: Some(spec.security_context.clone().unwrap_or_else(init::confined)),
+        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
         volume_mounts: Some(volumes::of_simulator(&name)),
         name,
         ..Container::default()
@@ -81,7 +60,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
     let own = input.track().and_then(|track| track.agent.as_ref());
     let name = names::agent_container(pair);
     let flags = [
-        format!("--work={}", volumes::AGENT),
+        format!("--work={AGENT}"),
         format!("--checkpoint={CHECKPOINT}"),
         seconds("ready", deadlines.ready_seconds),
         seconds("idle", deadlines.idle_seconds),
@@ -100,7 +79,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         command: Some(behind_runner("agent", pair, flags, words)),
         env: Some(merged(agent_env(input, pair), &spec.env)),
         resources: effective::resources(own, spec.resources.as_ref()),
-        security_context: Some(spec.security_context.clone().unwrap_or_else(init::confined)),
+        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
         volume_mounts: Some(volumes::of_agent(&name, pair)),
         name,
         ..Container::default()
@@ -112,7 +91,7 @@ fn behind_runner<const N: usize>(side: &str, pair: usize, flags: [String; N], wo
         format!("{TOOLS}/{RUNNER}"),
         side.to_owned(),
         format!("--pair={pair}"),
-        format!("--status={}", volumes::STATUS),
+        format!("--status={STATUS}"),
     ];
     start
         .into_iter()
@@ -154,7 +133,7 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         variable("REPETITIONS", &plan.repetitions.to_string()),
         variable("RESUME", resume),
         variable("CHECKPOINT_ENDPOINT", CHECKPOINT),
-        variable("RECORD_PATH", volumes::SAVED),
+        variable("RECORD_PATH", SAVED),
         variable("DEBUG_CHALLENGE", "0"),
         variable("CARLA_ROOT", CARLA_ROOT),
         variable("SCENARIO_RUNNER_ROOT", SCENARIO_RUNNER_ROOT),

@@ -1,5 +1,4 @@
-//! The Pod's volumes, and who mounts which of them where. Pure; called by the builders of the containers and, for what an
-//! overlay may not touch, by `pod_overlay`.
+//! The Pod's volumes, and who mounts which of them where. Pure; called by the builders of the containers.
 
 use k8s_openapi::api::core::v1::{
     DownwardAPIVolumeFile, DownwardAPIVolumeSource, EmptyDirVolumeSource, ObjectFieldSelector, ProjectedVolumeSource,
@@ -8,33 +7,11 @@ use k8s_openapi::api::core::v1::{
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
 use super::JobInput;
+use crate::controller::pod_layout::{
+    AGENT, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, STATUS, TOOLS_VOLUME,
+};
 use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
 use leaderboard_api::names;
-
-/// Volumes with the private contents, each with where `contents` writes it and where agents read it.
-pub(in crate::controller) const CONTENTS_VOLUMES: [(&str, &str, &str); 3] = [
-    ("leaderboard", "/tmp/leaderboard", super::pairs::LEADERBOARD_ROOT),
-    (
-        "scenario-runner",
-        "/tmp/scenario_runner",
-        super::pairs::SCENARIO_RUNNER_ROOT,
-    ),
-    ("carla-python-api", "/tmp/CARLA", super::pairs::CARLA_ROOT),
-];
-/// The other volumes of ours. Nothing but our own mounts of them keeps a stranger from what is in them.
-pub(in crate::controller) const OWN_VOLUMES: [&str; 4] = [LOGS_VOLUME, TOOLS_VOLUME, PODINFO_VOLUME, IDENTITY_VOLUME];
-
-const LOGS_VOLUME: &str = "logs";
-const TOOLS_VOLUME: &str = "tools";
-const PODINFO_VOLUME: &str = "podinfo";
-const IDENTITY_VOLUME: &str = "identity";
-
-/// Status files, in simulators and agents.
-pub(super) const STATUS: &str = "/tmp/status";
-/// An agent's own folder of results and log.
-pub(super) const AGENT: &str = "/tmp/agent";
-/// What a simulator keeps.
-pub(super) const SAVED: &str = "/home/carla/CarlaUE4/Saved";
 
 const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;
@@ -200,12 +177,4 @@ fn read_only(mount: VolumeMount) -> VolumeMount {
         read_only: Some(true),
         ..mount
     }
-}
-
-/// Paths at and below which an overlay may mount nothing.
-pub(in crate::controller) fn protected_mounts() -> impl Iterator<Item = &'static str> {
-    let contents = CONTENTS_VOLUMES
-        .into_iter()
-        .flat_map(|(_, written, read)| [written, read]);
-    contents.chain([LOGS, TOOLS, PODINFO, IDENTITY, STATUS, AGENT, SAVED])
 }

@@ -6,8 +6,10 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
-use super::isolation::{self, Policy};
+use super::isolation;
+use super::probe::EvalaiStanding;
 use super::reach::Unreachable;
+use super::state::Policy;
 use crate::controller::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
 use leaderboard_api::conditions::{self, Truth};
@@ -41,22 +43,6 @@ pub struct LeaderboardView {
     pub evalai_writes_from: Option<Timestamp>,
     /// Requests of the last minute and the limit.
     pub budget: Option<(u32, u32)>,
-}
-
-/// How a Leaderboard stands with EvalAI.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum EvalaiStanding {
-    NotRequired,
-    NoToken(String),
-    TokenRefused(String),
-    /// Its phases or labels do not fit the challenge.
-    Misfit(String),
-    /// Not checked yet, or EvalAI does not answer.
-    Unchecked(Option<String>),
-    Fits {
-        /// Something to be said although it works, such as a token that ends soon.
-        note: Option<String>,
-    },
 }
 
 /// What a pass wants.

@@ -2,7 +2,7 @@
 //!
 //! `keep` writes it, `restore` as soon as somebody else has changed it; `measured` reads what the Pods found; `condition` is pure and says what follows for `Isolated`.
 
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -12,15 +12,15 @@ use k8s_openapi::api::core::v1::{ContainerStateTerminated, ContainerStatus, Pod}
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::reflector::ObjectRef;
-use kube::{Api, ResourceExt};
+use kube::{Api, Client, ResourceExt};
 
-use super::{Desk, POLICY_AGAIN, RESYNC, SOONEST};
-use crate::controller::context::{CALL_TIMEOUT, Context, Stores};
+use super::state::{Applied, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
 use crate::controller::network_policy::{is_in_place, network_policy};
-use crate::controller::observe::uid_of;
-use crate::kubernetes::WatchEvents;
+use crate::controller::objects::{key_of, uid_of};
+use crate::controller::slots::SlotAllocator;
+use crate::controller::stores::Stores;
+use crate::kubernetes::{WatchEvents, call};
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
-use leaderboard_api::client_errors;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, names, reasons};
@@ -28,37 +28,26 @@ use leaderboard_api::{Enforcement, Leaderboard, PolicySource, names, reasons};
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;
 
-/// How the policy of a Leaderboard stands.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Policy {
-    InPlace,
-    /// The cluster has its own.
-    External,
-    /// The API server refuses it, and why.
-    Refused(String),
-    /// It could not be applied, or came out otherwise, and why.
-    NotApplied(String),
+/// Wakes a Leaderboard.
+pub type Wake = Box<dyn Fn(ObjectRef<Leaderboard>) + Send + Sync>;
+
+/// What keeps the policies in place.
+#[derive(Clone, Copy)]
+pub struct Policies<'a> {
+    pub client: &'a Client,
+    pub stores: &'a Stores,
+    pub state: &'a LeaderboardState,
+    pub slots: &'a SlotAllocator,
+    pub wake: &'a Wake,
 }
 
-/// The last apply.
-#[derive(Clone, Debug)]
-pub(super) struct Applied {
-    at: Timestamp,
-    /// Of which spec.
-    generation: Option<i64>,
-    policy: Policy,
-    /// Since when applies are answered well and the cache does not show it.
-    unseen: Option<Timestamp>,
-}
-
-impl Applied {
-    pub(super) fn has_failed(&self) -> bool {
-        matches!(self.policy, Policy::Refused(_) | Policy::NotApplied(_))
+impl Policies<'_> {
+    /// Whether Jobs may be made: the watch shows the policy of the present spec, and the last apply did not fail.
+    pub fn is_in_place(&self, leaderboard: &Leaderboard) -> bool {
+        let last = self.state.applied(&uid_of(leaderboard));
+        self.stores.shows_policy(leaderboard) && !last.is_some_and(|last| last.has_failed())
     }
 }
-
-/// What was measured last, of which generation.
-pub(super) type Measured = (Option<i64>, WorkspaceVerdict);
 
 /// How long after an apply another one is due. `is_shown`: the cache shows the policy as it should be.
 pub(super) fn again(policy: &Policy, is_shown: bool) -> Duration {
@@ -74,27 +63,27 @@ pub(super) fn again(policy: &Policy, is_shown: bool) -> Duration {
 }
 
 /// Puts the policy in place if it is not, and once in a while all the same. Never fails: what is wrong is shown.
-pub(super) async fn keep(context: &Context, leaderboard: &Leaderboard, now: Timestamp) -> Policy {
+pub(super) async fn keep(policies: Policies<'_>, leaderboard: &Leaderboard, now: Timestamp) -> Policy {
     if leaderboard.spec.network.policy == PolicySource::External {
         return Policy::External;
     }
     let uid = uid_of(leaderboard);
     let generation = leaderboard.metadata.generation;
-    let is_shown = context.stores.shows_policy(leaderboard);
+    let is_shown = policies.stores.shows_policy(leaderboard);
     if is_shown {
-        context.desk.note_seen(&uid);
+        policies.state.note_seen(&uid);
     }
-    let last = context.desk.applied(&uid);
+    let last = policies.state.applied(&uid);
     if let Some(last) = last.as_ref().filter(|last| last.generation == generation)
         && now.duration_since(last.at).unsigned_abs() < again(&last.policy, is_shown)
     {
         return last.policy.clone();
     }
-    let answer = apply(context, leaderboard).await;
-    let is_shown = context.stores.shows_policy(leaderboard);
+    let answer = apply(policies.client, leaderboard).await;
+    let is_shown = policies.stores.shows_policy(leaderboard);
     let is_unseen = answer == Policy::InPlace && !is_shown;
     let unseen = is_unseen.then(|| last.as_ref().and_then(|last| last.unseen).unwrap_or(now));
-    let is_blind = !context.stores.policies_synced.is_true()
+    let is_blind = !policies.stores.policies_synced.is_true()
         || unseen.is_some_and(|since| now.duration_since(since).unsigned_abs() >= POLICY_AGAIN);
     let policy = settled(answer, is_shown, is_blind);
     let applied = Applied {
@@ -104,10 +93,12 @@ pub(super) async fn keep(context: &Context, leaderboard: &Leaderboard, now: Time
         unseen,
     };
     tell(leaderboard, last.as_ref(), &applied);
-    context.desk.note_applied(&uid, applied);
+    policies.state.note_applied(&uid, applied);
     if policy == Policy::InPlace && last.is_some_and(|last| last.has_failed()) {
         // An apply that changes nothing is no event.
-        context.wake(ObjectRef::from_obj(leaderboard));
+        let reference = ObjectRef::from_obj(leaderboard);
+        policies.slots.wake_pending(&reference);
+        (policies.wake)(reference);
     }
     policy
 }
@@ -132,7 +123,7 @@ fn tell(leaderboard: &Leaderboard, last: Option<&Applied>, new: &Applied) {
     if last.is_some_and(|last| last.policy == new.policy) {
         return;
     }
-    let leaderboard = super::key_of(leaderboard).to_string();
+    let leaderboard = key_of(leaderboard).to_string();
     match &new.policy {
         Policy::Refused(why) | Policy::NotApplied(why) => {
             tracing::warn!(leaderboard, why, "the NetworkPolicy is not in place");
@@ -142,103 +133,67 @@ fn tell(leaderboard: &Leaderboard, last: Option<&Applied>, new: &Applied) {
     }
 }
 
-impl Desk {
-    fn applied(&self, uid: &str) -> Option<Applied> {
-        let policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
-        policies.get(uid).cloned()
-    }
-
-    /// Whether the last apply of its policy was refused or failed.
-    pub fn policy_failed(&self, uid: &str) -> bool {
-        self.applied(uid).is_some_and(|last| last.has_failed())
-    }
-
-    fn note_applied(&self, uid: &str, applied: Applied) {
-        let mut policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
-        policies.insert(uid.to_owned(), applied);
-    }
-
-    /// The cache shows the policy as it should be.
-    fn note_seen(&self, uid: &str) {
-        let mut policies = self.policies.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(applied) = policies.get_mut(uid) {
-            applied.unseen = None;
-        }
-    }
-
-    fn measured(&self, uid: &str) -> Option<Measured> {
-        let measured = self.measured.lock().unwrap_or_else(PoisonError::into_inner);
-        measured.get(uid).cloned()
-    }
-
-    fn note_measured(&self, uid: &str, found: Measured) {
-        let mut measured = self.measured.lock().unwrap_or_else(PoisonError::into_inner);
-        measured.insert(uid.to_owned(), found);
-    }
-}
-
 /// Restores what somebody has edited or deleted, and applies what a new spec asks for, until the process stops: a task of its
-/// own, because the reconcile of a Leaderboard may wait for a bucket or a token meanwhile.
-pub async fn restore(
+/// own, because the reconcile of a Leaderboard may wait for a bucket or a token meanwhile. `keep` is `keep_missing`.
+pub async fn restore<F: Future<Output = ()>>(
     policies: WatchEvents<NetworkPolicy>,
     leaderboards: WatchEvents<Leaderboard>,
-    context: Arc<Context>,
+    keep: impl Fn(ObjectRef<Leaderboard>) -> F,
 ) {
     // The reconcile of a Leaderboard has a moment to do it itself.
-    let of_spec = leaderboards.map(|touch| (Some(ObjectRef::from_obj(touch.object.as_ref())), false));
-    let of_policy = policies.map(|touch| (Stores::leaderboard_of(touch.object.as_ref()), true));
-    let restored = select(of_spec, of_policy).for_each_concurrent(RESTORED_AT_ONCE, |(reference, at_once)| {
-        let context = Arc::clone(&context);
-        async move {
+    let of_spec = leaderboards.map(|event| (Some(ObjectRef::from_obj(event.object.as_ref())), false));
+    let of_policy = policies.map(|event| (Stores::leaderboard_of(event.object.as_ref()), true));
+    let keep = &keep;
+    let restored =
+        select(of_spec, of_policy).for_each_concurrent(RESTORED_AT_ONCE, |(reference, at_once)| async move {
             let Some(reference) = reference else { return };
             if at_once {
-                keep_missing(&context, &reference).await;
+                keep(reference.clone()).await;
             }
             // The edit may have come a moment after an apply, which is then left to this second one.
             tokio::time::sleep(SOONEST).await;
-            keep_missing(&context, &reference).await;
-        }
-    });
+            keep(reference).await;
+        });
     restored.await;
 }
 
-async fn keep_missing(context: &Context, reference: &ObjectRef<Leaderboard>) {
-    let Some(leaderboard) = context.stores.leaderboards.get(reference) else {
+/// Applies the policy of a Leaderboard if the watch does not show it.
+pub async fn keep_missing(policies: Policies<'_>, reference: &ObjectRef<Leaderboard>) {
+    let Some(leaderboard) = policies.stores.leaderboards.get(reference) else {
         return;
     };
-    if context.stores.shows_policy(&leaderboard) {
-        context.desk.note_seen(&uid_of(leaderboard.as_ref()));
+    if policies.stores.shows_policy(&leaderboard) {
+        policies.state.note_seen(&uid_of(leaderboard.as_ref()));
     } else {
-        keep(context, &leaderboard, Timestamp::now()).await;
+        keep(policies, &leaderboard, Timestamp::now()).await;
     }
 }
 
-async fn apply(context: &Context, leaderboard: &Leaderboard) -> Policy {
+async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
     let wanted = network_policy(leaderboard);
     let name = wanted.name_any();
     let namespace = leaderboard.namespace().unwrap_or_default();
-    let api: Api<NetworkPolicy> = Api::namespaced(context.client.clone(), &namespace);
+    let api: Api<NetworkPolicy> = Api::namespaced(client.clone(), &namespace);
     let params = PatchParams::apply(names::MANAGER_CHILDREN).force();
     let patch = Patch::Apply(&wanted);
-    match tokio::time::timeout(CALL_TIMEOUT, api.patch(&name, &params, &patch)).await {
-        Ok(Ok(answer)) if is_in_place(&answer, leaderboard) => Policy::InPlace,
-        Ok(Ok(_)) => Policy::NotApplied(format!(
+    match call("the NetworkPolicy", &name, api.patch(&name, &params, &patch)).await {
+        Ok(answer) if is_in_place(&answer, leaderboard) => Policy::InPlace,
+        Ok(_) => Policy::NotApplied(format!(
             "The API server has changed the NetworkPolicy {name} while it was applied. Look for an admission webhook that \
              does so."
         )),
-        Ok(Err(kube::Error::Api(status))) if is_refusal(status.code) => Policy::Refused(format!(
-            "The API server refuses the NetworkPolicy {name}: {} Give the operator's role create and patch of \
-             networkpolicies in this namespace, or correct what the admission webhook says; where the cluster has policies \
-             of its own, set network.policy to External.",
-            sentence(&status.message)
-        )),
-        Ok(Err(error)) => Policy::NotApplied(format!(
-            "The NetworkPolicy {name} could not be applied: {} It is tried again.",
-            sentence(&client_errors::kube(&error))
-        )),
-        Err(_) => Policy::NotApplied(format!(
-            "The NetworkPolicy {name} could not be applied: the API server did not answer. It is tried again."
-        )),
+        Err(error) => match error.status().filter(|status| is_refusal(status.code)) {
+            Some(status) => Policy::Refused(format!(
+                "The API server refuses the NetworkPolicy {name}: {} Give the operator's role create and patch of \
+                 networkpolicies in this namespace, or correct what the admission webhook says; where the cluster has policies \
+                 of its own, set network.policy to External.",
+                sentence(&status.message)
+            )),
+            None => Policy::NotApplied(format!(
+                "The NetworkPolicy {name} could not be applied: {} It is tried again.",
+                sentence(&error.cause())
+            )),
+        },
     }
 }
 
@@ -249,7 +204,11 @@ fn is_refusal(code: u16) -> bool {
 
 /// What was measured last of this generation: by a Pod that is there, else by one that is gone, as the condition says; while the
 /// condition says something else, as this process remembers it.
-pub(super) fn measured(context: &Context, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
+pub(super) fn measured(
+    stores: &Stores,
+    state: &LeaderboardState,
+    leaderboard: &Leaderboard,
+) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
         // The condition does not show it, and each reconcile would look at all Pods.
@@ -257,13 +216,13 @@ pub(super) fn measured(context: &Context, leaderboard: &Leaderboard) -> Option<W
     }
     let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation);
     let remembered = || {
-        let (of, verdict) = context.desk.measured(&uid)?;
+        let (of, verdict) = state.measured(&uid)?;
         (of == generation).then_some(verdict)
     };
-    let found = by_pods(&context.stores, leaderboard)
+    let found = by_pods(stores, leaderboard)
         .or_else(|| known(leaderboard))
         .or_else(remembered)?;
-    context.desk.note_measured(&uid, (generation, found.clone()));
+    state.note_measured(&uid, (generation, found.clone()));
     Some(found)
 }
 

@@ -4,7 +4,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::{Value, json};
 
 use super::*;
+use crate::controller::context::Context;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
+use crate::controller::leaderboards::{Uses, reconcile};
 use crate::observability::logging::tests::Lines;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
@@ -97,7 +99,7 @@ fn only_what_was_measured_is_called_enforced() {
 async fn what_a_pod_found_outlives_it_until_the_spec_changes() {
     let around = surroundings(Cluster::default(), "http://127.0.0.1:1").await;
     let said = |leaderboard: &Leaderboard| {
-        let found = measured(&around.context, leaderboard);
+        let found = measured(&around.context.stores, &around.context.leaderboards, leaderboard);
         condition(leaderboard, &Policy::InPlace, found.as_ref())
     };
     for (reason, of) in [
@@ -211,7 +213,7 @@ fn note(context: &Context, board: &Leaderboard, policy: Policy, at: Timestamp) {
         policy,
         unseen: None,
     };
-    context.desk.note_applied(&uid_of(board), applied);
+    context.leaderboards.note_applied(&uid_of(board), applied);
 }
 
 #[tokio::test]
@@ -239,12 +241,18 @@ async fn what_was_refused_stays_so_until_it_is_tried_again_and_then_wakes_who_wa
     let after = |seconds: i64| began + jiff::SignedDuration::from_secs(seconds);
     let refused = Policy::Refused("no".into());
     note(&around.context, &board, refused.clone(), began);
-    assert_eq!(keep(&around.context, &board, after(5)).await, refused);
+    assert_eq!(keep(around.context.policies(), &board, after(5)).await, refused);
     assert!(around.requests.try_recv().is_err() && around.woken.try_recv().is_err());
-    assert_eq!(keep(&around.context, &board, after(11)).await, Policy::InPlace);
+    assert_eq!(
+        keep(around.context.policies(), &board, after(11)).await,
+        Policy::InPlace
+    );
     assert_eq!(around.requests.try_recv().unwrap().method, http::Method::PATCH);
     assert_eq!(around.woken.try_recv().unwrap(), "carla");
-    assert_eq!(keep(&around.context, &board, after(20)).await, Policy::InPlace);
+    assert_eq!(
+        keep(around.context.policies(), &board, after(20)).await,
+        Policy::InPlace
+    );
     assert!(around.requests.try_recv().is_err() && around.woken.try_recv().is_err());
 }
 
@@ -259,7 +267,7 @@ async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missi
     let mut said = Vec::new();
     for second in 0..60 {
         let now = began + jiff::SignedDuration::from_secs(second);
-        said.push(keep(&around.context, &board, now).await == Policy::InPlace);
+        said.push(keep(around.context.policies(), &board, now).await == Policy::InPlace);
     }
     assert!(said[..10].iter().all(|is_fine| *is_fine), "the cache may lag");
     assert!(said[10..].iter().all(|is_fine| !is_fine));
@@ -273,7 +281,7 @@ async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missi
     assert!(told.contains("one/carla"), "{told}");
     around.context.stores.policies_synced.set(false);
     board.metadata.generation = Some(2);
-    let policy = keep(&around.context, &board, began).await;
+    let policy = keep(around.context.policies(), &board, began).await;
     assert!(matches!(policy, Policy::NotApplied(_)), "never listed: said at once");
 }
 
@@ -302,9 +310,16 @@ async fn a_leaderboard_and_with_it_the_policy_stays_while_a_pod_of_it_runs() {
             ..Cluster::default()
         };
         let mut around = surroundings(cluster, "http://127.0.0.1:1").await;
-        let context = Arc::new(around.context);
+        let context = &around.context;
+        let uses = Uses {
+            policies: context.policies(),
+            settings: &context.settings,
+            slots: &context.slots,
+            sync: &context.sync,
+            aws: &context.aws,
+        };
         // The mock's answer to a finalizer is no Leaderboard.
-        let _ = crate::controller::leaderboards::reconcile(Arc::new(board), context).await;
+        let _ = reconcile(Arc::new(board), uses).await;
         let sent = std::iter::from_fn(|| around.requests.try_recv().ok());
         let is_released = sent
             .into_iter()

@@ -7,10 +7,10 @@ use std::time::Duration;
 use futures::future::{BoxFuture, FutureExt, join_all};
 use jiff::Timestamp;
 
-use super::key_of;
 use super::reach::{Finding, Place, Reach};
-use crate::controller::context::Context;
-use crate::services::archive::ArchiveError;
+use crate::controller::objects::key_of;
+use crate::services::archive::{Archive, ArchiveError};
+use crate::services::aws::Aws;
 use crate::services::fault::Fault;
 use crate::services::queue::{self, QueueError};
 use crate::services::table::{Table, TableError};
@@ -22,7 +22,7 @@ const LIMIT: Duration = Duration::from_secs(10);
 const NO_RUN: &str = "none";
 
 /// Asks what is due.
-pub(super) async fn look(context: &Context, leaderboard: &Leaderboard, mut reach: Reach, now: Timestamp) -> Reach {
+pub(super) async fn look(aws: &Aws, leaderboard: &Leaderboard, mut reach: Reach, now: Timestamp) -> Reach {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
     let named = named(leaderboard);
     let places: Vec<Place> = named.iter().map(|(place, _)| *place).collect();
@@ -31,7 +31,7 @@ pub(super) async fn look(context: &Context, leaderboard: &Leaderboard, mut reach
         .into_iter()
         .filter(|(place, address)| reach.is_due(*place, address, generation, now));
     let asked = due.map(|(place, address)| {
-        let question = ask(context, leaderboard, place);
+        let question = ask(aws, leaderboard, place);
         async move {
             let answer = tokio::time::timeout(LIMIT, question).await;
             let silent = || Finding::Silent(format!("{address} did not answer within {} s", LIMIT.as_secs()));
@@ -73,11 +73,11 @@ fn named(leaderboard: &Leaderboard) -> Vec<(Place, String)> {
     places
 }
 
-fn ask<'a>(context: &'a Context, leaderboard: &'a Leaderboard, place: Place) -> BoxFuture<'a, Finding> {
-    let (aws, spec) = (&context.aws, &leaderboard.spec);
+fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFuture<'a, Finding> {
+    let spec = &leaderboard.spec;
     match (place, &spec.table, &spec.queue) {
         (Place::Bucket, ..) => {
-            let archive = context.archive(&spec.storage, NO_RUN);
+            let archive = Archive::of_run(aws, &spec.storage, NO_RUN);
             async move { of_bucket(archive.prefix_is_empty().await.map(|_| ())) }.boxed()
         }
         (Place::Table, Some(table), _) => {

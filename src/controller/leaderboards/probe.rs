@@ -6,17 +6,20 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::core::v1::Secret;
 use kube::api::{ApiResource, DynamicObject, PostParams};
-use kube::{Api, ResourceExt};
+use kube::{Api, Client, ResourceExt};
 use leaderboard_results::metrics;
 
-use super::decide::EvalaiStanding;
+use super::Uses;
 use super::places;
 use super::reach::{Reach, Unreachable};
-use crate::controller::context::{CALL_TIMEOUT, Context};
 use crate::controller::job_spec::{self, JobInput};
+use crate::controller::objects::key_of;
 use crate::controller::pod_overlay;
+use crate::controller::settings::Settings;
+use crate::kubernetes::call;
 use crate::services::ObjectKey;
-use crate::services::evalai::{Labels, Target};
+use crate::services::aws::Aws;
+use crate::services::evalai::{Hub, Labels, Target};
 use crate::services::token::{Token, TokenSource};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Evalai, Leaderboard, LeaderboardVersion, Submission, Token as TokenPlace, effective};
@@ -32,35 +35,59 @@ pub(super) struct Probe {
     token: Option<Result<Arc<Token>, String>>,
     token_at: Option<Timestamp>,
     reach: Reach,
+    /// The way to EvalAI that follows.
+    target: Option<Arc<Target>>,
     /// Generation whose Pod was tried, and why it was refused.
     pod: Option<(i64, Option<String>)>,
 }
 
+/// How a Leaderboard stands with EvalAI.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum EvalaiStanding {
+    NotRequired,
+    NoToken(String),
+    TokenRefused(String),
+    /// Its phases or labels do not fit the challenge.
+    Misfit(String),
+    /// Not checked yet, or EvalAI does not answer.
+    Unchecked(Option<String>),
+    Fits {
+        /// Something to be said although it works, such as a token that ends soon.
+        note: Option<String>,
+    },
+}
+
 impl Probe {
     /// Tries what is due.
-    pub(super) async fn refresh(mut self, context: &Context, leaderboard: &Leaderboard, now: Timestamp) -> Self {
+    pub(super) async fn refresh(mut self, uses: Uses<'_>, leaderboard: &Leaderboard, now: Timestamp) -> Self {
+        let client = uses.policies.client;
         let generation = leaderboard.metadata.generation.unwrap_or_default();
         if self.pod.as_ref().is_none_or(|(tried, _)| *tried != generation) {
-            self.pod = Some((generation, refused_pod(context, leaderboard).await));
+            self.pod = Some((generation, refused_pod(client, uses.settings, leaderboard).await));
         }
         let reach = std::mem::take(&mut self.reach);
         // A bucket that hangs must not keep EvalAI waiting.
-        let places = places::look(context, leaderboard, reach, now);
-        (self.reach, ()) = tokio::join!(places, self.refresh_token(context, leaderboard, now));
+        let places = places::look(uses.aws, leaderboard, reach, now);
+        (self.reach, ()) = tokio::join!(places, self.refresh_token(uses, leaderboard, now));
         self
     }
 
-    async fn refresh_token(&mut self, context: &Context, leaderboard: &Leaderboard, now: Timestamp) {
+    async fn refresh_token(&mut self, uses: Uses<'_>, leaderboard: &Leaderboard, now: Timestamp) {
         let Some(evalai) = &leaderboard.spec.evalai else { return };
-        let refused = context.sync.hub.token_refused(&super::key_of(leaderboard)).is_some();
+        let refused = uses.sync.hub.token_refused(&key_of(leaderboard)).is_some();
         let good = self.token.as_ref().is_some_and(Result::is_ok) && !refused;
         if due(self.token_at, good, now) {
-            self.token = Some(read_token(context, leaderboard, &evalai.token).await);
+            self.token = Some(read_token(uses.policies.client, uses.aws, leaderboard, &evalai.token).await);
             self.token_at = Some(now);
         }
         if let Some(Ok(token)) = &self.token {
-            serve(context, leaderboard, evalai, token);
+            self.target = Some(serve(&uses.sync.hub, leaderboard, evalai, token));
         }
+    }
+
+    /// How EvalAI is reached, once there is a token.
+    pub(super) fn target(&self) -> Option<Arc<Target>> {
+        self.target.clone()
     }
 
     pub(super) fn invalid_pod(&self) -> Option<String> {
@@ -80,7 +107,7 @@ impl Probe {
 
     pub(super) fn evalai_standing(
         &self,
-        context: &Context,
+        hub: &Hub,
         leaderboard: &Leaderboard,
         key: &ObjectKey,
         now: Timestamp,
@@ -93,10 +120,10 @@ impl Probe {
             Some(Err(why)) => return EvalaiStanding::NoToken(why.clone()),
             Some(Ok(token)) => token,
         };
-        if let Some(why) = context.sync.hub.token_refused(key) {
+        if let Some(why) = hub.token_refused(key) {
             return EvalaiStanding::TokenRefused(why);
         }
-        match context.sync.hub.labels(key) {
+        match hub.labels(key) {
             (None, why) => EvalaiStanding::Unchecked(why),
             (Some(labels), _) if !labels.ok() => {
                 let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
@@ -139,15 +166,19 @@ fn due(at: Option<Timestamp>, good: bool, now: Timestamp) -> bool {
     at.is_none_or(|at| now.duration_since(at) >= wait || now < at)
 }
 
-async fn read_token(context: &Context, leaderboard: &Leaderboard, place: &TokenPlace) -> Result<Arc<Token>, String> {
+async fn read_token(
+    client: &Client,
+    aws: &Aws,
+    leaderboard: &Leaderboard,
+    place: &TokenPlace,
+) -> Result<Arc<Token>, String> {
     let source = match (&place.secret_key_ref, &place.secrets_manager) {
         (Some(key), _) => {
             let namespace = leaderboard.namespace().unwrap_or_default();
-            let api: Api<Secret> = Api::namespaced(context.client.clone(), &namespace);
-            let secret = tokio::time::timeout(CALL_TIMEOUT, api.get(&key.name))
+            let api: Api<Secret> = Api::namespaced(client.clone(), &namespace);
+            let secret = call("reading the token", &key.name, api.get(&key.name))
                 .await
-                .map_err(|_| "the API server did not answer".to_owned())?
-                .map_err(|e| format!("Secret {} cannot be read: {e}", key.name))?;
+                .map_err(|error| format!("Secret {} cannot be read: {}", key.name, error.cause()))?;
             let value = secret.data.as_ref().and_then(|d| d.get(&key.key));
             let value = value.ok_or_else(|| format!("Secret {} has no key {}", key.name, key.key))?;
             let text = String::from_utf8(value.0.clone())
@@ -162,10 +193,10 @@ async fn read_token(context: &Context, leaderboard: &Leaderboard, place: &TokenP
         },
         (None, None) => return Err("evalai.token names no place".into()),
     };
-    source.read(&context.aws).await.map(Arc::new).map_err(|e| e.to_string())
+    source.read(aws).await.map(Arc::new).map_err(|e| e.to_string())
 }
 
-fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) {
+fn serve(hub: &Hub, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) -> Arc<Target> {
     let format = match leaderboard.spec.leaderboard_version {
         LeaderboardVersion::V1 => leaderboard_results::Format::V1,
         LeaderboardVersion::V2 => leaderboard_results::Format::V2,
@@ -187,32 +218,37 @@ fn serve(context: &Context, leaderboard: &Leaderboard, evalai: &Evalai, token: &
             .map(|t| t.0)
             .unwrap_or_default(),
     };
-    if let Err(error) = context.sync.hub.serve(&super::key_of(leaderboard), &target) {
+    if let Err(error) = hub.serve(&key_of(leaderboard), &target) {
         tracing::error!(leaderboard = %leaderboard.name_any(), %error, "EvalAI cannot be spoken to");
     }
-    context.sync.set_target(leaderboard, Some(Arc::new(target)));
+    Arc::new(target)
 }
 
 /// Why a Pod of this Leaderboard would be refused: by our own rules, or by the API server's dry run.
-async fn refused_pod(context: &Context, leaderboard: &Leaderboard) -> Option<String> {
+async fn refused_pod(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> Option<String> {
     if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
         return Some(error.to_string());
     }
-    let job = sample_job(context, leaderboard)?;
+    let job = sample_job(settings, leaderboard)?;
     let namespace = leaderboard.namespace().unwrap_or_default();
     let resource = ApiResource::erase::<k8s_openapi::api::batch::v1::Job>(&());
-    let api: Api<DynamicObject> = Api::namespaced_with(context.client.clone(), &namespace, &resource);
+    let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), &namespace, &resource);
     let params = PostParams {
         dry_run: true,
         ..PostParams::default()
     };
-    match tokio::time::timeout(CALL_TIMEOUT, api.create(&params, &job)).await {
-        Ok(Err(kube::Error::Api(status))) if status.code == 422 || status.code == 400 => Some(status.message.clone()),
-        _ => None,
-    }
+    let error = call(
+        "a dry run of the Job",
+        &leaderboard.name_any(),
+        api.create(&params, &job),
+    )
+    .await
+    .err()?;
+    let status = error.status().filter(|status| [400, 422].contains(&status.code))?;
+    Some(status.message.clone())
 }
 
-fn sample_job(context: &Context, leaderboard: &Leaderboard) -> Option<DynamicObject> {
+fn sample_job(settings: &Settings, leaderboard: &Leaderboard) -> Option<DynamicObject> {
     let track = leaderboard.spec.tracks.first()?;
     let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
     let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
@@ -231,9 +267,9 @@ fn sample_job(context: &Context, leaderboard: &Leaderboard) -> Option<DynamicObj
         plan: &plan,
         attempt: 1,
         retry: 0,
-        operator_image: &context.settings.image,
-        image_pull_policy: context.settings.image_pull_policy.as_deref(),
-        region: context.settings.region.as_deref(),
+        operator_image: &settings.image,
+        image_pull_policy: settings.image_pull_policy.as_deref(),
+        region: settings.region.as_deref(),
         now: Timestamp::now(),
     }))
 }

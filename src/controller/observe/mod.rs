@@ -10,14 +10,14 @@ use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
-use kube::{Resource, ResourceExt};
 
 use super::context::Context;
 use super::decide::job_name;
+pub use super::objects::{children_selector, is_pod_of, uid_of};
 use super::view::{JobSight, NodeSight, PodView, ReportSight, View};
-use leaderboard_api::{Leaderboard, Submission, conditions, names};
+use leaderboard_api::{Leaderboard, Submission, conditions};
 
 /// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
 /// than all the rest.
@@ -119,25 +119,9 @@ fn is_owned_by(job: &Job, submission: &Submission) -> bool {
     job.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
 }
 
-/// Whether a Pod belongs to a Job.
-pub(super) fn is_pod_of(pod: &Pod, job: &Job) -> bool {
-    let uid = job.uid();
-    pod.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
-}
-
-/// The label selector of everything the operator makes for submissions.
-pub fn children_selector() -> String {
-    format!("{}={}", names::LABEL_MANAGED_BY, names::OPERATOR)
-}
-
 impl ReportSight {
     /// Nothing was stored for this attempt.
     pub fn is_nothing(&self) -> bool {
         matches!(self, Self::Absent | Self::Foreign)
     }
-}
-
-/// The key of an object in every map of the controller: its UID, which a name does not replace.
-pub fn uid_of(object: &impl Resource) -> String {
-    object.meta().uid.clone().unwrap_or_default()
 }

@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{EnvVar, PodTemplateSpec};
 use serde_json::{Map, Value};
 
 use super::without_nulls;
-use crate::controller::job_spec::{
+use crate::controller::pod_layout::{
     ANNOTATION_SKIP_CONTAINERS, CONTENTS_VOLUMES, FIXED_ENV, OWN_VOLUMES, protected_mounts,
 };
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};

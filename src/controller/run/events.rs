@@ -13,9 +13,10 @@ use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 use tokio::sync::mpsc;
 
-use super::{Shared, Watches, key};
-use crate::controller::context::Stores;
+use super::{Shared, Watches};
 use crate::controller::leaderboards::isolation;
+use crate::controller::objects::key_of;
+use crate::controller::stores::Stores;
 use crate::kubernetes::WatchEvent;
 use crate::services::ObjectKey;
 use crate::services::evalai::Changed;
@@ -102,7 +103,7 @@ fn of_submission(
         let original = shared.context.reruns.moved(object, event.is_gone);
         if event.is_gone {
             marks.forget(object);
-            shared.forget(&key(object));
+            shared.forget(&key_of(object));
             return Vec::new();
         }
         let is_news = marks.moved(object, "");
@@ -120,7 +121,7 @@ fn of_leaderboard(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Leaderboard>) ->
         if event.is_gone {
             marks.forget(object);
             standings.forget(object);
-            shared.forget(&key(object));
+            shared.forget(&key_of(object));
             slots.wake_pending(&reference);
             return None;
         }

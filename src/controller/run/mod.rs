@@ -15,10 +15,10 @@ use std::time::Duration;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::Client;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
-use kube::{Client, ResourceExt};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -28,7 +28,7 @@ use super::backoff::BackoffMap;
 use super::context::{Context, Settings, Stores};
 use super::leader::{self, Leader, Leadership};
 use super::leaderboards::isolation;
-use super::observe::children_selector;
+use super::objects::children_selector;
 use super::observe::lookups::Lookups;
 use super::sync::Sync;
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
@@ -68,7 +68,7 @@ impl Shared {
     /// Drops everything that is remembered of an object that is gone.
     fn forget(&self, key: &ObjectKey) {
         self.context.forget(&key.uid);
-        self.context.desk.forget(&key.uid);
+        self.context.leaderboards.forget(&key.uid);
         self.context.sync.gone(key);
         self.backoff.dropped(&key.uid);
     }
@@ -198,14 +198,6 @@ pub(super) fn trim_pod(pod: &mut Pod) {
     }
 }
 
-fn key(object: &impl ResourceExt) -> ObjectKey {
-    ObjectKey {
-        namespace: object.namespace().unwrap_or_default(),
-        name: object.name_any(),
-        uid: object.uid().unwrap_or_default(),
-    }
-}
-
 /// What one process is made of.
 struct Parts {
     client: Client,
@@ -268,11 +260,12 @@ impl Parts {
             seen: self.seen.clone(),
         });
         shared.context.stores.fill(&shared.context.slots);
-        let restored = isolation::restore(
-            watches.policies.subscribe(),
-            watches.leaderboards.subscribe(),
-            Arc::clone(&shared.context),
-        );
+        let context = Arc::clone(&shared.context);
+        let keep = move |board| {
+            let context = Arc::clone(&context);
+            async move { isolation::keep_missing(context.policies(), &board).await }
+        };
+        let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
         self.seen.tasks.stay("policies", restored);
         let reports = events::Reports { rows, evalai, answers };
         let of_submissions = events::of_submissions(&watches, reports, &boards, &shared);

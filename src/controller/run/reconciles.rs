@@ -10,13 +10,15 @@ use kube::Resource;
 use kube::runtime::controller::{Action, Config, applier};
 use kube::runtime::reflector::ObjectRef;
 
-use super::{Shared, key};
+use super::Shared;
 use crate::backoff::jittered;
 use crate::controller::act::{ActError, act};
 use crate::controller::decide::{self, Plan, decide};
-use crate::controller::leaderboards::{self, LeaderboardError};
-use crate::controller::observe::{observe, uid_of};
+use crate::controller::leaderboards::{self, Uses};
+use crate::controller::objects::{key_of, uid_of};
+use crate::controller::observe::observe;
 use crate::controller::slots::SlotAllocator;
+use crate::kubernetes::CallError;
 use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::{Leaderboard, Submission};
 
@@ -33,7 +35,7 @@ enum ReconcileError {
     #[error(transparent)]
     Act(#[from] ActError),
     #[error(transparent)]
-    Leaderboard(#[from] LeaderboardError),
+    Leaderboard(#[from] CallError),
     #[error("the reconcile took longer than {} s", TIME_LIMIT.as_secs())]
     TooLong,
 }
@@ -83,7 +85,7 @@ pub(super) async fn run(
 
 async fn reconcile_submission(submission: Arc<Submission>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
     let started = Instant::now();
-    let name = key(submission.as_ref()).to_string();
+    let name = key_of(submission.as_ref()).to_string();
     let slots = &shared.context.slots;
     let work = async {
         let view = observe(&shared.context, Arc::clone(&submission));
@@ -122,8 +124,16 @@ fn settle(slots: &SlotAllocator, submission: &Submission, plan: &Plan) {
 
 async fn reconcile_leaderboard(leaderboard: Arc<Leaderboard>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
     let started = Instant::now();
-    let (name, uid) = (key(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
-    let work = leaderboards::reconcile(leaderboard, Arc::clone(&shared.context));
+    let (name, uid) = (key_of(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
+    let context = &shared.context;
+    let uses = Uses {
+        policies: context.policies(),
+        settings: &context.settings,
+        slots: &context.slots,
+        sync: &context.sync,
+        aws: &context.aws,
+    };
+    let work = leaderboards::reconcile(leaderboard, uses);
     let result = match tokio::time::timeout(TIME_LIMIT, work).await {
         Ok(result) => result.map(Some).map_err(ReconcileError::from),
         Err(_) => Err(ReconcileError::TooLong),

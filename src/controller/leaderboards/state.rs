@@ -1,0 +1,139 @@
+//! What is remembered of each Leaderboard between two reconciles, by UID.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::probe::Probe;
+use crate::pod::workspace::WorkspaceVerdict;
+
+/// A status whose counts alone have changed is written at most this often.
+pub(super) const COUNTS_EVERY: Duration = Duration::from_secs(5);
+/// The next reconcile that something is due for is at least so far away.
+pub(super) const SOONEST: Duration = Duration::from_secs(1);
+/// A policy that the API server did not take is applied again after this long.
+pub(super) const POLICY_AGAIN: Duration = Duration::from_secs(10);
+/// A Leaderboard is reconciled this often without any cause.
+pub(super) const RESYNC: Duration = Duration::from_mins(1);
+
+/// How the policy of a Leaderboard stands.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Policy {
+    InPlace,
+    /// The cluster has its own.
+    External,
+    /// The API server refuses it, and why.
+    Refused(String),
+    /// It could not be applied, or came out otherwise, and why.
+    NotApplied(String),
+}
+
+/// The last apply.
+#[derive(Clone, Debug)]
+pub(super) struct Applied {
+    pub(super) at: Timestamp,
+    /// Of which spec.
+    pub(super) generation: Option<i64>,
+    pub(super) policy: Policy,
+    /// Since when applies are answered well and the cache does not show it.
+    pub(super) unseen: Option<Timestamp>,
+}
+
+impl Applied {
+    pub(super) fn has_failed(&self) -> bool {
+        matches!(self.policy, Policy::Refused(_) | Policy::NotApplied(_))
+    }
+
+    /// The cache shows it.
+    pub(super) fn is_seen(&mut self) {
+        self.unseen = None;
+    }
+}
+
+/// What was measured last, of which generation.
+pub(super) type Measured = (Option<i64>, WorkspaceVerdict);
+
+/// One entry for each Leaderboard.
+#[derive(Default)]
+pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
+
+#[derive(Default)]
+struct Entry {
+    probe: Probe,
+    /// When its status was written.
+    written: Option<Timestamp>,
+    applied: Option<Applied>,
+    measured: Option<Measured>,
+}
+
+impl LeaderboardState {
+    /// Drops a Leaderboard that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.lock().remove(uid);
+    }
+
+    pub(super) fn probe(&self, uid: &str) -> Probe {
+        self.lock()
+            .get(uid)
+            .map(|entry| entry.probe.clone())
+            .unwrap_or_default()
+    }
+
+    pub(super) fn keep(&self, uid: &str, probe: Probe) {
+        self.change(uid, |entry| entry.probe = probe);
+    }
+
+    /// Whether a status whose counts alone have changed may be written.
+    pub(super) fn counts_may_be_written(&self, uid: &str, now: Timestamp) -> bool {
+        self.is_older(uid, now, COUNTS_EVERY)
+    }
+
+    /// The number of requests moves with each of them; alone it is worth a write a minute.
+    pub(super) fn budget_may_be_written(&self, uid: &str, now: Timestamp) -> bool {
+        self.is_older(uid, now, RESYNC)
+    }
+
+    pub(super) fn wrote(&self, uid: &str, now: Timestamp) {
+        self.change(uid, |entry| entry.written = Some(now));
+    }
+
+    pub(super) fn applied(&self, uid: &str) -> Option<Applied> {
+        self.lock().get(uid)?.applied.clone()
+    }
+
+    pub(super) fn note_applied(&self, uid: &str, applied: Applied) {
+        self.change(uid, |entry| entry.applied = Some(applied));
+    }
+
+    /// The cache shows the policy as it should be.
+    pub(super) fn note_seen(&self, uid: &str) {
+        self.change(uid, |entry| {
+            if let Some(applied) = &mut entry.applied {
+                applied.is_seen();
+            }
+        });
+    }
+
+    pub(super) fn measured(&self, uid: &str) -> Option<Measured> {
+        self.lock().get(uid)?.measured.clone()
+    }
+
+    pub(super) fn note_measured(&self, uid: &str, found: Measured) {
+        self.change(uid, |entry| entry.measured = Some(found));
+    }
+
+    fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
+        let written = self.lock().get(uid).and_then(|entry| entry.written);
+        written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
+    }
+
+    fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
+        change(self.lock().entry(uid.to_owned()).or_default());
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

@@ -1,0 +1,33 @@
+//! What is read off any object: its key, its owner, and what marks it as ours. Pure.
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::Pod;
+use kube::{Resource, ResourceExt};
+
+use crate::services::ObjectKey;
+use leaderboard_api::names;
+
+/// The key of an object in every map of the controller: its UID, which a name does not replace.
+pub fn uid_of(object: &impl Resource) -> String {
+    object.meta().uid.clone().unwrap_or_default()
+}
+
+/// The key of an object towards the services.
+pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
+    ObjectKey {
+        namespace: object.namespace().unwrap_or_default(),
+        name: object.name_any(),
+        uid: object.uid().unwrap_or_default(),
+    }
+}
+
+/// Whether a Pod belongs to a Job.
+pub fn is_pod_of(pod: &Pod, job: &Job) -> bool {
+    let uid = job.uid();
+    pod.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
+}
+
+/// The label selector of everything the operator makes for submissions.
+pub fn children_selector() -> String {
+    format!("{}={}", names::LABEL_MANAGED_BY, names::OPERATOR)
+}

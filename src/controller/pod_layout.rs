@@ -1,0 +1,60 @@
+//! The inside of a Pod as the Job and the rules for an overlay agree on it: volumes, paths, variables. Pure.
+
+use crate::pod::run::{IDENTITY, LOGS, PODINFO, TOOLS};
+
+pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
+pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
+pub(super) const LEADERBOARD_ROOT: &str = "/workspace/leaderboard";
+
+/// Volumes with the private contents, each with where `contents` writes it and where agents read it.
+pub(super) const CONTENTS_VOLUMES: [(&str, &str, &str); 3] = [
+    ("leaderboard", "/tmp/leaderboard", LEADERBOARD_ROOT),
+    ("scenario-runner", "/tmp/scenario_runner", SCENARIO_RUNNER_ROOT),
+    ("carla-python-api", "/tmp/CARLA", CARLA_ROOT),
+];
+/// The other volumes of ours. Nothing but our own mounts of them keeps a stranger from what is in them.
+pub(super) const OWN_VOLUMES: [&str; 4] = [LOGS_VOLUME, TOOLS_VOLUME, PODINFO_VOLUME, IDENTITY_VOLUME];
+
+pub(super) const LOGS_VOLUME: &str = "logs";
+pub(super) const TOOLS_VOLUME: &str = "tools";
+pub(super) const PODINFO_VOLUME: &str = "podinfo";
+pub(super) const IDENTITY_VOLUME: &str = "identity";
+
+/// Status files, in simulators and agents.
+pub(super) const STATUS: &str = "/tmp/status";
+/// An agent's own folder of results and log.
+pub(super) const AGENT: &str = "/tmp/agent";
+/// What a simulator keeps.
+pub(super) const SAVED: &str = "/home/carla/CarlaUE4/Saved";
+
+/// Annotation that keeps EKS from putting the ServiceAccount's role into the containers it names.
+pub(super) const ANNOTATION_SKIP_CONTAINERS: &str = "eks.amazonaws.com/skip-containers";
+
+/// Variables of simulators and agents that follow from the plan: nobody else may set them.
+pub(super) const FIXED_ENV: [&str; 12] = [
+    "CARLA_PORT",
+    "CARLA_TM_PORT",
+    "CHALLENGE_TRACK_CODENAME",
+    "ROUTES",
+    "ROUTES_SUBSET",
+    "SCENARIOS",
+    "REPETITIONS",
+    "RESUME",
+    "CHECKPOINT_ENDPOINT",
+    "CARLA_ROOT",
+    "SCENARIO_RUNNER_ROOT",
+    "LEADERBOARD_ROOT",
+];
+
+/// Puts what the original's script put there in front of the image's own PYTHONPATH.
+pub(super) fn python_path() -> String {
+    format!("{CARLA_ROOT}/PythonAPI/carla:{SCENARIO_RUNNER_ROOT}:{LEADERBOARD_ROOT}")
+}
+
+/// Paths at and below which an overlay may mount nothing.
+pub(super) fn protected_mounts() -> impl Iterator<Item = &'static str> {
+    let contents = CONTENTS_VOLUMES
+        .into_iter()
+        .flat_map(|(_, written, read)| [written, read]);
+    contents.chain([LOGS, TOOLS, PODINFO, IDENTITY, STATUS, AGENT, SAVED])
+}
