@@ -164,7 +164,7 @@ pub(super) fn of_job(draft: &Draft<'_>, end: &JobEnd) -> Failure {
             )
         }
         JobEnd::Failed { reason, message, .. } => crashes::worst(&draft.status).unwrap_or_else(|| {
-            let what = format!("Its Job failed with {reason}: {}", sentence(message));
+            let what = format!("The Job failed with {reason}: {}", sentence(message));
             infrastructure(reasons::JOB_FAILED, &what)
         }),
     }
