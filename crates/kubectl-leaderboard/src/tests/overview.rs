@@ -28,7 +28,7 @@ fn those_that_wait_failed_or_are_stuck_have_a_line() {
         &json!({"conditions": [condition("Finished", "True", "Finished", ""),
                                condition("Published", "False", "Refused", "EvalAI rejected the result.")]}),
     );
-    let submissions = [
+    let submissions = vec![
         named("well", &running()),
         named("done", &finished()),
         named("stopped", &cancelled()),
