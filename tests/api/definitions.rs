@@ -194,7 +194,7 @@ fn half_filled_services() -> Vec<HalfFilled> {
         (
             "storage",
             json!({"bucket": "results", "prefix": "a/"}),
-            json!({"bucket": "results", "prefix": "a/", "limit": 21_474_836_480_i64}),
+            json!({"bucket": "results", "prefix": "a/", "sizeLimit": "20Gi"}),
         ),
         ("evalai", sent(secret.clone()), evalai(secret, "Hosts")),
         (

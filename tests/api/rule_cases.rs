@@ -141,7 +141,7 @@ fn kept() -> Vec<Case> {
         ),
         update(
             Leaderboard,
-            "results is immutable",
+            "leaderboardVersion is immutable",
             &json!({}),
             &json!({"leaderboardVersion": "V1"}),
             &served,
