@@ -13,7 +13,7 @@ use kube::runtime::events::{Event as KubeEvent, EventType};
 use kube::{Api, Resource, ResourceExt};
 use serde_json::json;
 
-use super::archive::state::LogDemand;
+use super::archive::request::LogDemand;
 use super::context::{CALL_TIMEOUT, Context};
 use super::decide::{Action, Event, LogPlace, Plan};
 use super::job_spec::{self, JobInput};

@@ -5,6 +5,8 @@
 //! limits of its own, so that a bucket which hangs keeps nothing else waiting. What is due when is `state`'s to say.
 
 pub mod digest;
+pub mod request;
+mod run;
 pub mod state;
 mod work;
 
@@ -26,7 +28,8 @@ use crate::services::archive::Archive;
 use crate::services::aws::Aws;
 use digest::ReportId;
 use leaderboard_api::{Storage, Submission, SubmissionStatus, effective};
-use state::{LogDemand, SeenReport, State, Target, Uid};
+use request::{LogDemand, Target, Uid, Work};
+use state::{SeenReport, State};
 
 /// Wakes a Submission.
 pub type WakeSubmission = Box<dyn Fn(ObjectRef<Submission>) + Send + Sync>;
@@ -262,7 +265,7 @@ impl ArchiveWorker {
         }
     }
 
-    fn next(&self) -> Option<state::Work> {
+    fn next(&self) -> Option<Work> {
         self.bucket.state().next(Instant::now())
     }
 }

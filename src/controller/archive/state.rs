@@ -10,13 +10,11 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::digest::{ReportDigest, ReportId};
-use crate::controller::decide::LogPlace;
+use super::digest::ReportId;
+use super::request::{Done, KINDS, Kind, LIMITS, LogAnswer, LogDemand, Target, Uid, What, Work};
+use super::run::{Content, FenceRun, LogRun, ReportRun, Run, TextsRun, answers};
 use crate::controller::failure_log::Tail;
-use crate::controller::view::{
-    ObservedFence, ObservedLog, ObservedTexts, ReportDemand, ReportSight, Stage, TextProblem, Texts,
-};
-use leaderboard_api::Storage;
+use crate::controller::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand, ReportSight, Stage};
 
 /// Time between two reads of reports in one bucket: at most 100 a second.
 const SPACING: Duration = Duration::from_millis(10);
@@ -31,115 +29,6 @@ pub(super) const FENCE_TRIES: Duration = Duration::from_mins(1);
 /// How often one log is looked for.
 const LOG_TRIES: u32 = 3;
 
-pub(super) type Uid = Arc<str>;
-
-/// The kinds of work, the most urgent first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
-    Fence,
-    Ended,
-    Log,
-    Texts,
-    Live,
-}
-
-const KINDS: [Kind; 5] = [Kind::Fence, Kind::Ended, Kind::Log, Kind::Texts, Kind::Live];
-/// How much of each kind is under way at once.
-const LIMITS: [usize; 5] = [16, 32, 8, 4, 32];
-
-/// Where a run's files are, and which object they belong to.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Target {
-    pub namespace: String,
-    pub name: String,
-    pub storage: Storage,
-    pub run_id: String,
-}
-
-/// Which log is to be kept.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LogDemand {
-    pub attempt: i64,
-    pub retry: i32,
-    pub places: Vec<LogPlace>,
-    /// The submission has come to its end, so that its log is stored too.
-    pub is_over: bool,
-}
-
-/// Something to do now.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Work {
-    pub kind: Kind,
-    pub uid: Uid,
-    pub target: Arc<Target>,
-    pub what: What,
-}
-
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum What {
-    Report {
-        sent: Sent,
-        etag: Option<String>,
-    },
-    Texts {
-        sent: Option<Sent>,
-    },
-    Fence {
-        attempt: i64,
-        retry: i32,
-        mark: String,
-        left: Duration,
-    },
-    Log {
-        demand: LogDemand,
-        tail: Option<Tail>,
-    },
-}
-
-/// What was known when a read was sent.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Sent {
-    demand: ReportDemand,
-    /// Of which memory of the run: what was dropped since is not answered.
-    memory: u64,
-}
-
-/// What a read of the report brought.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum Answer {
-    NotModified,
-    Absent,
-    /// It is another object's.
-    Foreign {
-        etag: Option<String>,
-    },
-    Found {
-        etag: Option<String>,
-        report: Arc<ReportDigest>,
-    },
-    Failed(String),
-}
-
-/// What came of looking for a log.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LogAnswer {
-    pub tail: Option<Tail>,
-    /// One that may have it did not answer, or storing failed.
-    pub is_unclear: bool,
-}
-
-/// What came of work.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum Done {
-    Report(Answer),
-    Texts {
-        report: Answer,
-        texts: Result<Texts, String>,
-    },
-    Fence(Result<(), String>),
-    Log(LogAnswer),
-}
-
 /// All runs of one bucket.
 #[derive(Default)]
 pub(super) struct State {
@@ -150,74 +39,11 @@ pub(super) struct State {
     memories: u64,
 }
 
-struct Run {
-    target: Arc<Target>,
-    due: [Option<Instant>; KINDS.len()],
-    report: Option<ReportRun>,
-    texts: Option<TextsRun>,
-    fence: Option<FenceRun>,
-    log: Option<LogRun>,
-}
-
-struct ReportRun {
-    memory: u64,
-    wanted: ReportDemand,
-    since: Instant,
-    is_under_way: bool,
-    /// What was known when the last answer was asked for.
-    of: Option<ReportDemand>,
-    error: Option<String>,
-    etag: Option<String>,
-    content: Option<Content>,
-}
-
-#[derive(Clone, PartialEq)]
-enum Content {
-    Absent,
-    Foreign,
-    Report(Arc<ReportDigest>),
-}
-
-struct TextsRun {
-    wanted: ReportId,
-    is_under_way: bool,
-    tried: Option<Instant>,
-    got: ObservedTexts,
-}
-
-struct FenceRun {
-    attempt: i64,
-    retry: i32,
-    mark: String,
-    since: Instant,
-    is_held: bool,
-    has_failed: bool,
-}
-
-struct LogRun {
-    demand: LogDemand,
-    since: Instant,
-    tries: u32,
-    is_under_way: bool,
-    tail: Option<Tail>,
-    end: Option<ObservedLog>,
-}
-
 /// What is known of a run's report.
 pub struct SeenReport {
     pub report: ReportSight,
     pub stage: Option<Stage>,
     pub waited: Duration,
-}
-
-fn is_same_run(one: &ReportDemand, other: &ReportDemand) -> bool {
-    one.attempt == other.attempt && one.retry == other.retry
-}
-
-/// Whether an answer that was asked for by one demand is one to the other.
-fn answers(sent: &ReportDemand, wanted: &ReportDemand) -> bool {
-    let is_of_pod = sent.pod == wanted.pod || sent.stage == Stage::JobEnded;
-    is_same_run(sent, wanted) && is_of_pod && sent.stage >= wanted.stage
 }
 
 impl State {
@@ -637,57 +463,6 @@ impl State {
         {
             self.forget(uid);
         }
-    }
-}
-
-impl TextsRun {
-    /// Returns whether there is something new to decide on. Another text for the same is not: it would be asked for again at once.
-    fn take(&mut self, texts: Result<Texts, String>) -> bool {
-        let got = texts.map_or_else(ObservedTexts::Unread, |texts| ObservedTexts::Read(Arc::new(texts)));
-        let is_same = match (&self.got, &got) {
-            (ObservedTexts::Unread(_), ObservedTexts::Unread(_)) => true,
-            (ObservedTexts::Read(old), ObservedTexts::Read(new)) => {
-                old.of == new.of && old.problem.is_some() == new.problem.is_some()
-            }
-            _ => false,
-        };
-        self.got = got;
-        !is_same
-    }
-}
-
-impl ReportRun {
-    fn sent(&self) -> Sent {
-        Sent {
-            demand: self.wanted.clone(),
-            memory: self.memory,
-        }
-    }
-
-    /// Returns whether there is something new to decide on.
-    fn take(&mut self, sent: &ReportDemand, answer: Answer) -> bool {
-        let sent = &ReportDemand {
-            stage: sent.stage.min(self.wanted.stage),
-            ..sent.clone()
-        };
-        let (error, etag, content) = match answer {
-            Answer::NotModified => (None, self.etag.take(), self.content.clone()),
-            Answer::Absent => (None, None, Some(Content::Absent)),
-            Answer::Foreign { etag } => (None, etag, Some(Content::Foreign)),
-            Answer::Found { etag, report } => (None, etag, Some(Content::Report(report))),
-            Answer::Failed(why) => (Some(why), self.etag.take(), self.content.clone()),
-        };
-        let is_first = !self.of.as_ref().is_some_and(|of| answers(of, sent));
-        let is_new = is_first || error.is_some() != self.error.is_some() || content != self.content;
-        self.of = Some(sent.clone());
-        (self.error, self.etag, self.content) = (error, etag, content);
-        is_new
-    }
-}
-
-impl TextProblem {
-    pub(super) fn unfit(key: &str, problem: &str) -> Self {
-        Self::Unfit(format!("{key} {problem}"))
     }
 }
 

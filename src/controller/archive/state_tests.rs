@@ -3,7 +3,10 @@
 use serde_json::json;
 
 use super::*;
-use crate::controller::decide::LogAt;
+use crate::controller::archive::digest::ReportDigest;
+use crate::controller::archive::request::Answer;
+use crate::controller::decide::{LogAt, LogPlace};
+use crate::controller::view::Texts;
 
 struct Bench {
     state: State,

@@ -7,7 +7,7 @@ use kube::Client;
 use sha2::{Digest, Sha256};
 
 use super::digest::{ReportDigest, ReportId};
-use super::state::{Answer, Done, Target, What, Work};
+use super::request::{Answer, Done, Target, What, Work};
 use crate::controller::failure_log;
 use crate::controller::view::{TextProblem, Texts};
 use crate::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
