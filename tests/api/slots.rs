@@ -82,22 +82,23 @@ impl World {
 async fn one_slot_is_one_job_also_after_a_takeover() {
     let world = World::new().await;
     let operator = world.operator().await;
-    world.submit("one").await;
-    world.has_job("one").await;
-    world.submit("two").await;
-    world.shows("two", reasons::WAITING_FOR_SLOT, 1).await;
+    // Those of one second stand in the order of their names.
+    world.submit("first").await;
+    world.has_job("first").await;
+    world.submit("second").await;
+    world.shows("second", reasons::WAITING_FOR_SLOT, 1).await;
     operator.end().await;
 
     let operator = world.operator().await;
-    world.submit("three").await;
-    world.shows("three", reasons::WAITING_FOR_SLOT, 2).await;
+    world.submit("third").await;
+    world.shows("third", reasons::WAITING_FOR_SLOT, 2).await;
     world.edit(json!({"paused": true})).await;
-    world.shows("two", reasons::PAUSED, 1).await;
-    world.shows("three", reasons::PAUSED, 2).await;
+    world.shows("second", reasons::PAUSED, 1).await;
+    world.shows("third", reasons::PAUSED, 2).await;
     world.edit(json!({"paused": false, "concurrency": {"total": 2}})).await;
-    world.has_job("two").await;
-    world.shows("three", reasons::WAITING_FOR_SLOT, 1).await;
+    world.has_job("second").await;
+    world.shows("third", reasons::WAITING_FOR_SLOT, 1).await;
     world.edit(json!({"concurrency": null})).await;
-    world.has_job("three").await;
+    world.has_job("third").await;
     operator.end().await;
 }

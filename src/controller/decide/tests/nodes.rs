@@ -51,7 +51,7 @@ fn going(node: NodeSight) -> World {
 fn a_node_that_is_away_is_told_before_kubernetes_gives_its_pod_up() {
     let silent = NodeSight::Silent { since: at(40) };
     for (node, words) in [
-        (NodeSight::Gone, "node-a is gone"),
+        (NodeSight::Gone, "Node node-a is gone, and the Pod with it."),
         (silent, "node-a has been silent since 2026-01-01T00:00:40Z."),
     ] {
         let mut world = World::local().running();
