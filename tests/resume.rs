@@ -19,6 +19,7 @@ mod resume {
     mod kills;
     mod kubelet;
     mod largest;
+    mod late;
     mod measure;
     mod process;
     mod results;

@@ -36,7 +36,7 @@ use round::{Rounds, Why};
 /// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.
 const LAST_FLUSH: Duration = Duration::from_mins(5);
 /// What a round under way has to land after SIGTERM. A request that is dropped may still be served, and then replace the newer
-/// results that the last flush has stored meanwhile.
+/// log that the last flush has stored meanwhile.
 const LANDING: Duration = Duration::from_secs(3);
 /// How often the stop file is read where inotify reports nothing.
 const STOP_POLL: Duration = Duration::from_secs(2);

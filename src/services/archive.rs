@@ -14,6 +14,7 @@ use std::time::Duration;
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
 use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPart, Delete, ObjectIdentifier};
+use hyper::body::Bytes;
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use tokio::io::AsyncWriteExt;
 
@@ -28,6 +29,8 @@ pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};
 const DELETE_PAGE: usize = 1000;
 /// Time S3 may take for copying a part or joining them.
 const LONG_TRY: Duration = Duration::from_mins(5);
+/// Times that an object is sent which another one gets ahead of.
+const REPLACE_TRIES: u32 = 5;
 /// What stays as it is in `x-amz-copy-source`.
 const PLAIN: &AsciiSet = &NON_ALPHANUMERIC
     .remove(b'-')
@@ -85,6 +88,17 @@ pub struct Listing {
     pub objects: Vec<Listed>,
     /// False if there are more than were asked for.
     pub complete: bool,
+}
+
+/// What has to be there for an object to be stored in its place.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Before {
+    /// No object.
+    Nothing,
+    /// The object with this entity tag.
+    Tagged(String),
+    /// It is not known, or this S3 knows no conditions.
+    Anything,
 }
 
 /// The stored beginning of a file that has grown.
@@ -216,6 +230,43 @@ impl Archive {
         let request = request.body(bytes.into()).send();
         let output = self.meter.aws("s3", "PutObject", request).await;
         Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
+    }
+
+    /// Stores an object that fits into memory in place of the one with the entity tag `known`, or of none. If another one is
+    /// there, that one is replaced. The condition is for a request that S3 carries out late, when its sender is gone: it must
+    /// not replace what was stored since. Returns the new entity tag.
+    pub async fn replace(&self, key: &str, bytes: Bytes, known: Option<&str>) -> Result<Option<String>, ArchiveError> {
+        let mut before = known.map_or(Before::Nothing, |etag| Before::Tagged(etag.to_owned()));
+        let mut tries: u32 = 0;
+        loop {
+            let request = self.client.put_object().bucket(&self.bucket).key(self.full(key));
+            let request = request.body(ByteStream::from(bytes.clone()));
+            let request = match &before {
+                Before::Nothing => request.if_none_match("*"),
+                Before::Tagged(etag) => request.if_match(etag),
+                Before::Anything => request,
+            };
+            let error = match self.meter.aws("s3", "PutObject", request.send()).await {
+                Ok(output) => return Ok(output.e_tag),
+                Err(error) => error,
+            };
+            tries = tries.saturating_add(1);
+            let failed = self.failed("storing", key, &error);
+            before = match failed.cause {
+                _ if tries == REPLACE_TRIES => return Err(failed),
+                _ if knows_no_conditions(&error) => Before::Anything,
+                Cause::Changed => self.before(key).await?,
+                _ => return Err(failed),
+            };
+        }
+    }
+
+    async fn before(&self, key: &str) -> Result<Before, ArchiveError> {
+        let listing = self.list(key, 1).await?;
+        let present = listing.objects.into_iter().find(|object| object.key == key);
+        Ok(present.map_or(Before::Nothing, |object| {
+            object.etag.map_or(Before::Anything, Before::Tagged)
+        }))
     }
 
     /// What lies below `folder` (empty: everything), at most `limit` objects.
@@ -403,6 +454,11 @@ impl Archive {
 
 fn is_absent<E: ProvideErrorMetadata>(error: &SdkError<E, HttpResponse>) -> bool {
     error::status(error) == Some(404) && error.code() != Some("NoSuchBucket")
+}
+
+/// Some stores refuse a request with a condition that they can't check.
+fn knows_no_conditions<E: ProvideErrorMetadata>(error: &SdkError<E, HttpResponse>) -> bool {
+    error::status(error) == Some(501) || error.code() == Some("NotImplemented")
 }
 
 /// Copying and joining large objects takes S3 longer than an ordinary answer.

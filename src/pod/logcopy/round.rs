@@ -69,6 +69,7 @@ pub(super) struct Rounds {
     last: Instant,
     round: u64,
     reported: Option<Report>,
+    report_etag: Option<String>,
     owner_etag: Option<String>,
     owner_missed: bool,
     ending: Option<Ending>,
@@ -102,6 +103,7 @@ impl Rounds {
             last: Instant::now(),
             round: 0,
             reported: None,
+            report_etag: None,
             owner_etag: None,
             owner_missed: false,
             ending: None,
@@ -316,7 +318,8 @@ impl Rounds {
             return Ok(());
         }
         report.round = report.round.saturating_add(1);
-        self.archive.put(REPORT_KEY, to_bytes(&report)).await?;
+        let (bytes, known) = (to_bytes(&report).into(), self.report_etag.as_deref());
+        self.report_etag = self.archive.replace(REPORT_KEY, bytes, known).await?;
         self.round = report.round;
         self.reported = Some(report);
         Ok(())

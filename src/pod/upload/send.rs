@@ -108,6 +108,7 @@ impl Uploader {
                 archive: self.archive.clone(),
                 key: key.clone(),
                 object: object.clone(),
+                known: self.memory.0.get(key).and_then(|known| known.etag.clone()),
                 now,
             })
             .collect();
@@ -239,13 +240,15 @@ struct Put {
     archive: Archive,
     key: String,
     object: Object,
+    /// Entity tag of what was stored last.
+    known: Option<String>,
     now: Duration,
 }
 
 impl Put {
     async fn store(self) -> (String, Outcome) {
         let Object { bytes, digest } = self.object;
-        let outcome = match self.archive.put(&self.key, bytes).await {
+        let outcome = match self.archive.replace(&self.key, bytes, self.known.as_deref()).await {
             Ok(etag) => {
                 let stamp = Stamp {
                     size: digest.size,

@@ -85,3 +85,48 @@ async fn a_missing_object_is_told_from_a_forbidden_one() {
     assert!(error.to_string().contains("s3:ListBucket"), "{error}");
     server.abort();
 }
+
+#[tokio::test]
+async fn an_object_is_replaced_whatever_was_known_of_it() {
+    let pod = Pod::new().await;
+    let archive = &pod.archive;
+    let first = archive.replace("a", "1".into(), None).await.unwrap();
+    // Longer names that begin the same are other objects.
+    archive.put("a.b", b"other".to_vec()).await.unwrap();
+    archive.put("a", b"another's".to_vec()).await.unwrap();
+    for (text, known) in [("2", first.as_deref()), ("3", first.as_deref()), ("4", None)] {
+        archive.replace("a", text.into(), known).await.unwrap();
+        assert_eq!(pod.stored("a").await.unwrap(), text.as_bytes());
+    }
+    archive.delete(&["a".to_owned()]).await.unwrap();
+    archive.replace("a", "5".into(), first.as_deref()).await.unwrap();
+    assert_eq!(pod.stored("a").await.unwrap(), b"5");
+    assert_eq!(pod.stored("a.b").await.unwrap(), b"other");
+}
+
+#[tokio::test]
+async fn an_s3_that_knows_no_conditions_stores_all_the_same() {
+    const REFUSED: &str = "<Error><Code>NotImplemented</Code></Error>";
+    let answer = |request: axum::extract::Request| async move {
+        let has_condition = |name| request.headers().contains_key(name);
+        if has_condition("if-match") || has_condition("if-none-match") {
+            (http::StatusCode::NOT_IMPLEMENTED, [("etag", "")], REFUSED)
+        } else {
+            (http::StatusCode::OK, [("etag", "\"x\"")], "")
+        }
+    };
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let router = axum::Router::new().fallback(answer);
+    let server = tokio::spawn(async move { axum::serve(listener, router).await.unwrap() });
+    let archive = Archive::new(
+        ministack::aws(&endpoint).await.s3(None, Some(&endpoint)),
+        "bucket",
+        "77/",
+    );
+    for known in [None, Some("\"w\"")] {
+        let etag = archive.replace("a", "1".into(), known).await.unwrap();
+        assert_eq!(etag.as_deref(), Some("\"x\""));
+    }
+    server.abort();
+}
