@@ -57,7 +57,8 @@ def in_cluster(expected: dict[str, Any], found: Findings) -> Iterator[str]:
     status = found.submission.get("status", {})
     yield from unlike("Kubernetes", "state", status.get("state"), "Finished")
     yield from unlike("Kubernetes", "progress", status.get("progress", {}).get("text"), progress_text(expected))
-    yield from unlike("Kubernetes", "score", status.get("score", {}).get("text"), f"{expected['metrics']['Driving score']:.2f}")
+    score = f"{expected['metrics']['Driving score']:.2f}"
+    yield from unlike("Kubernetes", "score", status.get("score", {}).get("text"), score)
     truth = {condition["type"]: condition["status"] for condition in status.get("conditions", [])}
     for name in CONDITIONS:
         yield from unlike("Kubernetes", f"condition {name}", truth.get(name), "True")

@@ -62,7 +62,7 @@ class Comparison(unittest.TestCase):
             return {
                 "Kubernetes: state": lambda: found.submission["status"].update(state="Failed"),
                 "Kubernetes: progress": lambda: found.submission["status"]["progress"].update(text="19/20"),
-                "Kubernetes: score": lambda: found.submission["status"].update(score="~69.41"),
+                "Kubernetes: score": lambda: found.submission["status"].update(score={"text": "~69.41"}),
                 "Kubernetes: condition Published": lambda: found.submission["status"]["conditions"][3].update(
                     status="False"
                 ),
