@@ -85,14 +85,15 @@ fn simulator(knobs: &str) -> Value {
 }
 
 /// The second pair's simulator crashes once, and the first pair's agent, which drives on, listens on its port from then on.
+/// That is long after the agent has begun, and it drives for a minute more.
 fn taken_port() -> Value {
     let agent = json!([
         {"name": "AGENT_KNOBS", "value": "pair=1,take-port=2100"},
-        {"name": "ROUTE_MS", "value": "30000"},
+        {"name": "ROUTE_MS", "value": "20000"},
     ]);
     with(
-        simulator("pair=2,crash@1"),
-        json!({"pairs": 2, "agent": {"env": agent}}),
+        simulator("pair=2,crash@2"),
+        json!({"pairs": 2, "routes": 8, "agent": {"env": agent}}),
     )
 }
 
@@ -196,7 +197,8 @@ fn of_simulators() -> Vec<Row> {
             "simulator hangs",
             with(
                 simulator("hang@2"),
-                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 1}}),
+                // A restarted simulator counts its routes anew, and would not hang again.
+                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 0}}),
             ),
             "Failed SimulationCrashed (infrastructure, not charged); 1/2 routes; EvalAI failed",
         ),

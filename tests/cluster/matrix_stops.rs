@@ -7,7 +7,7 @@ use futures::FutureExt;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{State, Submission, conditions};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, measured, together};
@@ -258,6 +258,13 @@ async fn while_the_end_is_published(scene: &Scene, evalai: &Evalai, phase: u64) 
     scene.submission(&name, "its cancel is observed", LIMIT, observed).await;
     evalai.release_puts();
     case.ends(scene, &name, LIMIT).await;
+    let published = |s: &Submission| {
+        let conditions = s.status.as_ref().map_or(&[][..], |status| &status.conditions);
+        conditions::is_true(conditions, conditions::PUBLISHED) && conditions::is_true(conditions, conditions::RECORDED)
+    };
+    scene
+        .submission(&name, "its end is published and recorded", LIMIT, published)
+        .await;
     case.evalai(evalai.submission(pk).status);
     let rows = scene.cloud.rows(&scene.cloud.table).await;
     let row = rows.iter().find(|row| row["submission_id"] == pk.to_string()).unwrap();

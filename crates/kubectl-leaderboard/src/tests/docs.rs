@@ -53,7 +53,10 @@ fn why_of_all() {
         named("submission-40", &stalled),
         named("submission-41", &running()),
         named("submission-42", &crashed()),
-        named("submission-43", &with(waiting(), &json!({"waiting": {"position": 1}}))),
+        named(
+            "submission-43",
+            &with(waiting(), &json!({"waiting": {"position": 1, "text": "1st"}})),
+        ),
         named("submission-45", &waiting()),
     ];
     let lines = overview::lines("carla", &submissions, Some(&[paused]), now());

@@ -16,7 +16,7 @@ fn printed(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> 
 
 #[test]
 fn those_that_wait_failed_or_are_stuck_have_a_line() {
-    let first = with(waiting(), &json!({"waiting": {"position": 1}}));
+    let first = with(waiting(), &json!({"waiting": {"position": 1, "text": "1st"}}));
     let stalled = with(
         running(),
         &json!({"reason": "NotStored", "message": "The results cannot be read.",
