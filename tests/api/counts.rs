@@ -19,6 +19,8 @@ const TABLE: &str = "tests/api/counts/expected.json";
 const UPDATE: &str = "UPDATE_COUNTS";
 /// What depends on a moment, such as reads of a report while a run ends, may differ by this part of the expected, and by one.
 const TOLERANCE: f64 = 0.25;
+/// On a busy machine a write can be refused as a conflict and sent again. A real change is there each time.
+const TRIES: usize = 3;
 
 /// What one submission costs from its creation until nothing more comes of its end.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -42,23 +44,33 @@ struct Table {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_submission_costs_what_the_table_says() {
-    let lifecycles =
-        join_all(Scenario::ALL.map(async |scenario| (scenario.name.to_owned(), Box::pin(scenario.cost()).await))).await;
-    let seen = Table {
-        lifecycles: lifecycles.into_iter().collect(),
-    };
-    println!("{}", text(&seen));
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(TABLE);
     if env::var_os(UPDATE).is_some() {
-        return fs::write(path, text(&seen)).unwrap();
+        return fs::write(path, text(&measured().await)).unwrap();
     }
     let expected: Table = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
-    let differences = differences(&expected, &seen);
-    assert!(
-        differences.is_empty(),
+    let mut found = Vec::new();
+    for _ in 0..TRIES {
+        found = differences(&expected, &measured().await);
+        if found.is_empty() {
+            return;
+        }
+        println!("{}", found.join("\n"));
+    }
+    panic!(
         "what a submission costs has changed; if it should, {UPDATE}=1 writes {TABLE} anew:\n{}",
-        differences.join("\n")
+        found.join("\n")
     );
+}
+
+async fn measured() -> Table {
+    let lifecycles =
+        join_all(Scenario::ALL.map(async |scenario| (scenario.name.to_owned(), Box::pin(scenario.cost()).await))).await;
+    let table = Table {
+        lifecycles: lifecycles.into_iter().collect(),
+    };
+    println!("{}", text(&table));
+    table
 }
 
 fn text(table: &Table) -> String {
