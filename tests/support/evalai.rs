@@ -92,7 +92,7 @@ impl Evalai {
         });
     }
 
-    /// From now on EvalAI works on results until [`Evalai::release_puts`].
+    /// From now on EvalAI works on final results until [`Evalai::release_puts`].
     pub fn hold_puts(&self) {
         self.handle.set_knobs(Knobs {
             put_held: true,

@@ -103,7 +103,7 @@ pub struct Knobs {
     pub put_turn_ms: u64,
     /// Between the reads and the saves of a PUT of results, in milliseconds.
     pub put_delay_ms: u64,
-    /// A PUT of results waits between its reads and its saves until this is false again.
+    /// A PUT of final results waits between its reads and its saves until this is false again.
     pub put_held: bool,
     /// Between the reads and the saves of a PATCH of progress, in milliseconds.
     pub patch_delay_ms: u64,

@@ -43,6 +43,16 @@ pub struct Write {
     texts: Option<Texts>,
 }
 
+impl Write {
+    /// Whether the submission comes to its end by it.
+    pub fn is_end(&self) -> bool {
+        matches!(
+            self.submission.status,
+            Status::Finished | Status::Failed | Status::Cancelled
+        )
+    }
+}
+
 /// Checks a PUT and reads what it will overwrite.
 pub fn prepare_put(state: &State, door: Door, form: &Form) -> Result<Write, Reply> {
     let status = form.text("submission_status")?.to_lowercase();

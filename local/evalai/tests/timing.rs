@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use reqwest::Method;
 use serde_json::{Value, json};
-use support::{HOST, Stand, TEAM_A, UPDATE, put_body};
+use support::{HOST, PARTIAL, Stand, TEAM_A, UPDATE, put_body};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -105,12 +105,13 @@ async fn a_held_result_is_saved_when_it_is_let_go() {
     let stand = Stand::start().await;
     stand.submit().await;
     stand.knobs(&json!({"put_held": true})).await;
+    stand.put(PARTIAL, &put_body(1, "partially_evaluated", 1.0)).await.ok();
     let body = put_body(1, "finished", 1.0);
     let mut put = std::pin::pin!(stand.put(UPDATE, &body));
     let status = async || stand.list("").await.ok().json()[0]["status"].clone();
     tokio::select! {
         answer = &mut put => panic!("answered while it is held: {answer:?}"),
-        before = status() => assert_eq!(before, "submitted"),
+        before = status() => assert_eq!(before, "partially_evaluated"),
     }
     stand.knobs(&json!({"put_held": false})).await;
     put.await.ok();

@@ -38,7 +38,7 @@ pub(super) async fn update(call: &Call, challenge: u64, door: Door) -> Answer {
         if put { knobs.put_delay_ms } else { knobs.patch_delay_ms }
     };
     pause(delay).await;
-    if put {
+    if put && write.is_end() {
         call.app.until(|| !call.app.knobs().put_held).await;
     }
     let progress = write.progress;
