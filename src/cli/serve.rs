@@ -8,9 +8,9 @@ use kube::{Client, Config};
 
 use super::{Controller, InPod, Server};
 use crate::bridge;
-use crate::controller::context::Settings;
-use crate::controller::leader::{self, Identity};
-use crate::controller::run;
+use crate::controller::runtime as run;
+use crate::controller::runtime::leader::{self, Identity};
+use crate::controller::settings::Settings;
 use crate::kubernetes::{Clients, watch_client};
 use crate::observability::Observability;
 use crate::observability::health::HealthServer;

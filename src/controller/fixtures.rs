@@ -22,10 +22,10 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
-use super::archive::{ArchiveWorkers, WakeSubmission};
-use super::context::{Context, Settings, Stores};
-use super::observe::lookups::Lookups;
-use super::sync::Sync;
+use crate::controller::runtime::context::{Context, Settings, Stores};
+use crate::controller::submissions::archive::{ArchiveWorkers, WakeSubmission};
+use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::observe::lookups::Lookups;
 use crate::kubernetes::Synced;
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
@@ -105,7 +105,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         meter: Meter::default(),
         tasks: tasks.clone(),
     });
-    let sync = Sync::new(hub, Recorder::new(aws.clone(), || true, wake, tasks.clone()));
+    let sync = ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, wake, tasks.clone()));
     let (answered_by, answered) = mpsc::unbounded_channel();
     let answered_by = move || -> WakeSubmission {
         let answered_by = answered_by.clone();

@@ -6,7 +6,7 @@ use k8s_openapi::api::coordination::v1::Lease;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client};
-use leaderboard_operator::controller::leader::{
+use leaderboard_operator::controller::runtime::leader::{
     ANNOTATION_DRAINED, Identity, Leader, Leadership, Settings, Timing, start,
 };
 use leaderboard_operator::observability::Observability;

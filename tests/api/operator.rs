@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use kube::{Client, Config};
-use leaderboard_operator::controller::context::Settings;
-use leaderboard_operator::controller::leader::{self, Identity, Timing};
-use leaderboard_operator::controller::run::{self, Clients, RunError};
+use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
+use leaderboard_operator::controller::runtime::{self as run, Clients, RunError};
+use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::watch_client;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
@@ -23,7 +23,7 @@ const LEASE: Duration = Duration::from_mins(4);
 
 /// A controller that leads, or will.
 pub struct Operator {
-    pub seen: Observability,
+    pub telemetry: Observability,
     stop: watch::Sender<bool>,
     task: JoinHandle<Result<(), RunError>>,
 }
@@ -37,10 +37,10 @@ impl Operator {
     /// Starts one with the rights that this configuration gives.
     pub fn start_as(namespace: &str, aws: Aws, config: Config) -> Self {
         let (stop, signal) = Stop::new();
-        let seen = Observability::new(signal);
+        let telemetry = Observability::new(signal);
         Self {
-            task: tokio::spawn(Box::pin(run(namespace, aws, config, seen.clone()))),
-            seen,
+            task: tokio::spawn(Box::pin(run(namespace, aws, config, telemetry.clone()))),
+            telemetry,
             stop,
         }
     }
@@ -52,7 +52,7 @@ impl Operator {
 
     /// What Prometheus would get.
     pub fn metrics(&self) -> String {
-        self.seen.metrics.text().unwrap()
+        self.telemetry.metrics.text().unwrap()
     }
 
     /// Tells it to end, and waits for that.
@@ -68,7 +68,7 @@ pub fn run(
     namespace: &str,
     aws: Aws,
     config: Config,
-    seen: Observability,
+    telemetry: Observability,
 ) -> impl Future<Output = Result<(), RunError>> + Send + use<> {
     let clients = Clients {
         api: Client::try_from(config.clone()).unwrap(),
@@ -93,5 +93,5 @@ pub fn run(
         namespace: Some(namespace.to_owned()),
         concurrency: 16,
     };
-    run::run(clients, lease, settings, aws, seen)
+    run::run(clients, lease, settings, aws, telemetry)
 }

@@ -10,7 +10,7 @@ use super::isolation;
 use super::probe::EvalaiStanding;
 use super::reach::Unreachable;
 use super::state::Policy;
-use crate::controller::decide::previous_controller;
+use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;

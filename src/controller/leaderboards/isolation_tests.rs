@@ -4,9 +4,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::controller::context::Context;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
 use crate::controller::leaderboards::{Uses, reconcile};
+use crate::controller::runtime::context::Context;
 use crate::observability::logging::tests::Lines;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
@@ -315,7 +315,7 @@ async fn a_leaderboard_and_with_it_the_policy_stays_while_a_pod_of_it_runs() {
             policies: context.policies(),
             settings: &context.settings,
             slots: &context.slots,
-            sync: &context.sync,
+            sync: &context.external,
             aws: &context.aws,
         };
         // The mock's answer to a finalizer is no Leaderboard.

@@ -22,7 +22,7 @@ use serde_json::json;
 use super::objects::{key_of, uid_of};
 use super::settings::Settings;
 use super::slots::SlotAllocator;
-use super::sync::Sync;
+use crate::controller::submissions::external::ExternalSystems;
 use crate::kubernetes::{CallError, call};
 use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
@@ -37,7 +37,7 @@ pub struct Uses<'a> {
     pub policies: Policies<'a>,
     pub settings: &'a Settings,
     pub slots: &'a SlotAllocator,
-    pub sync: &'a Sync,
+    pub external: &'a ExternalSystems,
     pub aws: &'a Aws,
 }
 

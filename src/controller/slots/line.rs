@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet};
 use std::mem::discriminant;
 
 use super::member::{Member, Stand};
-use crate::controller::turns::{InLine, Limits, Past, RUNS, Turn, turns};
+use crate::controller::slots::turns::{InLine, Limits, Past, RUNS, Turn, turns};
 use leaderboard_api::State;
 use leaderboard_api::leaderboard::Counts;
 

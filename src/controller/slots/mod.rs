@@ -7,6 +7,7 @@
 
 mod line;
 mod member;
+pub mod turns;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -19,7 +20,7 @@ use kube::runtime::reflector::ObjectRef;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use super::turns::{InLine, Limits, Turn};
+use crate::controller::slots::turns::{InLine, Limits, Turn};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{Leaderboard, Submission, names};
 use line::Line;

@@ -299,7 +299,7 @@ fn is_settled(submission: &Submission) -> bool {
 /// A controller on a thread of its own.
 struct Controller {
     user: String,
-    seen: Observability,
+    telemetry: Observability,
     measured: oneshot::Sender<()>,
     thread: JoinHandle<AllocationInfo>,
 }
@@ -308,9 +308,9 @@ impl Controller {
     async fn start(world: &World) -> Self {
         let (config, user) = server().await.counted();
         let (stop, signal) = Stop::new();
-        let seen = Observability::new(signal);
+        let telemetry = Observability::new(signal);
         let (measured, until) = oneshot::channel::<()>();
-        let (namespace, endpoint, of_thread) = (world.namespace.clone(), world.aws.endpoint.clone(), seen.clone());
+        let (namespace, endpoint, of_thread) = (world.namespace.clone(), world.aws.endpoint.clone(), telemetry.clone());
         let thread = std::thread::spawn(move || {
             let mut running = None;
             let memory = allocation_counter::measure(|| {
@@ -333,7 +333,7 @@ impl Controller {
         });
         Self {
             user,
-            seen,
+            telemetry,
             measured,
             thread,
         }
@@ -348,7 +348,7 @@ impl Controller {
     }
 
     fn reconciles(&self) -> u64 {
-        let text = self.seen.metrics.text().unwrap();
+        let text = self.telemetry.metrics.text().unwrap();
         let lines = text
             .lines()
             .filter(|line| line.starts_with("leaderboard_reconciles_total{"));

@@ -1,0 +1,301 @@
+//! The calls of an election: looks at the Lease, asks `decide`, writes with the resourceVersion that was read.
+//!
+//! One task a process, started by `leader::start`. Each call is bounded; what a call did when no answer came is found out
+//! by looking again, never assumed.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::api::coordination::v1::Lease;
+use kube::api::PostParams;
+use kube::{Api, Client};
+use tokio::sync::{oneshot, watch};
+use tokio::time::{Instant, sleep, timeout};
+
+use super::decide::{Decision, Leading, Loss, Seen, decide, is_overdue};
+use super::record::{Record, held, released};
+use super::{Fence, Leadership, Settings};
+use crate::backoff::jittered;
+use crate::observability::Observability;
+use crate::observability::liveness::Liveness;
+use crate::observability::metrics::Metrics;
+use leaderboard_api::client_errors;
+
+/// Looks at a Lease that changes while it is being released.
+const RELEASE_TRIES: u32 = 3;
+
+/// What the election tells.
+pub(super) struct Outlets {
+    pub publish: watch::Sender<Leadership>,
+    pub fence: Fence,
+    pub is_drained: watch::Receiver<bool>,
+}
+
+pub(super) struct Elector {
+    api: Api<Lease>,
+    settings: Settings,
+    outlets: Outlets,
+    metrics: Arc<Metrics>,
+    liveness: Liveness,
+    seen: Seen,
+    /// The Lease as the server last told it. None: there is none, if `is_fresh`.
+    lease: Option<Lease>,
+    /// The last look or write was answered, and nothing has been sent since.
+    is_fresh: bool,
+    leading: Option<Leading>,
+}
+
+/// Why a call brought no answer that helps.
+#[derive(Debug)]
+enum CallError {
+    /// Somebody else was quicker, or the Lease is gone: look again.
+    Stale,
+    Failed {
+        reason: &'static str,
+        text: String,
+    },
+}
+
+/// How the election goes on.
+enum Next {
+    After(Duration),
+    End(Loss),
+}
+
+impl Elector {
+    pub(super) fn new(client: Client, settings: Settings, outlets: Outlets, telemetry: &Observability) -> Self {
+        Self {
+            api: Api::namespaced(client, &settings.namespace),
+            settings,
+            outlets,
+            metrics: telemetry.metrics.clone(),
+            liveness: telemetry.liveness.clone(),
+            seen: Seen::default(),
+            lease: None,
+            is_fresh: false,
+            leading: None,
+        }
+    }
+
+    /// Until the Lease is lost or handed over.
+    pub(super) async fn run(mut self, mut release: oneshot::Receiver<oneshot::Sender<Result<(), String>>>) {
+        loop {
+            let pause = match self.round().await {
+                Next::After(pause) => pause,
+                Next::End(loss) => return self.lose(&loss.to_string()),
+            };
+            tokio::select! {
+                () = sleep(pause) => {}
+                wish = &mut release => return match wish {
+                    Ok(answer) => self.hand_over(answer).await,
+                    Err(_) => self.lose("the election was abandoned by its process"),
+                },
+            }
+        }
+    }
+
+    async fn round(&mut self) -> Next {
+        let now = self.settings.clock.now();
+        if let Some(loss) = self
+            .leading
+            .and_then(|leading| is_overdue(&leading, &self.settings.timing, now))
+        {
+            return Next::End(loss);
+        }
+        // A leader writes with what its last write was answered; only a doubt costs it a look.
+        if (self.leading.is_none() || !self.is_fresh)
+            && let Err(error) = self.look().await
+        {
+            return self.failed("read", error);
+        }
+        let now = self.settings.clock.now();
+        match decide(
+            &self.telemetry,
+            &self.settings.identity,
+            self.leading.as_ref(),
+            &self.settings.timing,
+            now,
+        ) {
+            Decision::Acquire { term } | Decision::Renew { term } => self.write(term).await,
+            Decision::Wait { until } => Next::After(self.retry().min(until.saturating_sub(now))),
+            Decision::Lost(loss) => Next::End(loss),
+        }
+    }
+
+    async fn look(&mut self) -> Result<(), CallError> {
+        let name = self.settings.name.clone();
+        let api = self.api.clone();
+        let lease = self.call(async move { api.get_opt(&name).await }).await?;
+        self.note(lease);
+        Ok(())
+    }
+
+    async fn write(&mut self, term: i32) -> Next {
+        let sent = self.settings.clock.now();
+        let lease = held(self.lease.as_ref(), &self.settings, term, Timestamp::now());
+        self.is_fresh = false;
+        match self.send(&lease).await {
+            Ok(written) => {
+                self.note(Some(written));
+                self.lead(term, sent);
+                Next::After(self.retry())
+            }
+            Err(error) => self.failed("written", error),
+        }
+    }
+
+    async fn send(&self, lease: &Lease) -> Result<Lease, CallError> {
+        let (api, params) = (self.api.clone(), PostParams::default());
+        match lease.metadata.resource_version {
+            Some(_) => {
+                self.call(async move { api.replace(&self.settings.name, &params, lease).await })
+                    .await
+            }
+            None => self.call(async move { api.create(&params, lease).await }).await,
+        }
+    }
+
+    /// Bounds a call, also by the moment at which a leader has to know that it has lost.
+    async fn call<T>(&self, call: impl Future<Output = Result<T, kube::Error>>) -> Result<T, CallError> {
+        let limit = self.settings.timing.call.min(self.time_left());
+        match timeout(limit, call).await {
+            Ok(Ok(answer)) => {
+                self.liveness.answered();
+                Ok(answer)
+            }
+            Ok(Err(kube::Error::Api(status)))
+                if status.is_conflict() || status.is_already_exists() || status.is_not_found() =>
+            {
+                self.liveness.answered();
+                Err(CallError::Stale)
+            }
+            Ok(Err(error)) => Err(CallError::Failed {
+                reason: client_errors::reason(&error),
+                text: client_errors::kube(&error),
+            }),
+            Err(_) => {
+                let text = format!("no answer within {:.1} s", limit.as_secs_f32());
+                Err(CallError::Failed {
+                    reason: "timeout",
+                    text,
+                })
+            }
+        }
+    }
+
+    fn note(&mut self, lease: Option<Lease>) {
+        self.telemetry
+            .note(lease.as_ref().map(Record::read), self.settings.clock.now());
+        self.lease = lease;
+        self.is_fresh = true;
+    }
+
+    /// A write that says we lead, sent at `sent`, has succeeded.
+    fn lead(&mut self, term: i32, sent: Duration) {
+        self.outlets.fence.renewed(sent);
+        if self.leading.replace(Leading { term, renewed_at: sent }).is_none() {
+            let since = Instant::now();
+            let drained_before = self
+                .seen
+                .record
+                .as_ref()
+                .is_some_and(|record| record.is_drained_before(term));
+            let quiet = if drained_before {
+                Duration::ZERO
+            } else {
+                self.settings.timing.evalai_quiet
+            };
+            self.outlets.fence.begin(term, since + quiet);
+            self.metrics.set_leading(Some(term));
+            tracing::info!(term, drained_before, lease = self.settings.name, "leading");
+            self.outlets.publish.send_replace(Leadership::Leader {
+                term,
+                since,
+                drained_before,
+            });
+        }
+    }
+
+    fn lose(&mut self, why: &str) {
+        self.outlets.fence.close();
+        self.metrics.set_leading(None);
+        tracing::error!(lease = self.settings.name, why, "leading no more");
+        self.outlets
+            .publish
+            .send_replace(Leadership::Lost { why: why.to_owned() });
+    }
+
+    fn failed(&self, what: &'static str, error: CallError) -> Next {
+        let timing = &self.settings.timing;
+        let pause = match error {
+            // Two candidates that met once are kept from meeting again.
+            CallError::Stale => jittered(timing.retry / 8, 0.1),
+            CallError::Failed { reason, text } => {
+                self.metrics.lease_failed(reason);
+                tracing::warn!(lease = self.settings.name, "the Lease could not be {what}: {text}");
+                jittered(timing.retry / 2, 0.1)
+            }
+        };
+        Next::After(pause.min(self.time_left()))
+    }
+
+    /// Until a leader is overdue; a standby has all the time.
+    fn time_left(&self) -> Duration {
+        let Some(leading) = self.leading else {
+            return Duration::MAX;
+        };
+        let deadline = leading.renewed_at + self.settings.timing.renew_deadline;
+        deadline.saturating_sub(self.settings.clock.now())
+    }
+
+    fn retry(&self) -> Duration {
+        jittered(self.settings.timing.retry, 0.1)
+    }
+
+    async fn hand_over(&mut self, answer: oneshot::Sender<Result<(), String>>) {
+        let result = match self.leading {
+            Some(leading) => self.release(leading.term).await,
+            None => Ok(()),
+        };
+        self.outlets.fence.close();
+        self.metrics.set_leading(None);
+        self.outlets.publish.send_replace(Leadership::Standby);
+        // A caller that no longer waits has nothing to do with the answer.
+        let _ = answer.send(result);
+    }
+
+    async fn release(&mut self, term: i32) -> Result<(), String> {
+        let is_drained = *self.outlets.is_drained.borrow();
+        let mut why = String::new();
+        for _ in 0..RELEASE_TRIES {
+            match self.try_release(term, is_drained).await {
+                Ok(()) => {
+                    tracing::info!(term, is_drained, lease = self.settings.name, "released the Lease");
+                    return Ok(());
+                }
+                Err(CallError::Stale) => "it was changed at the same time".clone_into(&mut why),
+                Err(CallError::Failed { text, .. }) => why = text,
+            }
+        }
+        Err(why)
+    }
+
+    async fn try_release(&mut self, term: i32, is_drained: bool) -> Result<(), CallError> {
+        // The renewal deadline no longer bounds a call: the fence is closed.
+        self.leading = None;
+        self.look().await?;
+        let me = self.settings.identity.as_str();
+        let is_ours = self
+            .seen
+            .record
+            .as_ref()
+            .is_some_and(|r| r.holder.as_deref() == Some(me) && r.term == term);
+        let Some(lease) = self.lease.take().filter(|_| is_ours) else {
+            return Ok(());
+        };
+        self.send(&released(lease, term, is_drained, Timestamp::now()))
+            .await
+            .map(|_| ())
+    }
+}

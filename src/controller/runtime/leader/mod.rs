@@ -1,0 +1,217 @@
+//! Which replica leads: a Lease of our own, and the fence that every write outside the cluster passes.
+//!
+//! `main` starts it once; every writer to EvalAI or DynamoDB asks `Fence::may_write` right before. `decide` is pure,
+//! `record` translates between Leases and what `decide` reads, `elector` does the calls. Knows no Submission.
+//!
+//! What is promised: at any moment at most one process may write, also when processes are paused, answers are lost and
+//! clocks disagree. A process that has led leads no second time: `Leadership::Lost` has to end it.
+
+pub mod decide;
+mod elector;
+pub mod fence;
+pub mod record;
+
+#[cfg(test)]
+pub(crate) mod fake_server;
+#[cfg(test)]
+mod simulation;
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
+use tokio::sync::{oneshot, watch};
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
+pub use fence::{Clock, Fence};
+pub use record::Identity;
+
+use crate::observability::Observability;
+
+/// Annotation on the Lease: the term whose leader has had an answer to all it sent to EvalAI.
+pub const ANNOTATION_DRAINED: &str = "leaderboard.carla.org/drained";
+
+/// Annotation on the Lease: the term whose leader has handed it over, and has closed its fence before.
+pub const ANNOTATION_RELEASED: &str = "leaderboard.carla.org/released";
+
+/// Times of the election.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Timing {
+    /// A Lease that has not changed for so long may be taken from its holder. Whole seconds.
+    pub lease: Duration,
+    /// A leader that has not renewed for so long is none. Well below `lease`.
+    pub renew_deadline: Duration,
+    /// Between renewals, and between a standby's looks.
+    pub retry: Duration,
+    /// Any one call.
+    pub call: Duration,
+    /// EvalAI may work for so long on what a leader before has sent.
+    pub evalai_quiet: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            lease: Duration::from_secs(15),
+            renew_deadline: Duration::from_secs(10),
+            retry: Duration::from_secs(2),
+            call: Duration::from_secs(5),
+            evalai_quiet: Duration::from_secs(75),
+        }
+    }
+}
+
+/// What an election needs to know.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// The operator's own namespace.
+    pub namespace: String,
+    /// Name of the Lease.
+    pub name: String,
+    pub identity: Identity,
+    /// Owner of a Lease that is made new, so that it goes with the operator.
+    pub owner: Option<OwnerReference>,
+    pub timing: Timing,
+    pub clock: Clock,
+}
+
+impl Settings {
+    /// The usual times and the boot clock.
+    pub fn new(namespace: &str, name: &str, identity: Identity) -> Self {
+        Self {
+            namespace: namespace.to_owned(),
+            name: name.to_owned(),
+            identity,
+            owner: None,
+            timing: Timing::default(),
+            clock: Clock::boot(),
+        }
+    }
+}
+
+/// Where this process stands.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Leadership {
+    /// Somebody else leads, or nobody is known to.
+    Standby,
+    /// This process leads.
+    Leader {
+        /// Grows with every change of leaders.
+        term: i32,
+        since: Instant,
+        /// Nothing sent to EvalAI by the leader before can still be worked on, or there was none.
+        drained_before: bool,
+    },
+    /// It led and does no more: stop starting work and exit with an error.
+    Lost { why: String },
+}
+
+impl Leadership {
+    /// The term, while it leads.
+    pub fn term(&self) -> Option<i32> {
+        match self {
+            Self::Leader { term, .. } => Some(*term),
+            Self::Standby | Self::Lost { .. } => None,
+        }
+    }
+}
+
+/// Why a Lease could not be handed over in order. Nobody has to do anything: it expires by itself.
+#[derive(Debug, thiserror::Error)]
+pub enum ReleaseError {
+    #[error("the Lease {name} could not be released: {why}; the next leader waits until it expires")]
+    NotReleased { name: String, why: String },
+    #[error("the task of the Lease {name} has ended before its time; the next leader waits until it expires")]
+    TaskEnded { name: String },
+}
+
+/// The part of an election that other parts hold.
+#[derive(Debug)]
+pub struct Leader {
+    name: String,
+    leadership: watch::Receiver<Leadership>,
+    fence: Fence,
+    drained: watch::Sender<bool>,
+    release: oneshot::Sender<oneshot::Sender<Result<(), String>>>,
+    task: JoinHandle<Option<()>>,
+}
+
+/// A client for the Lease alone: no retries of its own, since the election decides what is tried again.
+///
+/// # Errors
+/// If the configuration holds no usable TLS or credentials.
+pub fn lease_client(mut config: kube::Config) -> Result<kube::Client, kube::Error> {
+    config.default_retry = false;
+    let limit = Timing::default().call;
+    config.connect_timeout = Some(limit);
+    config.read_timeout = Some(limit);
+    config.write_timeout = Some(limit);
+    kube::Client::try_from(config)
+}
+
+/// Starts to stand for leader. `client` is one from `lease_client`.
+pub fn start(client: kube::Client, settings: Settings, telemetry: &Observability) -> Leader {
+    let (publish, leadership) = watch::channel(Leadership::Standby);
+    let (drained, is_drained) = watch::channel(false);
+    let (release, released) = oneshot::channel();
+    let fence = Fence::new(settings.clock.clone(), settings.timing.renew_deadline);
+    let name = settings.name.clone();
+    let outlets = elector::Outlets {
+        publish,
+        fence: fence.clone(),
+        is_drained,
+    };
+    let elector = elector::Elector::new(client, settings, outlets, telemetry);
+    // Its orderly end says that the Lease is lost or released.
+    let task = telemetry.tasks.may_end("lease", elector.run(released));
+    Leader {
+        name,
+        leadership,
+        fence,
+        drained,
+        release,
+        task,
+    }
+}
+
+impl Leader {
+    /// Where this process stands, now and later. `Lost` is the last value.
+    pub fn leadership(&self) -> watch::Receiver<Leadership> {
+        self.leadership.clone()
+    }
+
+    /// What writers ask.
+    pub fn fence(&self) -> Fence {
+        self.fence.clone()
+    }
+
+    /// Every request to EvalAI is answered and no other write is under way. Closes the fence for good, so that this
+    /// stays true, and lets the successor write at once.
+    pub fn drained(&self) {
+        self.fence.close();
+        self.drained.send_replace(true);
+    }
+
+    /// Hands the Lease over: clears the holder, with the note of `drained` if that was called. The last thing a stopping
+    /// process does; bounded by a few calls. A standby, or a process that has lost the Lease, has nothing to release.
+    ///
+    /// # Errors
+    /// If the Lease could not be written. The successor then waits for its expiry.
+    pub async fn release(self) -> Result<(), ReleaseError> {
+        self.fence.close();
+        let (answer, answered) = oneshot::channel();
+        if self.release.send(answer).is_err() {
+            // The election ends by itself only when the Lease is lost.
+            return Ok(());
+        }
+        let name = self.name;
+        let result = answered
+            .await
+            .map_err(|_| ReleaseError::TaskEnded { name: name.clone() })?;
+        // The task has answered; what is left of it is its return.
+        let _ = self.task.await;
+        result.map_err(|why| ReleaseError::NotReleased { name, why })
+    }
+}

@@ -1,0 +1,439 @@
+//! Whole elections on tokio's paused clock against one Lease on a mock of the API server, with faults.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use serde_json::json;
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep, timeout};
+
+use super::fake_server::{FakeServer, Fault};
+use super::*;
+use crate::observability::shutdown::Stop;
+
+/// Longer than anything an election may take.
+const LIMIT: Duration = Duration::from_mins(5);
+
+struct Candidate {
+    leader: Leader,
+    telemetry: Observability,
+    /// Seconds by which its boot clock is ahead of tokio's: a pause of the machine.
+    paused: Arc<AtomicU64>,
+    _stop: watch::Sender<bool>,
+}
+
+impl Candidate {
+    fn start(server: &FakeServer, identity: Identity) -> Self {
+        let (sender, stop) = Stop::new();
+        let telemetry = Observability::new(stop);
+        let (begin, paused) = (Instant::now(), Arc::new(AtomicU64::new(1000)));
+        let ahead = paused.clone();
+        let clock = Clock::new(move || begin.elapsed() + Duration::from_secs(ahead.load(Ordering::SeqCst)));
+        let settings = Settings {
+            clock,
+            ..Settings::new("ns", "operator", identity)
+        };
+        let leader = start(server.client(), settings, &telemetry);
+        Self {
+            leader,
+            telemetry,
+            paused,
+            _stop: sender,
+        }
+    }
+
+    async fn until(&self, what: &str, is: impl Fn(&Leadership) -> bool) -> Leadership {
+        let mut leadership = self.leader.leadership();
+        let found = timeout(LIMIT, leadership.wait_for(|now| is(now))).await;
+        found.unwrap_or_else(|_| panic!("never {what}")).unwrap().clone()
+    }
+
+    async fn leads(&self) -> Leadership {
+        self.until("leads", |l| l.term().is_some()).await
+    }
+
+    async fn loses(&self) -> String {
+        match self.until("loses", |l| matches!(l, Leadership::Lost { .. })).await {
+            Leadership::Lost { why } => why,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn may_write(&self) -> bool {
+        self.leader.fence().may_write()
+    }
+}
+
+fn someone() -> Identity {
+    Identity::random("host")
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_first_ever_leads_at_once_and_may_write_to_evalai_at_once() {
+    let (server, begin) = (FakeServer::default(), Instant::now());
+    let candidate = Candidate::start(&server, someone());
+    assert!(!candidate.may_write());
+    let leadership = candidate.leads().await;
+    assert!(
+        matches!(
+            leadership,
+            Leadership::Leader {
+                term: 1,
+                drained_before: true,
+                ..
+            }
+        ),
+        "{leadership:?}"
+    );
+    assert!(candidate.may_write() && begin.elapsed() < Duration::from_secs(1));
+    let not_before = candidate.leader.fence().evalai_not_before().unwrap();
+    assert!(not_before <= Instant::now());
+    assert_eq!(candidate.leader.fence().term(), Some(1));
+    assert!(
+        candidate
+            .seen
+            .metrics
+            .text()
+            .unwrap()
+            .contains("leaderboard_is_leader 1\n")
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_leader_renews_every_two_seconds_without_reading() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    server.with(|state| state.log.clear());
+    for _ in 0..60 {
+        sleep(Duration::from_secs(1)).await;
+        assert!(candidate.may_write());
+    }
+    let log = server.with(|state| state.log.clone());
+    assert!(
+        log.iter().all(|method| method == "PUT") && (27..=34).contains(&log.len()),
+        "{log:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_standby_takes_over_fifteen_seconds_after_the_last_sign_and_waits_for_evalai() {
+    let server = FakeServer::default();
+    server.with(|state| state.put(Some("gone"), 3, &json!({})));
+    let begin = Instant::now();
+    let candidate = Candidate::start(&server, someone());
+    let leadership = candidate.leads().await;
+    let waited = begin.elapsed();
+    assert!((15..=18).contains(&waited.as_secs()), "{waited:?}");
+    assert!(
+        matches!(
+            leadership,
+            Leadership::Leader {
+                term: 4,
+                drained_before: false,
+                ..
+            }
+        ),
+        "{leadership:?}"
+    );
+    let quiet = candidate.leader.fence().evalai_not_before().unwrap() - Instant::now();
+    assert!((74..=75).contains(&quiet.as_secs()), "{quiet:?}");
+    assert!(candidate.may_write(), "DynamoDB needs no quiet time");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_live_leader_is_left_alone_whatever_its_clock_says() {
+    let server = FakeServer::default();
+    server.with(|state| state.put(Some("alive"), 3, &json!({})));
+    let candidate = Candidate::start(&server, someone());
+    for _ in 0..20 {
+        sleep(Duration::from_secs(10)).await;
+        // The times it writes lie months away; only that they change counts.
+        server.with(|state| state.put(Some("alive"), 3, &json!({})));
+    }
+    assert_eq!(*candidate.leader.leadership().borrow(), Leadership::Standby);
+    assert!(!candidate.may_write());
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_orderly_end_hands_over_within_a_look_and_without_quiet_time() {
+    let server = FakeServer::default();
+    let old = Candidate::start(&server, someone());
+    old.leads().await;
+    let new = Candidate::start(&server, someone());
+    sleep(Duration::from_secs(5)).await;
+    let fence = old.leader.fence();
+    old.leader.drained();
+    assert!(!fence.may_write(), "what was drained stays so");
+    old.leader.release().await.unwrap();
+    let begin = Instant::now();
+    let leadership = new.leads().await;
+    assert!(
+        matches!(
+            leadership,
+            Leadership::Leader {
+                term: 2,
+                drained_before: true,
+                ..
+            }
+        ),
+        "{leadership:?}"
+    );
+    assert!(begin.elapsed() < Duration::from_secs(3));
+    assert!(new.leader.fence().evalai_not_before().unwrap() <= Instant::now());
+    assert!(
+        futures::FutureExt::now_or_never(old.telemetry.tasks.failed()).is_none(),
+        "an orderly end is no failed task"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_end_without_all_answers_hands_over_with_the_quiet_time() {
+    let server = FakeServer::default();
+    let old = Candidate::start(&server, someone());
+    old.leads().await;
+    old.leader.release().await.unwrap();
+    assert!(server.with(|state| state.spec("holderIdentity")).is_null());
+    let new = Candidate::start(&server, someone());
+    let leadership = new.leads().await;
+    assert!(
+        matches!(
+            leadership,
+            Leadership::Leader {
+                term: 2,
+                drained_before: false,
+                ..
+            }
+        ),
+        "{leadership:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_old_note_of_drained_does_not_count_for_a_later_term() {
+    let server = FakeServer::default();
+    server.with(|state| state.put(Some("gone"), 7, &json!({ANNOTATION_DRAINED: "6"})));
+    let candidate = Candidate::start(&server, someone());
+    let leadership = candidate.leads().await;
+    assert!(
+        matches!(
+            leadership,
+            Leadership::Leader {
+                term: 8,
+                drained_before: false,
+                ..
+            }
+        ),
+        "{leadership:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_restarted_container_takes_over_from_its_own_past_at_once_but_keeps_quiet() {
+    let server = FakeServer::default();
+    let before = Identity::of_pod("pod", "uid");
+    server.with(|state| state.put(Some(before.as_str()), 3, &json!({})));
+    let begin = Instant::now();
+    let candidate = Candidate::start(&server, Identity::of_pod("pod", "uid"));
+    let leadership = candidate.leads().await;
+    assert!(begin.elapsed() < Duration::from_secs(1));
+    assert!(
+        matches!(
+            leadership,
+            Leadership::Leader {
+                term: 4,
+                drained_before: false,
+                ..
+            }
+        ),
+        "{leadership:?}"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_conflict_means_look_again_not_lose() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    server.with(|state| state.writes = [Fault::Meddled, Fault::Meddled].into());
+    for _ in 0..20 {
+        sleep(Duration::from_secs(1)).await;
+        assert!(candidate.may_write());
+    }
+    assert!(server.with(|state| state.writes.is_empty()));
+    assert_eq!(server.with(|state| state.spec("leaseTransitions")), 1);
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_acquisition_whose_answer_was_lost_is_found_and_kept_in_its_term() {
+    for fault in [Fault::DoneBut504, Fault::Silence] {
+        let server = FakeServer::default();
+        server.with(|state| {
+            state.put(None, 3, &json!({ANNOTATION_RELEASED: "3"}));
+            state.writes = [fault].into();
+        });
+        let candidate = Candidate::start(&server, someone());
+        let leadership = candidate.leads().await;
+        assert_eq!(leadership.term(), Some(4), "{fault:?}");
+        assert!(candidate.may_write());
+        assert_eq!(server.with(|state| state.spec("leaseTransitions")), 4, "{fault:?}");
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_renewal_whose_answer_was_lost_costs_one_look() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    server.with(|state| {
+        state.writes = [Fault::DoneBut504].into();
+        state.log.clear();
+    });
+    sleep(Duration::from_secs(8)).await;
+    assert!(candidate.may_write());
+    let log = server.with(|state| state.log.clone());
+    assert_eq!(log.iter().filter(|method| *method == "GET").count(), 1, "{log:?}");
+    assert!(
+        candidate
+            .seen
+            .metrics
+            .text()
+            .unwrap()
+            .contains("leaderboard_lease_errors_total{reason=\"server\"} 1\n")
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn silence_closes_the_fence_in_ten_seconds_and_ends_the_term() {
+    for fault in [Fault::Silence, Fault::Forbidden] {
+        let server = FakeServer::default();
+        let candidate = Candidate::start(&server, someone());
+        candidate.leads().await;
+        sleep(Duration::from_secs(7)).await;
+        server.with(|state| state.always = Some(fault));
+        let begin = Instant::now();
+        let why = candidate.loses().await;
+        let taken = begin.elapsed();
+        assert!(why.contains("could not be renewed for 10 s"), "{why}");
+        assert!((7..=10).contains(&taken.as_secs()), "{fault:?} {taken:?}");
+        assert!(!candidate.may_write());
+        assert!(
+            candidate
+                .seen
+                .metrics
+                .text()
+                .unwrap()
+                .contains("leaderboard_is_leader 0\n")
+        );
+        server.with(|state| state.always = None);
+        sleep(Duration::from_mins(1)).await;
+        assert!(!candidate.may_write(), "a process leads only once");
+        candidate.leader.release().await.expect("there is nothing to release");
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_renewal_counts_from_when_it_was_sent() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    let begin = Instant::now();
+    server.with(|state| {
+        state.writes = [Fault::Late].into_iter().chain([Fault::Silence; 20]).collect();
+        state.reads = [Fault::Silence; 20].into();
+    });
+    candidate.loses().await;
+    // Sent after 2 s, answered after 6 s.
+    let taken = begin.elapsed().as_secs_f32();
+    assert!((11.7..=12.3).contains(&taken), "{taken}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_pause_of_the_machine_closes_the_fence_before_anything_else_runs() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    candidate.paused.fetch_add(30, Ordering::SeqCst);
+    assert!(!candidate.may_write());
+    server.with(|state| state.log.clear());
+    let why = candidate.loses().await;
+    assert!(why.contains("could not be renewed"), "{why}");
+    assert!(
+        server.with(|state| state.log.is_empty()),
+        "a leader that overslept does not renew"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_taken_lease_ends_the_term() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    server.with(|state| state.put(Some("other"), 2, &json!({})));
+    assert_eq!(candidate.loses().await, "other holds the Lease");
+    assert!(!candidate.may_write());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_holder_cleared_by_hand_ends_its_term_before_the_next_begins() {
+    let server = FakeServer::default();
+    let old = Candidate::start(&server, someone());
+    old.leads().await;
+    let new = Candidate::start(&server, someone());
+    sleep(Duration::from_secs(5)).await;
+    server.with(|state| state.put(None, 1, &json!({})));
+    assert_eq!(old.loses().await, "somebody has cleared the holder of the Lease");
+    assert!(!new.may_write());
+    assert_eq!(new.leads().await.term(), Some(2));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_deleted_lease_is_written_again_in_the_same_term() {
+    let server = FakeServer::default();
+    server.with(|state| state.put(None, 3, &json!({ANNOTATION_RELEASED: "3"})));
+    let (one, two) = (Candidate::start(&server, someone()), someone());
+    one.leads().await;
+    let standby = Candidate::start(&server, two);
+    sleep(Duration::from_secs(5)).await;
+    server.with(|state| state.lease = None);
+    sleep(Duration::from_mins(1)).await;
+    assert!(one.may_write() && !standby.may_write());
+    assert_eq!(server.with(|state| state.spec("leaseTransitions")), 4);
+    assert_eq!(*standby.leader.leadership().borrow(), Leadership::Standby);
+}
+
+#[tokio::test(start_paused = true)]
+async fn of_many_candidates_exactly_one_leads_at_any_time() {
+    let server = FakeServer::default();
+    let mut candidates: Vec<_> = (0..5).map(|_| Candidate::start(&server, someone())).collect();
+    let mut leaders = 0;
+    while !candidates.is_empty() {
+        let mut found = None;
+        for _ in 0..60 {
+            sleep(Duration::from_millis(500)).await;
+            let writers: Vec<_> = (0..candidates.len()).filter(|&i| candidates[i].may_write()).collect();
+            assert!(writers.len() <= 1, "{writers:?}");
+            found = writers.first().copied().or(found);
+        }
+        let leader = candidates.swap_remove(found.expect("somebody leads"));
+        leaders += 1;
+        // Every other one vanishes without a word.
+        if leaders % 2 == 0 {
+            leader.leader.release().await.unwrap();
+        }
+    }
+    assert_eq!(server.with(|state| state.spec("leaseTransitions")), 5);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_release_that_fails_is_told_and_leaves_the_fence_closed() {
+    let server = FakeServer::default();
+    let candidate = Candidate::start(&server, someone());
+    candidate.leads().await;
+    let fence = candidate.leader.fence();
+    server.with(|state| state.always = Some(Fault::Forbidden));
+    let error = candidate.leader.release().await.unwrap_err().to_string();
+    assert!(error.contains("operator") && error.contains("403"), "{error}");
+    assert!(!fence.may_write());
+}

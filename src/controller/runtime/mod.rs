@@ -1,0 +1,387 @@
+//! Wires the controller: watches, lease, services, reconciles. Called by the command line; decides nothing.
+//!
+//! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error, and so does one
+//! that has lost one of its tasks: the kubelet starts it again with empty hands.
+
+pub mod backoff;
+pub mod context;
+mod counts;
+mod events;
+pub mod leader;
+mod needs;
+mod reconciles;
+mod sweep;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
+use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::Client;
+use kube::runtime::events::{Recorder as EventRecorder, Reporter};
+use kube::runtime::reflector::{ObjectRef, Store};
+use kube::runtime::watcher::Config;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
+use super::leaderboards::isolation;
+use super::objects::children_selector;
+use crate::controller::runtime::backoff::BackoffMap;
+use crate::controller::runtime::context::{Context, Settings, Stores};
+use crate::controller::runtime::leader::{self, Leader, Leadership};
+use crate::controller::submissions::archive::{ArchiveWorkers, WakeSubmission};
+use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::observe::lookups::Lookups;
+use crate::kubernetes::preflight::{self, await_kinds, watch_access};
+use crate::kubernetes::{Watch, guarded, spawn_watch};
+use crate::observability::Observability;
+use crate::observability::tasks::TaskFailed;
+use crate::services::ObjectKey;
+use crate::services::aws::Aws;
+use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
+use crate::services::meter::Meter;
+use crate::services::table::Recorder;
+use leaderboard_api::{Leaderboard, Submission};
+
+/// Reconciles under way may take this long to end after a stop.
+const DRAIN: Duration = Duration::from_secs(20);
+
+/// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
+const POLICIES_LIMIT: Duration = Duration::from_secs(5);
+
+/// Why the controller ended.
+#[derive(thiserror::Error, Debug)]
+pub enum RunError {
+    #[error("this process no longer leads: {0}")]
+    LostLease(String),
+    #[error(transparent)]
+    TaskFailed(#[from] TaskFailed),
+}
+
+/// What all reconciles share.
+pub(super) struct Shared {
+    context: Arc<Context>,
+    backoff: BackoffMap,
+    telemetry: Observability,
+}
+
+impl Shared {
+    /// Drops everything that is remembered of an object that is gone.
+    fn forget(&self, key: &ObjectKey) {
+        self.context.forget(&key.uid);
+        self.context.leaderboards.forget(&key.uid);
+        self.context.external.gone(key);
+        self.backoff.dropped(&key.uid);
+    }
+}
+
+/// Runs until told to stop, or until it no longer leads.
+pub async fn run(
+    clients: Clients,
+    lease: leader::Settings,
+    settings: Settings,
+    aws: Aws,
+    telemetry: Observability,
+) -> Result<(), RunError> {
+    preflight::register(&telemetry);
+    let tasks = telemetry.tasks.clone();
+    let work = Box::pin(work(clients, lease, settings, aws, telemetry));
+    tokio::select! {
+        biased;
+        failed = tasks.failed() => Err(failed.into()),
+        result = work => result,
+    }
+}
+
+async fn work(
+    clients: Clients,
+    lease: leader::Settings,
+    settings: Settings,
+    aws: Aws,
+    telemetry: Observability,
+) -> Result<(), RunError> {
+    let client = &clients.api;
+    if !await_kinds(client, &["leaderboards", "submissions"], &telemetry).await {
+        return Ok(());
+    }
+    let rights = watch_rights(
+        client.clone(),
+        settings.namespace.clone(),
+        lease.clone(),
+        telemetry.clone(),
+    );
+    telemetry.tasks.may_end("permissions", rights);
+    let watches = Watches::start(&clients.watch, settings.namespace.as_deref(), &telemetry);
+    telemetry.readiness.registered();
+    let leader = leader::start(clients.lease, lease, &telemetry);
+    let parts = Parts {
+        client: clients.api,
+        settings,
+        aws: aws.counted_by(Meter::for_metrics(&telemetry.metrics)),
+        watches,
+        telemetry,
+    };
+    let result = parts.lead(&leader).await;
+    if result.is_ok()
+        && let Err(error) = leader.release().await
+    {
+        tracing::warn!("{error}");
+    }
+    result
+}
+
+async fn watch_rights(client: Client, namespace: Option<String>, lease: leader::Settings, telemetry: Observability) {
+    let needs = needs::needs(namespace.as_deref(), &lease);
+    watch_access(client, &needs, &telemetry).await;
+}
+
+/// One client for calls, one whose dead connections end for watches, one without retries for the lease.
+pub struct Clients {
+    pub api: Client,
+    pub watch: Client,
+    pub lease: Client,
+}
+
+struct Watches {
+    leaderboards: Watch<Leaderboard>,
+    submissions: Watch<Submission>,
+    jobs: Watch<Job>,
+    pods: Watch<Pod>,
+    policies: Watch<NetworkPolicy>,
+}
+
+impl Watches {
+    fn start(client: &Client, namespace: Option<&str>, telemetry: &Observability) -> Self {
+        let children = || Config::default().labels(&children_selector());
+        Self {
+            leaderboards: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, telemetry),
+            submissions: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, telemetry),
+            jobs: spawn_watch(guarded(client.clone(), namespace), children(), trim_job, telemetry),
+            pods: spawn_watch(guarded(client.clone(), namespace), children(), trim_pod, telemetry),
+            policies: spawn_watch(guarded(client.clone(), namespace), children(), |_| {}, telemetry),
+        }
+    }
+
+    fn stores(&self) -> Stores {
+        Stores {
+            leaderboards: self.leaderboards.store.clone(),
+            submissions: self.submissions.store.clone(),
+            jobs: self.jobs.store.clone(),
+            pods: self.pods.store.clone(),
+            policies: self.policies.store.clone(),
+            policies_synced: self.policies.synced.clone(),
+        }
+    }
+
+    async fn synced(&self) {
+        // An error means that the watch's task is gone, which ends the process.
+        let _ = self.leaderboards.store.wait_until_ready().await;
+        let _ = self.submissions.store.wait_until_ready().await;
+        let _ = self.jobs.store.wait_until_ready().await;
+        let _ = self.pods.store.wait_until_ready().await;
+        let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
+    }
+}
+
+/// Of a Job, decisions read metadata and status.
+fn trim_job(job: &mut Job) {
+    if let Some(spec) = &mut job.spec {
+        spec.template = PodTemplateSpec::default();
+    }
+}
+
+/// Of a Pod, decisions read metadata, its node, the names of its containers and status.
+pub(super) fn trim_pod(pod: &mut Pod) {
+    if let Some(spec) = &mut pod.spec {
+        for container in &mut spec.containers {
+            *container = Container {
+                name: std::mem::take(&mut container.name),
+                ..Container::default()
+            };
+        }
+        spec.init_containers = None;
+        spec.volumes = None;
+    }
+}
+
+/// What one process is made of.
+struct Parts {
+    client: Client,
+    settings: Settings,
+    aws: Aws,
+    watches: Watches,
+    telemetry: Observability,
+}
+
+impl Parts {
+    async fn lead(self, leader: &Leader) -> Result<(), RunError> {
+        if !await_lead(leader, &self.telemetry).await? {
+            return Ok(());
+        }
+        tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
+        let (boards, woken_boards) = mpsc::unbounded_channel();
+        let (changed_rows, rows) = mpsc::unbounded_channel();
+        let (changed, evalai) = mpsc::unbounded_channel();
+        let fence = leader.fence();
+        let hub = hub(
+            &fence,
+            changed,
+            &self.client,
+            &self.watches.leaderboards.store,
+            &self.telemetry,
+        );
+        let may_write = fence.clone();
+        let tasks = self.telemetry.tasks.clone();
+        let recorder = Recorder::new(self.aws.clone(), move || may_write.may_write(), changed_rows, tasks);
+        let sync = ExternalSystems::new(hub.clone(), recorder);
+        let gauges = counts::keep(
+            hub.clone(),
+            self.watches.submissions.store.clone(),
+            self.telemetry.clone(),
+        );
+        self.telemetry.tasks.stay("gauges", gauges);
+        let watches = self.watches;
+        let to_queue = boards.clone();
+        let wake = Box::new(move |board| {
+            // Without a receiver the process is ending.
+            let _ = to_queue.send(board);
+        });
+        let (answered, answers) = mpsc::unbounded_channel();
+        let archive_workers = ArchiveWorkers::new(
+            self.aws.clone(),
+            self.client.clone(),
+            self.telemetry.tasks.clone(),
+            waking(&answered),
+        );
+        let lookups = Lookups::start(self.client.clone(), &self.telemetry.tasks, waking(&answered));
+        let events = events(&self.client);
+        let context = Context::new(
+            self.client,
+            self.settings,
+            watches.stores(),
+            (sync, archive_workers, lookups),
+            self.aws,
+            events,
+            wake,
+        );
+        let shared = Arc::new(Shared {
+            context: Arc::new(context),
+            backoff: BackoffMap::default(),
+            telemetry: self.telemetry.clone(),
+        });
+        shared.context.stores.fill(&shared.context.slots);
+        let context = Arc::clone(&shared.context);
+        let keep = move |board| {
+            let context = Arc::clone(&context);
+            async move { isolation::keep_missing(context.policies(), &board).await }
+        };
+        let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
+        self.telemetry.tasks.stay("policies", restored);
+        let reports = events::Reports { rows, evalai, answers };
+        let of_submissions = events::of_submissions(&watches, reports, &boards, &shared);
+        let of_leaderboards = events::of_leaderboards(&watches, woken_boards, &shared);
+        let mut leadership = leader.leadership();
+        let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
+        let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
+        tokio::select! {
+            () = self.telemetry.stop.wait() => {}
+            why = lost(&mut leadership) => {
+                reconciles.abort();
+                return Err(RunError::LostLease(why));
+            }
+        }
+        finish(reconciles).await;
+        if hub.drain().await {
+            leader.drained();
+        }
+        Ok(())
+    }
+}
+
+/// Puts a Submission into the queue.
+fn waking(queue: &mpsc::UnboundedSender<ObjectRef<Submission>>) -> WakeSubmission {
+    let queue = queue.clone();
+    Box::new(move |submission| {
+        // Without a receiver the process is ending.
+        let _ = queue.send(submission);
+    })
+}
+
+/// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.
+async fn finish<T>(mut reconciles: JoinHandle<T>) {
+    if tokio::time::timeout(DRAIN, &mut reconciles).await.is_err() {
+        reconciles.abort();
+    }
+}
+
+fn events(client: &Client) -> EventRecorder {
+    let reporter = Reporter {
+        controller: "leaderboard.carla.org/controller".into(),
+        instance: std::env::var("POD_NAME").ok(),
+    };
+    EventRecorder::new(client.clone(), reporter)
+}
+
+/// Waits to become the leader. False if told to stop before.
+async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, RunError> {
+    let mut leadership = leader.leadership();
+    loop {
+        match &*leadership.borrow_and_update() {
+            Leadership::Leader { .. } => return Ok(true),
+            Leadership::Lost { why } => return Err(RunError::LostLease(why.clone())),
+            Leadership::Standby => {}
+        }
+        tokio::select! {
+            () = telemetry.stop.wait() => return Ok(false),
+            // The task of the Lease has failed, which ends the process.
+            changed = leadership.changed() => if changed.is_err() { telemetry.stop.wait().await },
+        }
+    }
+}
+
+async fn lost(leadership: &mut tokio::sync::watch::Receiver<Leadership>) -> String {
+    let why = {
+        let ended = leadership.wait_for(|l| !matches!(l, Leadership::Leader { .. })).await;
+        ended.map(|leadership| match &*leadership {
+            Leadership::Lost { why } => why.clone(),
+            _ => "the Lease was released".into(),
+        })
+    };
+    match why {
+        Ok(why) => why,
+        // The task of the Lease has failed, and ends the process by its name.
+        Err(_) => std::future::pending().await,
+    }
+}
+
+fn hub(
+    fence: &leader::Fence,
+    changed: mpsc::UnboundedSender<Changed>,
+    client: &Client,
+    leaderboards: &Store<Leaderboard>,
+    telemetry: &Observability,
+) -> Hub {
+    let (sweep, rows) = mpsc::unbounded_channel::<SweepRow>();
+    let sweeping = sweep::into_cluster(client.clone(), leaderboards.clone(), rows);
+    let stop = telemetry.stop.clone();
+    telemetry.tasks.stay("sweep", async move {
+        tokio::select! { () = stop.wait() => {}, () = sweeping => {} }
+    });
+    let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
+    let writes = fence.clone();
+    Hub::new(Options {
+        write_guard: Arc::new(move || writes.may_write()),
+        not_before,
+        changed,
+        sweep,
+        timing: Timing::default(),
+        timeouts: Timeouts::default(),
+        meter: Meter::for_metrics(&telemetry.metrics),
+        tasks: telemetry.tasks.clone(),
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,71 @@
+//! Reconciles against caches of the test's own, under a paused clock.
+
+use futures::stream;
+use http::Method;
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use tokio::sync::mpsc;
+
+use super::*;
+use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
+use crate::controller::runtime::backoff::BackoffMap;
+use crate::observability::Observability;
+use crate::observability::shutdown::Stop;
+
+/// Submissions that wait for a bucket which takes connections and never answers.
+const BEHIND: usize = 300;
+/// Cancels of others. The queue takes who waits in no order, so that one of them may be lucky.
+const CANCELS: usize = 6;
+
+#[tokio::test(start_paused = true)]
+async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("http://{}", silent.local_addr().unwrap());
+    let (hanging, other) = (leaderboard("hanging", &endpoint), leaderboard("other", &endpoint));
+    let mut cluster = Cluster::default();
+    for number in 0..BEHIND {
+        let (mut submission, job) = with_job(&format!("behind-{number}"), &hanging);
+        let status = submission.status.as_mut().unwrap();
+        status.times.scheduled = Some(Time(Timestamp::now()));
+        cluster.submissions.push(submission);
+        cluster.jobs.push(job);
+    }
+    for number in 0..CANCELS {
+        let (mut cancelled, job) = with_job(&format!("cancelled-{number}"), &other);
+        cancelled.spec.cancel = true;
+        cluster.submissions.push(cancelled);
+        cluster.jobs.push(job);
+    }
+    cluster.leaderboards = vec![hanging, other];
+
+    let (queue, mut queued) = mpsc::unbounded_channel();
+    let touch = |submission: &ObjectRef<Submission>| queue.send(submission.clone()).unwrap();
+    let mut all: Vec<_> = cluster.submissions.iter().map(ObjectRef::from_obj).collect();
+    let cancelled = all.split_off(BEHIND);
+    let mut around = surroundings(cluster, &endpoint).await;
+    let (_stop, signal) = Stop::new();
+    let shared = Arc::new(Shared {
+        context: Arc::new(around.context),
+        backoff: BackoffMap::default(),
+        telemetry: Observability::new(signal),
+    });
+    let of_submissions = stream::poll_fn(move |cx| queued.poll_recv(cx)).boxed();
+    let reconciles = tokio::spawn(run(of_submissions, stream::pending().boxed(), shared));
+    all.iter().for_each(touch);
+    // As many reconciles as there may be at once have begun, and the others wait.
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    let began = tokio::time::Instant::now();
+    cancelled.iter().for_each(touch);
+    let mut stopped = Vec::new();
+    while stopped.len() < CANCELS {
+        let request = around.requests.recv().await.unwrap();
+        if request.method == Method::DELETE && request.path.contains("/jobs/cancelled-") {
+            stopped.push(request.at - began);
+        }
+    }
+    reconciles.abort();
+    assert!(
+        stopped.iter().all(|took| *took <= Duration::from_secs(1)),
+        "their Jobs were deleted after {stopped:?}"
+    );
+}

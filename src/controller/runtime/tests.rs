@@ -1,0 +1,140 @@
+//! The whole controller on a mock of the API server: what becomes of the process when one of its tasks ends.
+
+use http::{Method, Request, Response};
+use kube::client::Body;
+use serde_json::{Value, json};
+use tokio::sync::watch;
+use tower_test::mock::{Handle, pair};
+
+use super::*;
+use crate::controller::fixtures;
+use crate::controller::runtime::leader::Identity;
+use crate::controller::runtime::leader::fake_server::FakeServer;
+use crate::observability::shutdown::Stop;
+
+/// All that runs in a leader without Leaderboards, in the order of names.
+const TASKS: [&str; 12] = [
+    "gauges",
+    "lease",
+    "lookups",
+    "permissions",
+    "policies",
+    "reconciles",
+    "sweep",
+    "watch of jobs",
+    "watch of leaderboards",
+    "watch of networkpolicies",
+    "watch of pods",
+    "watch of submissions",
+];
+
+/// Serves our kinds, empty lists and watches without news; allows nothing, so that permissions are asked for again.
+async fn serve(mut handle: Handle<Request<Body>, Response<Body>>) {
+    let mut watches = Vec::new();
+    while let Some((request, answer)) = handle.next_request().await {
+        let is_watch = request.uri().query().is_some_and(|query| query.contains("watch="));
+        if is_watch {
+            watches.push(answer);
+            continue;
+        }
+        let body = answer_to(request.method(), request.uri().path());
+        answer.send_response(Response::new(Body::from(body.to_string().into_bytes())));
+    }
+}
+
+fn answer_to(method: &Method, path: &str) -> Value {
+    let kind =
+        |plural, kind| json!({"name": plural, "singularName": "", "namespaced": true, "kind": kind, "verbs": ["get"]});
+    match (method, path) {
+        (&Method::GET, "/apis/leaderboard.carla.org/v1alpha1") => json!({
+            "kind": "APIResourceList", "apiVersion": "v1", "groupVersion": "leaderboard.carla.org/v1alpha1",
+            "resources": [kind("leaderboards", "Leaderboard"), kind("submissions", "Submission")],
+        }),
+        (&Method::POST, _) => json!({
+            "kind": "SelfSubjectAccessReview", "apiVersion": "authorization.k8s.io/v1",
+            "metadata": {}, "spec": {}, "status": {"allowed": false},
+        }),
+        _ => json!({"apiVersion": "v1", "kind": "List", "metadata": {"resourceVersion": "1"}, "items": []}),
+    }
+}
+
+struct Process {
+    telemetry: Observability,
+    stop: watch::Sender<bool>,
+    task: JoinHandle<Result<(), RunError>>,
+}
+
+/// A controller that leads.
+async fn leader() -> Process {
+    let (service, handle) = pair::<Request<Body>, Response<Body>>();
+    tokio::spawn(serve(handle));
+    let client = Client::new(service, "default");
+    let clients = Clients {
+        api: client.clone(),
+        watch: client,
+        lease: FakeServer::default().client(),
+    };
+    let (stop, signal) = Stop::new();
+    let telemetry = Observability::new(signal);
+    let lease = leader::Settings::new("ns", "operator", Identity::random("test"));
+    let settings = Settings {
+        image: "operator:1".into(),
+        image_pull_policy: None,
+        region: None,
+        namespace: None,
+        concurrency: 4,
+    };
+    let aws = fixtures::aws("http://127.0.0.1:9").await;
+    let task = tokio::spawn(Box::pin(run(clients, lease, settings, aws, telemetry.clone())));
+    // Tasks have no event for their start.
+    while !telemetry.tasks.names().contains(&"reconciles".to_owned()) {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    Process { telemetry, stop, task }
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_end_of_any_task_ends_the_process_by_its_name() {
+    for name in TASKS {
+        let process = leader().await;
+        let mut names = process.telemetry.tasks.names();
+        names.sort();
+        assert_eq!(names, TASKS);
+        process.telemetry.tasks.end(name);
+        let ended = tokio::time::timeout(Duration::from_mins(1), process.task).await;
+        let result = ended.unwrap_or_else(|_| panic!("the process goes on without {name}"));
+        assert_eq!(
+            result.unwrap().unwrap_err().to_string(),
+            format!("task {name} has ended; the process exits, so that the kubelet restarts it")
+        );
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_stop_is_no_failure_of_the_tasks_that_it_ends() {
+    let process = leader().await;
+    let missing = process.telemetry.readiness.missing();
+    assert!(
+        missing.len() == 1 && missing[0].starts_with("permissions: may not"),
+        "all checks are registered by now: {missing:?}"
+    );
+    process.stop.send_replace(true);
+    process.task.await.unwrap().unwrap();
+}
+
+#[tokio::test(start_paused = true)]
+async fn reconciles_are_waited_for_until_they_have_ended_and_no_longer_than_the_limit() {
+    let began = Instant::now();
+    finish(tokio::spawn(async {})).await;
+    assert_eq!(began.elapsed(), Duration::ZERO);
+    finish(tokio::spawn(tokio::time::sleep(Duration::from_secs(3)))).await;
+    assert_eq!(began.elapsed(), Duration::from_secs(3));
+    let (alive, hangs) = tokio::sync::oneshot::channel::<()>();
+    let hanging = tokio::spawn(async move {
+        let _alive = alive;
+        std::future::pending::<()>().await;
+    });
+    finish(hanging).await;
+    assert_eq!(began.elapsed(), Duration::from_secs(3) + DRAIN);
+    assert!(hangs.await.is_err(), "one that hangs is given up");
+}

@@ -1,0 +1,95 @@
+//! What is logged of a status that was written.
+
+use std::sync::Arc;
+
+use super::*;
+use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
+use crate::controller::submissions::decide::Plan;
+use crate::controller::submissions::observe::observe;
+use crate::observability::logging::tests::Lines;
+use leaderboard_api::Progress;
+
+#[tokio::test(start_paused = true)]
+async fn each_transition_is_one_line_with_all_that_identifies_it() {
+    let board = leaderboard("board", "http://127.0.0.1:9");
+    let (submission, job) = with_job("first", &board);
+    let old = submission.status.clone().unwrap();
+    let cluster = Cluster {
+        leaderboards: vec![board],
+        submissions: vec![submission.clone()],
+        jobs: vec![job],
+        ..Cluster::default()
+    };
+    let around = surroundings(cluster, "http://127.0.0.1:9").await;
+    let view = observe(&around.context, Arc::new(submission));
+    let lines = Lines::default();
+    let _guard = lines.collect();
+    let write = async |status: SubmissionStatus| {
+        let plan = Plan {
+            status,
+            actions: Vec::new(),
+            events: Vec::new(),
+            report: None,
+            requeue: None,
+        };
+        act(&around.context, &view, plan).await.unwrap();
+    };
+
+    write(old.clone()).await;
+    assert_eq!(lines.take(), "", "nothing was written");
+    let node = Some("node-1".to_owned());
+    write(SubmissionStatus {
+        node_name: node.clone(),
+        ..old.clone()
+    })
+    .await;
+    let progress = Some(Progress {
+        done: 1,
+        total: 4,
+        text: "1/4".into(),
+    });
+    write(SubmissionStatus {
+        node_name: node.clone(),
+        progress,
+        ..old.clone()
+    })
+    .await;
+    assert_eq!(lines.take(), "", "neither the node nor the progress is a transition");
+
+    let running = SubmissionStatus {
+        state: Some(State::Running),
+        reason: Some("AgentRunning".into()),
+        message: Some("Agents run.".into()),
+        node_name: node,
+        ..old
+    };
+    write(running).await;
+    let text = lines.take();
+    let line: serde_json::Value = serde_json::from_str(text.trim_end()).expect("one line");
+    for (field, value) in [
+        ("level", json!("INFO")),
+        ("submission", json!("one/first")),
+        ("leaderboard", json!("board")),
+        ("attempt", json!(1)),
+        ("from", json!("Pending")),
+        ("to", json!("Running")),
+        ("reason", json!("AgentRunning")),
+        ("message", json!("Agents run.")),
+    ] {
+        assert_eq!(line[field], value, "{field} of {text}");
+    }
+}
+
+#[test]
+fn an_answer_of_the_api_server_is_logged_without_a_dump() {
+    let status = kube::core::Status::failure("jobs is forbidden", "Forbidden").with_code(403);
+    let error = ActError::Kubernetes {
+        what: "creating the Job",
+        object: "a-1".into(),
+        source: Box::new(kube::Error::Api(status.boxed())),
+    };
+    assert_eq!(
+        error.to_string(),
+        "creating the Job of a-1 failed: the API server answered 403: jobs is forbidden"
+    );
+}

@@ -1,0 +1,125 @@
+//! What a bucket's worker is asked for, does, and brings.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::digest::ReportDigest;
+use crate::controller::submissions::decide::LogPlace;
+use crate::controller::submissions::failure_log::Tail;
+use crate::controller::submissions::view::{ReportDemand, TextProblem, Texts};
+use leaderboard_api::Storage;
+
+pub(super) type Uid = Arc<str>;
+
+/// The kinds of work, the most urgent first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Fence,
+    Ended,
+    Log,
+    Texts,
+    Live,
+}
+
+pub(super) const KINDS: [Kind; 5] = [Kind::Fence, Kind::Ended, Kind::Log, Kind::Texts, Kind::Live];
+/// How much of each kind is under way at once.
+pub(super) const LIMITS: [usize; 5] = [16, 32, 8, 4, 32];
+
+/// Where a run's files are, and which object they belong to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Target {
+    pub namespace: String,
+    pub name: String,
+    pub storage: Storage,
+    pub run_id: String,
+}
+
+/// Which log is to be kept.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LogDemand {
+    pub attempt: i64,
+    pub retry: i32,
+    pub places: Vec<LogPlace>,
+    /// The submission has come to its end, so that its log is stored too.
+    pub is_over: bool,
+}
+
+/// Something to do now.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Work {
+    pub kind: Kind,
+    pub uid: Uid,
+    pub target: Arc<Target>,
+    pub what: What,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum What {
+    Report {
+        sent: Sent,
+        etag: Option<String>,
+    },
+    Texts {
+        sent: Option<Sent>,
+    },
+    Fence {
+        attempt: i64,
+        retry: i32,
+        mark: String,
+        left: Duration,
+    },
+    Log {
+        demand: LogDemand,
+        tail: Option<Tail>,
+    },
+}
+
+/// What was known when a read was sent.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Sent {
+    pub demand: ReportDemand,
+    /// Of which memory of the run: what was dropped since is not answered.
+    pub memory: u64,
+}
+
+/// What a read of the report brought.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Answer {
+    NotModified,
+    Absent,
+    /// It is another object's.
+    Foreign {
+        etag: Option<String>,
+    },
+    Found {
+        etag: Option<String>,
+        report: Arc<ReportDigest>,
+    },
+    Failed(String),
+}
+
+/// What came of looking for a log.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LogAnswer {
+    pub tail: Option<Tail>,
+    /// One that may have it did not answer, or storing failed.
+    pub is_unclear: bool,
+}
+
+/// What came of work.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Done {
+    Report(Answer),
+    Texts {
+        report: Answer,
+        texts: Result<Texts, String>,
+    },
+    Fence(Result<(), String>),
+    Log(LogAnswer),
+}
+
+impl TextProblem {
+    pub(super) fn unfit(key: &str, problem: &str) -> Self {
+        Self::Unfit(format!("{key} {problem}"))
+    }
+}

@@ -1,0 +1,118 @@
+//! What one bucket's worker remembers of one run.
+
+use std::sync::Arc;
+
+use tokio::time::Instant;
+
+use super::digest::{ReportDigest, ReportId};
+use super::request::{Answer, KINDS, LogDemand, Sent, Target};
+use crate::controller::submissions::failure_log::Tail;
+use crate::controller::submissions::view::{ObservedLog, ObservedTexts, ReportDemand, Stage, Texts};
+
+pub(super) struct Run {
+    pub target: Arc<Target>,
+    pub due: [Option<Instant>; KINDS.len()],
+    pub report: Option<ReportRun>,
+    pub texts: Option<TextsRun>,
+    pub fence: Option<FenceRun>,
+    pub log: Option<LogRun>,
+}
+
+pub(super) struct ReportRun {
+    pub memory: u64,
+    pub wanted: ReportDemand,
+    pub since: Instant,
+    pub is_under_way: bool,
+    /// What was known when the last answer was asked for.
+    pub of: Option<ReportDemand>,
+    pub error: Option<String>,
+    pub etag: Option<String>,
+    pub content: Option<Content>,
+}
+
+#[derive(Clone, PartialEq)]
+pub(super) enum Content {
+    Absent,
+    Foreign,
+    Report(Arc<ReportDigest>),
+}
+
+pub(super) struct TextsRun {
+    pub wanted: ReportId,
+    pub is_under_way: bool,
+    pub tried: Option<Instant>,
+    pub got: ObservedTexts,
+}
+
+pub(super) struct FenceRun {
+    pub attempt: i64,
+    pub retry: i32,
+    pub mark: String,
+    pub since: Instant,
+    pub is_held: bool,
+    pub has_failed: bool,
+}
+
+pub(super) struct LogRun {
+    pub demand: LogDemand,
+    pub since: Instant,
+    pub tries: u32,
+    pub is_under_way: bool,
+    pub tail: Option<Tail>,
+    pub end: Option<ObservedLog>,
+}
+
+fn is_same_run(one: &ReportDemand, other: &ReportDemand) -> bool {
+    one.attempt == other.attempt && one.retry == other.retry
+}
+
+/// Whether an answer that was asked for by one demand is one to the other.
+pub(super) fn answers(sent: &ReportDemand, wanted: &ReportDemand) -> bool {
+    let is_of_pod = sent.pod == wanted.pod || sent.stage == Stage::JobEnded;
+    is_same_run(sent, wanted) && is_of_pod && sent.stage >= wanted.stage
+}
+
+impl TextsRun {
+    /// Returns whether there is something new to decide on. Another text for the same is not: it would be asked for again at once.
+    pub fn take(&mut self, texts: Result<Texts, String>) -> bool {
+        let got = texts.map_or_else(ObservedTexts::Unread, |texts| ObservedTexts::Read(Arc::new(texts)));
+        let is_same = match (&self.got, &got) {
+            (ObservedTexts::Unread(_), ObservedTexts::Unread(_)) => true,
+            (ObservedTexts::Read(old), ObservedTexts::Read(new)) => {
+                old.of == new.of && old.problem.is_some() == new.problem.is_some()
+            }
+            _ => false,
+        };
+        self.got = got;
+        !is_same
+    }
+}
+
+impl ReportRun {
+    pub fn sent(&self) -> Sent {
+        Sent {
+            demand: self.wanted.clone(),
+            memory: self.memory,
+        }
+    }
+
+    /// Returns whether there is something new to decide on.
+    pub fn take(&mut self, sent: &ReportDemand, answer: Answer) -> bool {
+        let sent = &ReportDemand {
+            stage: sent.stage.min(self.wanted.stage),
+            ..sent.clone()
+        };
+        let (error, etag, content) = match answer {
+            Answer::NotModified => (None, self.etag.take(), self.content.clone()),
+            Answer::Absent => (None, None, Some(Content::Absent)),
+            Answer::Foreign { etag } => (None, etag, Some(Content::Foreign)),
+            Answer::Found { etag, report } => (None, etag, Some(Content::Report(report))),
+            Answer::Failed(why) => (Some(why), self.etag.take(), self.content.clone()),
+        };
+        let is_first = !self.of.as_ref().is_some_and(|of| answers(of, sent));
+        let is_new = is_first || error.is_some() != self.error.is_some() || content != self.content;
+        self.of = Some(sent.clone());
+        (self.error, self.etag, self.content) = (error, etag, content);
+        is_new
+    }
+}

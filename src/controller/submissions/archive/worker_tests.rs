@@ -1,0 +1,172 @@
+//! A worker against a bucket of the test's own.
+
+use std::collections::HashMap;
+
+use axum::extract::State as Shared;
+use axum::http::{HeaderMap, StatusCode, Uri};
+use axum::response::{IntoResponse, Response};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+use tokio::time::timeout;
+
+use super::*;
+use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
+use crate::controller::submissions::view::{ObservedReport, Stage, TextProblem};
+use crate::pod::upload::hex;
+
+/// Longer than a read takes on a busy machine.
+const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
+
+/// Objects by the end of their key.
+type Objects = Arc<Mutex<HashMap<&'static str, String>>>;
+
+async fn answer(Shared(objects): Shared<Objects>, uri: Uri, headers: HeaderMap) -> Response {
+    let objects = lock(&objects);
+    let found = objects.iter().find(|(key, _)| uri.path().ends_with(*key));
+    let Some((_, body)) = found else {
+        let error = "<Error><Code>NoSuchKey</Code><Message>no</Message></Error>";
+        return (StatusCode::NOT_FOUND, error).into_response();
+    };
+    let etag = format!("\"{}\"", hex(&Sha256::digest(body)));
+    if headers.get("if-none-match").is_some_and(|known| known == etag.as_str()) {
+        return StatusCode::NOT_MODIFIED.into_response();
+    }
+    ([("etag", etag)], body.clone()).into_response()
+}
+
+struct Bench {
+    around: Surroundings,
+    objects: Objects,
+    submission: Submission,
+}
+
+async fn bench() -> Bench {
+    let objects = Objects::default();
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let router = axum::Router::new().fallback(answer).with_state(Arc::clone(&objects));
+    tokio::spawn(async move { axum::serve(listener, router).await });
+    let (submission, _) = with_job("sub", &leaderboard("one", &endpoint));
+    Bench {
+        around: surroundings(Cluster::default(), &endpoint).await,
+        objects,
+        submission,
+    }
+}
+
+fn report(stdout: &str) -> String {
+    json!({
+        "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
+        "pairs": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": "[1]",
+        "files": {"evalai/stdout.txt": {"size": stdout.len(), "sha256": hex(&Sha256::digest(stdout))}},
+    })
+    .to_string()
+}
+
+impl Bench {
+    fn stores(&self, key: &'static str, body: impl Into<String>) {
+        lock(&self.objects).insert(key, body.into());
+    }
+
+    fn workers(&self) -> &ArchiveWorkers {
+        &self.around.context.archive_workers
+    }
+
+    fn status(&self) -> SubmissionStatus {
+        self.submission.status.clone().unwrap()
+    }
+
+    fn demand(&self, stage: Stage) {
+        let demand = ReportDemand {
+            attempt: 1,
+            retry: 0,
+            pod: None,
+            stage,
+            period: std::time::Duration::from_secs(10),
+        };
+        self.workers().demand(&self.submission, &self.status(), Some(demand));
+    }
+
+    /// Waits until the submission is woken; hands back what is known then.
+    async fn answer(&mut self) -> Observed {
+        let woken = timeout(LIMIT, self.around.answered.recv()).await;
+        assert_eq!(woken.expect("it is woken").unwrap(), "sub");
+        self.seen()
+    }
+
+    fn seen(&self) -> Observed {
+        self.workers().observe(&self.submission, None, false)
+    }
+}
+
+#[tokio::test]
+async fn a_report_is_read_in_the_background_and_wakes_its_submission() {
+    let mut bench = bench().await;
+    assert_eq!(bench.seen().report.report, ObservedReport::NotRead);
+    bench.demand(Stage::Live);
+    assert_eq!(bench.answer().await.report.report, ObservedReport::Absent);
+    bench.stores("logcopy/report.json", report("all is well"));
+    bench.demand(Stage::RunEnded);
+    let seen = bench.answer().await.report;
+    assert_eq!(
+        (seen.stage, seen.report.ours().unwrap().done),
+        (Some(Stage::RunEnded), 4)
+    );
+    // S3 says that it is the same.
+    bench.demand(Stage::JobEnded);
+    let seen = bench.answer().await.report;
+    assert_eq!(
+        (seen.stage, seen.report.ours().unwrap().done),
+        (Some(Stage::JobEnded), 4)
+    );
+    bench.workers().forget("uid-of-sub");
+    assert_eq!(bench.seen().report.report, ObservedReport::NotRead);
+}
+
+#[tokio::test]
+async fn what_is_no_report_is_unreadable_and_another_objects_is_foreign() {
+    let mut bench = bench().await;
+    bench.stores("logcopy/report.json", "torn");
+    bench.demand(Stage::JobEnded);
+    let seen = bench.answer().await.report;
+    assert!(matches!(seen.report, ObservedReport::Unreadable(why) if why.contains("not one of ours")));
+    bench.stores(
+        "logcopy/report.json",
+        report("").replace("uid-of-sub", "uid-of-another"),
+    );
+    bench.workers().forget("uid-of-sub");
+    bench.demand(Stage::JobEnded);
+    assert_eq!(bench.answer().await.report.report, ObservedReport::Foreign);
+}
+
+#[tokio::test]
+async fn texts_count_only_with_the_digest_that_the_report_names() {
+    let mut bench = bench().await;
+    bench.stores("logcopy/report.json", report("all is well"));
+    for (stored, problem) in [
+        (None, Some("evalai/stdout.txt is missing although the report names it")),
+        (
+            Some("of a later round"),
+            Some("evalai/stdout.txt is of another round than the report"),
+        ),
+        (Some("all is well"), None),
+    ] {
+        if let Some(stored) = stored {
+            bench.stores("evalai/stdout.txt", stored);
+        }
+        bench
+            .workers()
+            .want_texts(&bench.submission, &bench.status(), ReportId::default());
+        let ObservedTexts::Read(texts) = bench.answer().await.texts else {
+            panic!("no texts")
+        };
+        assert_eq!(texts.problem, problem.map(|why| TextProblem::Unfit(why.into())));
+        assert_eq!(
+            (texts.result.as_str(), texts.metadata.as_str()),
+            ("[1]", ""),
+            "the numbers are the report's"
+        );
+        assert_eq!(texts.stdout, if problem.is_none() { "all is well" } else { "" });
+        bench.workers().forget("uid-of-sub");
+    }
+}

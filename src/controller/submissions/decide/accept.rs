@@ -1,0 +1,316 @@
+//! Acceptance: a Leaderboard, a track, an image, and EvalAI's word that the submission wants to run. Pins the plan.
+
+use std::time::Duration;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after};
+use super::failure::{self, infrastructure};
+use super::isolation::Missing;
+use super::{Action, end, isolation};
+use crate::controller::submissions::view::{EvalaiInfo, Standing};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
+use leaderboard_api::{ImageReference, LeaderboardSpec, State, Team, TeamStatus, Track, effective, reasons};
+
+/// How long EvalAI may take before its silence is shown.
+const RETRY: Duration = Duration::from_secs(30);
+/// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
+/// participant, whose team has that submission in progress.
+const PHASE_SECONDS: i64 = 3600;
+/// How long after its creation a submission does not say that the policy is not in place yet.
+const POLICY_SECONDS: i64 = 5;
+
+/// Whether the submission may go on to its turn. Otherwise the draft says why not. EvalAI's own end goes before all that it may
+/// wait for.
+pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
+    let Some(leaderboard) = draft.leaderboard() else {
+        let message = no_leaderboard(draft);
+        return refuse(draft, reasons::LEADERBOARD_NOT_FOUND, &message);
+    };
+    let info = match ask_evalai(draft) {
+        Answer::NotNeeded => None,
+        Answer::Waiting => return false,
+        Answer::Ended(status) => {
+            end::cancelled(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(&status));
+            return false;
+        }
+        Answer::Wanted(info) => Some(info),
+    };
+    take_team(draft, info.as_ref());
+    let Some(track) = find_track(draft, leaderboard) else {
+        let message = missing_track(draft, leaderboard);
+        return refuse(draft, reasons::TRACK_NOT_FOUND, &message);
+    };
+    draft.status.track = Some(track.name.clone());
+    if let Some(what) = foreign_phase(draft, info.as_ref()) {
+        return wait_for_phase(draft, &what);
+    }
+    let image = match image(draft, info.as_ref()) {
+        Image::Named(image) => image,
+        Image::Unknown => {
+            let message = image_unread(draft);
+            draft.stall_with(reasons::IMAGE_MISSING, &message);
+            return refuse(draft, reasons::IMAGE_MISSING, &message);
+        }
+        Image::Invalid { image, what } => {
+            // The plan makes it a row of the table, as any other failure.
+            pin(draft, leaderboard, track, image, info.as_ref());
+            let found = failure::image_invalid(&what);
+            draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
+            end::failed(draft, found);
+            return false;
+        }
+    };
+    if let Some(message) = not_ready(draft) {
+        return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
+    }
+    if let Some(missing) = isolation::missing(draft) {
+        return wait_for_policy(draft, &missing);
+    }
+    pin(draft, leaderboard, track, image, info.as_ref());
+    draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
+    true
+}
+
+/// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
+fn wait_for_policy(draft: &mut Draft<'_>, missing: &Missing) -> bool {
+    let created = draft.submission().metadata.creation_timestamp.as_ref();
+    let until = after(created.map_or(draft.now(), |time| time.0), POLICY_SECONDS);
+    if draft.now() < until && !missing.is_refused {
+        draft.requeue_at(until);
+        return refuse(draft, reasons::PREPARING, &missing.message);
+    }
+    refuse(draft, reasons::NOT_ISOLATED, &missing.message)
+}
+
+/// What is said of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
+/// and counts what was deleted before its end as being processed until it is ended.
+fn ended_in_evalai(status: &str) -> String {
+    let done = if status == "deleted" {
+        "`cancelled` is written there"
+    } else {
+        "nothing is reported"
+    };
+    let next = match status {
+        "failed" => "Resume it there if it is to run.",
+        "deleted" | "ignored" | "missing" => {
+            "EvalAI takes up nothing that was deleted; the participant can submit again."
+        }
+        _ => "EvalAI resumes only what has failed; re-run it there if it is to run.",
+    };
+    format!("EvalAI says {status}: nothing is run and {done}. {next}")
+}
+
+/// What is said while the Leaderboard does not exist.
+pub(super) fn no_leaderboard(draft: &Draft<'_>) -> String {
+    let name = &draft.spec().leaderboard_name;
+    format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
+}
+
+/// Faults of the Leaderboard with which no Job can be made, or none may. The others speak for themselves where they hurt.
+fn not_ready(draft: &Draft<'_>) -> Option<String> {
+    let status = draft.view.leaderboard.as_ref()?.status.as_ref()?;
+    let ready = conditions::get(&status.conditions, conditions::READY).filter(|c| c.status == "False")?;
+    let blocks = [reasons::INVALID_POD, reasons::PREFIX_CONFLICT].contains(&ready.reason.as_str());
+    blocks.then(|| {
+        format!(
+            "Leaderboard {} is not ready ({}): {} Fix it, and the submission goes on.",
+            draft.spec().leaderboard_name,
+            ready.reason,
+            sentence(&ready.message)
+        )
+    })
+}
+
+/// What is known of the participant's image.
+enum Image {
+    Named(String),
+    /// It could not be asked for yet.
+    Unknown,
+    /// It can never be pulled, and why.
+    Invalid {
+        image: String,
+        what: String,
+    },
+}
+
+/// The image that was pinned, else the object's, else that of the file in EvalAI.
+fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
+    let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
+    let named = pinned
+        .filter(|image| !image.is_empty())
+        .or_else(|| draft.spec().image.clone())
+        .or_else(|| info.and_then(|i| i.image.clone()));
+    let Some(image) = named else {
+        let problem = info.and_then(|i| i.image_problem.as_deref());
+        return problem.map_or(Image::Unknown, |why| Image::Invalid {
+            image: String::new(),
+            what: sentence(&format!("The submission names no usable image: {why}")),
+        });
+    };
+    match ImageReference::parse(&image) {
+        Ok(_) => Image::Named(image),
+        Err(why) => {
+            let what = sentence(&format!("The submitted image is not a valid image reference: {why}"));
+            Image::Invalid { image, what }
+        }
+    }
+}
+
+/// What is said while the file in EvalAI cannot be read.
+fn image_unread(draft: &Draft<'_>) -> String {
+    let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
+    let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
+    format!(
+        "The image is not known: spec.image is empty, and the file in EvalAI that names it could not be read; it is tried \
+         again.{why} If this lasts, check that EvalAI serves the submission's input_file, or set spec.image."
+    )
+}
+
+/// What is said of a row that belongs to another phase than the Submission: its run would count for neither.
+fn foreign_phase(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Option<String> {
+    let evalai = draft.spec().evalai?;
+    let (pk, ours) = (evalai.submission, evalai.phase);
+    let theirs = info?.phase.filter(|theirs| *theirs != ours)?;
+    Some(format!(
+        "EvalAI says that submission {pk} belongs to phase {theirs}, not to phase {ours} of this Submission, so it is not run."
+    ))
+}
+
+/// Waits until the row is of our phase again. The object may have been applied with a wrong phase, so nothing is reported at
+/// once; but the participant's submission does not wait for an end without limit.
+fn wait_for_phase(draft: &mut Draft<'_>, what: &str) -> bool {
+    let message = format!(
+        "{what} Set phase {} back in EvalAI, or delete this Submission and apply it with the right phase; after {} min it \
+         fails, uncharged.",
+        draft.spec().evalai.map_or(0, |evalai| evalai.phase),
+        PHASE_SECONDS / 60
+    );
+    let message = draft.stall(reasons::PHASE_DIFFERS, &message);
+    let since = draft.stalled_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
+    let until = after(since, PHASE_SECONDS);
+    if draft.now() >= until {
+        end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, what));
+        return false;
+    }
+    draft.requeue_at(until);
+    refuse(draft, reasons::PHASE_DIFFERS, &message)
+}
+
+enum Answer {
+    NotNeeded,
+    Waiting,
+    Ended(String),
+    Wanted(EvalaiInfo),
+}
+
+fn ask_evalai(draft: &mut Draft<'_>) -> Answer {
+    if draft.spec().evalai.is_none() {
+        return Answer::NotNeeded;
+    }
+    let view = draft.view.evalai.clone().unwrap_or_default();
+    match view.info {
+        Some(info) if info.standing == Standing::Ended => Answer::Ended(info.status),
+        Some(info) => Answer::Wanted(info),
+        None => {
+            draft.act(Action::AskEvalai);
+            draft.requeue_in(RETRY);
+            let message = match view.error {
+                Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(&error))),
+                None => asking(None),
+            };
+            draft.say(State::Pending, reasons::ASKING_EVALAI, message);
+            draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::ASKING_EVALAI, "");
+            Answer::Waiting
+        }
+    }
+}
+
+fn asking(error: Option<&str>) -> String {
+    let why = error.map(|e| format!(" The last request failed: {}", sentence(e)));
+    format!(
+        "EvalAI is asked whether the submission wants to run.{}",
+        why.unwrap_or_default()
+    )
+}
+
+fn find_track<'a>(draft: &Draft<'_>, leaderboard: &'a LeaderboardSpec) -> Option<&'a Track> {
+    match (&draft.spec().evalai, &draft.spec().track) {
+        (Some(evalai), _) => leaderboard.tracks.iter().find(|t| t.phase == Some(evalai.phase)),
+        (None, Some(name)) => leaderboard.tracks.iter().find(|t| t.name == *name),
+        (None, None) => None,
+    }
+}
+
+fn missing_track(draft: &Draft<'_>, leaderboard: &LeaderboardSpec) -> String {
+    let known: Vec<&str> = leaderboard.tracks.iter().map(|t| t.name.as_str()).collect();
+    let what = match (&draft.spec().evalai, &draft.spec().track) {
+        (Some(evalai), _) => format!("No track has the phase {}", evalai.phase),
+        (None, track) => format!("There is no track {}", track.as_deref().unwrap_or("")),
+    };
+    format!(
+        "{what} in Leaderboard {}, whose tracks are {}. Add it there, or cancel this submission.",
+        draft.spec().leaderboard_name,
+        known.join(", ")
+    )
+}
+
+/// A team of a Submission as people see it: anybody who may create one writes its name.
+fn shown(team: &Team) -> Team {
+    let line = |text: &Option<String>| text.as_deref().map(|text| one_line(text, LONGEST_NAME));
+    Team {
+        id: line(&team.id),
+        name: line(&team.name),
+    }
+}
+
+fn take_team(draft: &mut Draft<'_>, info: Option<&EvalaiInfo>) {
+    let given = draft.spec().team.as_ref().map(shown);
+    let is_pinned = draft.status.plan.is_some() && draft.status.team.is_some();
+    if is_pinned {
+        // A row that is edited later changes neither the run's place in line nor its row of the table.
+    } else if let Some(info) = info {
+        let name = given.and_then(|t| t.name).or_else(|| info.team_name.clone());
+        let id = Some(info.team_id.clone());
+        draft.status.team = Some(Team { id, name }.into());
+    } else if given.is_some() {
+        draft.status.team = given.map(TeamStatus::from);
+    }
+    let submitted = info.and_then(|info| info.submitted_at).map(Time);
+    draft.status.times.submitted = draft.status.times.submitted.take().or(submitted);
+    if draft.status.times.submitted.is_none() {
+        draft.status.times.submitted = draft.submission().metadata.creation_timestamp.clone();
+    }
+}
+
+fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String, info: Option<&EvalaiInfo>) {
+    let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
+    let plan = match draft.status.plan.take() {
+        // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
+        // made; all else belongs to the submission.
+        Some(pinned) if draft.status.retry == 0 && draft.status.job_name.is_none() => leaderboard_api::RunPlan {
+            // The same, unless an earlier attempt had none.
+            image,
+            contents_image: leaderboard.contents.image.clone(),
+            simulator_image: leaderboard.simulator.image.clone(),
+            ..pinned
+        },
+        Some(pinned) => pinned,
+        None => {
+            let resume = resumed || draft.spec().attempt > 1;
+            effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume)
+        }
+    };
+    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
+    draft.status.plan = Some(plan);
+    if draft.status.times.accepted.is_none() {
+        draft.status.times.accepted = Some(draft.time());
+    }
+}
+
+fn refuse(draft: &mut Draft<'_>, reason: &str, message: &str) -> bool {
+    draft.condition(conditions::ACCEPTED, Truth::False, reason, message);
+    draft.say(State::Pending, reason, message);
+    false
+}

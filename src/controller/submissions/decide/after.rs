@@ -1,0 +1,427 @@
+//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after, seconds};
+use super::reading::{self, Reading};
+use super::{Action, EvalaiUpdate, accept, log, stop};
+use crate::controller::submissions::view::{EvalaiEnd, JobView, ObservedJob};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Ingested, State, reasons};
+
+/// How often an unpublished end is looked at again.
+const AGAIN: Duration = Duration::from_secs(30);
+/// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
+const FAREWELL_SECONDS: i64 = 120;
+/// How long after the time of a re-run a row may have been read that does not show it: the clocks differ.
+const RERUN_SECONDS: i64 = 60;
+/// What EvalAI calls a row that was cancelled.
+const CANCELLED: &str = "cancelled";
+const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
+                           the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
+                           needed.";
+
+/// Decides for a submission in a terminal state.
+pub(super) fn decide(draft: &mut Draft<'_>) {
+    leave_job(draft);
+    show_refused_attempt(draft);
+    // Before EvalAI has the end, since its hosts read it there.
+    let log_left = log::keep_at_end(draft);
+    let published = publish(draft, log_left);
+    // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
+    let recorded = published != Delivery::Waiting && record(draft) == Delivery::Done;
+    if let Some(left) = log_left {
+        draft.requeue_in(left);
+    }
+    let complete = published == Delivery::Done && recorded && log_left.is_none();
+    if complete && !follow_rerun(draft) {
+        draft.act(Action::Forget);
+    } else {
+        draft.requeue_in(AGAIN);
+    }
+    release(draft, complete);
+}
+
+/// Shows once that EvalAI's row asks for another attempt which does not begin.
+fn show_refused_attempt(draft: &mut Draft<'_>) {
+    let refused = Ingested::of(draft.submission()).and_then(|record| record.refused);
+    let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt + 1) else {
+        return;
+    };
+    let reason = reasons::ATTEMPT_WITHOUT_MESSAGE;
+    let message = format!(
+        "Attempt {} does not begin: EvalAI's status asks for it since {}, but no queue message announced it, and participants \
+         can edit that status. Raise spec.attempt if it is to run; otherwise set the status back in EvalAI.",
+        refused.attempt,
+        seconds(refused.at)
+    );
+    let is_new = draft.stalled_since(reason).is_none();
+    draft.condition(conditions::STALLED, Truth::True, reason, &message);
+    if is_new {
+        draft.event(true, reason, message);
+    }
+}
+
+/// How far another system is with the end.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Delivery {
+    /// It knows the end, or need not.
+    Done,
+    /// It will not take it.
+    Refused,
+    Waiting,
+}
+
+/// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
+pub(super) fn leave_job(draft: &mut Draft<'_>) {
+    let ObservedJob::Ours(job) = &draft.view.job else {
+        return;
+    };
+    if job.end.is_some() {
+        return keep_job_for_its_time(draft, job);
+    }
+    if let Some(until) = farewell(draft) {
+        draft.requeue_at(until);
+        return keep_job_for_its_time(draft, job);
+    }
+    if job.deleting {
+        stop::remove_overdue_pod(draft);
+    } else {
+        draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
+    }
+    draft.requeue_in(AGAIN);
+}
+
+/// Until when a Pod whose run has ended may take to say its farewell; None if nothing is to be waited for.
+fn farewell(draft: &Draft<'_>) -> Option<Timestamp> {
+    let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
+    pod.run_ended?;
+    let end = conditions::get(&draft.status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
+    let until = after(end.last_transition_time.0, FAREWELL_SECONDS);
+    (draft.now() < until).then_some(until)
+}
+
+fn is_not_wanted(draft: &Draft<'_>, type_: &str) -> bool {
+    conditions::get(&draft.status.conditions, type_).is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
+}
+
+/// A Leaderboard that is gone can't say what is wanted: what was decided before stands, and what never ran needs nothing.
+fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Delivery {
+    if is_not_wanted(draft, type_) {
+        return Delivery::Done;
+    }
+    let message = accept::no_leaderboard(draft);
+    draft.condition(type_, Truth::False, reasons::LEADERBOARD_NOT_FOUND, &message);
+    if draft.status.plan.is_none() {
+        Delivery::Done
+    } else {
+        Delivery::Waiting
+    }
+}
+
+/// Notes that EvalAI has cancelled a result because it was re-run, of which nobody is notified. Returns whether EvalAI has to be
+/// asked for that: the re-run's row can be edited by its participant, so it alone is no proof.
+fn follow_rerun(draft: &mut Draft<'_>) -> bool {
+    let rerun = draft.view.rerun_as.clone().filter(|_| draft.status.rerun_as.is_none());
+    let Some(rerun) = rerun.filter(|_| !draft.is_deleting() && draft.leaderboard().is_some()) else {
+        return false;
+    };
+    let evalai = draft.view.evalai.as_ref();
+    let Some(info) = evalai.and_then(|evalai| evalai.info.as_ref()) else {
+        draft.act(Action::AskEvalai);
+        return true;
+    };
+    if info.status != CANCELLED {
+        let read_at = evalai.and_then(|evalai| evalai.read_at);
+        let is_old = may_be_older(read_at, rerun.time.as_ref(), draft.now());
+        if is_old {
+            // What is known is forgotten, so that the next pass asks anew.
+            draft.act(Action::ForgetEvalai);
+        }
+        return is_old;
+    }
+    let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
+    if is_recorded && matches!(row_of_end(draft), Reading::Waits(_)) {
+        return true;
+    }
+    let message = format!(
+        "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state and score stay, in the table too.",
+        rerun.submission_name
+    );
+    let ended = draft.status.message.take().unwrap_or_default();
+    draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
+    if let Some(published) = conditions::get(&draft.status.conditions, conditions::PUBLISHED).cloned() {
+        let truth = Truth::from(published.status == "True");
+        draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
+    }
+    draft.event(false, reasons::RERUN_IN_EVALAI, message);
+    draft.status.rerun_as = Some(rerun);
+    record_again(draft)
+}
+
+/// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
+fn record_again(draft: &mut Draft<'_>) -> bool {
+    let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
+    if is_recorded {
+        draft.act(Action::Record { end: true });
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    }
+    is_recorded
+}
+
+/// Whether what was read may be from before a re-run that EvalAI dates so. A time that is still to come was not written by EvalAI.
+fn may_be_older(read_at: Option<Timestamp>, rerun: Option<&Time>, now: Timestamp) -> bool {
+    let Some((read_at, rerun)) = read_at.zip(rerun) else {
+        return false;
+    };
+    let latest = after(now, RERUN_SECONDS);
+    rerun.0 <= latest && read_at <= after(rerun.0, RERUN_SECONDS)
+}
+
+fn publish(draft: &mut Draft<'_>, log_left: Option<Duration>) -> Delivery {
+    let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
+    let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
+    let is_overtaken = is_evalais && is_overtaken(draft);
+    // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
+    let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
+    if !is_ours || (is_evalais && !is_overtaken) {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
+        return Delivery::Done;
+    }
+    if conditions::is_true(&draft.status.conditions, conditions::PUBLISHED)
+        || is_not_wanted(draft, conditions::PUBLISHED)
+    {
+        return Delivery::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::PUBLISHED);
+    }
+    let view = draft.view.evalai.clone().unwrap_or_default();
+    match view.end {
+        Some(EvalaiEnd::Published { at }) => {
+            draft.status.times.published = Some(Time(at));
+            published(draft, view.team_id.as_deref());
+            Delivery::Done
+        }
+        Some(EvalaiEnd::Ended { status }) => amend(draft, &status),
+        Some(EvalaiEnd::Refused { message }) => {
+            refused(draft, &message);
+            Delivery::Refused
+        }
+        None => {
+            send_end(draft, view.error, is_overtaken, log_left);
+            Delivery::Waiting
+        }
+    }
+}
+
+/// Sends the end with all that belongs to it, once that is there.
+fn send_end(draft: &mut Draft<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
+    let mut unread = None;
+    match reading::result_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why)),
+        Reading::Done if log_left.is_some() => {}
+        Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state {
+            Some(State::Finished) => EvalaiUpdate::Finished,
+            Some(State::Cancelled) => EvalaiUpdate::Cancelled,
+            _ => EvalaiUpdate::Failed,
+        })),
+    }
+    let failed = error.map(|e| format!("The last request failed: {}", sentence(&e)));
+    let failed = failed.or(unread);
+    let (reason, message) = if is_overtaken {
+        (
+            reasons::CONCURRENT_UPDATE,
+            failed.or_else(|| Some(TOLD_AGAIN.to_owned())),
+        )
+    } else if let Some(until) = draft.view.evalai_writes_from {
+        draft.requeue_at(until);
+        (
+            reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
+            Some(previous_controller(until)),
+        )
+    } else {
+        (reasons::WAITING, failed)
+    };
+    let message = message.unwrap_or_default();
+    draft.condition(conditions::PUBLISHED, Truth::False, reason, &message);
+}
+
+/// EvalAI has the end. Its row may by now be another team's, to whom EvalAI shows the result: participants can edit it.
+fn published(draft: &mut Draft<'_>, team: Option<&str>) {
+    let ours = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
+    let moved = ours.zip(team).filter(|(ours, theirs)| ours != theirs);
+    let message = moved.map(|(ours, theirs)| {
+        format!(
+            "The submission was moved to team {theirs} in EvalAI, which shows the result there; it was run and recorded for team \
+             {ours}. Set the team back in EvalAI, or correct the table."
+        )
+    });
+    let shown = message.clone().unwrap_or_default();
+    draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
+    draft.event(false, reasons::PUBLISHED, "EvalAI has the result.");
+    if let Some(message) = message {
+        draft.event(true, reasons::TEAM_DIFFERS, message);
+    }
+}
+
+/// Whether it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
+fn is_of_another_phase(draft: &Draft<'_>) -> bool {
+    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
+    differs && draft.status.plan.is_none() && draft.status.state == Some(State::Cancelled)
+}
+
+/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
+pub fn previous_controller(until: Timestamp) -> String {
+    format!(
+        "Nothing is written to EvalAI before {} UTC: the previous controller did not confirm its last requests, and they may \
+         still be running. Nothing to do.",
+        until.strftime("%H:%M:%S")
+    )
+}
+
+/// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
+fn cannot_be_read(draft: &Draft<'_>, type_: &str, why: &str) -> String {
+    const BEGINS: &str = "The stored result cannot be read:";
+    let known = conditions::get(&draft.status.conditions, type_).map(|c| c.message.clone());
+    let known = known.filter(|message| message.starts_with(BEGINS));
+    known.unwrap_or_else(|| {
+        format!(
+            "{BEGINS} {} It is published when it can; look at the bucket.",
+            sentence(why)
+        )
+    })
+}
+
+/// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
+fn is_overtaken(draft: &Draft<'_>) -> bool {
+    let published = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
+    draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
+        || published.is_some_and(|c| c.reason == reasons::CONCURRENT_UPDATE)
+}
+
+fn refused(draft: &mut Draft<'_>, message: &str) {
+    let message = format!(
+        "EvalAI does not take the result: {} Compare its metrics with the leaderboard of the phase; it is tried again \
+         from time to time.",
+        sentence(message)
+    );
+    let known = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
+    let is_new = known.is_none_or(|c| c.reason != reasons::REFUSED);
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::REFUSED, &message);
+    if is_new {
+        draft.event(true, reasons::REFUSED, message);
+    }
+}
+
+/// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
+fn amend(draft: &mut Draft<'_>, status: &str) -> Delivery {
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
+    if draft.status.state == Some(State::Cancelled) {
+        return Delivery::Done;
+    }
+    draft.status.failure = None;
+    let message = format!("EvalAI says {status}, so the result is not published.");
+    draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
+    draft.say(State::Cancelled, reasons::ENDED_IN_EVALAI, message);
+    if !conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
+        return Delivery::Done;
+    }
+    // While EvalAI refused the result, its row was written with the outcome that no longer holds.
+    draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    draft.act(Action::Record { end: true });
+    Delivery::Waiting
+}
+
+fn record(draft: &mut Draft<'_>) -> Delivery {
+    if conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
+        return Delivery::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::RECORDED);
+    }
+    let Some(view) = draft.view.record.clone() else {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, "");
+        return Delivery::Done;
+    };
+    if draft.status.plan.is_none() {
+        let message = "The submission was never accepted, so the table has no row for it.";
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
+        return Delivery::Done;
+    }
+    if draft.status.team.as_ref().and_then(|t| t.id.as_ref()).is_none() {
+        let message = "The row needs a team; give spec.team.id to a submission that is not EvalAI's.";
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
+        return Delivery::Done;
+    }
+    if view.end_written {
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
+        return Delivery::Done;
+    }
+    let mut unread = None;
+    match row_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
+        Reading::Done => draft.act(Action::Record { end: true }),
+    }
+    let (reason, message) = match view.error {
+        Some(error) => (
+            reasons::REFUSED,
+            format!(
+                "The last write failed: {} It is tried again; look at the table and the operator's rights.",
+                sentence(&error)
+            ),
+        ),
+        None => (reasons::WAITING, unread.unwrap_or_default()),
+    };
+    draft.condition(conditions::RECORDED, Truth::False, reason, &message);
+    Delivery::Waiting
+}
+
+/// Whether all that the row shows is there: only that of a finished submission has metrics.
+fn row_of_end(draft: &mut Draft<'_>) -> Reading {
+    if draft.is_successful() {
+        reading::report_of_end(draft)
+    } else {
+        Reading::Done
+    }
+}
+
+fn keep_job_for_its_time(draft: &mut Draft<'_>, job: &JobView) {
+    if !job.has_ttl && !job.deleting {
+        let seconds = draft.leaderboard().map_or(86_400, |l| l.ttl_seconds_after_finished);
+        draft.act(Action::SetJobTtl {
+            name: job.name.clone(),
+            seconds,
+        });
+    }
+}
+
+fn release(draft: &mut Draft<'_>, complete: bool) {
+    let Some(deleted) = draft.submission().metadata.deletion_timestamp.clone() else {
+        return;
+    };
+    if !draft.has_finalizer() {
+        return;
+    }
+    if complete {
+        return draft.act(Action::ReleaseFinalizer);
+    }
+    let patience = draft.leaderboard().map_or(900, |l| l.deadlines.finalize_seconds);
+    let until = after(deleted.0, patience);
+    if draft.now() >= until {
+        draft.event(
+            true,
+            reasons::RELEASED_UNPUBLISHED,
+            "It was deleted and its end could not be published in time; it is released.",
+        );
+        draft.act(Action::Forget);
+        draft.act(Action::ReleaseFinalizer);
+    } else {
+        draft.requeue_at(until);
+    }
+}

@@ -1,0 +1,196 @@
+//! Crashes of pairs: counting them, and the failure that they come to once they are too many.
+//!
+//! Called by `live`, `failure` and `end`. Whose fault a crash was is decided by `blame`.
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use leaderboard_runner::protocol::{Member, Pair, Side};
+
+use super::blame::{self, Crash};
+use super::draft::{Draft, after};
+use super::failure::{infrastructure, participant};
+use super::next_steps::{Steps, for_both, in_the_log_of, smaller};
+use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::view::{ContainerView, PodView};
+use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
+
+/// Counts the crashes of each pair and remembers the last one: its Pod may be gone when the cause is looked for.
+pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
+    for container in &pod.containers {
+        let Some(id) = pair_of(&container.name) else {
+            continue;
+        };
+        let crashes = count(container);
+        if crashes > 0 {
+            let pair = pair_entry(status, id);
+            pair.crashes = pair.crashes.max(crashes);
+        }
+    }
+    for pair in &mut status.pairs {
+        if let Some(crash) = last_crash(pod, pair.id, now) {
+            pair.last = Some(LastEnd {
+                reason: crash.cause,
+                exit_code: Some(crash.exit_code),
+                time: crash.at.map(Time),
+            });
+        }
+    }
+}
+
+/// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again.
+fn count(container: &ContainerView) -> i32 {
+    let end = container.last.as_ref().filter(|_| !container.running);
+    let is_new = end.is_some_and(blame::is_crash);
+    container.restarts.saturating_add(i32::from(is_new))
+}
+
+fn last_crash(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
+    let pair = u16::try_from(id).ok().and_then(Pair::new)?;
+    let container = |side| {
+        let name = Member { side, pair }.to_string();
+        pod.containers.iter().find(|container| container.name == name)
+    };
+    blame::last_crash(container(Side::Simulator), container(Side::Agent), now)
+}
+
+fn pair_of(container: &str) -> Option<i32> {
+    Some(Member::parse(container)?.pair.get().into())
+}
+
+fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
+    if let Some(at) = status.pairs.iter().position(|p| p.id == id) {
+        return &mut status.pairs[at];
+    }
+    let fresh = PairStatus {
+        id,
+        done: 0,
+        total: pair_total(status, id),
+        crashes: 0,
+        state: PairState::Waiting,
+        last: None,
+    };
+    let at = status.pairs.partition_point(|p| p.id < id);
+    status.pairs.insert(at, fresh);
+    &mut status.pairs[at]
+}
+
+fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
+    let slice = status.plan.as_ref().and_then(|plan| {
+        let slice = plan.slices.get(usize::try_from(id).ok()?.checked_sub(1)?)?;
+        i32::try_from(slice.routes()).ok()?.checked_mul(plan.repetitions)
+    });
+    slice.unwrap_or(0)
+}
+
+/// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
+pub(super) fn too_many(draft: &mut Draft<'_>) -> Option<Failure> {
+    let limit = draft.retries().per_pair.saturating_add(1);
+    let is_too_many =
+        |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair) == Some(EndReason::CannotStart));
+    let mut awaited = None;
+    for pair in draft.status.pairs.iter().filter(is_too_many) {
+        let Some(cause) = cause(pair) else { continue };
+        let pod = draft.view.pod.as_ref();
+        let crash = pod.and_then(|pod| last_crash(pod, pair.id, draft.now()));
+        match crash.filter(|crash| !crash.is_settled) {
+            None => return Some(of_pair(pair.id, pair.crashes, cause)),
+            Some(crash) => awaited = awaited.or(crash.at),
+        }
+    }
+    if let Some(at) = awaited {
+        draft.requeue_at(after(at, blame::PEER_SECONDS));
+    }
+    None
+}
+
+/// The failure of the pair that has crashed most.
+pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
+    let crashed = status.pairs.iter().filter(|p| p.crashes > 0 && p.last.is_some());
+    let pair = crashed.max_by_key(|p| p.crashes)?;
+    Some(of_pair(pair.id, pair.crashes, cause(pair)?))
+}
+
+/// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
+/// results that can be read is tried again as one that crashed.
+pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
+    let by_itself = |pair: &PairStatus| matches!(cause(pair), Some(EndReason::Exited | EndReason::Incomplete));
+    let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
+    is_of_results && status.pairs.iter().any(by_itself) && report.is_final && report.why.is_some()
+}
+
+fn cause(pair: &PairStatus) -> Option<EndReason> {
+    pair.last.as_ref().map(|last| last.reason)
+}
+
+fn of_pair(id: i32, crashes: i32, cause: EndReason) -> Failure {
+    let times = if crashes == 1 {
+        "once".to_owned()
+    } else {
+        format!("{crashes} times")
+    };
+    let failure = if let Some(what) = of_simulator(cause) {
+        let what = format!("The simulator of pair {id} failed {times}: {what}.");
+        infrastructure(reasons::SIMULATION_CRASHED, &what)
+    } else {
+        let (reason, what, next) = of_agent(id, &times, cause);
+        participant(reason, &what, &next)
+    };
+    Failure {
+        pair: Some(id),
+        ..failure
+    }
+}
+
+/// What a simulator did, if it was the cause.
+fn of_simulator(cause: EndReason) -> Option<&'static str> {
+    match cause {
+        EndReason::SimulatorCrashed => Some("it crashed"),
+        EndReason::SimulatorNotReady => Some("it was not ready in time"),
+        EndReason::SimulatorSilent => Some("its server did not answer any more"),
+        EndReason::SimulatorNotStarted => Some("its container could not be started"),
+        _ => None,
+    }
+}
+
+fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, Steps) {
+    match cause {
+        EndReason::OutOfMemory => (
+            reasons::OUT_OF_MEMORY,
+            format!("Agent {id} crashed {times}, the last time for lack of memory."),
+            smaller(),
+        ),
+        EndReason::Idle => (
+            reasons::IDLE,
+            format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
+            in_the_log_of(id),
+        ),
+        EndReason::Incomplete => (
+            reasons::INVALID_RESULTS,
+            format!(
+                "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
+                 no global record."
+            ),
+            in_the_log_of(id),
+        ),
+        EndReason::CannotStart | EndReason::StartError => (
+            reasons::CANNOT_START,
+            format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
+            for_both("Rebuild the image for linux/amd64."),
+        ),
+        EndReason::BlamesSimulator => (
+            reasons::AGENT_CRASHED,
+            format!("Agent {id} ended {times} and blamed its simulator, which had not failed."),
+            for_both("Leave the files of the evaluator's runner alone, and submit again."),
+        ),
+        EndReason::PortTaken => (
+            reasons::AGENT_CRASHED,
+            format!("Another container of the Pod listened on the port of simulator {id}, which failed {times}."),
+            for_both("Let the agents listen on no port of a simulator, and submit again."),
+        ),
+        _ => (
+            reasons::AGENT_CRASHED,
+            format!("Agent {id} crashed {times}."),
+            in_the_log_of(id),
+        ),
+    }
+}

@@ -1,0 +1,333 @@
+//! The plan while it is being made: the new status, and what is to be done.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::{Action, EvalaiUpdate, Event, Plan, reading};
+use crate::controller::submissions::view::View;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::{
+    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
+    SubmissionStatus, effective, names, reasons,
+};
+
+/// A plan in the making.
+pub(super) struct Draft<'a> {
+    pub(super) view: &'a View,
+    pub(super) status: SubmissionStatus,
+    actions: Vec<Action>,
+    events: Vec<Event>,
+    requeue: Option<Duration>,
+    /// The end is published with the report.
+    pub(super) needs_report: bool,
+}
+
+impl<'a> Draft<'a> {
+    pub(super) fn new(view: &'a View) -> Self {
+        let mut status = view.submission.status.clone().unwrap_or_default();
+        status.observed_generation = view.submission.metadata.generation;
+        Self {
+            view,
+            status,
+            actions: Vec::new(),
+            events: Vec::new(),
+            requeue: None,
+            needs_report: false,
+        }
+    }
+
+    pub(super) fn submission(&self) -> &'a Submission {
+        &self.view.submission
+    }
+
+    pub(super) fn spec(&self) -> &'a SubmissionSpec {
+        &self.view.submission.spec
+    }
+
+    pub(super) fn leaderboard(&self) -> Option<&'a LeaderboardSpec> {
+        self.view.leaderboard.as_ref().map(|l| &l.spec)
+    }
+
+    pub(super) fn deadlines(&self) -> Deadlines {
+        let track = self.status.track.as_deref().or(self.spec().track.as_deref());
+        let of =
+            |l: &LeaderboardSpec| effective::deadlines(l, l.tracks.iter().find(|t| Some(t.name.as_str()) == track));
+        self.leaderboard().map(of).unwrap_or_default()
+    }
+
+    pub(super) fn retries(&self) -> Retries {
+        self.leaderboard().map(|l| l.retries).unwrap_or_default()
+    }
+
+    pub(super) fn now(&self) -> Timestamp {
+        self.view.now
+    }
+
+    pub(super) fn time(&self) -> Time {
+        Time(self.view.now)
+    }
+
+    pub(super) fn is_deleting(&self) -> bool {
+        self.submission().metadata.deletion_timestamp.is_some()
+    }
+
+    pub(super) fn has_finalizer(&self) -> bool {
+        let finalizers = self.submission().metadata.finalizers.as_deref().unwrap_or_default();
+        finalizers.iter().any(|f| f == names::FINALIZER_SUBMISSION)
+    }
+
+    /// A request to stop that is not a failure: a person's, EvalAI's, or the object's deletion. It holds for the whole
+    /// attempt: a higher attempt takes `spec.cancel` back while the present one is still being stopped.
+    pub(super) fn is_cancelled(&self) -> bool {
+        let is_stopping = self.status.times.stopping.is_some() && self.status.failure.is_none();
+        is_stopping || self.spec().cancel || self.is_deleting() || self.is_ended_in_evalai()
+    }
+
+    pub(super) fn is_ended_in_evalai(&self) -> bool {
+        self.view.evalai.as_ref().is_some_and(|e| e.cancelled)
+    }
+
+    /// Nothing of this attempt's Job is to run any more.
+    pub(super) fn is_to_stop(&self) -> bool {
+        self.is_cancelled() || self.status.failure.is_some()
+    }
+
+    pub(super) fn is_finished(&self) -> bool {
+        conditions::is_true(&self.status.conditions, conditions::FINISHED)
+    }
+
+    /// Its results count.
+    pub(super) fn is_successful(&self) -> bool {
+        self.status.state == Some(State::Finished)
+    }
+
+    /// How often the report of a live run is read.
+    pub(super) fn period(&self) -> Duration {
+        Duration::from_secs(self.leaderboard().map_or(10, |l| l.sync_period_seconds).unsigned_abs())
+    }
+
+    pub(super) fn is_running(&self) -> bool {
+        matches!(self.status.state, Some(State::Running | State::Resumed))
+    }
+
+    /// The state of a live submission: once its agents ran it is never Pending again while it has a Job.
+    pub(super) fn live_state(&self) -> State {
+        self.status
+            .state
+            .filter(|_| self.is_running())
+            .unwrap_or(State::Pending)
+    }
+
+    /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished.
+    /// True if what this pass has seen speaks of another attempt and can't be used.
+    pub(super) fn begin_attempt(&mut self) -> bool {
+        let wanted = self.spec().attempt;
+        match self.status.attempt {
+            None => {
+                self.start_status(wanted);
+                self.show_unannounced(wanted);
+                // Without a status the world was seen as the first attempt's.
+                wanted != 1
+            }
+            Some(present) if wanted > present && self.may_be_resumed() => {
+                self.start_status(wanted);
+                self.show_unannounced(wanted);
+                true
+            }
+            Some(_) => false,
+        }
+    }
+
+    fn may_be_resumed(&self) -> bool {
+        let end = conditions::get(&self.status.conditions, conditions::FINISHED).filter(|c| c.status == "True");
+        end.is_some_and(|end| end.reason != reasons::FINISHED)
+    }
+
+    /// The status of a new attempt, with what was pinned and what earlier attempts reached.
+    fn start_status(&mut self, wanted: i64) {
+        let old = std::mem::take(&mut self.status);
+        self.status = SubmissionStatus {
+            observed_generation: self.submission().metadata.generation,
+            attempt: Some(wanted),
+            team: old.team,
+            track: old.track,
+            plan: old.plan.map(|plan| leaderboard_api::RunPlan { resume: true, ..plan }),
+            progress: old.progress,
+            score: old.score.map(Score::so_far),
+            results_url: old.results_url,
+            rerun_of: old.rerun_of,
+            times: leaderboard_api::Times {
+                submitted: old.times.submitted,
+                ..Default::default()
+            },
+            ..Default::default()
+        };
+        self.condition(conditions::FINISHED, Truth::False, reasons::PREPARING, "");
+        self.say(State::Pending, reasons::PREPARING, "The submission was just taken in.");
+    }
+
+    /// Shows that no message has announced an attempt: its row may have been edited by the participant.
+    fn show_unannounced(&mut self, attempt: i64) {
+        let record = Ingested::of(self.submission()).filter(|record| record.without_message.contains(&attempt));
+        let Some(record) = record else { return };
+        let message = format!(
+            "Attempt {attempt} begins without a queue message: EvalAI's row has asked for it since {}. Only hosts can resume or \
+             re-run, but participants can edit the row. Check who asked for it; cancel the submission if nobody did.",
+            seconds(record.sent)
+        );
+        self.event(true, reasons::ATTEMPT_WITHOUT_MESSAGE, message);
+    }
+
+    pub(super) fn act(&mut self, action: Action) {
+        self.actions.push(action);
+    }
+
+    /// Whether EvalAI receives its progress.
+    pub(super) fn tells_progress(&self) -> bool {
+        let is_progress = |action: &Action| {
+            matches!(
+                action,
+                Action::UpdateEvalai(EvalaiUpdate::Queued | EvalaiUpdate::Running)
+            )
+        };
+        self.actions.iter().any(is_progress)
+    }
+
+    pub(super) fn event(&mut self, warning: bool, reason: &str, message: impl Into<String>) {
+        self.events.push(Event {
+            warning,
+            reason: reason.into(),
+            message: message.into(),
+        });
+    }
+
+    /// Asks for another look after this long, or sooner if somebody else wants so.
+    pub(super) fn requeue_in(&mut self, delay: Duration) {
+        self.requeue = Some(self.requeue.map_or(delay, |present| present.min(delay)));
+    }
+
+    /// Asks for another look at this time.
+    pub(super) fn requeue_at(&mut self, at: Timestamp) {
+        let left = at.duration_since(self.now());
+        self.requeue_in(Duration::try_from(left).unwrap_or_default() + Duration::from_millis(50));
+    }
+
+    pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: &str, message: &str) {
+        if type_ == conditions::STALLED {
+            self.note_blocked(truth, reason);
+        }
+        let now = self.time();
+        let generation = self.status.observed_generation;
+        conditions::set(
+            &mut self.status.conditions,
+            type_,
+            truth,
+            reason,
+            message,
+            generation,
+            &now,
+        );
+    }
+
+    /// Remembers since when it has been stalled for one reason: the condition's own time moves with its status alone.
+    fn note_blocked(&mut self, truth: Truth, reason: &str) {
+        if truth != Truth::True {
+            self.status.blocked_since = None;
+        } else if self.stalled_since(reason).is_none_or(|since| since > self.now()) {
+            // Also after a clock was set back: what is counted from this time would not end.
+            self.status.blocked_since = Some(BlockedSince {
+                reason: reason.to_owned(),
+                time: self.time(),
+            });
+        }
+    }
+
+    /// Shows a state with its reason, and tells the event of a transition once.
+    pub(super) fn say(&mut self, state: State, reason: &str, message: impl Into<String>) {
+        let message = message.into();
+        let moved = self.status.state != Some(state) || self.status.reason.as_deref() != Some(reason);
+        if moved {
+            let warning = state == State::Failed;
+            self.event(
+                warning,
+                reason,
+                if message.is_empty() {
+                    state.as_str().to_owned()
+                } else {
+                    message.clone()
+                },
+            );
+        }
+        self.status.state = Some(state);
+        self.status.reason = Some(reason.to_owned());
+        self.status.message = (!message.is_empty()).then_some(message);
+    }
+
+    /// Shows that nothing moves. The first words stand while the reason does, so that a changing detail of an error
+    /// (a time, a request id) is not a write to the API each pass.
+    pub(super) fn stall(&mut self, reason: &str, message: &str) -> String {
+        let known = conditions::get(&self.status.conditions, conditions::STALLED)
+            .filter(|c| c.status == "True" && c.reason == reason)
+            .map(|c| c.message.clone());
+        let message = known.unwrap_or_else(|| message.to_owned());
+        self.condition(conditions::STALLED, Truth::True, reason, &message);
+        message
+    }
+
+    /// The same with the words of this moment: for a cause that changes while the reason stays.
+    pub(super) fn stall_with(&mut self, reason: &str, message: &str) {
+        self.stall(reason, message);
+        self.condition(conditions::STALLED, Truth::True, reason, message);
+    }
+
+    pub(super) fn moves(&mut self) {
+        self.condition(conditions::STALLED, Truth::False, reasons::NOT_STALLED, "");
+    }
+
+    /// Since when it is stalled for this reason.
+    pub(super) fn stalled_since(&self, reason: &str) -> Option<Timestamp> {
+        let blocked = self.status.blocked_since.as_ref();
+        blocked
+            .filter(|blocked| blocked.reason == reason)
+            .map(|blocked| blocked.time.0)
+    }
+
+    /// Shows nothing new: the status stays as it was observed, and nothing is published.
+    pub(super) fn keeps_status(&mut self) {
+        self.status = self.submission().status.clone().unwrap_or_default();
+        self.events.clear();
+    }
+
+    /// Marks a failure that ends the attempt; the first one stands.
+    pub(super) fn fail(&mut self, failure: Failure) {
+        if self.status.failure.is_none() {
+            self.status.failure = Some(failure);
+        }
+    }
+
+    pub(super) fn into_plan(mut self) -> Plan {
+        self.status.fit();
+        Plan {
+            report: reading::demand(&self),
+            status: self.status,
+            actions: self.actions,
+            events: self.events,
+            requeue: self.requeue,
+        }
+    }
+}
+
+/// Milliseconds since 1970, for people.
+pub(super) fn seconds(milliseconds: i64) -> String {
+    let at = Timestamp::from_millisecond(milliseconds).unwrap_or_default();
+    format!("{at:.0}")
+}
+
+/// The moment `seconds` after another.
+pub(super) fn after(start: Timestamp, seconds: i64) -> Timestamp {
+    start
+        .checked_add(jiff::SignedDuration::from_secs(seconds))
+        .unwrap_or(Timestamp::MAX)
+}

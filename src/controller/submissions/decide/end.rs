@@ -1,0 +1,257 @@
+//! The end of an attempt: which outcome it has, or whether an infrastructure failure gives it another Job.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after};
+use super::{allowance, crashes, failure, reading};
+use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage, View};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, FailureClass, State, reasons};
+
+/// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
+const NO_ANSWER: &str = "its bucket has not answered yet.";
+/// First delay before a new Job after an infrastructure failure; doubles with each.
+const RETRY_SECONDS: i64 = 10;
+/// Most doublings of that delay.
+const MAX_DOUBLINGS: i32 = 8;
+/// Longest delay before a new Job.
+pub(super) const LONGEST_RETRY_SECONDS: i64 = RETRY_SECONDS << MAX_DOUBLINGS;
+/// How long an end waits for a bucket that does not answer; what it stores can still be taken up by a resume.
+const READ_SECONDS: i64 = 86_400;
+/// The same of one that was cancelled, which has `deadlines.cancelSeconds`: a bucket that hung is left alone for up to half of it.
+const READ_AT_LEAST_SECONDS: i64 = 60;
+
+/// The Job is terminal, or gone because we ended it (`None`).
+pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
+    let view = draft.view;
+    // A mark that comes late would stop the next Pod.
+    if let Some(left) = reading::requested_fence_left(draft) {
+        return draft.requeue_in(left);
+    }
+    // Without a plan nobody knows where a report would be.
+    let is_read = reading::is_of(draft, Stage::JobEnded) && view.report != ObservedReport::NotRead;
+    if draft.status.plan.is_some() && !is_read {
+        if let Some(left) = reading::answer_left(draft) {
+            return draft.requeue_in(left);
+        }
+        if wait_for_bucket(draft, NO_ANSWER) {
+            return;
+        }
+    }
+    let report = match &view.report {
+        ObservedReport::Ours(report) if is_read => Some(report.as_ref()),
+        ObservedReport::Unreadable(why) if wait_for_bucket(draft, why) => return,
+        _ => None,
+    };
+    let complete = report.filter(|r| is_complete(r));
+    if let Some(report) = complete.filter(|r| r.eligible) {
+        return finished(draft, report);
+    }
+    if draft.is_cancelled() {
+        let reason = cancel_reason(draft);
+        let message = if reason == reasons::ENDED_IN_EVALAI {
+            "EvalAI has ended it; what it had reached is kept."
+        } else {
+            "It was cancelled; what it had reached is kept."
+        };
+        return cancelled(draft, reason, message);
+    }
+    let recorded = draft.status.failure.clone();
+    let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
+    let found = recorded.unwrap_or_else(|| cause(draft, report, complete, job_end));
+    if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
+        return retry(draft, &found);
+    }
+    let found = allowance::counted(draft, found);
+    failed(draft, found);
+}
+
+/// Finishes a run whose agents and simulators have ended well and whose complete results are stored and count: nothing that its
+/// Pod still does can change them. Returns whether it did. Every other end waits for the Job.
+pub(super) fn of_complete_run(draft: &mut Draft<'_>) -> bool {
+    let view = draft.view;
+    let Some(pod) = view.pod.as_ref().filter(|pod| pod.run_ended.is_some()) else {
+        return false;
+    };
+    if !reading::is_of(draft, Stage::RunEnded) {
+        return false;
+    }
+    let report = view.report.ours().filter(|r| r.pod_uid == pod.uid);
+    let Some(report) = report.filter(|r| is_complete(r) && r.eligible) else {
+        return false;
+    };
+    finished(draft, report);
+    true
+}
+
+fn is_complete(report: &ReportDigest) -> bool {
+    report.is_final && report.done == report.total && report.total > 0
+}
+
+/// Whether a report says how a run came to its own end, whatever becomes of its Job.
+pub(super) fn is_verdict(report: &ReportDigest) -> bool {
+    is_complete(report) || (report.is_final && report.why.is_some())
+}
+
+/// Whether the end still waits until the bucket can be read.
+fn wait_for_bucket(draft: &mut Draft<'_>, why: &str) -> bool {
+    let limit = if draft.is_cancelled() {
+        draft.deadlines().cancel_seconds.max(READ_AT_LEAST_SECONDS)
+    } else {
+        READ_SECONDS
+    };
+    let message = format!(
+        "Its results cannot be read: {} It goes on when they can.",
+        sentence(why)
+    );
+    let message = draft.stall(reasons::NOT_STORED, &message);
+    let since = draft.stalled_since(reasons::NOT_STORED).unwrap_or(draft.now());
+    let until = after(since, limit);
+    if draft.now() >= until {
+        return false;
+    }
+    draft.say(draft.live_state(), reasons::NOT_STORED, message);
+    draft.requeue_at(until);
+    draft.requeue_in(Duration::from_secs(10));
+    true
+}
+
+/// Ends as Cancelled; nothing needs to be stopped any more.
+pub(super) fn cancelled(draft: &mut Draft<'_>, reason: &str, message: &str) {
+    draft.status.failure = None;
+    close(draft, State::Cancelled, reason, message);
+}
+
+/// Why a cancelled submission was cancelled.
+pub(super) fn cancel_reason(draft: &Draft<'_>) -> &'static str {
+    if draft.spec().cancel {
+        reasons::CANCELLED
+    } else if draft.is_deleting() {
+        reasons::DELETED
+    } else if draft.is_ended_in_evalai() {
+        reasons::ENDED_IN_EVALAI
+    } else {
+        reasons::CANCELLED
+    }
+}
+
+fn cause(
+    draft: &Draft<'_>,
+    report: Option<&ReportDigest>,
+    complete: Option<&ReportDigest>,
+    job_end: Option<&JobEnd>,
+) -> Failure {
+    // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
+    if let Some(why) = report.filter(|r| r.is_final).and_then(|r| r.why.as_deref()) {
+        return failure::invalid_results(why);
+    }
+    if let Some(report) = complete {
+        return failure::not_eligible(&report.entry_status);
+    }
+    match job_end {
+        Some(end) => failure::of_job(draft, end),
+        None => failure::job_deleted(),
+    }
+}
+
+/// Failures that a second try may fix.
+fn may_retry(draft: &Draft<'_>, found: &Failure) -> bool {
+    const NOT_MENDABLE: [&str; 3] = [reasons::PREFIX_IN_USE, reasons::JOB_DELETED, reasons::SCHEDULE_DEADLINE];
+    let is_mendable = !NOT_MENDABLE.contains(&found.reason.as_str());
+    // A higher attempt that is already requested takes the place of a retry.
+    let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
+    is_mendable
+        && is_latest
+        && !allowance::is_used_up(draft, found)
+        && draft.status.retry < draft.retries().infrastructure
+}
+
+fn retry(draft: &mut Draft<'_>, found: &Failure) {
+    let delay = RETRY_SECONDS << draft.status.retry.clamp(0, MAX_DOUBLINGS);
+    let at = after(draft.now(), delay);
+    draft.status.retry += 1;
+    draft.status.job_name = None;
+    draft.status.node_name = None;
+    draft.status.failure = None;
+    draft.status.recreated = 0;
+    draft.status.next_retry_time = Some(Time(at));
+    draft.status.times.scheduled = None;
+    draft.status.times.stopping = None;
+    for pair in &mut draft.status.pairs {
+        pair.crashes = 0;
+        pair.last = None;
+    }
+    let what = &found.message;
+    let message = format!("{what} It is tried again in {delay} s; this costs no attempt.");
+    draft.moves();
+    draft.condition(conditions::RUNNING, Truth::False, &found.reason, what);
+    draft.say(State::Pending, reasons::REPLACING, message);
+    draft.requeue_at(at);
+}
+
+fn finished(draft: &mut Draft<'_>, report: &ReportDigest) {
+    draft.status.failure = None;
+    let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
+    let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
+    close(draft, State::Finished, reasons::FINISHED, &message);
+}
+
+/// Ends as Failed; nothing needs to be stopped any more.
+pub(super) fn failed(draft: &mut Draft<'_>, found: Failure) {
+    let found = failure::at_the_end(found);
+    let (reason, message) = (found.reason.clone(), found.message.clone());
+    draft.status.failure = Some(found);
+    close(draft, State::Failed, &reason, &message);
+}
+
+fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
+    let ended = draft.view.ended_at().unwrap_or(draft.now());
+    let ended = ended.min(draft.now());
+    draft.status.times.finished = Some(Time(ended));
+    let started = draft.status.times.started.as_ref();
+    draft.status.duration = started.map(|started| duration(ended.duration_since(started.0).as_secs()));
+    draft.status.waiting = None;
+    draft.status.next_retry_time = None;
+    let stored = draft.view.report.ours().is_some_and(|r| r.is_final);
+    let (truth, why) = if stored {
+        (Truth::True, reasons::STORED)
+    } else {
+        (Truth::False, reasons::NOT_STORED)
+    };
+    draft.condition(conditions::ARCHIVED, truth, why, "");
+    draft.condition(conditions::RUNNING, Truth::False, reason, "");
+    draft.moves();
+    draft.condition(conditions::FINISHED, Truth::True, reason, message);
+    if draft.spec().evalai.is_some() {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::WAITING, "");
+    }
+    if draft.view.record.is_some() {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    }
+    draft.say(state, reason, message);
+}
+
+/// A time span in its two largest units.
+fn duration(seconds: i64) -> String {
+    let minutes = seconds.max(0) / 60;
+    match (minutes / 1440, minutes / 60 % 24, minutes % 60) {
+        (0, 0, 0) => format!("{}s", seconds.max(0)),
+        (0, 0, minutes) => format!("{minutes}m"),
+        (0, hours, minutes) => format!("{hours}h{minutes}m"),
+        (days, hours, _) => format!("{days}d{hours}h"),
+    }
+}
+
+impl View {
+    fn ended_at(&self) -> Option<Timestamp> {
+        match self.job.ours()?.end.as_ref() {
+            Some(JobEnd::Complete { at } | JobEnd::Failed { at, .. }) => *at,
+            None => self.pod.as_ref()?.run_ended,
+        }
+    }
+}

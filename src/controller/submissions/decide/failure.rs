@@ -1,0 +1,171 @@
+//! Failures: from what was observed of Jobs, Pods and results to a class, a reason and one sentence.
+//!
+//! Called by the stages of `decide`. The class says whose failure it is; only a participant's is charged. Those of crashed
+//! pairs are in `crashes`.
+
+use super::crashes;
+use super::draft::Draft;
+use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure};
+use crate::controller::submissions::view::{JobEnd, ObservedNode, PodView};
+use crate::pod::run::Stop;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, FailureClass, reasons};
+
+/// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
+pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
+    let message = format!("{what} {}", next.hosts);
+    let for_participants = format!("{what} {}", next.participant);
+    Failure {
+        class: FailureClass::Participant,
+        reason: reason.into(),
+        participant_message: Some(for_participants).filter(|text| *text != message),
+        message,
+        next_step: Some(next.hosts.clone()),
+        charged: true,
+        pair: None,
+    }
+}
+
+/// A failure that is not: `what` happened, in one sentence for hosts. As long as another Job may follow there is no next step.
+pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
+    Failure {
+        class: FailureClass::Infrastructure,
+        reason: reason.into(),
+        message: what.to_owned(),
+        next_step: None,
+        participant_message: Some(infrastructure_for_participants(reason)),
+        charged: false,
+        pair: None,
+    }
+}
+
+/// A failure that ends its submission: with what a host does about it.
+pub(super) fn at_the_end(found: Failure) -> Failure {
+    match found.class {
+        FailureClass::Participant => found,
+        FailureClass::Infrastructure => {
+            let step = of_infrastructure(&found.reason);
+            Failure {
+                message: format!("{} {step}", found.message).trim_end().to_owned(),
+                next_step: Some(step.to_owned()).filter(|step| !step.is_empty()),
+                ..found
+            }
+        }
+    }
+}
+
+/// What was submitted names no image that could ever be pulled.
+pub(super) fn image_invalid(what: &str) -> Failure {
+    let next = for_both("Submit again with an image as in registry.example/team/agent:1.");
+    participant(reasons::IMAGE_INVALID, what, &next)
+}
+
+pub(super) fn job_deleted() -> Failure {
+    infrastructure(reasons::JOB_DELETED, "The Job was deleted repeatedly by somebody else.")
+}
+
+pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure {
+    let node = node.map_or_else(|| "Its node".to_owned(), |node| format!("Node {node}"));
+    let what = if node_state == ObservedNode::Reports {
+        "did not end its Pod within its grace"
+    } else {
+        "was lost and its Pod with it"
+    };
+    infrastructure(reasons::NODE_LOST, &format!("{node} {what}; finished routes are kept."))
+}
+
+pub(super) fn time_limit(seconds: i64) -> Failure {
+    let what = format!("The run took longer than {seconds} s and was stopped; finished routes are kept.");
+    participant(reasons::TIME_LIMIT, &what, &faster())
+}
+
+fn faster() -> Steps {
+    for_both("Make the agent faster, or ask the host for more time.")
+}
+
+pub(super) fn results_not_stored() -> Failure {
+    infrastructure(
+        reasons::RESULTS_NOT_STORED,
+        "The Pod ended before its final results were stored; what was stored is kept.",
+    )
+}
+
+pub(super) fn invalid_results(why: &str) -> Failure {
+    let what = format!("The results cannot be used: {}", sentence(why));
+    let next = for_both("Check what the agent writes into its checkpoint, and submit again.");
+    Failure {
+        pair: pair_named(why),
+        ..participant(reasons::INVALID_RESULTS, &what, &next)
+    }
+}
+
+/// The pair whose checkpoint logcopy speaks of: `pair 2: …` or `pair 2, record …`.
+fn pair_named(why: &str) -> Option<i32> {
+    let (number, _) = why.strip_prefix("pair ")?.split_once([':', ','])?;
+    number.parse().ok()
+}
+
+/// Results that are complete but do not count.
+pub(super) fn not_eligible(entry_status: &str) -> Failure {
+    if entry_status == "Crashed" {
+        return infrastructure(
+            reasons::SIMULATION_CRASHED,
+            "The simulation crashed during a route, so the results do not count.",
+        );
+    }
+    let what = format!("The run ended as {entry_status}, so its results do not count.");
+    let next = for_both("Compare the agent's sensors with those the track allows, and submit again.");
+    participant(reasons::NOT_ELIGIBLE, &what, &next)
+}
+
+/// A Pod that was evicted because the agent's side filled its disk. Another Pod would run into it again.
+pub(super) fn disk_full(pod: &PodView) -> Option<Failure> {
+    let (reason, message) = pod.ended_by_node.as_ref()?;
+    let is_agents = reason == "Evicted" && is_agents_disk(message);
+    is_agents.then(|| {
+        let what = format!("The Pod was evicted because it filled its disk: {}", sentence(message));
+        let next = for_both("Write less to disk or to the log.");
+        participant(reasons::DISK_FULL, &what, &next)
+    })
+}
+
+/// A limit of the Pod, the logs or an agent; not the node's own shortage, nor a limit of the host's containers.
+fn is_agents_disk(message: &str) -> bool {
+    let signs = [
+        "Pod ephemeral local storage usage exceeds",
+        "EmptyDir volume \"logs\"",
+        "Container agent-",
+    ];
+    !message.starts_with("The node was low on") && signs.iter().any(|sign| message.contains(sign))
+}
+
+/// The stop that a failure calls for.
+pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
+    if failure.is_some_and(|f| f.reason == reasons::TIME_LIMIT) {
+        Stop::RunDeadline
+    } else {
+        Stop::Retries
+    }
+}
+
+/// The failure of a Job that ended without final results.
+pub(super) fn of_job(draft: &Draft<'_>, end: &JobEnd) -> Failure {
+    if let Some(failure) = draft.view.pod.as_ref().and_then(disk_full) {
+        return failure;
+    }
+    match end {
+        JobEnd::Complete { .. } => results_not_stored(),
+        // Without a limit on the run the deadline is not ours.
+        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds > 0 => {
+            participant(
+                reasons::TIME_LIMIT,
+                "The Pod reached its time limit; finished routes are kept.",
+                &faster(),
+            )
+        }
+        JobEnd::Failed { reason, message, .. } => crashes::worst(&draft.status).unwrap_or_else(|| {
+            let what = format!("The Job failed with {reason}: {}", sentence(message));
+            infrastructure(reasons::JOB_FAILED, &what)
+        }),
+    }
+}

@@ -1,0 +1,67 @@
+//! In line for a slot: joins it, and shows the place. Who is next is decided by `slots`.
+
+use super::Action;
+use super::draft::Draft;
+use crate::controller::slots::turns::{InLine, Turn};
+use leaderboard_api::{Eta, State, Waiting, reasons};
+
+/// What follows from its turn.
+pub(super) enum Step {
+    /// It has a slot.
+    Start,
+    /// It joins the line, and is woken by the answer.
+    Join,
+    /// It shows its place.
+    Wait,
+}
+
+/// Decides for a submission that waits for nothing but a slot.
+pub(super) fn decide(draft: &mut Draft<'_>) -> Step {
+    let (position, eta, reason, message) = match draft.view.turn.clone() {
+        Turn::Go => return Step::Start,
+        Turn::NotInLine => {
+            join(draft);
+            // Its first place is worth a write, that it has none yet is not.
+            draft.keeps_status();
+            return Step::Join;
+        }
+        Turn::Wait { position, eta } => (
+            position,
+            known_eta(draft, position).or(eta),
+            reasons::WAITING_FOR_SLOT,
+            "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
+        ),
+        Turn::Paused { position } => (
+            position,
+            None,
+            reasons::PAUSED,
+            "The Leaderboard is paused; it starts again with paused: false.",
+        ),
+    };
+    draft.status.waiting = Some(Waiting::new(position, eta));
+    draft.moves();
+    draft.say(State::Pending, reason, message);
+    // Its priority may have been edited since.
+    join(draft);
+    Step::Wait
+}
+
+fn join(draft: &mut Draft<'_>) {
+    let status = &draft.status;
+    let team = status.team.as_ref();
+    let team = team.and_then(|team| team.id.clone().or_else(|| team.name.clone()));
+    let place = InLine {
+        uid: draft.submission().metadata.uid.clone().unwrap_or_default(),
+        team: team.unwrap_or_default(),
+        track: status.track.clone().unwrap_or_default(),
+        priority: draft.spec().priority,
+        submitted: status.times.submitted.as_ref().map_or(draft.now(), |time| time.0),
+    };
+    draft.act(Action::JoinLine(place));
+}
+
+/// The wait that is shown of this place. One that is only estimated anew is not worth a write; it follows the place.
+fn known_eta(draft: &Draft<'_>, position: i32) -> Option<Eta> {
+    let known = draft.status.waiting.as_ref().filter(|known| known.position == position);
+    known.and_then(Waiting::eta)
+}

@@ -1,0 +1,362 @@
+//! A submission that has not come to its end: in line, with its Job, without it.
+
+use std::time::Duration;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+
+use super::draft::{Draft, after};
+use super::{Action, EvalaiUpdate, accept, crashes, end, failure, isolation, job_name, line, reading, start, stop};
+use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{PairStatus, Progress, Score, State, reasons};
+
+/// Times a Job is made again after somebody deleted it.
+const MAX_RECREATED: i32 = 3;
+/// When a submission in line is looked at again, should nothing wake it before.
+const BACKSTOP: Duration = Duration::from_mins(5);
+/// When a live run is looked at again, should nothing wake it before: its report, its Pod, its node or EvalAI.
+const LIVE_BACKSTOP: Duration = Duration::from_mins(5);
+/// How soon a Job that was just asked for is looked for.
+const LOOK: Duration = Duration::from_secs(15);
+
+/// Decides for a live submission.
+pub(super) fn decide(draft: &mut Draft<'_>) {
+    let view = draft.view;
+    // Without a plan (a status that was lost) nothing can be made again before it is accepted.
+    let has_job = draft.status.job_name.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
+    match &view.job {
+        // What was seen is of an earlier try; the next pass looks at the present one.
+        ObservedJob::Ours(job) if job.name != own_job_name(draft) => draft.requeue_in(Duration::from_secs(1)),
+        ObservedJob::Ours(job) => with_job(draft, job),
+        ObservedJob::Foreign if !draft.is_to_stop() => name_taken(draft),
+        ObservedJob::Absent | ObservedJob::Foreign if has_job => without_its_job(draft),
+        ObservedJob::Absent | ObservedJob::Foreign => in_line(draft),
+    }
+    follow(draft);
+}
+
+/// Looks for its end in EvalAI also while it waits and nothing is sent to EvalAI, whatever it waits for.
+fn follow(draft: &mut Draft<'_>) {
+    let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
+    // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
+    let is_known = draft.status.times.submitted.is_some();
+    let may_run = is_known && info.is_some_and(|info| info.standing != Standing::Ended);
+    if may_run && !draft.is_finished() && !draft.is_to_stop() && !draft.tells_progress() {
+        draft.act(Action::FollowEvalai);
+    }
+}
+
+fn own_job_name(draft: &Draft<'_>) -> String {
+    let name = draft.submission().metadata.name.as_deref().unwrap_or_default();
+    job_name(name, &draft.status)
+}
+
+fn name_taken(draft: &mut Draft<'_>) {
+    let message = format!(
+        "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
+        own_job_name(draft)
+    );
+    let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
+    draft.say(draft.live_state(), reasons::JOB_NAME_TAKEN, message);
+    draft.requeue_in(Duration::from_secs(5));
+}
+
+fn in_line(draft: &mut Draft<'_>) {
+    if draft.is_cancelled() {
+        let reason = end::cancel_reason(draft);
+        let what = if reason == reasons::ENDED_IN_EVALAI {
+            "EvalAI has ended it"
+        } else {
+            "It was cancelled"
+        };
+        let when = if draft.status.retry > 0 {
+            "between two tries; what it had reached is kept"
+        } else {
+            "before it started"
+        };
+        return end::cancelled(draft, reason, &format!("{what} {when}."));
+    }
+    if !accept::decide(draft) {
+        return draft.requeue_in(BACKSTOP);
+    }
+    note_original(draft);
+    if waits_for_next_try(draft) {
+        return;
+    }
+    match line::decide(draft) {
+        line::Step::Start => return start_job(draft),
+        line::Step::Join => {}
+        line::Step::Wait => tell(draft),
+    }
+    draft.requeue_in(BACKSTOP);
+}
+
+/// Remembers which submission this one re-runs, so that the other learns of it.
+fn note_original(draft: &mut Draft<'_>) {
+    let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
+    if draft.status.rerun_of.is_none() {
+        draft.status.rerun_of = info.and_then(|info| info.rerun_of.clone());
+    }
+}
+
+fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {
+    let Some(at) = draft.status.next_retry_time.as_ref().map(|t| t.0) else {
+        return false;
+    };
+    // A clock that was set back must not turn seconds into days.
+    let latest = after(draft.now(), end::LONGEST_RETRY_SECONDS);
+    if at <= draft.now() || at > latest {
+        return false;
+    }
+    if draft.status.reason.as_deref() != Some(reasons::REPLACING) {
+        let message = "It is tried again after a failure that is not the participant's.";
+        draft.say(State::Pending, reasons::REPLACING, message);
+    }
+    draft.requeue_at(at);
+    true
+}
+
+fn start_job(draft: &mut Draft<'_>) {
+    let name = own_job_name(draft);
+    let (attempt, retry) = (draft.status.attempt.unwrap_or(1), draft.status.retry);
+    let is_new = draft.status.job_name.is_none();
+    draft.status.waiting = None;
+    draft.status.next_retry_time = None;
+    draft.status.job_name = Some(name.clone());
+    draft.act(Action::CreateJob { attempt, retry });
+    draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
+    if draft.is_running() {
+        let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
+        start::replacing(draft, message);
+    } else {
+        draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
+        draft.say(State::Pending, reasons::PREPARING, start::PREPARED);
+    }
+    if is_new {
+        draft.event(false, reasons::JOB_CREATED, format!("Created Job {name}."));
+    }
+    tell(draft);
+    record(draft);
+    draft.requeue_in(LOOK);
+}
+
+/// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
+/// crash or a slow watch looks the same. `start_job` sets the mark, `start::watch` takes it away.
+pub(super) fn was_seen(draft: &Draft<'_>) -> bool {
+    const BEFORE_IT: [&str; 3] = [
+        reasons::JOB_NAME_TAKEN,
+        reasons::LEADERBOARD_NOT_FOUND,
+        reasons::NOT_ISOLATED,
+    ];
+    let seen = |c: &Condition| match c.status.as_str() {
+        "True" => !BEFORE_IT.contains(&c.reason.as_str()),
+        _ => c.reason != reasons::PREPARING,
+    };
+    let stalled = conditions::get(&draft.status.conditions, conditions::STALLED);
+    draft.status.times.scheduled.is_some() || stalled.is_some_and(seen)
+}
+
+/// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
+fn without_its_job(draft: &mut Draft<'_>) {
+    // What the run has stored last decides whether it is made again.
+    let is_read = reading::is_of(draft, Stage::JobEnded);
+    if !draft.is_to_stop()
+        && was_seen(draft)
+        && !is_read
+        && let Some(left) = reading::answer_left(draft)
+    {
+        return draft.requeue_in(left);
+    }
+    // A report from before this Job was seen is its predecessor's.
+    let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
+    if draft.is_to_stop() || (is_verdict && was_seen(draft)) {
+        return end::decide(draft, None);
+    }
+    if draft.leaderboard().is_none() {
+        let message = accept::no_leaderboard(draft);
+        let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
+        draft.say(draft.live_state(), reasons::LEADERBOARD_NOT_FOUND, message);
+        return draft.requeue_in(BACKSTOP);
+    }
+    if let Some(missing) = isolation::missing(draft) {
+        draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
+        draft.say(draft.live_state(), reasons::NOT_ISOLATED, missing.message);
+        return draft.requeue_in(BACKSTOP);
+    }
+    if let Some(left) = reading::requested_fence_left(draft) {
+        return draft.requeue_in(left);
+    }
+    if was_seen(draft) {
+        if draft.status.recreated >= MAX_RECREATED {
+            draft.fail(failure::job_deleted());
+            return end::decide(draft, None);
+        }
+        draft.status.recreated += 1;
+        draft.status.times.scheduled = None;
+        draft.event(
+            true,
+            reasons::JOB_RECREATED,
+            "The Job was deleted by somebody else; it is created again.",
+        );
+    }
+    start_job(draft);
+}
+
+fn with_job(draft: &mut Draft<'_>, job: &JobView) {
+    draft.status.job_name = Some(job.name.clone());
+    draft.status.waiting = None;
+    draft.status.next_retry_time = None;
+    // An object that was restored from a backup has lost its status and with it the plan.
+    if draft.status.plan.is_none() && !draft.is_to_stop() && !accept::decide(draft) {
+        return draft.requeue_in(LOOK);
+    }
+    let view = draft.view;
+    if let Some(pod) = &view.pod {
+        take_pod(draft, pod);
+    }
+    if let Some(report) = view.report.ours() {
+        take_report(draft, report);
+    }
+    if let Some(job_end) = &job.end {
+        return end::decide(draft, Some(job_end));
+    }
+    if end::of_complete_run(draft) {
+        return;
+    }
+    if job.deleting {
+        return stop::being_deleted(draft);
+    }
+    if let Some(lost) = stop::lost_pod(draft) {
+        return stop::leave_lost_pod(draft, job, lost);
+    }
+    if !draft.is_to_stop() {
+        watch_run(draft);
+    }
+    if !draft.is_to_stop() {
+        start::watch(draft, job);
+    }
+    if draft.is_to_stop() {
+        return stop::decide(draft, job);
+    }
+    tell(draft);
+    if draft.is_running() {
+        record(draft);
+        draft.requeue_in(LIVE_BACKSTOP);
+    } else {
+        draft.requeue_in(draft.period());
+    }
+}
+
+fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
+    let known = draft.status.node_name.take();
+    draft.status.node_name = pod.node.clone().or(known);
+    let times = &mut draft.status.times;
+    times.scheduled = times.scheduled.take().or(pod.scheduled.map(Time));
+    times.started = times.started.take().or(pod.agent_started.map(Time));
+    let now = draft.now();
+    crashes::note(&mut draft.status, pod, now);
+}
+
+fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
+    let clamp = |n: u32| i32::try_from(n).unwrap_or(i32::MAX);
+    draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
+    if let Some(score) = report.score {
+        let complete = report.is_final && report.done == report.total;
+        let (completion, penalty) = (report.route_completion, report.infraction_penalty);
+        draft.status.score = Some(Score::new(score, completion, penalty, complete));
+    }
+    // Until the present Pod's first round the report is its predecessor's, whose crashes are forgiven or counted already.
+    let is_present = draft.view.pod.as_ref().is_some_and(|p| p.uid == report.pod_uid);
+    let old = std::mem::take(&mut draft.status.pairs);
+    draft.status.pairs = report
+        .pairs
+        .iter()
+        .map(|pair| {
+            let known = old.iter().find(|p| p.id == clamp(pair.id));
+            let told = if is_present { clamp(pair.crashes) } else { 0 };
+            PairStatus {
+                id: clamp(pair.id),
+                done: clamp(pair.done),
+                total: clamp(pair.total),
+                crashes: told.max(known.map_or(0, |k| k.crashes)),
+                state: pair.state,
+                last: known.and_then(|k| k.last.clone()),
+            }
+        })
+        .collect();
+    note_scores(draft, report);
+}
+
+/// Says that scores do not follow from the infractions, and that they do again.
+fn note_scores(draft: &mut Draft<'_>, report: &ReportDigest) {
+    let (truth, reason, message) = match &report.warning {
+        Some(first) => {
+            let message = format!("Scores do not follow from the infractions: {}", sentence(first));
+            (Truth::False, reasons::UNEXPLAINED_SCORES, message)
+        }
+        None if conditions::get(&draft.status.conditions, conditions::PLAUSIBLE).is_none() => return,
+        None => (Truth::True, reasons::SCORES_EXPLAINED, String::new()),
+    };
+    draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
+}
+
+/// Limits of a run under way: disk, crashes, time.
+fn watch_run(draft: &mut Draft<'_>) {
+    let evicted = draft.view.pod.as_ref().and_then(failure::disk_full);
+    if let Some(found) = evicted.or_else(|| crashes::too_many(draft)) {
+        return draft.fail(found);
+    }
+    // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.
+    let Some(since) = run_since(draft).filter(|_| draft.leaderboard().is_some()) else {
+        return;
+    };
+    let limit = draft.deadlines().run_seconds;
+    if limit == 0 {
+        return;
+    }
+    let deadline = after(since, limit);
+    if draft.now() >= deadline {
+        draft.fail(failure::time_limit(limit));
+    } else {
+        draft.requeue_at(deadline);
+    }
+}
+
+/// When the clock of the run began: with its first agent. A Job that replaces one which the infrastructure took away has
+/// the whole time again, from its Pod's scheduling: waiting for a node costs the participant nothing.
+fn run_since(draft: &Draft<'_>) -> Option<jiff::Timestamp> {
+    let times = &draft.status.times;
+    let started = times.started.as_ref()?.0;
+    match &times.scheduled {
+        Some(scheduled) => Some(started.max(scheduled.0)),
+        None => (draft.status.retry == 0 && draft.status.recreated == 0).then_some(started),
+    }
+}
+
+/// What EvalAI hears of a live submission; it is sent once, however often it is requested.
+fn tell(draft: &mut Draft<'_>) {
+    if draft.spec().evalai.is_none() {
+        return;
+    }
+    if !draft.is_running() {
+        // Between two tries EvalAI keeps saying running.
+        if draft.status.times.started.is_none() {
+            draft.act(Action::UpdateEvalai(EvalaiUpdate::Queued));
+        }
+        return;
+    }
+    draft.act(Action::UpdateEvalai(EvalaiUpdate::Running));
+    let Some(report) = draft.view.report.ours() else { return };
+    let is_new = report.done > 0 && Some(report.done) != draft.view.partial_sent;
+    if is_new && reading::has_texts(draft, report) {
+        draft.act(Action::UpdateEvalai(EvalaiUpdate::Partial));
+    }
+}
+
+fn record(draft: &mut Draft<'_>) {
+    if draft.view.record.is_some() {
+        draft.act(Action::Record { end: false });
+    }
+}

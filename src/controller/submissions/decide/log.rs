@@ -1,0 +1,139 @@
+//! Which log explains a failure: the places where its tail may be had, the best first. Pure.
+//!
+//! Called by `stop`, while the Pod is still there, and by `after`. An agent's log is in S3, where logcopy stores it; the
+//! others are on the node alone, and only as long as their Pod lives.
+
+use std::time::Duration;
+
+use super::draft::Draft;
+use super::{Action, trouble};
+use crate::controller::submissions::view::{ObservedLog, PodView};
+use crate::pod::run::console;
+use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
+
+/// A place where a log may be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogPlace {
+    /// Whose log it is.
+    pub container: String,
+    pub at: LogAt,
+}
+
+/// Where a log is kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LogAt {
+    /// On the Pod's node; `previous`: of the container's last run, since it runs again.
+    Node { pod: String, previous: bool },
+    /// In S3, at this key below the run's prefix.
+    Bucket { key: String },
+}
+
+/// How long a log is waited for before its Pod goes, or EvalAI has the end without it.
+const LONGEST: Duration = Duration::from_secs(15);
+
+/// Requests the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away. Returns how
+/// long that end waits for it.
+pub(super) fn keep_while_there(draft: &mut Draft<'_>) -> Option<Duration> {
+    if draft.is_cancelled() {
+        return None;
+    }
+    let mut places = places(&draft.status, draft.view.pod.as_ref());
+    // What is in S3 is complete only when the Pod has ended; it is read then, and the best place first.
+    if !places.first().is_some_and(is_on_node) {
+        return None;
+    }
+    places.retain(is_on_node);
+    draft.act(Action::KeepLog { places });
+    left(draft.view.log, Some(LONGEST))
+}
+
+/// How long a log is still waited for; `at_first`: while nobody has been asked for it.
+fn left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
+    match log {
+        ObservedLog::NotRequested => at_first,
+        ObservedLog::Pending(waited) => LONGEST.checked_sub(waited).filter(|left| !left.is_zero()),
+        ObservedLog::Kept | ObservedLog::None | ObservedLog::GivenUp => None,
+    }
+}
+
+/// Requests the log of a run that has failed, until EvalAI's answer to the end is known: its hosts read it there. Returns how
+/// long EvalAI waits for it.
+pub(super) fn keep_at_end(draft: &mut Draft<'_>) -> Option<Duration> {
+    let before = draft.view.submission.status.as_ref();
+    let has_just_ended = !before.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
+    let published = before.and_then(|s| conditions::get(&s.conditions, conditions::PUBLISHED));
+    let is_told = published.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED);
+    let is_answered = draft.view.evalai.as_ref().is_some_and(|e| e.end.is_some());
+    let is_awaited = draft.spec().evalai.is_some() && !is_told && !is_answered;
+    if is_awaited || (has_just_ended && !is_answered) {
+        let places = places(&draft.status, draft.view.pod.as_ref());
+        if !places.is_empty() {
+            draft.act(Action::KeepLog { places });
+            // What is known is of the time before the end.
+            let log = if has_just_ended {
+                ObservedLog::NotRequested
+            } else {
+                draft.view.log
+            };
+            return left(log, Some(LONGEST));
+        }
+    }
+    left(draft.view.log, None).filter(|_| !has_just_ended)
+}
+
+fn is_on_node(place: &LogPlace) -> bool {
+    matches!(place.at, LogAt::Node { .. })
+}
+
+/// The places of the log that explains the failure of a status.
+fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
+    let Some(failure) = &status.failure else {
+        return Vec::new();
+    };
+    let pair = failure.pair.unwrap_or_else(|| unfinished(status));
+    let agent = || stored(&format!("agent-{pair}"), format!("agent/agent{pair}/leaderboard.log"));
+    let simulator = format!("simulator-{pair}");
+    let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
+    let found = match failure.reason.as_str() {
+        reasons::SIMULATION_CRASHED => vec![on_node(&simulator), Some(stored(&simulator, console(pair)))],
+        reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
+        reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
+            on_node(names::CONTAINER_LOGCOPY),
+            Some(stored(names::CONTAINER_LOGCOPY, crate::pod::ownlog::OWN_LOG.into())),
+        ],
+        // It never ran.
+        reasons::IMAGE_INVALID | reasons::IMAGE_PULL | reasons::CONTAINER_CONFIG => Vec::new(),
+        _ if failure.class == FailureClass::Participant => vec![Some(agent()), on_node(&format!("agent-{pair}"))],
+        _ => Vec::new(),
+    };
+    found.into_iter().flatten().collect()
+}
+
+/// The first pair that has not done all its routes: a failure of the whole run is most likely told by its log.
+fn unfinished(status: &SubmissionStatus) -> i32 {
+    let mut pairs = status.pairs.iter();
+    pairs.find(|pair| pair.done < pair.total).map_or(1, |pair| pair.id)
+}
+
+fn stored(container: &str, key: String) -> LogPlace {
+    LogPlace {
+        container: container.into(),
+        at: LogAt::Bucket { key },
+    }
+}
+
+/// None for a container that never ran: it has no log.
+fn on_node(pod: &PodView, container: &str) -> Option<LogPlace> {
+    let found = pod.containers.iter().find(|c| c.name == container)?;
+    if !found.running && found.last.is_none() {
+        return None;
+    }
+    let at = LogAt::Node {
+        pod: pod.name.clone(),
+        previous: found.running && found.last.is_some(),
+    };
+    Some(LogPlace {
+        container: container.into(),
+        at,
+    })
+}

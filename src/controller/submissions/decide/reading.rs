@@ -1,0 +1,176 @@
+//! What a decision needs of S3, and how long it waits for it. Pure.
+//!
+//! Reports and texts are read next to the reconciles; an answer wakes the object. An end is decided only on a report that was
+//! asked for after that end was seen: one that was asked for before may lack what was stored last.
+
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::Action;
+use super::draft::Draft;
+use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::view::{
+    ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
+};
+use leaderboard_api::conditions;
+
+/// How long an answer is waited for before the status shows that.
+const ANSWER: Duration = Duration::from_secs(15);
+/// After this time without the fence a lost Pod is given up all the same.
+pub(super) const FENCE: Duration = Duration::from_mins(1);
+/// How long an end waits to be published for a result that cannot be read: as long as the end itself.
+pub(super) const END_WAITS: SignedDuration = SignedDuration::from_hours(24);
+/// The same for texts that are of another round than the report: they hardly change.
+const UNFIT_WAITS: SignedDuration = SignedDuration::from_mins(10);
+/// What is left to publish an end in before the finalizer of a deleted object gives up.
+const BEFORE_RELEASE: SignedDuration = SignedDuration::from_mins(2);
+
+/// What is known of a result that is to be published.
+pub(super) enum Reading {
+    /// As much as there ever will be.
+    Done,
+    /// It is being read, or cannot be read and why.
+    Waits(Option<String>),
+}
+
+/// Which report the present state of the run needs.
+pub(super) fn demand(draft: &Draft<'_>) -> Option<ReportDemand> {
+    let status = &draft.status;
+    status.plan.as_ref()?;
+    let stage = if draft.is_finished() {
+        draft.needs_report.then(|| stage_after_end(draft))?
+    } else {
+        stage_of_live(draft)?
+    };
+    Some(ReportDemand {
+        attempt: status.attempt.unwrap_or(1),
+        retry: status.retry,
+        pod: draft.view.pod.as_ref().map(|pod| pod.uid.clone()),
+        stage,
+        period: draft.period(),
+    })
+}
+
+/// An end that was decided on a complete run waits for its Job no more.
+fn stage_after_end(draft: &Draft<'_>) -> Stage {
+    let is_live = draft.view.job.ours().is_some_and(|job| job.end.is_none());
+    let has_ended = draft.view.pod.as_ref().is_some_and(|pod| pod.run_ended.is_some());
+    if is_live && has_ended && draft.is_successful() {
+        Stage::RunEnded
+    } else {
+        Stage::JobEnded
+    }
+}
+
+fn stage_of_live(draft: &Draft<'_>) -> Option<Stage> {
+    draft.status.job_name.as_ref()?;
+    match &draft.view.job {
+        ObservedJob::Ours(job) if job.end.is_some() => Some(Stage::JobEnded),
+        ObservedJob::Ours(_) if draft.view.pod.as_ref().is_some_and(|pod| pod.run_ended.is_some()) => {
+            Some(Stage::RunEnded)
+        }
+        ObservedJob::Ours(_) => draft.status.times.scheduled.as_ref().map(|_| Stage::Live),
+        // One that was asked for just now is not there either.
+        ObservedJob::Absent | ObservedJob::Foreign => {
+            (draft.is_to_stop() || super::live::was_seen(draft)).then_some(Stage::JobEnded)
+        }
+    }
+}
+
+/// Whether the report that is known was asked for at this stage of the run, or later.
+pub(super) fn is_of(draft: &Draft<'_>, stage: Stage) -> bool {
+    draft.view.report_stage >= Some(stage)
+}
+
+/// How long is still waited for an answer before anything is shown.
+pub(super) fn answer_left(draft: &Draft<'_>) -> Option<Duration> {
+    ANSWER
+        .checked_sub(draft.view.report_waited)
+        .filter(|left| !left.is_zero())
+}
+
+/// How long a lost Pod still waits for the fence.
+pub(super) fn fence_left(draft: &Draft<'_>) -> Option<Duration> {
+    let waited = match draft.view.fence {
+        // Without a plan nobody knows where it would be.
+        _ if draft.status.plan.is_none() => return None,
+        ObservedFence::Held => return None,
+        ObservedFence::NotRequested => Duration::ZERO,
+        ObservedFence::Pending(waited) | ObservedFence::Failed(waited) => waited,
+    };
+    FENCE.checked_sub(waited).filter(|left| !left.is_zero())
+}
+
+/// The same for what follows the Pod: only a fence that was requested is waited for.
+pub(super) fn requested_fence_left(draft: &Draft<'_>) -> Option<Duration> {
+    fence_left(draft).filter(|_| draft.view.fence != ObservedFence::NotRequested)
+}
+
+/// Whether the report of an ended run is there. Asks for it.
+pub(super) fn report_of_end(draft: &mut Draft<'_>) -> Reading {
+    // What never had a Job has stored nothing.
+    let had_job = draft.status.job_name.is_some() || draft.status.retry > 0;
+    if draft.status.plan.is_none() || !had_job {
+        return Reading::Done;
+    }
+    draft.needs_report = true;
+    let view = draft.view;
+    let is_read = is_of(draft, stage_after_end(draft)) && view.report != ObservedReport::NotRead;
+    match &view.report {
+        _ if !is_read && (draft.is_successful() || may_wait(draft, END_WAITS)) => Reading::Waits(None),
+        // What is Finished is nothing without its result.
+        ObservedReport::Unreadable(why) if draft.is_successful() || may_wait(draft, END_WAITS) => {
+            Reading::Waits(Some(why.clone()))
+        }
+        _ => Reading::Done,
+    }
+}
+
+/// Whether all that an end is published with is there. Asks for it.
+pub(super) fn result_of_end(draft: &mut Draft<'_>) -> Reading {
+    let reading = report_of_end(draft);
+    let view = draft.view;
+    let (Reading::Done, Some(report)) = (&reading, view.report.ours()) else {
+        return reading;
+    };
+    let (why, waits) = match &view.texts {
+        ObservedTexts::Read(texts) if texts.of == report.id => match &texts.problem {
+            None => return Reading::Done,
+            Some(TextProblem::Unread(why)) => (Some(why.clone()), may_wait(draft, END_WAITS)),
+            Some(TextProblem::Unfit(why)) => (Some(why.clone()), may_wait(draft, UNFIT_WAITS)),
+        },
+        ObservedTexts::Unread(why) => (Some(why.clone()), draft.is_successful() || may_wait(draft, END_WAITS)),
+        ObservedTexts::NotRead | ObservedTexts::Read(_) => (None, draft.is_successful() || may_wait(draft, END_WAITS)),
+    };
+    if !waits {
+        return Reading::Done;
+    }
+    draft.act(Action::ReadTexts { of: report.id });
+    Reading::Waits(why)
+}
+
+/// Whether the texts of a live report are there. Asks for them once: what is missing is left out, the next route has a result of
+/// its own.
+pub(super) fn has_texts(draft: &mut Draft<'_>, report: &ReportDigest) -> bool {
+    match &draft.view.texts {
+        ObservedTexts::Read(texts) if texts.of == report.id => texts.problem.is_none(),
+        _ => {
+            draft.act(Action::ReadTexts { of: report.id });
+            false
+        }
+    }
+}
+
+/// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
+fn may_wait(draft: &Draft<'_>, longest: SignedDuration) -> bool {
+    let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
+    let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
+    let patience = until(end.map_or(draft.now(), |c| c.last_transition_time.0), longest);
+    let Some(deleted) = &draft.submission().metadata.deletion_timestamp else {
+        return draft.now() < patience;
+    };
+    let seconds = draft.leaderboard().map_or(0, |l| l.deadlines.finalize_seconds);
+    let release = until(deleted.0, SignedDuration::from_secs(seconds) - BEFORE_RELEASE);
+    draft.now() < patience.min(release)
+}

@@ -1,0 +1,242 @@
+//! From the Job's creation to its running agents: what its Pod waits for, and when that has taken too long.
+//!
+//! Also of a Pod that replaces a lost one: then the submission keeps its state, with the reason `Replacing`.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::draft::{Draft, after};
+use super::failure::{self, infrastructure, participant};
+use super::next_steps::for_both;
+use super::trouble::{self, Trouble};
+use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Failure, State, names, reasons};
+
+/// The message for a Pod that starts as it should.
+pub(super) const PREPARED: &str = "The Pod is being prepared.";
+const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
+/// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then. Less than the minute
+/// in which people want to see a cause.
+const SILENCE: i64 = 45;
+/// The minutes of silence that are reported: a count of every one would be a write each.
+const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
+/// How long a new Pod may find no node before that is shown: the Pod whose slot it got may still be leaving.
+const SETTLE_SECONDS: i64 = 5;
+/// How long a Job may take to make its Pod before that is shown.
+const POD_SECONDS: i64 = 45;
+
+/// Reports how far a Job's Pod is, and fails the attempt when a start has taken too long.
+pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
+    let view = draft.view;
+    let Some(pod) = &view.pod else {
+        return without_pod(draft, job);
+    };
+    if pod.delete_by.is_some() || pod.ended_by_node.is_some() {
+        draft.moves();
+        return replacing(draft, LOST);
+    }
+    if let Some(message) = left_by_node(draft, pod) {
+        draft.moves();
+        return replacing(draft, &message);
+    }
+    if let Some(words) = &pod.unschedulable {
+        return unschedulable(draft, job, words);
+    }
+    let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
+    // Until the scheduler has spoken there is no node that could be late.
+    let deadline = pod.scheduled.map(|at| after(at, draft.deadlines().start_seconds));
+    let is_over = deadline.is_some_and(|deadline| draft.now() >= deadline);
+    let has_started = pod.agent_started.is_some();
+    match trouble::of_pod(pod) {
+        Some(found) if found.is_hopeless || (is_over && found.is_start) => {
+            draft.fail(too_late(&found, draft.deadlines().start_seconds));
+        }
+        Some(found) => {
+            show_trouble(draft, &found, has_started);
+            if let Some(deadline) = deadline.filter(|_| found.is_start) {
+                draft.requeue_at(deadline);
+            }
+        }
+        None if has_started => show_running(draft),
+        None if is_over => draft.fail(start_deadline(pod, draft.deadlines().start_seconds)),
+        None => {
+            show_preparing(draft, pod, since);
+            if let Some(deadline) = deadline {
+                draft.requeue_at(deadline);
+            }
+        }
+    }
+}
+
+/// The message for a run whose node is away, before Kubernetes has given its Pod up.
+fn left_by_node(draft: &Draft<'_>, pod: &PodView) -> Option<String> {
+    let node = pod.node.as_deref().filter(|_| draft.is_running())?;
+    match draft.view.node {
+        ObservedNode::Gone => Some(format!(
+            "Node {node} is gone, and the Pod with it. A new Pod will resume from the results in S3."
+        )),
+        ObservedNode::Silent { since } => Some(format!(
+            "Node {node} has been silent since {since:.0}. If that lasts, the Pod is given up, and a new Pod will resume from the results in S3."
+        )),
+        ObservedNode::Reports | ObservedNode::Unknown => None,
+    }
+}
+
+/// Shows a live submission whose agents are gone and come back.
+pub(super) fn replacing(draft: &mut Draft<'_>, message: &str) {
+    draft.condition(conditions::RUNNING, Truth::False, reasons::REPLACING, "");
+    draft.say(draft.live_state(), reasons::REPLACING, message);
+}
+
+fn show_running(draft: &mut Draft<'_>) {
+    let is_resumed = draft.status.plan.as_ref().is_some_and(|p| p.resume) || draft.status.attempt > Some(1);
+    let (state, reason) = if is_resumed {
+        (State::Resumed, reasons::RESUMED)
+    } else {
+        (State::Running, reasons::RUNNING)
+    };
+    let progress = draft.status.progress.as_ref();
+    let message = progress.map(|p| format!("{} routes done.", p.text)).unwrap_or_default();
+    draft.moves();
+    draft.condition(conditions::RUNNING, Truth::True, reason, "");
+    // A changed count is progress, not a transition: `say` sends events only when state or reason changed.
+    draft.say(state, reason, message);
+}
+
+fn show_trouble(draft: &mut Draft<'_>, found: &Trouble, has_started: bool) {
+    draft.condition(conditions::STALLED, Truth::True, found.reason, &found.message);
+    if draft.is_running() && !has_started {
+        replacing(
+            draft,
+            &format!("The Pod was lost, and the new one waits. {}", found.message),
+        );
+    } else {
+        draft.say(draft.live_state(), found.reason, found.message.clone());
+    }
+}
+
+fn show_preparing(draft: &mut Draft<'_>, pod: &PodView, since: Timestamp) {
+    draft.moves();
+    let silent = draft.now().duration_since(since).as_secs();
+    let message = if silent < SILENCE {
+        draft.requeue_at(after(since, SILENCE));
+        PREPARED.to_owned()
+    } else {
+        let told = REPORTED_MINUTES.iter().rev().find(|m| silent >= **m * 60);
+        let long = told.map_or_else(String::new, |m| format!(", for over {m} min"));
+        let node = pod.node.as_deref().map(|n| format!(" on {n}")).unwrap_or_default();
+        format!("The Pod is being prepared{node}: {}{long}.", stage(pod))
+    };
+    if draft.is_running() {
+        replacing(draft, &format!("The Pod was lost. {message}"));
+    } else {
+        draft.say(State::Pending, reasons::PREPARING, message);
+    }
+}
+
+fn stage(pod: &PodView) -> &'static str {
+    let ended = |name: &str| {
+        let end = pod
+            .containers
+            .iter()
+            .find(|c| c.name == name)
+            .and_then(|c| c.last.as_ref());
+        end.is_some_and(|l| l.exit_code == 0)
+    };
+    if pod.logcopy_running {
+        "images are pulled, simulators and agents start"
+    } else if ended(names::CONTAINER_WORKSPACE) {
+        "logcopy starts"
+    } else if ended(names::CONTAINER_CONTENTS) {
+        "the workspace is filled"
+    } else {
+        "images are pulled and contents copied"
+    }
+}
+
+fn without_pod(draft: &mut Draft<'_>, job: &JobView) {
+    let had_pod = draft.status.times.scheduled.is_some();
+    if let Some(words) = &job.failed_create {
+        let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
+        let (reason, what) = if is_quota {
+            (reasons::QUOTA_EXCEEDED, "The namespace's quota does not allow the Pod")
+        } else {
+            (reasons::POD_REFUSED, "The API server refuses the Pod")
+        };
+        let message = sentence(&format!("{what}: {words}"));
+        wait_for_node(draft, job, reason, &message);
+    } else if had_pod {
+        replacing(draft, LOST);
+    } else if job.created.is_some_and(|at| draft.now() >= after(at, POD_SECONDS)) {
+        let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
+                       cluster's controller manager runs.";
+        draft.condition(conditions::STALLED, Truth::True, reasons::PREPARING, message);
+        draft.say(State::Pending, reasons::PREPARING, message);
+    }
+    draft.requeue_in(Duration::from_secs(15));
+}
+
+fn unschedulable(draft: &mut Draft<'_>, job: &JobView, words: &str) {
+    let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
+    if let Some(settled) = settled.filter(|at| draft.now() < *at) {
+        return draft.requeue_at(settled);
+    }
+    wait_for_node(draft, job, reasons::UNSCHEDULABLE, &sentence(words));
+}
+
+/// No node has the Pod: waits as long as `scheduleSeconds` says, and says why.
+fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &str) {
+    let had_pod = draft.status.times.scheduled.is_some();
+    let since = if had_pod {
+        draft.stalled_since(reason)
+    } else {
+        job.created
+    };
+    let limit = draft.deadlines().schedule_seconds;
+    if limit > 0 {
+        let deadline = after(since.unwrap_or(draft.now()), limit);
+        if draft.now() >= deadline {
+            let what = format!("No node accepted the Pod within {limit} s: {message}");
+            return draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
+        }
+        draft.requeue_at(deadline);
+    }
+    draft.condition(conditions::STALLED, Truth::True, reason, message);
+    if draft.is_running() {
+        replacing(draft, &format!("The Pod was lost, and the new one waits. {message}"));
+    } else {
+        draft.say(State::Pending, reason, message);
+    }
+}
+
+fn too_late(found: &Trouble, seconds: i64) -> Failure {
+    match found.reason {
+        reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => return infrastructure(found.reason, &found.message),
+        reasons::IMAGE_INVALID => return failure::image_invalid(&found.message),
+        _ => {}
+    }
+    let reason = if found.reason == reasons::PREPARING {
+        reasons::START_DEADLINE
+    } else {
+        found.reason
+    };
+    let what = format!("{} It was tried for {seconds} s.", found.message);
+    if found.is_participants {
+        let next = for_both("Push the image again and check that it runs on linux/amd64.");
+        participant(reason, &what, &next)
+    } else {
+        infrastructure(reason, &what)
+    }
+}
+
+fn start_deadline(pod: &PodView, seconds: i64) -> Failure {
+    let node = pod.node.as_deref().unwrap_or("the node");
+    let what = format!(
+        "The Pod did not start within {seconds} s, and {node} reports no reason: {}.",
+        stage(pod)
+    );
+    failure::infrastructure(reasons::START_DEADLINE, &what)
+}

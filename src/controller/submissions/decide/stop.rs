@@ -1,0 +1,189 @@
+//! The way to an end that is not the run's own: stops, deleted Jobs, lost Pods. Every path ends in bounded time.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::draft::{Draft, after};
+use super::{Action, failure, log, reading, start};
+use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
+use crate::pod::run::Stop;
+use leaderboard_api::reasons;
+
+/// Added to `cancelSeconds` before a Pod that was told to stop is deleted.
+const STOP_MARGIN_SECONDS: i64 = 15;
+/// Grace of a Pod that is deleted because it did not stop by itself.
+pub(super) const DELETE_GRACE_SECONDS: i64 = 60;
+/// How long a Pod may be past its grace before its node is given up, where nobody knows about the node.
+const LOST_MARGIN_SECONDS: i64 = 30;
+/// The same while the kubelet reports: it may still be cleaning up.
+const STUCK_MARGIN_SECONDS: i64 = 120;
+/// How long a node must have been silent, or gone, and its Pod been deleted, before the Pod is given up. The node controller
+/// itself has waited some 40 s for a word, and 60 s more before it deletes the Pod.
+const SILENT_SECONDS: i64 = 30;
+/// How soon a deletion is looked at again.
+const SOON: Duration = Duration::from_secs(2);
+
+/// Brings a Job to its end: first by word, then by deletion, then by force.
+pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
+    let since = stopping_since(draft);
+    show(draft);
+    let log_left = log::keep_while_there(draft);
+    let view = draft.view;
+    // Without agents there is nothing to store; with them, a logcopy that is being restarted may still do so.
+    let listening = view
+        .pod
+        .as_ref()
+        .filter(|p| p.logcopy_running || p.agent_started.is_some());
+    let Some(pod) = listening else {
+        return end_job(draft, job, DELETE_GRACE_SECONDS, log_left);
+    };
+    let delete_at = after(since, draft.deadlines().cancel_seconds + STOP_MARGIN_SECONDS);
+    let force_at = after(delete_at, DELETE_GRACE_SECONDS + STOP_MARGIN_SECONDS);
+    if draft.now() >= force_at {
+        if log_left.is_none() && force(draft, pod) {
+            end_job(draft, job, 0, None);
+        }
+        draft.requeue_in(SOON);
+    } else if draft.now() >= delete_at {
+        end_job(draft, job, DELETE_GRACE_SECONDS, log_left);
+        draft.requeue_at(force_at);
+    } else {
+        annotate(draft, pod);
+        draft.requeue_at(delete_at);
+    }
+}
+
+/// Deletes a Job, once the log that goes with its Pod is kept or was waited for long enough.
+fn end_job(draft: &mut Draft<'_>, job: &JobView, grace_seconds: i64, log_left: Option<Duration>) {
+    if let Some(left) = log_left {
+        return draft.requeue_in(left);
+    }
+    draft.act(delete(job, grace_seconds));
+    draft.requeue_in(SOON);
+}
+
+/// When the stop began. A clock that was set back must not put its end off, so the stop begins anew then.
+fn stopping_since(draft: &mut Draft<'_>) -> Timestamp {
+    let now = draft.now();
+    let since = draft.status.times.stopping.as_ref().map_or(now, |t| t.0.min(now));
+    draft.status.times.stopping = Some(Time(since));
+    since
+}
+
+fn show(draft: &mut Draft<'_>) {
+    let failure = draft.status.failure.as_ref().filter(|_| !draft.is_cancelled());
+    let message = match failure {
+        Some(failure) if failure.reason == reasons::NODE_LOST => {
+            let what = failure.message.clone();
+            return start::replacing(draft, &what);
+        }
+        Some(failure) => format!(
+            "{} The run is being stopped; completed routes are kept.",
+            failure.message
+        ),
+        None => "Stopping as requested; completed routes are kept.".to_owned(),
+    };
+    draft.say(draft.live_state(), reasons::STOPPING, message);
+}
+
+fn annotate(draft: &mut Draft<'_>, pod: &PodView) {
+    if pod.stop.is_some() {
+        return;
+    }
+    let stop = if draft.is_cancelled() {
+        Stop::Cancel
+    } else {
+        failure::stop_of(draft.status.failure.as_ref())
+    };
+    draft.act(Action::AnnotateStop {
+        pod: pod.name.clone(),
+        stop,
+    });
+}
+
+/// Deletes a Job with its Pods.
+pub(super) fn delete(job: &JobView, grace_seconds: i64) -> Action {
+    Action::DeleteJob {
+        name: job.name.clone(),
+        uid: job.uid.clone(),
+        grace_seconds,
+    }
+}
+
+/// Removes a Pod that we can't reach. The fence goes first: what it still writes counts for nobody. Returns whether it did.
+fn force(draft: &mut Draft<'_>, pod: &PodView) -> bool {
+    draft.act(Action::TakeOwnership);
+    if let Some(left) = reading::fence_left(draft) {
+        draft.requeue_in(left);
+        return false;
+    }
+    draft.act(Action::ForceDeletePod {
+        name: pod.name.clone(),
+        uid: pod.uid.clone(),
+    });
+    true
+}
+
+/// We, or somebody else, deleted the Job; it goes with its Pod.
+pub(super) fn being_deleted(draft: &mut Draft<'_>) {
+    if draft.is_to_stop() {
+        stopping_since(draft);
+        show(draft);
+    } else {
+        start::replacing(draft, "The Job is being deleted by somebody else; it is created again.");
+    }
+    remove_overdue_pod(draft);
+    draft.requeue_in(Duration::from_secs(5));
+}
+
+/// Removes by force a Pod that outstays its grace.
+pub(super) fn remove_overdue_pod(draft: &mut Draft<'_>) {
+    let view = draft.view;
+    let overdue = |pod: &&PodView| {
+        pod.delete_by
+            .is_some_and(|by| view.now >= after(by, STOP_MARGIN_SECONDS))
+    };
+    if let Some(pod) = view.pod.as_ref().filter(overdue) {
+        force(draft, pod);
+    }
+}
+
+/// A Pod that goes away although nobody told it to stop, on a node that is gone: the Job would wait for the node.
+pub(super) fn lost_pod<'a>(draft: &mut Draft<'a>) -> Option<&'a PodView> {
+    let is_given_up = |f: &leaderboard_api::Failure| f.reason == reasons::NODE_LOST;
+    let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));
+    let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
+    let at = given_up_at(draft.view.node, pod)?;
+    if draft.now() >= at {
+        return Some(pod);
+    }
+    draft.requeue_at(at);
+    None
+}
+
+/// When a Pod that is being deleted is given up. While the kubelet reports it has the whole grace, and then some.
+fn given_up_at(node: ObservedNode, pod: &PodView) -> Option<Timestamp> {
+    let by = pod.delete_by?;
+    let deleted = pod.deleted.unwrap_or(by);
+    let at = match node {
+        ObservedNode::Unknown => after(by, LOST_MARGIN_SECONDS),
+        ObservedNode::Reports => after(by, STUCK_MARGIN_SECONDS),
+        ObservedNode::Silent { since } => after(deleted.max(since), SILENT_SECONDS),
+        ObservedNode::Gone => after(deleted, SILENT_SECONDS),
+    };
+    // A grace that is shorter than the silence is over all the same.
+    Some(at.min(after(by, STUCK_MARGIN_SECONDS)))
+}
+
+/// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
+pub(super) fn leave_lost_pod(draft: &mut Draft<'_>, job: &JobView, pod: &PodView) {
+    let found = failure::node_lost(pod.node.as_deref(), draft.view.node);
+    start::replacing(draft, &found.message);
+    draft.fail(found);
+    if force(draft, pod) {
+        draft.act(delete(job, 0));
+        draft.requeue_in(SOON);
+    }
+}

@@ -1,0 +1,445 @@
+//! After the end: EvalAI, the table, the Job's time to live.
+
+use jiff::SignedDuration;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::builders::*;
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan};
+use crate::controller::submissions::view::{EvalaiEnd, EvalaiInfo, ObservedReport, Standing};
+use leaderboard_api::State::{Cancelled, Failed, Finished};
+use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
+use leaderboard_api::{Rerun, reasons};
+
+fn finished() -> World {
+    let mut world = World::evalai().running();
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    world
+}
+
+fn failed() -> World {
+    let mut world = World::evalai().running();
+    world.see(ended("agent-1", 3, "exited", 1, 100));
+    world.pass();
+    world.complete();
+    world.pass_to(Failed, reasons::AGENT_CRASHED);
+    world
+}
+
+#[test]
+fn evalai_first_then_the_table_then_rest() {
+    for (mut world, state, wish) in [
+        (finished(), Finished, EvalaiUpdate::Finished),
+        (failed(), Failed, EvalaiUpdate::Failed),
+    ] {
+        world.job().has_ttl = true;
+        let mut plan = world.pass();
+        plan.actions.retain(|a| !matches!(a, Action::KeepLog { .. }));
+        assert_eq!(plan.actions, [Action::UpdateEvalai(wish)]);
+        assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::WAITING.into()));
+        world.published();
+        let plan = world.pass();
+        assert_eq!(condition(&plan, PUBLISHED).0, "True");
+        assert_eq!(events(&plan), ["Published"]);
+        assert_eq!(plan.actions, [Action::Record { end: true }]);
+        world.recorded();
+        let plan = world.pass();
+        assert_eq!(condition(&plan, RECORDED).0, "True");
+        assert_eq!(
+            (plan.actions.as_slice(), plan.requeue),
+            ([Action::Forget].as_slice(), None)
+        );
+        // The services have forgotten; the conditions remember.
+        world.view.evalai = None;
+        world.view.record = Some(crate::controller::submissions::view::RecordView::default());
+        let plan = world.pass();
+        assert_eq!(
+            (plan.status.state, plan.actions.as_slice()),
+            (Some(state), [Action::Forget].as_slice())
+        );
+    }
+}
+
+#[test]
+fn an_end_whose_result_cannot_be_read_says_why_it_waits() {
+    let mut world = finished();
+    world.view.report = ObservedReport::Unreadable("the bucket results did not answer in time".into());
+    let told = |plan: &Plan, type_: &str| {
+        let condition = conditions::get(&plan.status.conditions, type_).unwrap();
+        (condition.reason.clone(), condition.message.clone())
+    };
+    let waits = (
+        reasons::WAITING.to_owned(),
+        "The stored result cannot be read: the bucket results did not answer in time. It is published when it can; look at the bucket."
+            .to_owned(),
+    );
+    assert_eq!(told(&world.pass(), PUBLISHED), waits);
+    world.view.report = ObservedReport::Unreadable("request 2 timed out".into());
+    assert_eq!(
+        told(&world.pass(), PUBLISHED),
+        waits,
+        "another text is not another write"
+    );
+    world.view.report = ObservedReport::Unreadable("the bucket results did not answer in time".into());
+    world.published();
+    assert_eq!(told(&world.pass(), RECORDED), waits);
+    world.report(final_report());
+    assert_eq!(
+        told(&world.pass(), RECORDED),
+        (reasons::WAITING.to_owned(), String::new())
+    );
+}
+
+#[test]
+fn a_cancel_that_our_own_write_may_have_undone_is_told_again() {
+    let mut world = World::evalai().running();
+    (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
+    world.pass();
+    world.job_gone();
+    world.view.report = ObservedReport::Absent;
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Cancelled]);
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::CONCURRENT_UPDATE.into())
+    );
+    // Also by a controller that has seen nothing of it.
+    world.in_evalai().overtaken = false;
+    assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Cancelled]);
+    world.published();
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert_eq!(
+        (evalai_updates(&plan), condition(&plan, PUBLISHED).0),
+        (vec![], "True".into())
+    );
+}
+
+#[test]
+fn evalais_end_wins_until_ours_is_answered_and_not_after() {
+    for mut world in [finished(), failed()] {
+        world.in_evalai().end = Some(EvalaiEnd::Ended {
+            status: "cancelled".into(),
+        });
+        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        assert_eq!(
+            condition(&plan, PUBLISHED),
+            ("False".into(), reasons::NOT_REQUIRED.into())
+        );
+        assert_eq!(evalai_updates(&plan), []);
+        world.recorded();
+        world.pass();
+        world.view.evalai = None;
+        assert_eq!(
+            evalai_updates(&world.pass()),
+            [],
+            "also when EvalAI's word is forgotten"
+        );
+    }
+    let mut world = finished();
+    world.published();
+    world.pass();
+    world.in_evalai().end = Some(EvalaiEnd::Ended {
+        status: "cancelled".into(),
+    });
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn a_cancelled_one_that_evalai_ended_too_is_told_once() {
+    let mut world = World::evalai();
+    world.submission().spec.cancel = true;
+    assert_eq!(
+        evalai_updates(&world.pass_to(Cancelled, reasons::CANCELLED)),
+        [EvalaiUpdate::Cancelled]
+    );
+    world.in_evalai().end = Some(EvalaiEnd::Ended {
+        status: "cancelled".into(),
+    });
+    world.pass();
+    world.recorded();
+    world.pass();
+    world.view.evalai = None;
+    assert_eq!(evalai_updates(&world.pass_to(Cancelled, reasons::CANCELLED)), []);
+}
+
+#[test]
+fn a_refused_result_is_said_once_and_does_not_hold_up_the_row() {
+    let mut world = finished();
+    world.in_evalai().end = Some(EvalaiEnd::Refused {
+        message: "metric x is unknown".into(),
+    });
+    let plan = world.pass();
+    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::REFUSED.into()));
+    assert_eq!(events(&plan), [reasons::REFUSED]);
+    assert!(has(&plan, |a| *a == Action::Record { end: true }));
+    assert!(world.pass().events.is_empty());
+    world.recorded();
+    let plan = world.pass();
+    assert!(plan.requeue.is_some() && !has(&plan, |a| *a == Action::Forget));
+}
+
+#[test]
+fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
+    let mut world = finished();
+    world.in_evalai().end = Some(EvalaiEnd::Refused {
+        message: "it belongs to another phase".into(),
+    });
+    world.pass();
+    world.recorded();
+    world.pass();
+    world.in_evalai().end = Some(EvalaiEnd::Ended {
+        status: "cancelled".into(),
+    });
+    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    assert!(
+        has(&plan, |a| *a == Action::Record { end: true }),
+        "the row said FINISHED"
+    );
+    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
+    assert!(!has(&plan, |a| *a == Action::Forget));
+    // The row that was handed in is not the written one.
+    world.view.record.as_mut().unwrap().end_written = false;
+    assert!(has(&world.pass(), |a| *a == Action::Record { end: true }));
+    world.recorded();
+    let plan = world.pass();
+    assert_eq!(condition(&plan, RECORDED).0, "True");
+    assert!(has(&plan, |a| *a == Action::Forget));
+}
+
+#[test]
+fn an_outage_is_shown_and_waited_for() {
+    let mut world = finished();
+    world.in_evalai().error = Some("502 Bad Gateway".into());
+    let plan = world.pass();
+    assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Finished]);
+    let shown = leaderboard_api::conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert_eq!(shown.message, "The last request failed: 502 Bad Gateway.");
+
+    world.published();
+    world.view.record.as_mut().unwrap().error = Some("AccessDenied".into());
+    let plan = world.pass();
+    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::REFUSED.into()));
+    assert_eq!(plan.status.state, Some(Finished));
+    world.recorded();
+    assert_eq!(condition(&world.pass(), RECORDED).0, "True");
+}
+
+#[test]
+fn what_is_not_wanted_is_not_waited_for() {
+    let mut world = World::local().running();
+    world.view.record = None;
+    world.complete();
+    world.report(final_report());
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
+    assert_eq!(condition(&plan, RECORDED).1, reasons::NOT_REQUIRED);
+    assert_eq!(plan.requeue, None);
+
+    let mut world = World::local();
+    world.submission().spec.team = None;
+    let mut world = world.running();
+    world.complete();
+    world.report(final_report());
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let shown = leaderboard_api::conditions::get(&plan.status.conditions, RECORDED).unwrap();
+    assert!(shown.message.contains("spec.team.id"));
+}
+
+#[test]
+fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
+    let mut world = finished();
+    world.view.leaderboard = None;
+    world.view.evalai = None;
+    world.view.record = None;
+    let plan = world.pass();
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::LEADERBOARD_NOT_FOUND.into())
+    );
+    assert!(plan.requeue.is_some() && evalai_updates(&plan).is_empty());
+
+    // What never ran under it needs nothing from it.
+    let mut world = World::evalai();
+    world.view.leaderboard = None;
+    world.pass();
+    world.delete();
+    assert!(has(&world.pass_to(Cancelled, reasons::DELETED), |a| *a
+        == Action::ReleaseFinalizer));
+}
+
+/// What EvalAI says of a row, as it was just read.
+fn says(world: &mut World, status: &str) {
+    world.in_evalai().info = Some(EvalaiInfo {
+        standing: Standing::Ended,
+        status: status.into(),
+        ..info()
+    });
+}
+
+#[test]
+fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
+    for (mut world, state) in [(finished(), Finished), (failed(), Failed)] {
+        world.job().has_ttl = true;
+        world.published();
+        world.recorded();
+        world.pass();
+        let before = world.pass().status;
+        world.view.evalai = None;
+        let rerun = Rerun {
+            submission_name: "submission-99".into(),
+            time: Some(Time(at(500))),
+        };
+        world.view.rerun_as = Some(rerun.clone());
+        let plan = world.pass();
+        assert_eq!(plan.actions, [Action::AskEvalai], "the row of a re-run is no proof");
+        assert!(plan.requeue.is_some() && plan.status.rerun_as.is_none());
+
+        says(&mut world, "finished");
+        let plan = world.pass();
+        assert_eq!((plan.actions, plan.status.rerun_as), (vec![Action::Forget], None));
+
+        says(&mut world, "cancelled");
+        let plan = world.pass();
+        let text = "A host re-ran this submission in EvalAI as submission-99; EvalAI cancelled this one's result. Its state and score stay, in the table too.";
+        assert_eq!(plan.status.rerun_as, Some(rerun));
+        assert_eq!(
+            (plan.status.state, plan.status.score.clone(), plan.status.reason.clone()),
+            (Some(state), before.score, before.reason)
+        );
+        assert_eq!(plan.status.message, Some(format!("{} {text}", before.message.unwrap())));
+        let published = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+        assert_eq!((published.status.as_str(), published.message.as_str()), ("True", text));
+        assert_eq!(events(&plan), [reasons::RERUN_IN_EVALAI]);
+        assert_eq!(plan.actions, [Action::Record { end: true }], "the row names it too");
+        assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
+
+        world.view.record.as_mut().unwrap().end_written = false;
+        let waits = world.pass();
+        assert_eq!(waits.actions, [Action::Record { end: true }], "until it is written");
+        world.recorded();
+        world.view.evalai = None;
+        let again = world.pass();
+        assert_eq!(
+            (again.actions.as_slice(), again.events.len()),
+            ([Action::Forget].as_slice(), 0)
+        );
+        assert_eq!(condition(&again, RECORDED).0, "True");
+        assert_eq!(again.status.message, plan.status.message, "it is said once");
+    }
+}
+
+#[test]
+fn a_row_that_was_read_before_the_rerun_is_asked_for_anew() {
+    let mut world = finished();
+    world.job().has_ttl = true;
+    world.published();
+    world.recorded();
+    world.pass();
+    world.view.rerun_as = Some(Rerun {
+        submission_name: "submission-99".into(),
+        time: Some(Time(at(500))),
+    });
+    says(&mut world, "finished");
+    world.in_evalai().read_at = Some(at(490));
+    world.go_to(501);
+    let plan = world.pass();
+    assert_eq!(plan.actions, [Action::ForgetEvalai]);
+    assert!(plan.requeue.is_some(), "nobody else looks again");
+
+    let mut unproven = world.clone();
+    world.view.evalai = None;
+    assert_eq!(world.pass().actions, [Action::AskEvalai]);
+    says(&mut world, "cancelled");
+    world.in_evalai().read_at = Some(at(532));
+    assert!(world.pass().status.rerun_as.is_some());
+
+    // The row of the re-run was edited: EvalAI still says finished after it.
+    unproven.go_to(600);
+    unproven.in_evalai().read_at = Some(at(590));
+    let plan = unproven.pass();
+    assert_eq!((plan.actions, plan.requeue), (vec![Action::Forget], None));
+    // A time to come would be asked about until then.
+    unproven.view.rerun_as.as_mut().unwrap().time = Some(Time(at(90_000)));
+    assert_eq!(unproven.pass().requeue, None);
+}
+
+#[test]
+fn a_submission_remembers_which_one_it_reruns() {
+    let mut world = World::evalai();
+    let of = Rerun {
+        submission_name: "submission-7".into(),
+        time: None,
+    };
+    let known = world.in_evalai().info.as_mut().unwrap();
+    known.rerun_of = Some(of.clone());
+    assert_eq!(world.pass().status.rerun_of, Some(of.clone()));
+    world.in_evalai().info.as_mut().unwrap().rerun_of = None;
+    assert_eq!(world.pass().status.rerun_of, Some(of));
+}
+
+#[test]
+fn an_end_says_until_when_it_waits_for_the_controller_before() {
+    let mut world = finished();
+    world.view.evalai_writes_from = world.view.now.checked_add(SignedDuration::from_secs(20)).ok();
+    let plan = world.pass();
+    let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert_eq!(shown.reason, reasons::WAITING_FOR_PREVIOUS_CONTROLLER);
+    let until = world.view.evalai_writes_from.unwrap().strftime("%H:%M:%S").to_string();
+    assert!(
+        shown.message.contains(&format!("before {until} UTC")),
+        "{}",
+        shown.message
+    );
+    assert_eq!(
+        evalai_updates(&plan),
+        [EvalaiUpdate::Finished],
+        "it is the first to be sent then"
+    );
+    assert!(plan.requeue.unwrap() <= std::time::Duration::from_secs(21));
+    world.view.evalai_writes_from = None;
+    assert_eq!(
+        condition(&world.pass(), PUBLISHED),
+        ("False".into(), reasons::WAITING.into())
+    );
+}
+
+#[test]
+fn a_finished_job_gets_its_time_to_live_once() {
+    let mut world = finished();
+    assert!(has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
+    world.job().has_ttl = true;
+    assert!(!has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
+}
+
+#[test]
+fn a_row_that_has_gone_to_another_team_is_said_with_its_end() {
+    let mut world = finished();
+    world.in_evalai().team_id = Some("42".into());
+    let mut same = world.clone();
+    same.published();
+    assert_eq!(events(&same.pass()), ["Published"]);
+
+    world.in_evalai().team_id = Some("43".into());
+    world.published();
+    let plan = world.pass();
+    assert_eq!(events(&plan), ["Published", reasons::TEAM_DIFFERS]);
+    let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
+    assert!(
+        shown.message.contains("team 43") && shown.message.contains("team 42"),
+        "{}",
+        shown.message
+    );
+}
+
+#[test]
+fn the_team_is_that_of_the_acceptance() {
+    let mut world = World::evalai();
+    let (position, eta) = (1, None);
+    world.view.turn = crate::controller::submissions::view::Turn::Wait { position, eta };
+    world.pass();
+    let info = world.in_evalai().info.as_mut().unwrap();
+    (info.team_id, info.team_name) = ("43".into(), Some("Other".into()));
+    let team = world.pass().status.team.unwrap();
+    assert_eq!((team.id.as_deref(), team.name.as_deref()), (Some("42"), Some("Team")));
+}

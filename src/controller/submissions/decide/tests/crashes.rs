@@ -1,0 +1,351 @@
+//! Crashes of a pair: whose they are, how many are forgiven.
+
+use super::builders::*;
+use crate::controller::submissions::view::{JobEnd, ObservedReport};
+use crate::pod::run::Stop;
+use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::State::{Failed, Finished, Pending, Running};
+use leaderboard_api::reasons;
+
+/// How often each side of pair 1 ends how, and what comes of it.
+#[test]
+fn a_pair_that_always_fails_ends_the_run_by_its_cause() {
+    let cases = [
+        (
+            "agent crashes",
+            Some("exited"),
+            Some("peerCrashed"),
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
+            "agent is killed",
+            Some("silentDeath"),
+            None,
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
+            "agent ends without results",
+            Some("incomplete"),
+            Some("peerCrashed"),
+            reasons::INVALID_RESULTS,
+            Participant,
+        ),
+        (
+            "agent is idle",
+            Some("idle"),
+            Some("peerCrashed"),
+            reasons::IDLE,
+            Participant,
+        ),
+        (
+            "agent cannot start",
+            Some("cannotStart"),
+            Some("peerCrashed"),
+            reasons::CANNOT_START,
+            Participant,
+        ),
+        (
+            "simulator crashes",
+            Some("peerCrashed"),
+            Some("exited"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+        (
+            "and the agent with it",
+            Some("exited"),
+            Some("killed"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+        (
+            "agent says that it crashed, and runs on",
+            Some("peerCrashed"),
+            Some("peerCrashed"),
+            reasons::AGENT_CRASHED,
+            Participant,
+        ),
+        (
+            "simulator cannot start",
+            None,
+            Some("cannotStart"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+        (
+            "simulator is late",
+            Some("notReady"),
+            Some("notReady"),
+            reasons::SIMULATION_CRASHED,
+            Infrastructure,
+        ),
+    ];
+    for (what, agent, simulator, reason, class) in cases {
+        let mut world = World::local().running();
+        for (name, word) in [("agent-1", agent), ("simulator-1", simulator)] {
+            if let Some(word) = word {
+                world.see_alone(ended(name, 3, word, 1, 100));
+            }
+        }
+        world.go_to(221);
+        let plan = world.pass_to(Running, reasons::STOPPING);
+        let failure = plan.status.failure.clone().unwrap();
+        assert_eq!((failure.reason.as_str(), failure.class), (reason, class), "{what}");
+        assert_eq!(annotated(&plan), Some(Stop::Retries), "{what}");
+        assert_eq!(
+            plan.status.pairs[0].crashes, 4,
+            "{what}: the end that is not restarted yet counts"
+        );
+    }
+}
+
+#[test]
+fn fewer_crashes_than_allowed_are_forgiven() {
+    let mut world = World::local().running();
+    world.see(ended("agent-1", 2, "exited", 1, 100));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!(plan.status.pairs[0].crashes, 3);
+    world.report(final_report());
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn memory_is_the_cause_only_of_the_agents_own_end() {
+    let oom = |what: &str, name: &str| {
+        let mut container = ended(name, 3, what, 137, 100);
+        container.last.as_mut().unwrap().reason = "OOMKilled".into();
+        container
+    };
+    let cases = [
+        ("agent-1", "", reasons::OUT_OF_MEMORY),
+        ("agent-1", "silentDeath", reasons::OUT_OF_MEMORY),
+        ("agent-1", "killed", reasons::OUT_OF_MEMORY),
+        ("agent-1", "idle", reasons::IDLE),
+        ("simulator-1", "killed", reasons::SIMULATION_CRASHED),
+    ];
+    for (name, what, reason) in cases {
+        let mut world = World::local().running();
+        world.see(oom(what, name));
+        assert_eq!(world.pass().status.failure.unwrap().reason, reason, "{name} {what}");
+    }
+}
+
+#[test]
+fn the_last_round_decides_whose_crash_it_was() {
+    let mut world = World::local().running();
+    world.see(ended("agent-1", 1, "exited", 1, 100));
+    world.pass();
+    world.see_alone(restarted("agent-1", 2, "exited", 1, 100));
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 900));
+    let failure = world.pass().status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn a_simulators_crash_of_an_earlier_round_does_not_excuse_the_agent() {
+    let mut world = World::local().running();
+    world.see_alone(restarted("simulator-1", 1, "exited", 1, 100));
+    // The agent waited for its simulator and then ran for hours, in one life.
+    let mut agent = ended("agent-1", 3, "exited", 1, 9000);
+    agent.last.as_mut().unwrap().began = Some(at(60));
+    world.see_alone(agent);
+    world.go_to(9001);
+    world.pass_to(Running, reasons::RUNNING);
+    world.go_to(9120);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::AGENT_CRASHED);
+}
+
+/// Whatever an agent leaves as its verdict, and whenever its simulator hears of it.
+#[test]
+fn an_agent_that_blames_its_simulator_is_charged() {
+    for word in ["notReady", "peerCrashed", "serverSilent", "portTaken"] {
+        let mut world = World::local().running();
+        world.see_alone(ended("agent-1", 3, word, 1, 100));
+        world.go_to(101);
+        let plan = world.pass_to(Running, reasons::RUNNING);
+        assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None), "{word}");
+        assert!(plan.requeue.unwrap().as_secs() <= 120, "{word}");
+        let mut alone = world.clone();
+        alone.go_to(220);
+        world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 101));
+        for mut world in [world, alone] {
+            let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+            let found = (failure.reason.as_str(), failure.charged);
+            assert_eq!(found, (reasons::AGENT_CRASHED, true), "{word}");
+            assert!(
+                failure.message.contains("blamed its simulator, which had not failed"),
+                "{word}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_port_that_an_agent_has_taken_is_the_participants() {
+    let mut world = World::local().running();
+    world.see_alone(ended("simulator-2", 3, "portTaken", 1, 100));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
+    assert_eq!(
+        failure.message,
+        "Another container of the Pod listened on the port of simulator 2, which failed 4 times. Let the agents listen on no \
+         port of a simulator, and submit again."
+    );
+}
+
+/// The kubelet waits for minutes before it starts a container again that has been killed often.
+#[test]
+fn a_simulator_that_was_killed_without_a_word_long_before_its_agent_noticed_is_the_cause() {
+    let mut world = World::local().running();
+    world.see_alone(restarted("simulator-1", 4, "silentDeath", 137, 100));
+    let mut agent = ended("agent-1", 3, "peerCrashed", 1, 400);
+    agent.last.as_mut().unwrap().began = Some(at(60));
+    world.see_alone(agent);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn an_end_of_an_earlier_round_is_not_the_verdict_that_is_waited_for() {
+    let mut world = World::local().running();
+    world.see_alone(restarted("agent-1", 3, "peerCrashed", 1, 100));
+    world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 400));
+    world.go_to(401);
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    world.see_alone(ended("agent-1", 3, "idle", 1, 401));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::IDLE);
+}
+
+#[test]
+fn a_simulator_that_is_ended_from_outside_each_time_is_the_cause() {
+    let mut world = World::local().running();
+    world.see_alone(ended("simulator-1", 3, "stopped", 143, 100));
+    world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
+    let mut world = World::local().running();
+    world.see_alone(restarted("simulator-1", 3, "peerCrashed", 1, 40));
+    world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+}
+
+#[test]
+fn simulators_that_fail_in_each_job_are_counted_by_team() {
+    let mut world = World::local().running();
+    world.view.simulator_failures_of_team = 2;
+    for (retry, pause) in [(1, 10), (2, 20)] {
+        world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+        world.pass_to(Running, reasons::STOPPING);
+        world.complete();
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        assert_eq!(plan.status.retry, retry);
+        let message = plan.status.message.unwrap();
+        assert!(
+            message.ends_with(&format!("It is tried again in {pause} s; this costs no attempt.")),
+            "{message}"
+        );
+        world.job_gone();
+        world.wait(pause);
+        world.pass_to(Pending, reasons::PREPARING);
+        world.see_job();
+        world.view.pod = Some(pod(100));
+        world.see_agents();
+        world.view.report = ObservedReport::NotRead;
+        world.pass_to(Running, reasons::RUNNING);
+    }
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    world.pass_to(Running, reasons::STOPPING);
+    world.complete();
+    let failure = world
+        .pass_to(Failed, reasons::SIMULATION_CRASHED)
+        .status
+        .failure
+        .unwrap();
+    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    assert_eq!(
+        failure.message,
+        "The simulator of pair 1 failed 4 times: it crashed. The attempt had 3 Jobs. Within a day 3 submissions of team t1 ended like this in \
+         this Leaderboard; after 3 of them a submission gets one Job only. Look at the simulator's log, then resume the submission; it \
+         repeats the route it was at."
+    );
+    assert!(!failure.participant_message.unwrap().contains("t1"));
+
+    let mut often = World::local().running();
+    often.view.simulator_failures_of_team = 3;
+    often.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    often.pass_to(Running, reasons::STOPPING);
+    often.complete();
+    let failure = often
+        .pass_to(Failed, reasons::SIMULATION_CRASHED)
+        .status
+        .failure
+        .unwrap();
+    assert!(
+        failure
+            .message
+            .contains("The attempt had 1 Job. Within a day 4 submissions of team t1"),
+        "{}",
+        failure.message
+    );
+}
+
+#[test]
+fn a_count_without_a_cause_waits_for_it() {
+    let mut world = World::local().running();
+    let mut told = report(1);
+    told.pairs[0].crashes = 4;
+    world.report(told);
+    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
+    world.see(ended("agent-1", 3, "exited", 1, 100));
+    world.pass_to(Running, reasons::STOPPING);
+}
+
+#[test]
+fn a_crash_that_only_the_simulator_has_told_of_waits_for_the_agents_own_word() {
+    let mut world = World::local().running();
+    world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 100));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    let mut late = world.clone();
+    world.see_alone(ended("agent-1", 3, "idle", 1, 100));
+    let plan = world.pass_to(Running, reasons::STOPPING);
+    assert_eq!(plan.status.failure.unwrap().reason, reasons::IDLE);
+
+    // The Pod is gone with it: that it crashed is all that will ever be known.
+    late.view.pod = None;
+    late.job().end = Some(JobEnd::Failed {
+        at: None,
+        reason: "BackoffLimitExceeded".into(),
+        message: "no more".into(),
+    });
+    late.view.report = ObservedReport::Absent;
+    let failure = late.pass_to(Failed, reasons::AGENT_CRASHED).status.failure;
+    assert_eq!(failure.unwrap().class, Participant);
+}
+
+#[test]
+fn ends_on_command_are_no_crashes() {
+    let mut world = World::local().running();
+    world.report(report(1));
+    for what in ["stopped", "cancelled"] {
+        world.see(ended("agent-1", 0, what, 143, 100));
+        let plan = world.pass_to(Running, reasons::RUNNING);
+        assert_eq!(plan.status.pairs.len(), 2);
+        assert!(plan.status.pairs.iter().all(|p| p.crashes == 0 && p.last.is_none()));
+    }
+}

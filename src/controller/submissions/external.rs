@@ -1,0 +1,285 @@
+//! The controller's side of EvalAI and DynamoDB: turns views of the services into what `decide` reads, and what `decide`
+//! wants into updates and rows. Never waits for either. Decides nothing.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use jiff::Timestamp;
+use kube::ResourceExt;
+
+use super::decide::EvalaiUpdate;
+use super::observe::uid_of;
+use super::reruns;
+use super::result_texts;
+use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
+use crate::controller::runtime::context::Context;
+use crate::services::ObjectKey;
+use crate::services::evalai::{
+    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Subject, SubmissionState, Target,
+};
+use crate::services::table::Recorder;
+use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
+
+/// Doors to both services, and what each Leaderboard needs to go through them.
+pub struct ExternalSystems {
+    pub hub: Hub,
+    pub recorder: Recorder,
+    targets: Mutex<HashMap<String, Arc<Target>>>,
+}
+
+impl ExternalSystems {
+    pub fn new(hub: Hub, recorder: Recorder) -> Self {
+        Self {
+            hub,
+            recorder,
+            targets: Mutex::default(),
+        }
+    }
+
+    /// A Leaderboard's way to EvalAI, renewed whenever its spec or token changes.
+    pub fn set_target(&self, leaderboard: &Leaderboard, target: Option<Arc<Target>>) {
+        let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        match target {
+            Some(target) => targets.insert(uid_of(leaderboard), target),
+            None => targets.remove(&uid_of(leaderboard)),
+        };
+    }
+
+    fn target(&self, leaderboard: &Leaderboard) -> Option<Arc<Target>> {
+        self.targets
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(&uid_of(leaderboard))
+            .cloned()
+    }
+
+    /// What EvalAI is known to say of a submission.
+    /// `known` looks another Submission up by its name.
+    pub fn evalai_view(
+        &self,
+        leaderboard: Option<&Leaderboard>,
+        submission: &Submission,
+        known: impl Fn(&str) -> Option<Arc<Submission>>,
+    ) -> Option<EvalaiView> {
+        submission.spec.evalai?;
+        let Some(seen) = self.hub.view(&object_key(submission)) else {
+            let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
+            let error = (!ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned());
+            return Some(EvalaiView {
+                error,
+                ..EvalaiView::default()
+            });
+        };
+        let rerun_of = seen
+            .row
+            .as_ref()
+            .and_then(|row| reruns::original(row, submission, known));
+        Some(map_view(&seen, submission, rerun_of))
+    }
+
+    /// What is known of a submission's row. None without a table.
+    pub fn record_view(&self, leaderboard: &Leaderboard, submission: &Submission) -> Option<RecordView> {
+        leaderboard.spec.table.as_ref()?;
+        let attempt = submission.status.as_ref().and_then(|s| s.attempt);
+        let seen = self
+            .recorder
+            .view(&object_key(submission))
+            .filter(|seen| Some(seen.attempt) == attempt);
+        Some(seen.map_or_else(RecordView::default, |s| RecordView {
+            end_written: s.end_written,
+            error: s.error,
+        }))
+    }
+
+    /// Asks EvalAI whether a submission wants to run, or what became of one that has ended.
+    pub fn ask(&self, view: &View) {
+        let Some(subject) = self.subject(view) else { return };
+        let wants_image = wants_image(&view.submission);
+        let asked = self.hub.ask(&subject, wants_image);
+        log_refused(&view.submission, asked);
+    }
+
+    /// Looks for a submission's end in EvalAI from now on, also while it waits before anything of it runs.
+    pub fn follow(&self, view: &View, status: &SubmissionStatus) {
+        let Some(subject) = self.subject(view) else { return };
+        let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
+        let followed = self.hub.live(&subject, since);
+        log_refused(&view.submission, followed);
+    }
+
+    /// Updates EvalAI with what the view shows.
+    pub fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: EvalaiUpdate) {
+        let Some(subject) = self.subject(view) else { return };
+        let update = match tell {
+            EvalaiUpdate::Queued => Some(DesiredUpdate::Queued),
+            EvalaiUpdate::Running => Some(DesiredUpdate::Running),
+            EvalaiUpdate::Partial => partial(context, view).map(DesiredUpdate::Partial),
+            EvalaiUpdate::Finished => Some(final_update(context, view, status, Outcome::Finished)),
+            EvalaiUpdate::Failed => Some(final_update(context, view, status, Outcome::Failed)),
+            EvalaiUpdate::Cancelled => Some(final_update(context, view, status, Outcome::Cancelled)),
+        };
+        if matches!(tell, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
+            self.follow(view, status);
+        }
+        if let Some(update) = update {
+            log_refused(&view.submission, self.hub.update(&subject, update));
+        }
+    }
+
+    /// Both systems have what this object has for them.
+    pub fn forget(&self, submission: &Submission) {
+        self.gone(&object_key(submission));
+    }
+
+    /// Nothing more is wanted of EvalAI; what is known is forgotten.
+    pub fn forget_evalai(&self, submission: &Submission) {
+        self.hub.forget(&object_key(submission));
+    }
+
+    /// Writes the row, or lets the next write carry it.
+    pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
+        let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
+        let Some(table) = table else { return };
+        if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
+            self.recorder
+                .record(table, &object_key(view.submission.as_ref()), row, end);
+        }
+    }
+
+    /// Drops everything of an object that is gone.
+    pub fn gone(&self, key: &ObjectKey) {
+        self.hub.forget(key);
+        self.recorder.forget(key);
+    }
+
+    fn subject(&self, view: &View) -> Option<Subject> {
+        let evalai = view.submission.spec.evalai?;
+        let target = self.target(view.leaderboard.as_deref()?)?;
+        Some(Subject {
+            target,
+            key: object_key(view.submission.as_ref()),
+            pk: evalai.submission,
+            run: run_of(&view.submission),
+        })
+    }
+}
+
+/// The present attempt, as EvalAI's side has to know it.
+fn run_of(submission: &Submission) -> Run {
+    let attempt = submission.spec.attempt;
+    let status = submission.status.as_ref().filter(|s| s.attempt == Some(attempt));
+    Run {
+        attempt,
+        job: names::job(&submission.name_any(), attempt, 0),
+        by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
+        has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
+    }
+}
+
+fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
+    let report = view.report.ours()?;
+    let leaderboard = object_key(view.leaderboard.as_deref()?);
+    let is_shown = context
+        .external
+        .hub
+        .shows_partial(&leaderboard, result_texts::phase(view));
+    let payload = result_texts::partial_payload(view, is_shown)?;
+    let attempt = view.submission.spec.attempt;
+    context.memory.told_partial(&view.submission, attempt, report.done);
+    Some(Arc::new(payload))
+}
+
+fn final_update(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
+    let mut payload = result_texts::payload(view);
+    payload.stderr = result_texts::stderr(status);
+    if outcome == Outcome::Failed {
+        let tail = context.archive_workers.tail(&view.submission, status);
+        result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
+    }
+    DesiredUpdate::Final(outcome, Arc::new(payload))
+}
+
+/// Whether it is run only with an image that EvalAI names.
+fn wants_image(submission: &Submission) -> bool {
+    let status = submission.status.as_ref();
+    let has_ended = status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
+    submission.spec.image.is_none() && !has_ended
+}
+
+fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
+    let attempt = submission.spec.attempt;
+    // An image that was asked for is waited for; why there is none is an answer too.
+    let image_known = !wants_image(submission) || seen.image.is_some();
+    let present = seen.attempt == attempt;
+    let ended = seen.ended.filter(|_| present);
+    let answered = seen.answered >= attempt;
+    let (image, image_problem) = match seen.image.clone() {
+        Some(ImageAnswer::Named(image)) => (Some(image), None),
+        Some(ImageAnswer::NotAnImage(why)) => (None, Some(why)),
+        Some(ImageAnswer::Unread(_)) | None => (None, None),
+    };
+    EvalaiView {
+        info: seen
+            .row
+            .as_ref()
+            .filter(|_| answered && image_known)
+            .map(|row| EvalaiInfo {
+                standing: match (ended, row.status) {
+                    (Some(_), _) => Standing::Ended,
+                    (None, Status::Resuming) => Standing::Resumed,
+                    (None, _) => Standing::Wanted,
+                },
+                status: ended.unwrap_or(row.status).as_str().to_owned(),
+                phase: row.phase,
+                team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
+                team_name: row.team_name.clone(),
+                submitted_at: row.submitted_at,
+                rerun_of,
+                image,
+                image_problem,
+            }),
+        read_at: seen.read_at,
+        cancelled: ended.is_some(),
+        overtaken: ended.is_some() && seen.overtaken,
+        end: seen
+            .end
+            .as_ref()
+            .filter(|_| present)
+            .map(|end| map_end(end, seen.read_at)),
+        team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
+        error: seen.last_error.clone(),
+    }
+}
+
+fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
+    match end {
+        Ended::Published { at, .. } => EvalaiEnd::Published { at: *at },
+        Ended::Agreed(_) => EvalaiEnd::Published {
+            at: read_at.unwrap_or_else(Timestamp::now),
+        },
+        Ended::Otherwise(status) => EvalaiEnd::Ended {
+            status: status.as_str().to_owned(),
+        },
+        Ended::Refused(message) => EvalaiEnd::Refused {
+            message: message.clone(),
+        },
+    }
+}
+
+fn log_refused(submission: &Submission, result: Result<(), evalai::client::ClientError>) {
+    if let Err(error) = result {
+        tracing::error!(submission = %submission.name_any(), %error, "cannot create EvalAI client");
+    }
+}
+
+fn object_key(object: &impl ResourceExt) -> ObjectKey {
+    ObjectKey {
+        namespace: object.namespace().unwrap_or_default(),
+        name: object.name_any(),
+        uid: uid_of(object),
+    }
+}
+
+#[cfg(test)]
+#[path = "external_tests.rs"]
+mod tests;

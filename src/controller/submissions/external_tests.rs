@@ -1,0 +1,203 @@
+//! Rows of an end, against a stand-in for DynamoDB of the test's own.
+
+use std::collections::BTreeMap;
+
+use axum::body::Bytes;
+use axum::extract::State as Shared;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use serde_json::{Value, json};
+use tokio::sync::mpsc;
+
+use super::*;
+use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
+use crate::controller::submissions::view::{
+    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Turn,
+};
+use leaderboard_api::State;
+
+/// Longer than a write takes on a busy machine.
+const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
+
+type Item = BTreeMap<String, String>;
+
+/// One row in one table.
+#[derive(Clone)]
+struct Stored {
+    item: Arc<Mutex<Item>>,
+    /// Told each row that was written.
+    written: mpsc::UnboundedSender<Item>,
+}
+
+impl Stored {
+    fn update(&self, request: &Value) {
+        let mut item = self.item.lock().unwrap();
+        let update = request["UpdateExpression"].as_str().unwrap();
+        let (set, remove) = update.split_once(" REMOVE ").unwrap_or((update, ""));
+        for name in remove.split(", ").filter(|name| !name.is_empty()) {
+            item.remove(request["ExpressionAttributeNames"][name].as_str().unwrap());
+        }
+        for set in set.trim_start_matches("SET ").split(", ") {
+            let (name, value) = set.split_once(" = ").unwrap();
+            let column = request["ExpressionAttributeNames"][name].as_str().unwrap();
+            let value = &request["ExpressionAttributeValues"][value];
+            let text = value["S"].as_str().or(value["N"].as_str()).unwrap();
+            item.insert(column.to_owned(), text.to_owned());
+        }
+        self.written.send(item.clone()).unwrap();
+    }
+}
+
+async fn answer(Shared(stored): Shared<Stored>, headers: HeaderMap, body: Bytes) -> Response {
+    let target = &headers["x-amz-target"];
+    if target.to_str().unwrap().ends_with("UpdateItem") {
+        stored.update(&serde_json::from_slice(&body).unwrap());
+        return "{}".into_response();
+    }
+    let denied = json!({"__type": "AccessDeniedException", "message": "no"});
+    (StatusCode::BAD_REQUEST, denied.to_string()).into_response()
+}
+
+struct Bench {
+    around: Surroundings,
+    written: mpsc::UnboundedReceiver<Item>,
+    view: View,
+    status: SubmissionStatus,
+}
+
+/// A submission that has come to this end, whose row has the metrics of a partial result of an earlier operator's.
+async fn bench(state: State) -> Bench {
+    let (sender, written) = mpsc::unbounded_channel();
+    let partial = BTreeMap::from([("driving_score".to_owned(), "10.5".to_owned())]);
+    let stored = Stored {
+        item: Arc::new(Mutex::new(partial)),
+        written: sender,
+    };
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let router = axum::Router::new().fallback(answer).with_state(stored.clone());
+    tokio::spawn(async move { axum::serve(listener, router).await });
+    let board = leaderboard("one", &endpoint);
+    let (mut submission, _) = with_job("sub", &board);
+    let now = Timestamp::now();
+    let status = submission.status.as_mut().unwrap();
+    status.state = Some(state);
+    status.conditions = vec![Condition {
+        type_: conditions::FINISHED.into(),
+        status: "True".into(),
+        reason: state.as_str().into(),
+        message: String::new(),
+        last_transition_time: Time(now),
+        observed_generation: None,
+    }];
+    let status = status.clone();
+    let view = View {
+        now,
+        submission: Arc::new(submission),
+        leaderboard: Some(Arc::new(board)),
+        is_policy_in_place: true,
+        turn: Turn::Go,
+        job: ObservedJob::Absent,
+        pod: None,
+        node: ObservedNode::Unknown,
+        report: ObservedReport::NotRead,
+        report_stage: None,
+        report_waited: std::time::Duration::ZERO,
+        texts: ObservedTexts::NotRead,
+        fence: ObservedFence::NotRequested,
+        log: ObservedLog::NotRequested,
+        evalai: None,
+        record: Some(RecordView::default()),
+        partial_sent: None,
+        rerun_as: None,
+        simulator_failures_of_team: 0,
+        evalai_writes_from: None,
+    };
+    Bench {
+        around: surroundings(Cluster::default(), &endpoint).await,
+        written,
+        view,
+        status,
+    }
+}
+
+impl Bench {
+    fn records_the_end(&self) {
+        self.around.context.external.record(&self.view, &self.status, true);
+    }
+
+    async fn row(&mut self) -> Item {
+        let row = tokio::time::timeout(LIMIT, self.written.recv()).await;
+        row.expect("a row is written").unwrap()
+    }
+}
+
+fn last() -> ObservedReport {
+    let results = json!([{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]);
+    let report = json!({
+        "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
+        "pairs": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": results.to_string(),
+    });
+    let report: crate::pod::report::Report = serde_json::from_value(report).unwrap();
+    ObservedReport::Ours(Arc::new((&report).into()))
+}
+
+#[tokio::test]
+async fn the_row_of_an_end_has_the_metrics_of_the_last_report() {
+    let mut bench = bench(State::Finished).await;
+    bench.view.report = last();
+    bench.records_the_end();
+    let row = bench.row().await;
+    assert_eq!(row["submission_status"], "FINISHED");
+    assert_eq!(row["driving_score"], "43.125", "not those of a partial result");
+}
+
+#[tokio::test]
+async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
+    for (state, status) in [(State::Cancelled, "CANCELLED"), (State::Failed, "FAILED")] {
+        let mut bench = bench(state).await;
+        bench.view.report = last();
+        bench.records_the_end();
+        let row = bench.row().await;
+        assert_eq!(
+            (row["submission_status"].as_str(), row.get("driving_score")),
+            (status, None)
+        );
+    }
+}
+
+#[test]
+fn an_attempt_that_evalai_has_asked_for_is_told_from_one_that_a_person_has_begun() {
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    let mut of = |attempt, record: Option<Value>| {
+        submission.spec.attempt = attempt;
+        let annotations = record.map(|record| (names::ANNOTATION_INGESTED.to_owned(), record.to_string()));
+        submission.metadata.annotations = annotations.map(|annotation| [annotation].into());
+        run_of(&submission).by_hand
+    };
+    let by_message = || Some(json!({"message": "m", "sent": 1, "attempt": 2}));
+    assert!(!of(2, by_message()));
+    assert!(of(3, by_message()), "raised after the one that the message began");
+    let by_sweep = || Some(json!({"message": "sweep", "sent": 1, "attempt": 3, "withoutMessage": [2, 3]}));
+    assert!(!of(2, by_sweep()) && !of(3, by_sweep()) && of(4, by_sweep()));
+    assert!(of(2, None), "nobody but people made it");
+    assert!(
+        of(2, Some(json!({"message": "m", "sent": 1}))),
+        "an older operator noted no attempt"
+    );
+}
+
+#[test]
+fn a_run_has_a_job_once_that_of_this_attempt_was_asked_for() {
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    assert!(run_of(&submission).has_job);
+    let status = submission.status.as_mut().unwrap();
+    (status.job_name, status.retry) = (None, 1);
+    assert!(run_of(&submission).has_job, "between two tries");
+    submission.status.as_mut().unwrap().retry = 0;
+    assert!(!run_of(&submission).has_job);
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    submission.spec.attempt += 1;
+    assert!(!run_of(&submission).has_job, "it was the attempt before");
+}

@@ -1,0 +1,170 @@
+//! The simulator and the agent of each pair: strangers' images behind our runner. Pure.
+//!
+//! What they see (mounts, variables, flags) is the original's, version by version.
+
+use k8s_openapi::api::core::v1::{Container, EnvVar};
+
+use super::security::confined;
+use super::{JobInput, commands, variable, volumes};
+use crate::controller::submissions::pod_layout::{
+    AGENT, CARLA_ROOT, FIXED_ENV, LEADERBOARD_ROOT, SAVED, SCENARIO_RUNNER_ROOT, STATUS, python_path,
+};
+use crate::pod::run::{RUNNER, TOOLS, console_name};
+use leaderboard_api::{LeaderboardVersion, effective, names};
+
+const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
+const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
+const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
+const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
+/// A server prints little; one that floods must not fill the disk. In bytes.
+const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
+
+/// Port of a pair's simulator; pairs count from 1.
+fn port(pair: usize) -> usize {
+    2000 + 100 * (pair - 1)
+}
+
+/// The simulator of a pair.
+pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
+    let (spec, deadlines) = (&input.spec().simulator, input.deadlines());
+    let own = input.track().and_then(|track| track.simulator.as_ref());
+    let name = names::simulator_container(pair);
+    let flags = [
+        format!("--port={}", port(pair)),
+        seconds("ready", deadlines.ready_seconds),
+        seconds("flush", deadlines.flush_seconds),
+        seconds("cancel", deadlines.cancel_seconds),
+        format!("--log={}/{}", SAVED, console_name(pair)),
+        format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
+    ];
+    let host = spec
+        .command
+        .as_deref()
+        .map(|command| commands::words(command, spec.args.as_deref()));
+    let words = host.unwrap_or_else(|| commands::simulator(input.plan.leaderboard_version));
+    Container {
+        image: Some(input.plan.simulator_image.clone()),
+        command: Some(behind_runner("simulator", pair, flags, words)),
+        env: Some(merged(simulator_env(pair), &spec.env)),
+        resources: effective::resources(own, spec.resources.as_ref()),
+        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
+        volume_mounts: Some(volumes::of_simulator(&name)),
+        name,
+        ..Container::default()
+    }
+}
+
+/// The agent of a pair.
+pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
+    let (spec, deadlines) = (&input.spec().agent, input.deadlines());
+    let own = input.track().and_then(|track| track.agent.as_ref());
+    let name = names::agent_container(pair);
+    let flags = [
+        format!("--work={AGENT}"),
+        format!("--checkpoint={CHECKPOINT}"),
+        seconds("ready", deadlines.ready_seconds),
+        seconds("idle", deadlines.idle_seconds),
+        format!("--log-limit={}", spec.log_size_limit.bytes()),
+        format!("--python-path={}", python_path()),
+    ];
+    let host = spec
+        .command
+        .as_deref()
+        .map(|command| commands::words(command, spec.args.as_deref()));
+    let words = host.unwrap_or_else(|| commands::agent(input.plan.leaderboard_version));
+    // The runner expands these words, so that RESUME is what it is in this round.
+    let words = words.iter().map(|word| commands::literal(word)).collect();
+    Container {
+        image: Some(input.plan.image.clone()),
+        command: Some(behind_runner("agent", pair, flags, words)),
+        env: Some(merged(agent_env(input, pair), &spec.env)),
+        resources: effective::resources(own, spec.resources.as_ref()),
+        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
+        volume_mounts: Some(volumes::of_agent(&name, pair)),
+        name,
+        ..Container::default()
+    }
+}
+
+fn behind_runner<const N: usize>(side: &str, pair: usize, flags: [String; N], words: Vec<String>) -> Vec<String> {
+    let start = [
+        format!("{TOOLS}/{RUNNER}"),
+        side.to_owned(),
+        format!("--pair={pair}"),
+        format!("--status={STATUS}"),
+    ];
+    start
+        .into_iter()
+        .chain(flags)
+        .chain(["--".to_owned()])
+        .chain(words)
+        .collect()
+}
+
+/// A flag of the runner, which counts seconds in 32 bits.
+fn seconds(what: &str, value: i64) -> String {
+    let value = value.clamp(0, u32::MAX.into());
+    format!("--{what}-seconds={value}")
+}
+
+fn simulator_env(pair: usize) -> Vec<EnvVar> {
+    let mut env = vec![variable("CARLA_PORT", &port(pair).to_string())];
+    env.extend(graphics(pair));
+    env
+}
+
+fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
+    let (plan, track) = (input.plan, input.track());
+    let routes = track
+        .and_then(|track| track.routes_file.as_deref())
+        .unwrap_or(ROUTES_FILE);
+    let scenarios = track
+        .and_then(|track| track.scenarios_file.as_deref())
+        .unwrap_or(SCENARIOS_FILE);
+    let slice = plan.slices.get(pair - 1).map(ToString::to_string).unwrap_or_default();
+    // The evaluator takes any text for a yes.
+    let resume = if plan.resume || input.attempt > 1 { "1" } else { "" };
+    let mut env = vec![
+        variable("CARLA_PORT", &port(pair).to_string()),
+        variable("CARLA_TM_PORT", &(port(pair) + 10).to_string()),
+        variable("CHALLENGE_TRACK_CODENAME", &plan.codename),
+        variable("ROUTES", routes),
+        variable("ROUTES_SUBSET", &slice),
+        variable("REPETITIONS", &plan.repetitions.to_string()),
+        variable("RESUME", resume),
+        variable("CHECKPOINT_ENDPOINT", CHECKPOINT),
+        variable("RECORD_PATH", SAVED),
+        variable("DEBUG_CHALLENGE", "0"),
+        variable("CARLA_ROOT", CARLA_ROOT),
+        variable("SCENARIO_RUNNER_ROOT", SCENARIO_RUNNER_ROOT),
+        variable("LEADERBOARD_ROOT", LEADERBOARD_ROOT),
+    ];
+    env.push(match plan.leaderboard_version {
+        LeaderboardVersion::V1 => variable("SCENARIOS", scenarios),
+        // The original's file lies in the contents, which are read-only here.
+        LeaderboardVersion::V2 => variable("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS),
+    });
+    env.extend(graphics(pair));
+    env
+}
+
+fn graphics(pair: usize) -> [EnvVar; 2] {
+    [
+        variable("NVIDIA_VISIBLE_DEVICES", &(pair - 1).to_string()),
+        variable("NVIDIA_DRIVER_CAPABILITIES", "all"),
+    ]
+}
+
+/// The host's variables take the place of ours of the same name, but for those that follow from the plan.
+fn merged(mut ours: Vec<EnvVar>, hosts: &[EnvVar]) -> Vec<EnvVar> {
+    for variable in hosts
+        .iter()
+        .filter(|variable| !FIXED_ENV.contains(&variable.name.as_str()))
+    {
+        match ours.iter_mut().find(|known| known.name == variable.name) {
+            Some(known) => known.clone_from(variable),
+            None => ours.push(variable.clone()),
+        }
+    }
+    ours
+}

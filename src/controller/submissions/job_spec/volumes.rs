@@ -1,0 +1,180 @@
+//! The Pod's volumes, and who mounts which of them where. Pure; called by the builders of the containers.
+
+use k8s_openapi::api::core::v1::{
+    DownwardAPIVolumeFile, DownwardAPIVolumeSource, EmptyDirVolumeSource, ObjectFieldSelector, ProjectedVolumeSource,
+    ServiceAccountTokenProjection, Volume, VolumeMount, VolumeProjection,
+};
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+
+use super::JobInput;
+use crate::controller::submissions::pod_layout::{
+    AGENT, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, STATUS, TOOLS_VOLUME,
+};
+use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
+use leaderboard_api::names;
+
+const AUDIENCE: &str = "sts.amazonaws.com";
+const TOKEN_SECONDS: i64 = 3600;
+/// Room in `logs` beyond what the limits on uploads and logs add up to: filling it up evicts the Pod with 1 s of grace,
+/// so those limits must be met first.
+const LOGS_MARGIN: u64 = 1 << 30;
+
+/// Every volume of the Pod.
+pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
+    let contents = CONTENTS_VOLUMES.map(|(name, _, _)| empty(name, None));
+    let own = [
+        empty(LOGS_VOLUME, Some(Quantity(logs_limit(input).to_string()))),
+        empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
+        podinfo(),
+    ];
+    let identity = has_role(input).then(identity);
+    contents.into_iter().chain(own).chain(identity).collect()
+}
+
+/// Whether the Pod proves its identity with a token of its ServiceAccount.
+pub(super) fn has_role(input: &JobInput<'_>) -> bool {
+    input
+        .spec()
+        .pod_identity
+        .as_ref()
+        .is_some_and(|identity| identity.role_arn.is_some())
+}
+
+fn logs_limit(input: &JobInput<'_>) -> u64 {
+    let pairs = u64::try_from(input.pairs()).unwrap_or(u64::MAX);
+    let agent_logs = pairs.saturating_mul(input.spec().agent.log_size_limit.bytes());
+    input
+        .plan
+        .storage
+        .size_limit
+        .bytes()
+        .saturating_add(agent_logs)
+        .saturating_add(LOGS_MARGIN)
+}
+
+fn empty(name: &str, size_limit: Option<Quantity>) -> Volume {
+    Volume {
+        name: name.into(),
+        empty_dir: Some(EmptyDirVolumeSource {
+            size_limit,
+            medium: None,
+        }),
+        ..Volume::default()
+    }
+}
+
+fn podinfo() -> Volume {
+    let file = DownwardAPIVolumeFile {
+        path: STOP_FILE.into(),
+        field_ref: Some(ObjectFieldSelector {
+            field_path: format!("metadata.annotations['{}']", names::ANNOTATION_STOP),
+            api_version: None,
+        }),
+        ..DownwardAPIVolumeFile::default()
+    };
+    Volume {
+        name: PODINFO_VOLUME.into(),
+        downward_api: Some(DownwardAPIVolumeSource {
+            items: Some(vec![file]),
+            default_mode: None,
+        }),
+        ..Volume::default()
+    }
+}
+
+fn identity() -> Volume {
+    let token = ServiceAccountTokenProjection {
+        audience: Some(AUDIENCE.into()),
+        expiration_seconds: Some(TOKEN_SECONDS),
+        path: IDENTITY_TOKEN_FILE.into(),
+    };
+    let source = VolumeProjection {
+        service_account_token: Some(token),
+        ..VolumeProjection::default()
+    };
+    Volume {
+        name: IDENTITY_VOLUME.into(),
+        projected: Some(ProjectedVolumeSource {
+            sources: Some(vec![source]),
+            default_mode: None,
+        }),
+        ..Volume::default()
+    }
+}
+
+/// Where `contents` writes.
+pub(super) fn of_contents() -> Vec<VolumeMount> {
+    CONTENTS_VOLUMES
+        .into_iter()
+        .map(|(volume, written, _)| mount(volume, written))
+        .collect()
+}
+
+/// What `workspace` prepares.
+pub(super) fn of_workspace(input: &JobInput<'_>) -> Vec<VolumeMount> {
+    let own = [mount(LOGS_VOLUME, LOGS), mount(TOOLS_VOLUME, TOOLS)];
+    own.into_iter().chain(token(input)).collect()
+}
+
+/// What `logcopy` reads and writes.
+pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
+    let own = [mount(LOGS_VOLUME, LOGS), read_only(mount(PODINFO_VOLUME, PODINFO))];
+    own.into_iter().chain(token(input)).collect()
+}
+
+/// What a simulator sees.
+pub(super) fn of_simulator(container: &str) -> Vec<VolumeMount> {
+    let own = [mount_part(LOGS_VOLUME, "simulator".into(), SAVED)];
+    runner_and_status(container).into_iter().chain(own).collect()
+}
+
+/// What an agent sees.
+pub(super) fn of_agent(container: &str, pair: usize) -> Vec<VolumeMount> {
+    let contents = CONTENTS_VOLUMES.map(|(volume, _, read)| read_only(mount(volume, read)));
+    let own = [mount_part(LOGS_VOLUME, format!("agent/agent{pair}"), AGENT)];
+    runner_and_status(container)
+        .into_iter()
+        .chain(contents)
+        .chain(own)
+        .collect()
+}
+
+/// The runner; all status files to read, the container's own to write. The kubelet makes a sub-folder when it comes to
+/// its mount, so the outer one stands first.
+fn runner_and_status(container: &str) -> [VolumeMount; 3] {
+    [
+        read_only(mount(TOOLS_VOLUME, TOOLS)),
+        read_only(mount_part(LOGS_VOLUME, STATUS_FOLDER.into(), STATUS)),
+        mount_part(
+            LOGS_VOLUME,
+            format!("{STATUS_FOLDER}/{container}"),
+            &format!("{STATUS}/{container}"),
+        ),
+    ]
+}
+
+fn token(input: &JobInput<'_>) -> Option<VolumeMount> {
+    has_role(input).then(|| read_only(mount(IDENTITY_VOLUME, IDENTITY)))
+}
+
+fn mount(volume: &str, path: &str) -> VolumeMount {
+    VolumeMount {
+        name: volume.into(),
+        mount_path: path.into(),
+        ..VolumeMount::default()
+    }
+}
+
+fn mount_part(volume: &str, sub_path: String, path: &str) -> VolumeMount {
+    VolumeMount {
+        sub_path: Some(sub_path),
+        ..mount(volume, path)
+    }
+}
+
+fn read_only(mount: VolumeMount) -> VolumeMount {
+    VolumeMount {
+        read_only: Some(true),
+        ..mount
+    }
+}

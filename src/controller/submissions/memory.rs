@@ -1,0 +1,180 @@
+//! What the leader remembers between passes of one object: the status it last wrote, and what it told.
+//!
+//! Needed because a cache may lag behind our own writes: a pass must never decide on a status older than its own.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use kube::ResourceExt;
+use tokio::time::Instant;
+
+use crate::controller::objects::uid_of;
+use leaderboard_api::{Submission, SubmissionStatus};
+
+/// Places in line that are written without waiting for their turn.
+const FIRST_PLACES: i32 = 20;
+/// Time between two writes of the places behind them, over all Submissions.
+const PLACE_PACE: Duration = Duration::from_secs(1);
+
+/// One entry for each Submission, by UID.
+#[derive(Default)]
+pub struct Memory {
+    entries: Mutex<HashMap<String, Entry>>,
+    /// When the next place of those far behind may be written.
+    next_place: Mutex<Option<Instant>>,
+}
+
+#[derive(Clone, Default)]
+struct Entry {
+    written: Option<Written>,
+    partial: Option<(i64, u32)>,
+    /// When its place may be written.
+    place_at: Option<Instant>,
+}
+
+#[derive(Clone)]
+struct Written {
+    version: u64,
+    at: Instant,
+    status: SubmissionStatus,
+}
+
+impl Memory {
+    /// The object with the status that we wrote last, where the cache does not have it yet.
+    pub fn with_own_status(&self, submission: Arc<Submission>) -> Arc<Submission> {
+        let seen = version(&submission);
+        let written = self
+            .lock()
+            .get(&uid_of(submission.as_ref()))
+            .and_then(|e| e.written.clone());
+        match written {
+            Some(written) if seen < written.version => {
+                let mut newer = submission.as_ref().clone();
+                newer.status = Some(written.status);
+                Arc::new(newer)
+            }
+            _ => submission,
+        }
+    }
+
+    /// Remembers what the API server answered to a write of status.
+    pub fn wrote(&self, answer: &Submission) {
+        let Some(status) = answer.status.clone() else { return };
+        let written = Written {
+            version: version(answer),
+            at: Instant::now(),
+            status,
+        };
+        self.lock().entry(uid_of(answer)).or_default().written = Some(written);
+    }
+
+    /// Time since our last write of its status; None if this process has not written it.
+    pub fn since_write(&self, submission: &Submission) -> Option<Duration> {
+        let entries = self.lock();
+        entries
+            .get(&uid_of(submission))
+            .and_then(|e| e.written.as_ref())
+            .map(|w| w.at.elapsed())
+    }
+
+    /// How long a changed place has to wait for its write; None: not at all. The first in line are told at once; of the others
+    /// each has a moment of its own, so that a step of a thousand is not a thousand writes.
+    pub fn place_waits(&self, submission: &Submission, position: i32, now: Instant) -> Option<Duration> {
+        let mut entries = self.lock();
+        let entry = entries.entry(uid_of(submission)).or_default();
+        if position <= FIRST_PLACES {
+            entry.place_at = None;
+            return None;
+        }
+        let at = *entry.place_at.get_or_insert_with(|| {
+            let mut next = self.next_place.lock().unwrap_or_else(PoisonError::into_inner);
+            let at = next.unwrap_or(now).max(now);
+            *next = Some(at + PLACE_PACE);
+            at
+        });
+        if at <= now {
+            entry.place_at = None;
+            return None;
+        }
+        Some(at - now)
+    }
+
+    /// Routes of the last partial result of the present attempt.
+    pub fn partial_sent(&self, submission: &Submission) -> Option<u32> {
+        let (attempt, done) = self.lock().get(&uid_of(submission))?.partial?;
+        (Some(attempt) == submission.status.as_ref()?.attempt).then_some(done)
+    }
+
+    /// Remembers a partial result.
+    pub fn told_partial(&self, submission: &Submission, attempt: i64, done: u32) {
+        self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
+    }
+
+    /// Drops an object that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.lock().remove(uid);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Resource versions of one kind grow; the API promises that they can be compared as numbers.
+fn version(object: &Submission) -> u64 {
+    object.resource_version().and_then(|v| v.parse().ok()).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn object(version: &str, reason: &str) -> Submission {
+        let mut object = Submission::new(
+            "s",
+            serde_json::from_value(serde_json::json!({"leaderboardName": "l", "track": "t", "image": "i"})).unwrap(),
+        );
+        object.metadata.uid = Some("u".into());
+        object.metadata.resource_version = Some(version.into());
+        object.status = Some(SubmissionStatus {
+            reason: Some(reason.into()),
+            ..Default::default()
+        });
+        object
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_step_of_a_thousand_in_line_is_one_write_a_second() {
+        let memory = Memory::default();
+        let mut object = object("1", "WaitingForSlot");
+        let mut writes = Vec::new();
+        let begin = Instant::now();
+        for second in 0..200 {
+            let now = begin + Duration::from_secs(second);
+            let mut count = 0;
+            for position in 1..=120 {
+                object.metadata.uid = Some(format!("u{position}"));
+                let waits = memory.place_waits(&object, position, now);
+                if position <= FIRST_PLACES {
+                    assert_eq!(waits, None);
+                } else {
+                    count += u32::from(waits.is_none());
+                }
+            }
+            writes.push(count);
+        }
+        assert!(writes.iter().all(|count| *count <= 1), "{writes:?}");
+        assert!(writes.iter().sum::<u32>() >= 190, "nobody is forgotten: {writes:?}");
+    }
+
+    #[test]
+    fn an_older_cache_does_not_hide_our_own_write() {
+        let memory = Memory::default();
+        memory.wrote(&object("12", "new"));
+        let seen = memory.with_own_status(Arc::new(object("9", "old")));
+        assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("new"));
+        let seen = memory.with_own_status(Arc::new(object("13", "newer")));
+        assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("newer"));
+    }
+}

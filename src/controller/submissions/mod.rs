@@ -1,0 +1,20 @@
+//! The reconcile of a Submission.
+//!
+//! It observes (`observe`: caches and memory), decides (`decide`: pure) and acts (`act`). What it needs of S3 the workers of
+//! `archive` read and write next to it.
+//! `job_spec` and `pod_overlay` build what is created in the cluster; they know no client and no clock.
+
+pub mod act;
+pub mod archive;
+pub mod decide;
+pub mod external;
+pub mod failure_log;
+pub mod job_spec;
+pub mod memory;
+pub mod observe;
+mod pod_layout;
+pub mod pod_overlay;
+pub mod reruns;
+mod result_texts;
+pub mod significance;
+pub mod view;

@@ -1,0 +1,87 @@
+//! A Job reduced to what decisions depend on. Pure.
+
+use k8s_openapi::api::batch::v1::{Job, JobCondition};
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+
+use crate::controller::submissions::view::{JobEnd, JobView};
+use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
+
+/// Reduces a Job. `pod` is its newest.
+pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
+    JobView {
+        name: job.name_any(),
+        uid: job.uid().unwrap_or_default(),
+        created: job.metadata.creation_timestamp.as_ref().map(|t| t.0),
+        end: end(job).or_else(|| pod.and_then(completion)),
+        deleting: job.metadata.deletion_timestamp.is_some(),
+        has_ttl: job
+            .spec
+            .as_ref()
+            .is_some_and(|s| s.ttl_seconds_after_finished.is_some()),
+        failed_create: None,
+    }
+}
+
+/// A Pod that has succeeded completes its Job, which has one completion. The Job controller says so some seconds later.
+fn completion(pod: &Pod) -> Option<JobEnd> {
+    let status = pod
+        .status
+        .as_ref()
+        .filter(|status| status.phase.as_deref() == Some("Succeeded"))?;
+    let all = [&status.init_container_statuses, &status.container_statuses];
+    let containers = all.into_iter().flatten().flatten();
+    let ends = containers.filter_map(|container| container.state.as_ref()?.terminated.as_ref()?.finished_at.as_ref());
+    Some(JobEnd::Complete {
+        at: ends.map(|time| time.0).max(),
+    })
+}
+
+fn end(job: &Job) -> Option<JobEnd> {
+    let conditions = job.status.as_ref()?.conditions.as_deref()?;
+    let find = |type_: &str| {
+        conditions
+            .iter()
+            .find(|c: &&JobCondition| c.type_ == type_ && c.status == "True")
+    };
+    if let Some(condition) = find("Complete") {
+        return Some(JobEnd::Complete {
+            at: condition.last_transition_time.as_ref().map(|t| t.0),
+        });
+    }
+    let condition = find("Failed")?;
+    Some(JobEnd::Failed {
+        at: condition.last_transition_time.as_ref().map(|t| t.0),
+        reason: condition.reason.clone().unwrap_or_default(),
+        message: one_line(condition.message.as_deref().unwrap_or_default(), LONGEST_MESSAGE),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_job_is_complete_with_its_pod() {
+        let job: Job = serde_json::from_value(json!({"metadata": {"name": "a-1"}})).unwrap();
+        let ended = |at: &str| {
+            json!({"name": "c", "image": "i", "imageID": "", "ready": false, "restartCount": 0,
+            "state": {"terminated": {"exitCode": 0, "finishedAt": at}}})
+        };
+        let pod = |phase: &str| -> Pod {
+            serde_json::from_value(json!({"metadata": {"name": "p"}, "status": {"phase": phase,
+                "initContainerStatuses": [ended("2026-01-01T00:00:09Z")],
+                "containerStatuses": [ended("2026-01-01T00:00:07Z")]}}))
+            .unwrap()
+        };
+        for phase in ["Pending", "Running", "Failed"] {
+            assert_eq!(view(&job, Some(&pod(phase))).end, None, "{phase}");
+        }
+        let end = view(&job, Some(&pod("Succeeded"))).end;
+        let at = Some("2026-01-01T00:00:09Z".parse().unwrap());
+        assert_eq!(end, Some(JobEnd::Complete { at }));
+        assert_eq!(view(&job, None).end, None);
+    }
+}

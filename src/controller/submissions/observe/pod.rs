@@ -1,0 +1,304 @@
+//! A Pod reduced to what decisions depend on. Pure; reads the runner's verdicts as hostile text.
+
+use k8s_openapi::api::core::v1::{
+    ContainerState, ContainerStateTerminated, ContainerStatus, Pod, PodCondition, PodStatus,
+};
+use kube::ResourceExt;
+use leaderboard_runner::protocol::Member;
+use leaderboard_runner::verdict::Verdict;
+
+use crate::controller::submissions::view::{ContainerView, EndView, PodView};
+use crate::pod::run::Stop;
+use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
+use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
+use leaderboard_api::{names, reasons};
+
+/// Reduces a Pod.
+pub fn view(pod: &Pod) -> PodView {
+    let status = pod.status.clone().unwrap_or_default();
+    let containers: Vec<ContainerView> = statuses(&status).map(container).collect();
+    let running = |name: &str| containers.iter().any(|c| c.name == name && c.running);
+    PodView {
+        name: pod.name_any(),
+        uid: pod.uid().unwrap_or_default(),
+        node: pod.spec.as_ref().and_then(|s| s.node_name.clone()),
+        scheduled: scheduled(&status),
+        unschedulable: unschedulable(&status),
+        delete_by: pod.metadata.deletion_timestamp.as_ref().map(|t| t.0),
+        deleted: deleted(pod),
+        agent_started: agent_started(&status),
+        logcopy_running: running(names::CONTAINER_LOGCOPY),
+        run_ended: run_ended(pod, &status),
+        ended_by_node: ended_by_node(&status),
+        stop: pod
+            .annotations()
+            .get(names::ANNOTATION_STOP)
+            .and_then(|text| Stop::parse(text)),
+        containers,
+    }
+}
+
+/// When its deletion was asked for: the API server adds the grace to what it shows.
+fn deleted(pod: &Pod) -> Option<jiff::Timestamp> {
+    let by = pod.metadata.deletion_timestamp.as_ref()?.0;
+    let grace = pod.metadata.deletion_grace_period_seconds.unwrap_or(0);
+    by.checked_sub(jiff::SignedDuration::from_secs(grace)).ok()
+}
+
+fn statuses(status: &PodStatus) -> impl Iterator<Item = &ContainerStatus> {
+    let init = status.init_container_statuses.iter().flatten();
+    init.chain(status.container_statuses.iter().flatten())
+}
+
+fn condition<'a>(status: &'a PodStatus, type_: &str) -> Option<&'a PodCondition> {
+    status.conditions.iter().flatten().find(|c| c.type_ == type_)
+}
+
+fn scheduled(status: &PodStatus) -> Option<jiff::Timestamp> {
+    condition(status, "PodScheduled")
+        .filter(|c| c.status == "True")?
+        .last_transition_time
+        .as_ref()
+        .map(|t| t.0)
+}
+
+fn unschedulable(status: &PodStatus) -> Option<String> {
+    let found = condition(status, "PodScheduled").filter(|c| c.status == "False")?;
+    Some(short(found.message.as_deref().unwrap_or("no node takes the Pod")))
+}
+
+fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
+    let agents = status
+        .container_statuses
+        .iter()
+        .flatten()
+        .filter(|c| c.name.starts_with("agent-"));
+    agents.flat_map(started_times).min()
+}
+
+/// The simulators leave once the final report is stored; logcopy's farewell and the kubelet's last word come seconds later.
+fn run_ended(pod: &Pod, status: &PodStatus) -> Option<jiff::Timestamp> {
+    let containers = pod.spec.iter().flat_map(|spec| &spec.containers);
+    let of_pairs = containers.filter(|c| ["agent-", "simulator-"].iter().any(|start| c.name.starts_with(start)));
+    let ends: Option<Vec<jiff::Timestamp>> = of_pairs
+        .map(|wanted| {
+            let mut statuses = status.container_statuses.iter().flatten();
+            let end = statuses
+                .find(|s| s.name == wanted.name)?
+                .state
+                .as_ref()?
+                .terminated
+                .as_ref()?;
+            end.finished_at.as_ref().filter(|_| end.exit_code == 0).map(|at| at.0)
+        })
+        .collect();
+    ends?.into_iter().max()
+}
+
+fn started_times(status: &ContainerStatus) -> impl Iterator<Item = jiff::Timestamp> {
+    let states = [status.state.as_ref(), status.last_state.as_ref()];
+    states.into_iter().flatten().filter_map(|state| {
+        let running = state.running.as_ref().and_then(|r| r.started_at.as_ref());
+        // A container that could not be started has no start of its own.
+        let ended = state
+            .terminated
+            .as_ref()
+            .filter(|t| t.reason.as_deref() != Some("StartError"));
+        running.or(ended.and_then(|t| t.started_at.as_ref())).map(|t| t.0)
+    })
+}
+
+fn ended_by_node(status: &PodStatus) -> Option<(String, String)> {
+    let reason = status.reason.clone()?;
+    Some((reason, short(status.message.as_deref().unwrap_or_default())))
+}
+
+fn container(status: &ContainerStatus) -> ContainerView {
+    let state = status.state.clone().unwrap_or_default();
+    ContainerView {
+        name: status.name.clone(),
+        restarts: status.restart_count,
+        running: state.running.is_some(),
+        waiting: state.waiting.as_ref().map(|w| {
+            (
+                w.reason.clone().unwrap_or_default(),
+                short(w.message.as_deref().unwrap_or_default()),
+            )
+        }),
+        last: last_end(status, &state),
+    }
+}
+
+fn last_end(status: &ContainerStatus, state: &ContainerState) -> Option<EndView> {
+    let before = status.last_state.as_ref().and_then(|s| s.terminated.as_ref());
+    let ended = state.terminated.as_ref().or(before)?;
+    Some(end(&status.name, ended))
+}
+
+/// Whose words are passed on to people. A stranger's program can write whatever it likes where the runner leaves its
+/// verdict, for example a private route; of that only a verdict's closed words and numbers are used.
+fn may_speak(container: &str, ended: &ContainerStateTerminated) -> bool {
+    let is_hosts = [
+        names::CONTAINER_CONTENTS,
+        names::CONTAINER_WORKSPACE,
+        names::CONTAINER_LOGCOPY,
+    ]
+    .contains(&container);
+    // Without a start there was no program yet; the words are the kubelet's.
+    is_hosts || matches!(ended.reason.as_deref(), Some("StartError" | "ContainerCannotRun"))
+}
+
+fn end(container: &str, terminated: &ContainerStateTerminated) -> EndView {
+    let message = terminated.message.as_deref().unwrap_or_default();
+    let is_behind_runner = Member::parse(container).is_some();
+    let verdict = Verdict::parse(message).ok().filter(|_| is_behind_runner);
+    let verdict = verdict.map(|verdict| Verdict {
+        why: short(&verdict.why),
+        ..verdict
+    });
+    let foreign = Some(message).filter(|_| may_speak(container, terminated));
+    let out_of_memory = verdict.as_ref().is_some_and(|v| v.out_of_memory);
+    let reason = terminated.reason.clone().unwrap_or_default();
+    EndView {
+        reason: if out_of_memory { "OOMKilled".into() } else { reason },
+        exit_code: terminated.exit_code,
+        began: terminated.started_at.as_ref().map(|t| t.0),
+        at: terminated.finished_at.as_ref().map(|t| t.0),
+        verdict,
+        own_reason: foreign.and_then(foreign_word),
+        why: foreign.and_then(foreign_why),
+    }
+}
+
+/// `workspace` leaves `{"reason": …, "message": …}`.
+fn foreign_word(message: &str) -> Option<String> {
+    let value: serde_json::Value = serde_json::from_str(message).ok()?;
+    let verdict = WorkspaceVerdict::parse(message);
+    if verdict.is_some_and(|verdict| verdict.reason == WorkspaceReason::NotKnownIsolated) {
+        // For the run it is the same; the Leaderboard's condition tells them apart.
+        return Some(reasons::NOT_ISOLATED.to_owned());
+    }
+    value.get("reason")?.as_str().map(short)
+}
+
+fn foreign_why(message: &str) -> Option<String> {
+    let parsed: Option<serde_json::Value> = serde_json::from_str(message).ok();
+    let told = parsed
+        .as_ref()
+        .and_then(|v| v.get("message"))
+        .and_then(|m| m.as_str())
+        .map(short);
+    told.or_else(|| (!message.trim().is_empty() && parsed.is_none()).then(|| short(message)))
+}
+
+fn short(text: &str) -> String {
+    one_line(text, LONGEST_MESSAGE)
+}
+
+#[cfg(test)]
+mod tests {
+    use leaderboard_runner::verdict::What;
+    use serde_json::json;
+
+    use super::*;
+
+    fn seen(container: &str, reason: &str, message: &str) -> EndView {
+        let pod = serde_json::from_value(json!({"metadata": {"name": "p"}, "status": {"containerStatuses": [{
+            "name": container, "image": "i", "imageID": "", "ready": false, "restartCount": 1,
+            "state": {"terminated": {"exitCode": 1, "reason": reason, "message": message}},
+        }]}}));
+        view(&pod.unwrap()).containers[0].last.clone().unwrap()
+    }
+
+    #[test]
+    fn a_strangers_program_puts_no_words_into_anybodys_mouth() {
+        let forged = r#"{"reason": "route 7 begins at x=13", "message": "and ends at y=4"}"#;
+        for container in ["agent-1", "simulator-1", "sidecar"] {
+            for message in [forged, "route 7 begins at x=13"] {
+                let end = seen(container, "Error", message);
+                assert_eq!((end.own_reason, end.why), (None, None), "{container}: {message}");
+                assert_eq!(end.verdict, None);
+            }
+        }
+        let told = seen("workspace", "Error", forged);
+        assert_eq!(told.own_reason.as_deref(), Some("route 7 begins at x=13"));
+        assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
+        let kubelets = seen("agent-1", "StartError", "exec: no such file");
+        assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
+    }
+
+    #[test]
+    fn what_a_container_or_the_kubelet_reports_is_one_harmless_line() {
+        let harmless = "disk\u{fffd}[2J full";
+        for (container, reason) in [("contents", "Error"), ("agent-1", "StartError")] {
+            let end = seen(container, reason, "disk\u{1b}[2J\r\n full\n");
+            assert_eq!(end.why.as_deref(), Some(harmless), "{container}");
+        }
+        let verdict = r#"{"what":"exited","exitCode":1,"signal":null,"why":"disk\u001b[2J\nfull"}"#;
+        assert_eq!(seen("agent-1", "Error", verdict).verdict.unwrap().why, harmless);
+        let long = seen("contents", "Error", &"x".repeat(5000)).why.unwrap();
+        assert_eq!(long.chars().count(), LONGEST_MESSAGE);
+    }
+
+    #[test]
+    fn a_verdict_is_parsed_even_if_its_end_is_cut_off() {
+        let whole = r#"{"what":"exited","round":3,"schema":2,"exitCode":0,"why":"it exited"}"#;
+        let verdict = seen("agent-1", "Error", whole).verdict.unwrap();
+        assert_eq!(
+            (verdict.what, verdict.round, verdict.exit_code),
+            (What::Exited, Some(3), Some(0))
+        );
+        let cut = seen("simulator-1", "Error", &whole[..40]).verdict.unwrap();
+        assert_eq!((cut.what, cut.round), (What::Exited, Some(3)));
+        assert_eq!(seen("workspace", "Error", whole).verdict, None, "no runner is there");
+    }
+
+    #[test]
+    fn a_run_has_ended_once_every_agent_and_simulator_has_ended_well() {
+        let ended = |name: &str, code: i32, at: &str| {
+            json!({"name": name, "image": "i", "imageID": "", "ready": false, "restartCount": 0,
+                   "state": {"terminated": {"exitCode": code, "finishedAt": at}}})
+        };
+        let seen = |statuses: Vec<serde_json::Value>| {
+            let pod = json!({"metadata": {"name": "p"},
+                "spec": {"containers": [{"name": "simulator-1"}, {"name": "agent-1"}, {"name": "extra"}]},
+                "status": {"containerStatuses": statuses}});
+            let mut pod = serde_json::from_value(pod).unwrap();
+            // As the cache keeps it.
+            crate::controller::runtime::trim_pod(&mut pod);
+            view(&pod).run_ended.map(|at| at.to_string())
+        };
+        let agent = ended("agent-1", 0, "2026-01-01T00:00:07Z");
+        let simulator = ended("simulator-1", 0, "2026-01-01T00:00:09Z");
+        assert_eq!(
+            seen(vec![agent.clone(), simulator]),
+            Some("2026-01-01T00:00:09Z".into())
+        );
+        assert_eq!(
+            seen(vec![agent.clone(), ended("simulator-1", 1, "2026-01-01T00:00:09Z")]),
+            None
+        );
+        let running = json!({"name": "simulator-1", "image": "i", "imageID": "", "ready": true, "restartCount": 1,
+            "state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}});
+        assert_eq!(seen(vec![agent.clone(), running]), None);
+        assert_eq!((seen(vec![agent]), seen(vec![])), (None, None), "not all are known yet");
+    }
+
+    #[test]
+    fn a_deletion_has_a_beginning_and_a_grace() {
+        let pod = serde_json::from_value(json!({"metadata": {
+            "name": "p", "deletionTimestamp": "2026-01-01T00:10:00Z", "deletionGracePeriodSeconds": 600,
+        }}));
+        let seen = view(&pod.unwrap());
+        assert_eq!(seen.deleted.unwrap().to_string(), "2026-01-01T00:00:00Z");
+        assert_eq!(seen.delete_by.unwrap().to_string(), "2026-01-01T00:10:00Z");
+    }
+
+    #[test]
+    fn a_pod_that_is_not_known_to_be_isolated_is_not_isolated_for_its_run() {
+        for reason in ["NotIsolated", "NotKnownIsolated"] {
+            let said = json!({"reason": reason, "message": "There is no address to try."}).to_string();
+            assert_eq!(foreign_word(&said).as_deref(), Some(reasons::NOT_ISOLATED), "{reason}");
+        }
+    }
+}

@@ -1,0 +1,336 @@
+//! The world of one submission, as one pass saw it. `observe` fills it, `decide` reads it; it holds no client and no clock.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use leaderboard_runner::verdict::Verdict;
+
+use super::archive::digest::{ReportDigest, ReportId};
+pub use crate::controller::slots::turns::Turn;
+use crate::pod::run::Stop;
+use leaderboard_api::{Leaderboard, Rerun, Submission};
+
+/// Everything a decision may depend on.
+#[derive(Clone, Debug)]
+pub struct View {
+    pub now: Timestamp,
+    pub submission: Arc<Submission>,
+    pub leaderboard: Option<Arc<Leaderboard>>,
+    /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place.
+    pub is_policy_in_place: bool,
+    /// Whether it may start now; only meaningful while it has no Job and all else is settled.
+    pub turn: Turn,
+    pub job: ObservedJob,
+    pub pod: Option<PodView>,
+    pub node: ObservedNode,
+    pub report: ObservedReport,
+    /// What was known of the run when the answer in `report` was asked for; None: nothing was read for this Job.
+    pub report_stage: Option<Stage>,
+    /// How long the present report has been asked for.
+    pub report_waited: Duration,
+    pub texts: ObservedTexts,
+    pub fence: ObservedFence,
+    pub log: ObservedLog,
+    /// None for a submission that is not EvalAI's.
+    pub evalai: Option<EvalaiView>,
+    /// None if the Leaderboard has no table.
+    pub record: Option<RecordView>,
+    /// Routes that the last partial result told EvalAI of, in this attempt.
+    pub partial_sent: Option<u32>,
+    /// The submission that re-runs this one, as its status says.
+    pub rerun_as: Option<Rerun>,
+    /// Ended submissions of the same team and Leaderboard whose simulators failed within a day; counted only once this one crashes.
+    pub simulator_failures_of_team: usize,
+    /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
+    pub evalai_writes_from: Option<Timestamp>,
+}
+
+/// The Job that the present attempt should have.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ObservedJob {
+    Absent,
+    /// It has the right name but another owner: an older object's, going away.
+    Foreign,
+    Ours(JobView),
+}
+
+impl ObservedJob {
+    /// The Job, if it is ours.
+    pub fn ours(&self) -> Option<&JobView> {
+        match self {
+            Self::Ours(job) => Some(job),
+            Self::Absent | Self::Foreign => None,
+        }
+    }
+}
+
+/// A Job, reduced to what matters.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JobView {
+    pub name: String,
+    pub uid: String,
+    pub created: Option<Timestamp>,
+    pub end: Option<JobEnd>,
+    pub deleting: bool,
+    pub has_ttl: bool,
+    /// The words of its last FailedCreate event, while it has no Pod.
+    pub failed_create: Option<String>,
+}
+
+/// How a Job ended; both wait for the end of its Pods.
+#[derive(Clone, Debug, PartialEq)]
+pub enum JobEnd {
+    Complete {
+        at: Option<Timestamp>,
+    },
+    Failed {
+        at: Option<Timestamp>,
+        reason: String,
+        message: String,
+    },
+}
+
+/// The newest Pod of the Job.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PodView {
+    pub name: String,
+    pub uid: String,
+    pub node: Option<String>,
+    pub scheduled: Option<Timestamp>,
+    /// The scheduler's words, while no node fits.
+    pub unschedulable: Option<String>,
+    /// When it has to be gone, once it is being deleted (its grace included).
+    pub delete_by: Option<Timestamp>,
+    /// When its deletion was asked for.
+    pub deleted: Option<Timestamp>,
+    /// When its first agent started.
+    pub agent_started: Option<Timestamp>,
+    pub logcopy_running: bool,
+    /// When the last of its agents and simulators ended, once all of them have ended well.
+    pub run_ended: Option<Timestamp>,
+    pub containers: Vec<ContainerView>,
+    /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
+    pub ended_by_node: Option<(String, String)>,
+    pub stop: Option<Stop>,
+}
+
+/// The Pod's node, which is looked at while the Pod runs or is being deleted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ObservedNode {
+    /// There was no reason to look, or no right to.
+    #[default]
+    Unknown,
+    /// Its kubelet speaks to the API server.
+    Reports,
+    /// Its kubelet has not been heard of since.
+    Silent { since: Timestamp },
+    /// There is no such node any more.
+    Gone,
+}
+
+/// One container of the Pod.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ContainerView {
+    pub name: String,
+    pub restarts: i32,
+    pub running: bool,
+    /// Reason and message, while it waits.
+    pub waiting: Option<(String, String)>,
+    pub last: Option<EndView>,
+}
+
+/// How a container last ended.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EndView {
+    /// Kubernetes' reason: `Completed`, `Error`, `OOMKilled`, `StartError`, …
+    pub reason: String,
+    pub exit_code: i32,
+    /// When this life of it began.
+    pub began: Option<Timestamp>,
+    pub at: Option<Timestamp>,
+    /// What the runner of a simulator or agent reported. An agent can forge its own.
+    pub verdict: Option<Verdict>,
+    /// The reason that a container of the host's reported, such as `PrefixInUse`.
+    pub own_reason: Option<String>,
+    /// The sentence of a container of the host's, or Kubernetes' own.
+    pub why: Option<String>,
+}
+
+/// What was known of a run when its report was asked for. What is stored later than that is not in the answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Stage {
+    /// Its agents may still run.
+    Live,
+    /// Its agents and simulators had ended.
+    RunEnded,
+    /// The Job had ended, or was gone.
+    JobEnded,
+}
+
+/// Which report a decision needs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReportDemand {
+    pub attempt: i64,
+    pub retry: i32,
+    /// UID of the Pod.
+    pub pod: Option<String>,
+    pub stage: Stage,
+    /// How often the report of a live run is read.
+    pub period: Duration,
+}
+
+/// The report in S3, as far as it was read.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ObservedReport {
+    /// It was not read, or nobody has asked for it.
+    NotRead,
+    Absent,
+    /// Another object's or attempt's.
+    Foreign,
+    /// S3 did not answer, or not with a report.
+    Unreadable(String),
+    Ours(Arc<ReportDigest>),
+}
+
+impl ObservedReport {
+    /// The report, if it is ours.
+    pub fn ours(&self) -> Option<&Arc<ReportDigest>> {
+        match self {
+            Self::Ours(report) => Some(report),
+            _ => None,
+        }
+    }
+}
+
+/// The texts of a result, as they are published.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Texts {
+    /// The report that names them.
+    pub of: ReportId,
+    /// The metrics as EvalAI takes them.
+    pub result: String,
+    /// The same over the routes so far, while the run goes on.
+    pub partial: Option<String>,
+    pub stdout: String,
+    pub metadata: String,
+    /// Why `stdout` and `metadata` are not there.
+    pub problem: Option<TextProblem>,
+}
+
+/// Why there is no text of a result.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum TextProblem {
+    /// It may come.
+    Unread(String),
+    /// What is stored is not what the report names: the Pod ended between the two. It will hardly change.
+    Unfit(String),
+}
+
+impl TextProblem {
+    pub fn why(&self) -> &str {
+        match self {
+            Self::Unread(why) | Self::Unfit(why) => why,
+        }
+    }
+}
+
+/// The texts of a report, as far as they were read.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ObservedTexts {
+    NotRead,
+    /// Not even the report that names them was there.
+    Unread(String),
+    Read(Arc<Texts>),
+}
+
+/// Whether our own mark is in `logcopy/owner`, so that a lost Pod stores nothing more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ObservedFence {
+    NotRequested,
+    /// Requested this long ago.
+    Pending(Duration),
+    /// The last write failed; it is tried again. Requested this long ago.
+    Failed(Duration),
+    Held,
+}
+
+/// What became of the log that explains a failure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ObservedLog {
+    NotRequested,
+    /// Requested this long ago.
+    Pending(Duration),
+    Kept,
+    /// There is none.
+    None,
+    /// It could not be read or stored.
+    GivenUp,
+}
+
+/// What is known of the submission in EvalAI.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EvalaiView {
+    /// What EvalAI last said of it; None until it was asked.
+    pub info: Option<EvalaiInfo>,
+    /// When its row was read.
+    pub read_at: Option<Timestamp>,
+    /// It was cancelled there, after this attempt was announced.
+    pub cancelled: bool,
+    /// A write of ours may have undone that cancel in EvalAI.
+    pub overtaken: bool,
+    /// What became of the final result of this attempt.
+    pub end: Option<EvalaiEnd>,
+    /// Team of its row, as last read.
+    pub team_id: Option<String>,
+    /// Why the last request failed.
+    pub error: Option<String>,
+}
+
+/// A submission in EvalAI.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EvalaiInfo {
+    pub standing: Standing,
+    pub status: String,
+    /// Phase of its row; none where EvalAI does not say.
+    pub phase: Option<i64>,
+    pub team_id: String,
+    pub team_name: Option<String>,
+    pub submitted_at: Option<Timestamp>,
+    /// The submission that this one re-runs.
+    pub rerun_of: Option<Rerun>,
+    pub image: Option<String>,
+    /// Why the uploaded file names no image, which no later read changes; none while it has not been read.
+    pub image_problem: Option<String>,
+}
+
+/// What EvalAI's status means for a run of this attempt.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Standing {
+    /// It wants to run.
+    Wanted,
+    /// It was resumed there: its stored results are taken up.
+    Resumed,
+    /// It has come to its end there without us.
+    Ended,
+}
+
+/// What became of a final result.
+#[derive(Clone, Debug, PartialEq)]
+pub enum EvalaiEnd {
+    /// EvalAI has it.
+    Published { at: Timestamp },
+    /// EvalAI had ended it before: cancelled, archived, ignored, or it is gone.
+    Ended { status: String },
+    /// EvalAI will never take it, and why.
+    Refused { message: String },
+}
+
+/// What is known of the row in DynamoDB.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RecordView {
+    /// The end of this attempt is written.
+    pub end_written: bool,
+    /// Why the last write failed.
+    pub error: Option<String>,
+}
