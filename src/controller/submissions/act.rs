@@ -9,19 +9,38 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::api::{
     ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions, PropagationPolicy,
 };
-use kube::runtime::events::{Event as KubeEvent, EventType};
-use kube::{Api, Resource, ResourceExt};
+use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
+use kube::{Api, Client, Resource, ResourceExt};
 use serde_json::json;
 
-use super::archive::request::LogDemand;
+use super::archive::ArchiveWorkers;
 use super::decide::{Action, Event, LogPlace, Plan};
+use super::external::ExternalSystems;
+use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
-use super::observe::{is_pod_of, uid_of};
+use super::memory::Memory;
 use super::significance::{Change, change, patience};
 use super::view::View;
-use crate::controller::runtime::context::{CALL_TIMEOUT, Context};
+use crate::controller::objects::{is_pod_of, uid_of};
+use crate::controller::settings::Settings;
+use crate::controller::slots::SlotAllocator;
+use crate::controller::stores::Stores;
+use crate::kubernetes::CALL_TIMEOUT;
 use leaderboard_api::client_errors;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
+
+/// What carrying a plan out uses.
+#[derive(Clone, Copy)]
+pub struct Uses<'a> {
+    pub client: &'a Client,
+    pub recorder: &'a Recorder,
+    pub settings: &'a Settings,
+    pub stores: &'a Stores,
+    pub memory: &'a Memory,
+    pub slots: &'a SlotAllocator,
+    pub archive: &'a ArchiveWorkers,
+    pub external: &'a ExternalSystems,
+}
 
 /// What a pass could not carry out.
 #[derive(thiserror::Error, Debug)]
@@ -52,9 +71,9 @@ impl ActError {
 /// Carries out a plan for what `view` shows.
 ///
 /// Returns when to look again if a status of mere progress was held back.
-pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Duration>, ActError> {
+pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Duration>, ActError> {
     let actor = Actor {
-        context,
+        uses,
         view,
         namespace: view.submission.namespace().unwrap_or_default(),
     };
@@ -65,9 +84,7 @@ pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Du
     for event in &plan.events {
         actor.publish(event).await;
     }
-    context
-        .archive_workers
-        .demand(&view.submission, &plan.status, plan.report);
+    uses.archive.demand(&view.submission, &plan.status, plan.report);
     for action in &plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
@@ -75,7 +92,7 @@ pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Du
 }
 
 struct Actor<'a> {
-    context: &'a Context,
+    uses: Uses<'a>,
     view: &'a View,
     namespace: String,
 }
@@ -94,12 +111,11 @@ impl Actor<'_> {
         K: Resource<Scope = k8s_openapi::NamespaceResourceScope>,
         K::DynamicType: Default,
     {
-        Api::namespaced(self.context.client.clone(), &self.namespace)
+        Api::namespaced(self.uses.client.clone(), &self.namespace)
     }
 
     async fn carry_out(&self, action: &Action, status: &SubmissionStatus) -> Result<(), ActError> {
         match action {
-            Action::AddFinalizer => Ok(()),
             Action::ReleaseFinalizer => self.set_finalizer(false).await,
             Action::CreateJob { attempt, retry } => self.create_job(status, *attempt, *retry).await,
             Action::DeleteJob {
@@ -108,10 +124,6 @@ impl Actor<'_> {
                 grace_seconds,
             } => self.delete_job(name, uid, *grace_seconds).await,
             Action::ForceDeletePod { name, uid } => self.delete_pod(name, uid, 0).await,
-            Action::TakeOwnership => {
-                self.context.archive_workers.want_fence(self.submission(), status);
-                Ok(())
-            }
             Action::AnnotateStop { pod, stop } => {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
@@ -120,56 +132,42 @@ impl Actor<'_> {
                 let patch = json!({ "spec": { "ttlSecondsAfterFinished": seconds } });
                 self.patch::<Job>("the time to live", name, &patch).await
             }
-            Action::KeepLog { places } => {
-                self.keep_log(places, status);
-                Ok(())
-            }
-            Action::ReadTexts { of } => {
-                self.context.archive_workers.want_texts(self.submission(), status, *of);
-                Ok(())
-            }
-            Action::JoinLine(place) => {
-                self.context.slots.join(self.submission(), place.clone());
-                Ok(())
-            }
-            Action::AskEvalai => {
-                self.context.external.ask(self.view);
-                Ok(())
-            }
-            Action::FollowEvalai => {
-                self.context.external.follow(self.view, status);
-                Ok(())
-            }
-            Action::UpdateEvalai(update) => {
-                self.context
-                    .external
-                    .update_evalai(self.context, self.view, status, *update);
-                Ok(())
-            }
-            Action::ForgetEvalai => {
-                self.context.external.forget_evalai(self.submission());
-                Ok(())
-            }
-            Action::Forget => {
-                self.context.external.forget(self.submission());
-                self.context.archive_workers.forget(&uid_of(self.submission()));
-                Ok(())
-            }
-            Action::Record { end } => {
-                self.context.external.record(self.view, status, *end);
+            other => {
+                self.request(other, status);
                 Ok(())
             }
         }
     }
 
-    fn keep_log(&self, places: &[LogPlace], status: &SubmissionStatus) {
-        let demand = LogDemand {
-            attempt: status.attempt.unwrap_or(1),
-            retry: status.retry,
-            places: places.to_vec(),
-            is_over: status.times.finished.is_some(),
-        };
-        self.context.archive_workers.want_log(self.submission(), status, demand);
+    /// Hands on what others do: the slots, the workers of S3, EvalAI and the table. Nothing here waits.
+    fn request(&self, action: &Action, status: &SubmissionStatus) {
+        let (uses, submission) = (self.uses, self.submission());
+        match action {
+            Action::JoinLine(place) => uses.slots.join(submission, place.clone()),
+            Action::TakeOwnership => uses.archive.want_fence(submission, status),
+            Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
+            Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
+            Action::AskEvalai => uses.external.ask(self.view),
+            Action::FollowEvalai => uses.external.follow(self.view, status),
+            Action::UpdateEvalai(update) => {
+                uses.external
+                    .update_evalai(uses.memory, uses.archive, self.view, status, *update);
+            }
+            Action::ForgetEvalai => uses.external.forget_evalai(submission),
+            Action::Forget => {
+                uses.external.forget(submission);
+                uses.archive.forget(&uid_of(submission));
+            }
+            Action::Record { end } => uses.external.record(self.view, status, *end),
+            // The finalizer goes before the status; the others are requests to the API server.
+            Action::AddFinalizer
+            | Action::ReleaseFinalizer
+            | Action::CreateJob { .. }
+            | Action::DeleteJob { .. }
+            | Action::ForceDeletePod { .. }
+            | Action::AnnotateStop { .. }
+            | Action::SetJobTtl { .. } => {}
+        }
     }
 
     async fn set_finalizer(&self, wanted: bool) -> Result<(), ActError> {
@@ -205,14 +203,14 @@ impl Actor<'_> {
             Change::Place => {
                 let position = status.waiting.as_ref().map_or(0, |w| w.position);
                 let now = tokio::time::Instant::now();
-                let waits = self.context.memory.place_waits(self.submission(), position, now);
+                let waits = self.uses.memory.place_waits(self.submission(), position, now);
                 if waits.is_some() {
                     return Ok(waits);
                 }
             }
             Change::Progress => {
                 let patience = patience(self.view.leaderboard.as_ref().map(|l| &l.spec));
-                let since = self.context.memory.since_write(self.submission());
+                let since = self.uses.memory.since_write(self.submission());
                 if let Some(left) = since.and_then(|since| patience.checked_sub(since)) {
                     return Ok(Some(left));
                 }
@@ -229,7 +227,7 @@ impl Actor<'_> {
         let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Apply(&patch));
         let call = api.patch_status(&name, &params, &body);
         let answer = self.call("the status", &self.name(), call).await?;
-        self.context.memory.wrote(&answer);
+        self.uses.memory.wrote(&answer);
         self.log_transition(status);
         Ok(None)
     }
@@ -257,7 +255,7 @@ impl Actor<'_> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
         };
-        let settings = &self.context.settings;
+        let settings = &self.uses.settings;
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
@@ -271,7 +269,7 @@ impl Actor<'_> {
         });
         let name = names::job(&self.name(), attempt, retry);
         let resource = ApiResource::erase::<Job>(&());
-        let api: Api<DynamicObject> = Api::namespaced_with(self.context.client.clone(), &self.namespace, &resource);
+        let api: Api<DynamicObject> = Api::namespaced_with(self.uses.client.clone(), &self.namespace, &resource);
         let params = PostParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PostParams::default()
@@ -305,7 +303,7 @@ impl Actor<'_> {
             Err(error) if !is_gone(&error) && !is_conflict(&error) => return Err(error),
             _ => {}
         }
-        let stores = &self.context.stores;
+        let stores = &self.uses.stores;
         let pods: Vec<_> = stores
             .pods
             .state()
@@ -399,7 +397,7 @@ impl Actor<'_> {
             action: event.reason.clone(),
             secondary: None,
         };
-        let call = self.context.recorder.publish(&note, &reference);
+        let call = self.uses.recorder.publish(&note, &reference);
         match tokio::time::timeout(CALL_TIMEOUT, call).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => {
@@ -408,6 +406,15 @@ impl Actor<'_> {
             }
             Err(_) => tracing::warn!(submission = %self.name(), reason = %event.reason, "an event was not answered"),
         }
+    }
+}
+
+fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {
+    LogDemand {
+        attempt: status.attempt.unwrap_or(1),
+        retry: status.retry,
+        places: places.to_vec(),
+        is_over: status.times.finished.is_some(),
     }
 }
 
