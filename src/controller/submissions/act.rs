@@ -1,15 +1,15 @@
 //! Carries a plan out: finalizer, status, children, requests, events, in this order. Decides nothing.
 //!
-//! Every step is safe to repeat. A failed status write ends the pass, because what follows would not be remembered.
+//! Every step is safe to repeat. A failed status write ends the reconcile, because what follows would not be remembered.
 
 use std::time::Duration;
 
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
-use kube::api::{
-    ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions, PropagationPolicy,
-};
+use kube::api::{ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions};
+use kube::core::NamespaceResourceScope;
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
+use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client, Resource, ResourceExt};
 use serde_json::json;
 
@@ -25,8 +25,8 @@ use crate::controller::objects::{is_pod_of, uid_of};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
-use crate::kubernetes::CALL_TIMEOUT;
-use leaderboard_api::client_errors;
+use crate::controller::writes::{apply_status, set_finalizer};
+use crate::kubernetes::{CallError, Watchable, call};
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
 /// What carrying a plan out uses.
@@ -42,17 +42,11 @@ pub struct Uses<'a> {
     pub external: &'a ExternalSystems,
 }
 
-/// What a pass could not carry out.
+/// What a reconcile could not carry out.
 #[derive(thiserror::Error, Debug)]
 pub enum ActError {
-    #[error("{what} of {object} failed: {}", client_errors::kube(source))]
-    Kubernetes {
-        what: &'static str,
-        object: String,
-        source: Box<kube::Error>,
-    },
-    #[error("{what} of {object}: the API server did not answer within {} s", CALL_TIMEOUT.as_secs())]
-    Silent { what: &'static str, object: String },
+    #[error(transparent)]
+    Call(#[from] CallError),
     #[error("{object} has no plan although its Job is to be made; its Leaderboard may have been deleted just now")]
     NoPlan { object: String },
 }
@@ -61,8 +55,7 @@ impl ActError {
     /// One word for metrics.
     pub fn label(&self) -> &'static str {
         match self {
-            Self::Kubernetes { .. } => "kubernetes",
-            Self::Silent { .. } => "timeout",
+            Self::Call(error) => error.label(),
             Self::NoPlan { .. } => "plan",
         }
     }
@@ -108,8 +101,7 @@ impl Actor<'_> {
 
     fn api<K>(&self) -> Api<K>
     where
-        K: Resource<Scope = k8s_openapi::NamespaceResourceScope>,
-        K::DynamicType: Default,
+        K: Watchable + Resource<Scope = NamespaceResourceScope>,
     {
         Api::namespaced(self.uses.client.clone(), &self.namespace)
     }
@@ -171,29 +163,8 @@ impl Actor<'_> {
     }
 
     async fn set_finalizer(&self, wanted: bool) -> Result<(), ActError> {
-        let present = self.submission().finalizers().to_vec();
-        let mut finalizers: Vec<String> = present
-            .into_iter()
-            .filter(|f| f != names::FINALIZER_SUBMISSION)
-            .collect();
-        if wanted {
-            finalizers.push(names::FINALIZER_SUBMISSION.into());
-        }
-        // The resource version keeps other controllers' finalizers safe: a concurrent change makes this write fail.
-        let patch = json!({ "metadata": {
-            "resourceVersion": self.submission().metadata.resource_version,
-            "finalizers": finalizers,
-        } });
-        let params = PatchParams {
-            field_manager: Some(names::MANAGER_FINALIZER.into()),
-            ..PatchParams::default()
-        };
-        let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Merge(&patch));
-        let call = api.patch(&name, &params, &body);
-        match self.call("the finalizer", &self.name(), call).await {
-            Err(error) if !wanted && is_gone(&error) => Ok(()),
-            other => other.map(|_| ()),
-        }
+        let set = set_finalizer(self.uses.client, self.submission(), names::FINALIZER_SUBMISSION, wanted);
+        Ok(set.await?)
     }
 
     async fn write_status(&self, status: &SubmissionStatus) -> Result<Option<Duration>, ActError> {
@@ -217,16 +188,7 @@ impl Actor<'_> {
             }
             Change::Real => {}
         }
-        let patch = json!({
-            "apiVersion": Submission::api_version(&()),
-            "kind": Submission::kind(&()),
-            "metadata": { "name": self.name(), "uid": uid_of(self.submission()) },
-            "status": status,
-        });
-        let params = PatchParams::apply(names::MANAGER_STATUS).force();
-        let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Apply(&patch));
-        let call = api.patch_status(&name, &params, &body);
-        let answer = self.call("the status", &self.name(), call).await?;
+        let answer = apply_status(self.uses.client, self.submission(), status).await?;
         self.uses.memory.wrote(&answer);
         self.log_transition(status);
         Ok(None)
@@ -274,116 +236,71 @@ impl Actor<'_> {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PostParams::default()
         };
-        let call = api.create(&params, &object);
-        match self.call("creating the Job", &name, call).await {
-            // Its name is ours alone; whose it is, the next pass sees.
-            Err(error) if is_conflict(&error) => Ok(()),
-            other => other.map(|_| ()),
+        match call("creating the Job", &name, api.create(&params, &object)).await {
+            // Its name is ours alone; whose it is, the next reconcile sees.
+            Err(error) if error.is_conflict() => Ok(()),
+            other => Ok(other.map(|_| ())?),
         }
     }
 
     async fn delete_job(&self, name: &str, uid: &str, grace_seconds: i64) -> Result<(), ActError> {
         // In the foreground the Job stays until its Pods are gone; a Pod that will never go must not hold it.
-        let propagation = if grace_seconds > 0 {
-            PropagationPolicy::Foreground
+        let params = if grace_seconds > 0 {
+            DeleteParams::foreground()
         } else {
-            PropagationPolicy::Background
+            DeleteParams::background()
         };
-        let params = DeleteParams {
-            propagation_policy: Some(propagation),
-            preconditions: Some(Preconditions {
-                uid: Some(uid.into()),
-                resource_version: None,
-            }),
-            ..DeleteParams::default()
+        self.delete::<Job>("deleting the Job", name, uid, params).await?;
+        let reference = ObjectRef::<Job>::new(name).within(&self.namespace);
+        let Some(job) = self.uses.stores.jobs.get(&reference) else {
+            return Ok(());
         };
-        let api = self.api::<Job>();
-        let call = api.delete(name, &params);
-        match self.call("deleting the Job", name, call).await {
-            Err(error) if !is_gone(&error) && !is_conflict(&error) => return Err(error),
-            _ => {}
-        }
-        let stores = &self.uses.stores;
-        let pods: Vec<_> = stores
-            .pods
-            .state()
-            .into_iter()
-            .filter(|pod| self.is_of_job(pod, name))
-            .collect();
-        for pod in pods {
+        let pods = self.uses.stores.pods.state();
+        for pod in pods.iter().filter(|pod| is_pod_of(pod, &job)) {
             self.delete_pod(&pod.name_any(), &uid_of(pod.as_ref()), grace_seconds)
                 .await?;
         }
         Ok(())
     }
 
-    fn is_of_job(&self, pod: &Pod, job: &str) -> bool {
-        let reference = kube::runtime::reflector::ObjectRef::<Job>::new(job).within(&self.namespace);
-        self.context
-            .stores
-            .jobs
-            .get(&reference)
-            .is_some_and(|job| is_pod_of(pod, &job))
-    }
-
     async fn delete_pod(&self, name: &str, uid: &str, grace_seconds: i64) -> Result<(), ActError> {
         let params = DeleteParams {
             grace_period_seconds: u32::try_from(grace_seconds).ok(),
-            preconditions: Some(Preconditions {
-                uid: Some(uid.into()),
-                resource_version: None,
-            }),
             ..DeleteParams::default()
         };
-        let api = self.api::<Pod>();
-        let call = api.delete(name, &params);
-        match self.call("deleting the Pod", name, call).await {
-            Err(error) if !is_gone(&error) && !is_conflict(&error) => Err(error),
+        self.delete::<Pod>("deleting the Pod", name, uid, params).await
+    }
+
+    /// Deletes the object of this UID. Nothing is left to do where it is gone, or another one has its name.
+    async fn delete<K>(&self, what: &'static str, name: &str, uid: &str, params: DeleteParams) -> Result<(), ActError>
+    where
+        K: Watchable + Resource<Scope = NamespaceResourceScope>,
+    {
+        let params = params.preconditions(Preconditions {
+            uid: Some(uid.into()),
+            resource_version: None,
+        });
+        match call(what, name, self.api::<K>().delete(name, &params)).await {
+            Err(error) if !error.is_gone() && !error.is_conflict() => Err(error.into()),
             _ => Ok(()),
         }
     }
 
     async fn patch<K>(&self, what: &'static str, name: &str, patch: &serde_json::Value) -> Result<(), ActError>
     where
-        K: Resource<Scope = k8s_openapi::NamespaceResourceScope>
-            + Clone
-            + std::fmt::Debug
-            + serde::de::DeserializeOwned,
-        K::DynamicType: Default,
+        K: Watchable + Resource<Scope = NamespaceResourceScope>,
     {
         let params = PatchParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PatchParams::default()
         };
-        let (api, body) = (self.api::<K>(), Patch::Merge(patch));
-        let call = api.patch(name, &params, &body);
-        match self.call(what, name, call).await {
-            Err(error) if is_gone(&error) => Ok(()),
-            other => other.map(|_| ()),
+        match call(what, name, self.api::<K>().patch(name, &params, &Patch::Merge(patch))).await {
+            Err(error) if error.is_gone() => Ok(()),
+            other => Ok(other.map(|_| ())?),
         }
     }
 
-    async fn call<T>(
-        &self,
-        what: &'static str,
-        object: &str,
-        call: impl Future<Output = Result<T, kube::Error>>,
-    ) -> Result<T, ActError> {
-        match tokio::time::timeout(CALL_TIMEOUT, call).await {
-            Ok(Ok(answer)) => Ok(answer),
-            Ok(Err(source)) => Err(ActError::Kubernetes {
-                what,
-                object: object.into(),
-                source: Box::new(source),
-            }),
-            Err(_) => Err(ActError::Silent {
-                what,
-                object: object.into(),
-            }),
-        }
-    }
-
-    /// An event that cannot be told never fails a pass.
+    /// An event that cannot be written never fails a reconcile.
     async fn publish(&self, event: &Event) {
         let reference = self.submission().object_ref(&());
         let note = KubeEvent {
@@ -397,14 +314,9 @@ impl Actor<'_> {
             action: event.reason.clone(),
             secondary: None,
         };
-        let call = self.uses.recorder.publish(&note, &reference);
-        match tokio::time::timeout(CALL_TIMEOUT, call).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => {
-                let error = client_errors::kube(&error);
-                tracing::warn!(submission = %self.name(), reason = %event.reason, error, "an event could not be written");
-            }
-            Err(_) => tracing::warn!(submission = %self.name(), reason = %event.reason, "an event was not answered"),
+        let published = self.uses.recorder.publish(&note, &reference);
+        if let Err(error) = call("an event", &self.name(), published).await {
+            tracing::warn!(submission = %self.name(), reason = %event.reason, "{error}");
         }
     }
 }
@@ -424,14 +336,6 @@ fn truncate(text: &str) -> String {
         Some((end, _)) => format!("{} …", &text[..end]),
         None => text.to_owned(),
     }
-}
-
-fn is_gone(error: &ActError) -> bool {
-    matches!(error, ActError::Kubernetes { source, .. } if matches!(source.as_ref(), kube::Error::Api(status) if status.code == 404))
-}
-
-fn is_conflict(error: &ActError) -> bool {
-    matches!(error, ActError::Kubernetes { source, .. } if matches!(source.as_ref(), kube::Error::Api(status) if status.code == 409))
 }
 
 #[cfg(test)]

@@ -79,17 +79,3 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         assert_eq!(line[field], value, "{field} of {text}");
     }
 }
-
-#[test]
-fn an_answer_of_the_api_server_is_logged_without_a_dump() {
-    let status = kube::core::Status::failure("jobs is forbidden", "Forbidden").with_code(403);
-    let error = ActError::Kubernetes {
-        what: "creating the Job",
-        object: "a-1".into(),
-        source: Box::new(kube::Error::Api(status.boxed())),
-    };
-    assert_eq!(
-        error.to_string(),
-        "creating the Job of a-1 failed: the API server answered 403: jobs is forbidden"
-    );
-}

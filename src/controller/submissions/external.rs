@@ -16,7 +16,7 @@ use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View}
 use crate::controller::objects::{key_of, uid_of};
 use crate::services::ObjectKey;
 use crate::services::evalai::{
-    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Subject, SubmissionState, Target,
+    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
