@@ -281,6 +281,11 @@ impl State {
         KINDS.into_iter().filter_map(of).min()
     }
 
+    /// Nobody needs anything, and nothing is under way.
+    pub fn is_idle(&self) -> bool {
+        self.runs.is_empty() && self.under_way.iter().all(|count| *count == 0)
+    }
+
     /// Takes in what came of work. Returns whether its object has something new to decide on.
     pub fn done(&mut self, work: &Work, done: Done, now: Instant) -> bool {
         self.under_way[work.kind as usize] -= 1;
