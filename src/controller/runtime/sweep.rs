@@ -40,39 +40,11 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
     let submission = format!("{namespace}/{}", names::submission(row.submission));
     match ingest::apply(&api, &leaderboard, &incoming).await {
         Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "the submission is known already"),
-        Ok(Outcome::Refused) => {
-            tracing::warn!(
-                server,
-                submission,
-                leaderboard,
-                "EvalAI's row asks for another attempt, and no message has announced it: none begins"
-            );
-        }
-        Ok(Outcome::NotNew) => {
-            tracing::warn!(
-                server,
-                submission,
-                leaderboard,
-                "EvalAI's row was run before and asks for another run, and no message has announced it: none is made"
-            );
-        }
-        Ok(Outcome::IdTaken(owner)) => {
-            tracing::warn!(
-                server,
-                submission,
-                leaderboard,
-                owner,
-                "another object has the name of this submission; rename or delete it"
-            );
+        Ok(outcome @ (Outcome::Refused | Outcome::NotNew | Outcome::IdTaken(_))) => {
+            tracing::warn!(server, submission, leaderboard, %outcome, "EvalAI waits for a run of a submission, and none begins");
         }
         Ok(outcome) => {
-            tracing::info!(
-                server,
-                submission,
-                leaderboard,
-                %outcome,
-                "EvalAI waits for a submission whose message was lost"
-            );
+            tracing::info!(server, submission, leaderboard, %outcome, "EvalAI waits for a submission whose message was lost");
         }
         Err(error) => {
             tracing::warn!(server, submission, leaderboard, %error, "EvalAI waits for a submission that could not be created or resumed");

@@ -27,7 +27,11 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::{CallError, Watchable, call};
+use leaderboard_api::text::one_line;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
+
+/// Kubernetes refuses notes above 1 kB.
+const LONGEST_NOTE: usize = 900;
 
 /// What carrying a plan out uses.
 #[derive(Clone, Copy)]
@@ -217,16 +221,13 @@ impl Actor<'_> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
         };
-        let settings = &self.uses.settings;
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
             plan,
             attempt,
             retry,
-            operator_image: &settings.image,
-            image_pull_policy: settings.image_pull_policy.as_deref(),
-            region: settings.region.as_deref(),
+            settings: self.uses.settings,
             now: self.view.now,
         });
         let name = names::job(&self.name(), attempt, retry);
@@ -310,7 +311,7 @@ impl Actor<'_> {
                 EventType::Normal
             },
             reason: event.reason.clone(),
-            note: Some(truncate(&event.message)),
+            note: Some(one_line(&event.message, LONGEST_NOTE)),
             action: event.reason.clone(),
             secondary: None,
         };
@@ -327,14 +328,6 @@ fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {
         retry: status.retry,
         places: places.to_vec(),
         is_over: status.times.finished.is_some(),
-    }
-}
-
-/// Kubernetes refuses notes above 1 kB.
-fn truncate(text: &str) -> String {
-    match text.char_indices().nth(900) {
-        Some((end, _)) => format!("{} …", &text[..end]),
-        None => text.to_owned(),
     }
 }
 

@@ -340,13 +340,10 @@ fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
 
 #[test]
 fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
-    let case = Case::new("V2", json!({}));
-    let input = JobInput {
-        image_pull_policy: Some("Always"),
-        region: Some("us-west-2"),
-        ..case.input()
-    };
-    let job = build_json(&input);
+    let mut case = Case::new("V2", json!({}));
+    case.settings.image_pull_policy = Some("Always".into());
+    case.settings.region = Some("us-west-2".into());
+    let job = case.json();
     for container in containers(&job) {
         assert_eq!(container.get("imagePullPolicy").is_some(), is_own(container));
         if is_own(container) {
