@@ -34,22 +34,28 @@ pub use after::previous_controller;
 pub use plan::{Action, EvalaiUpdate, Event, LogAt, LogPlace, Plan, job_name};
 use plan_builder::PlanBuilder;
 
-/// Decides one pass.
+/// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
     let mut draft = PlanBuilder::new(view);
     if !draft.has_finalizer() && !draft.is_deleting() {
         draft.act(Action::AddFinalizer);
     }
     if draft.begin_attempt() {
+        // What was observed is of another attempt.
         after::leave_job(&mut draft);
         draft.requeue_in(Duration::ZERO);
-        return draft.into_plan(reading::demand(&draft));
+    } else {
+        decide_stage(&mut draft);
     }
+    let report = reading::demand(&draft);
+    draft.into_plan(report)
+}
+
+fn decide_stage(draft: &mut PlanBuilder<'_>) {
     if !draft.is_finished() {
-        live::decide(&mut draft);
+        live::decide(draft);
     }
     if draft.is_finished() {
-        after::decide(&mut draft);
+        after::decide(draft);
     }
-    draft.into_plan(reading::demand(&draft))
 }

@@ -41,7 +41,7 @@ pub enum Action {
     ForceDeletePod { name: String, uid: String },
     /// Write our own mark into `logcopy/owner`, so that a Pod we lost sight of stops itself.
     TakeOwnership,
-    /// EvalaiUpdate the Pod to stop.
+    /// Ask the Pod to stop.
     AnnotateStop { pod: String, stop: Stop },
     /// Let Kubernetes remove the finished Job after its time.
     SetJobTtl { name: String, seconds: i32 },
@@ -53,7 +53,7 @@ pub enum Action {
     AskEvalai,
     /// Look for its end in EvalAI from now on, although nothing was sent to EvalAI yet.
     FollowEvalai,
-    /// EvalaiUpdate EvalAI.
+    /// Send an update to EvalAI.
     UpdateEvalai(EvalaiUpdate),
     /// Forget what EvalAI last said, so that it is asked anew.
     ForgetEvalai,

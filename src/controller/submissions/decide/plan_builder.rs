@@ -115,7 +115,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
-    /// crash or a slow watch looks the same. `start_job` sets the mark, `start::watch` takes it away.
+    /// crash or a slow watch looks the same.
     pub(super) fn was_job_seen(&self) -> bool {
         const BEFORE_IT: [&str; 3] = [
             reasons::JOB_NAME_TAKEN,
