@@ -1,7 +1,7 @@
-//! A pass of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
+//! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
 //! Applies the policy before it waits for anything else, since no Job is made without it. Reads the token (every five minutes,
-//! or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands the way to EvalAI to `external`. `decide`
+//! or when EvalAI refuses it), checks whether bucket, table and queues answer, and gives the way to EvalAI to `external`. `decide`
 //! and `reach` are pure.
 
 pub mod decide;

@@ -123,12 +123,12 @@ mod tests {
     /// Answers with what was sent, and hands back each path.
     fn cluster() -> (Client, mpsc::UnboundedReceiver<(String, Value)>) {
         let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
-        let (tell, asked) = mpsc::unbounded_channel();
+        let (sender, asked) = mpsc::unbounded_channel();
         tokio::spawn(async move {
             while let Some((request, answer)) = handle.next_request().await {
                 let line = format!("{} {}", request.method(), request.uri().path());
                 let body = request.into_body().collect_bytes().await.unwrap();
-                let _ = tell.send((line, serde_json::from_slice(&body).unwrap()));
+                let _ = sender.send((line, serde_json::from_slice(&body).unwrap()));
                 answer.send_response(Response::new(Body::from(body.to_vec())));
             }
         });

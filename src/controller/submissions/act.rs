@@ -14,13 +14,13 @@ use kube::{Api, Client, Resource, ResourceExt};
 use serde_json::json;
 
 use super::archive::ArchiveWorkers;
-use super::decide::{Action, Event, LogPlace, Plan};
+use super::decide::{Action, Event, Plan};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::significance::{Change, change, patience};
-use super::view::View;
+use super::view::{LogPlace, View};
 use crate::controller::objects::{is_pod_of, uid_of};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;

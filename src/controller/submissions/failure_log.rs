@@ -12,7 +12,7 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::api::LogParams;
 use kube::{Api, Client};
 
-use super::decide::{LogAt, LogPlace};
+use super::view::{LogAt, LogPlace};
 use crate::services::archive::Archive;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;

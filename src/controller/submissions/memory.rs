@@ -1,6 +1,6 @@
-//! What the leader remembers between passes of one object: the status it last wrote, and what it told.
+//! What the leader remembers between two reconciles of one object: the status it last wrote, and the partial result it last sent.
 //!
-//! Needed because a cache may lag behind our own writes: a pass must never decide on a status older than its own.
+//! Needed because a cache may lag behind our own writes: a reconcile must never decide on a status older than its own.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -78,7 +78,7 @@ impl Memory {
             .map(|w| w.at.elapsed())
     }
 
-    /// How long a changed place has to wait for its write; None: not at all. The first in line are told at once; of the others
+    /// How long a changed place has to wait for its write; None: not at all. The first in line are written at once; of the others
     /// each has a moment of its own, so that a step of a thousand is not a thousand writes.
     pub fn place_waits(&self, submission: &Submission, position: i32, now: Instant) -> Option<Duration> {
         let mut entries = self.lock();
@@ -107,7 +107,7 @@ impl Memory {
     }
 
     /// Remembers a partial result.
-    pub fn told_partial(&self, submission: &Submission, attempt: i64, done: u32) {
+    pub fn sent_partial(&self, submission: &Submission, attempt: i64, done: u32) {
         self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
     }
 

@@ -3,8 +3,8 @@
 use leaderboard_results::{metrics, number_text};
 use serde_json::Value;
 
-use super::archive::digest::ReportDigest;
 use super::failure_log::Tail;
+use super::report_digest::ReportDigest;
 use super::view::{ObservedTexts, Texts, View};
 use crate::pod::run::results_format;
 use crate::services::evalai::Payload;
@@ -227,8 +227,8 @@ mod tests {
         for container in ["agent-1", "simulator-1", "contents"] {
             assert!(!shown(container, LogTail::Hosts).contains("route"), "{container}");
         }
-        let told = "it crashed.\n\nThe end of agent-1's log in attempt 1:\nroute 7";
-        assert!(shown("agent-1", LogTail::Participants).ends_with(told));
+        let text = "it crashed.\n\nThe end of agent-1's log in attempt 1:\nroute 7";
+        assert!(shown("agent-1", LogTail::Participants).ends_with(text));
         for container in ["simulator-1", "contents", "workspace", "logcopy"] {
             assert!(
                 !shown(container, LogTail::Participants).contains("route"),

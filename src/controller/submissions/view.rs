@@ -1,4 +1,4 @@
-//! The world of one submission, as one pass saw it. `observe` fills it, `decide` reads it; it holds no client and no clock.
+//! The world of one submission, as one reconcile has read it. `observe` fills it, `decide` reads it; it holds no client and no clock.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
-use super::archive::digest::{ReportDigest, ReportId};
+use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use leaderboard_api::{Leaderboard, Rerun, Submission};
@@ -36,7 +36,7 @@ pub struct View {
     pub evalai: Option<EvalaiView>,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
-    /// Routes that the last partial result told EvalAI of, in this attempt.
+    /// Routes in the last partial result that was sent to EvalAI, in this attempt.
     pub partial_sent: Option<u32>,
     /// The submission that re-runs this one, as its status says.
     pub rerun_as: Option<Rerun>,
@@ -115,7 +115,7 @@ pub struct PodView {
     pub stop: Option<Stop>,
 }
 
-/// The Pod's node, which is looked at while the Pod runs or is being deleted.
+/// The Pod's node, which is read while the Pod runs or is being deleted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedNode {
     /// There was no reason to look, or no right to.
@@ -178,6 +178,23 @@ pub struct ReportDemand {
     pub stage: Stage,
     /// How often the report of a live run is read.
     pub period: Duration,
+}
+
+/// A place where a log may be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogPlace {
+    /// Whose log it is.
+    pub container: String,
+    pub at: LogAt,
+}
+
+/// Where a log is kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LogAt {
+    /// On the Pod's node; `previous`: of the container's last run, since it runs again.
+    Node { pod: String, previous: bool },
+    /// In S3, at this key below the run's prefix.
+    Bucket { key: String },
 }
 
 /// The report in S3, as far as it was read.

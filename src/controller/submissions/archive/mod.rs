@@ -4,10 +4,9 @@
 //! Four kinds of work: the report of a run, the texts of a result, the fence against a lost Pod, the log of a failure. Each has
 //! limits of its own, so that a bucket which hangs keeps nothing else waiting. What is due when is `state`'s to say.
 
-pub mod digest;
-pub mod request;
+mod request;
 mod run;
-pub mod state;
+mod state;
 mod work;
 
 use std::collections::HashMap;
@@ -22,12 +21,12 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use super::failure_log::{LogDemand, Tail};
+use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
 use crate::controller::objects::{Wake, uid_of};
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use digest::ReportId;
 use leaderboard_api::{Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
@@ -66,8 +65,8 @@ impl Bucket {
     }
 }
 
-/// What tells a bucket from another one.
-pub fn bucket_id(storage: &Storage) -> String {
+/// The key of a bucket.
+fn bucket_id(storage: &Storage) -> String {
     format!("{:?}/{:?}/{}", storage.region, storage.endpoint, storage.bucket)
 }
 

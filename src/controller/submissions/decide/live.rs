@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate, job_name};
 use super::plan_builder::{PlanBuilder, after};
 use super::{accept, crashes, end, failure, isolation, line, reading, start, stop};
-use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;

@@ -31,7 +31,7 @@ use std::time::Duration;
 
 use super::view::View;
 pub use after::previous_controller;
-pub use plan::{Action, EvalaiUpdate, Event, LogAt, LogPlace, Plan, job_name};
+pub use plan::{Action, EvalaiUpdate, Event, Plan, job_name};
 use plan_builder::PlanBuilder;
 
 /// Decides one reconcile.

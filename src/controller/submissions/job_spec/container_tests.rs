@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
-use super::{JobInput, build_json, run_document};
+use super::{run_document};
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
 use leaderboard_api::names;
@@ -333,8 +333,11 @@ fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
         ("Warn", "Forbidden", 3, lately, false),
         ("Require", "NotEnforced", 3, lately, false),
     ] {
-        let told = asked(json!({"enforcement": enforcement}), Some((reason, generation, since)));
-        assert_eq!(told["isKnownOpen"], expected, "{enforcement} {reason} of {generation}");
+        let isolation = asked(json!({"enforcement": enforcement}), Some((reason, generation, since)));
+        assert_eq!(
+            isolation["isKnownOpen"], expected,
+            "{enforcement} {reason} of {generation}"
+        );
     }
 }
 

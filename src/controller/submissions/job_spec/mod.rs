@@ -22,13 +22,13 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::{Job, JobSpec};
 use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
-use kube::Resource;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
 use kube::api::{DynamicObject, TypeMeta};
 use serde_json::{Value, json};
 
 use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
+use crate::controller::objects::owner_reference;
 use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 use leaderboard_api::{
@@ -188,14 +188,7 @@ fn metadata(input: &JobInput<'_>) -> ObjectMeta {
             names::ANNOTATION_RETRY.into(),
             input.retry.to_string(),
         )])),
-        owner_references: Some(vec![OwnerReference {
-            api_version: Submission::api_version(&()).into_owned(),
-            kind: Submission::kind(&()).into_owned(),
-            name: input.submission_name().to_owned(),
-            uid: input.submission.metadata.uid.clone().unwrap_or_default(),
-            controller: Some(true),
-            block_owner_deletion: Some(true),
-        }]),
+        owner_references: Some(vec![owner_reference(input.submission)]),
         ..ObjectMeta::default()
     }
 }
