@@ -2,8 +2,8 @@
 
 use serde_json::{Value, json};
 
+use super::run_document;
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
-use super::{run_document};
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
 use leaderboard_api::names;
