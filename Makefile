@@ -7,7 +7,7 @@ LAB := ./local/lab
 FUZZ_SECONDS ?= 600
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale cluster down status build static image images crds docs fmt lint deny bench fuzz chart-test lab-test
+.PHONY: help demo test test-core measure-scale cluster down status build static image images crds docs fmt lint deny bench fuzz chart-test chart-docs install-yaml lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,8 +66,14 @@ deny: ## Check licenses, bans, sources and unused dependencies (needs cargo-deny
 	cargo deny --offline check bans licenses sources
 	cargo machete
 
-chart-test: ## Lint the chart and check what it renders against the schemas
+chart-test: ## Check the chart: its values, what each of them renders, and what an API server makes of it
 	$(LAB) chart-test
+
+chart-docs: ## Write the table of values in the chart's README
+	$(LAB) chart-docs
+
+install-yaml: ## Print one file that installs the operator without Helm; ARGS are for helm template
+	@$(LAB) install-yaml -- $(ARGS)
 
 bench: ## Measure the merge of results
 	cargo bench -p leaderboard-results
