@@ -186,14 +186,14 @@ def one_file(kube: Kube, chart: Path, more: Sequence[str] = ()) -> str:
 def applied(kube: Kube, chart: Path) -> str:
     """The one file goes in, and out again."""
     with tempfile.NamedTemporaryFile("w", suffix=".yaml", prefix="leaderboard-") as file:
-        file.write(one_file(kube, chart))
+        file.write(one_file(kube, chart, ['--set-json=leaderboards=[{"namespace":"other","secrets":["evalai"]}]']))
         file.flush()
         argv = [f"--filename={file.name}", "--output=name"]
         made = kube.run("kubectl", "apply", "--server-side", "--validate=strict", *argv).splitlines()
-        # The namespace has no controller that would empty it, and is needed again.
+        # Nothing here would empty a namespace that is deleted.
         selector = f"--selector=app.kubernetes.io/part-of={RELEASE}"
         kinds = "deployments,services,poddisruptionbudgets,serviceaccounts,roles,rolebindings,clusterroles,clusterrolebindings"
-        gone = kube.run("kubectl", "delete", kinds, selector, f"--namespace={SYSTEM}", "--output=name").splitlines()
+        gone = kube.run("kubectl", "delete", kinds, selector, "--all-namespaces", "--output=name").splitlines()
         kube.run("kubectl", "delete", "crd", "--all", "--wait=true", "--timeout=30s")
     if len(made) != len(gone) + len(("namespace", "leaderboards", "submissions")):
         raise LabError(

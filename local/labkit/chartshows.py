@@ -71,7 +71,8 @@ def of_program(component: str, deployment: str) -> list[Case]:
     budget = f"PodDisruptionBudget/{name}"
     affinity = {"nodeAffinity": {"preferredDuringSchedulingIgnoredDuringExecution": []}}
     spread = {"maxSkew": 1, "topologyKey": "topology.kubernetes.io/zone", "whenUnsatisfiable": "ScheduleAnyway"}
-    foreign = {"matchLabels": {"app": "another"}}
+    own = {"matchLabels": selector(component)}
+    foreign = {"matchExpressions": [{"key": "app", "operator": "Exists"}]}
     apart = f"{POD}.affinity.podAntiAffinity.preferredDuringSchedulingIgnoredDuringExecution.0.podAffinityTerm"
     return [
         case(
@@ -109,15 +110,11 @@ def of_program(component: str, deployment: str) -> list[Case]:
             (deployment, f"{POD}.affinity.podAntiAffinity", ABSENT),
         ),
         case(
-            {f"{component}.topologySpreadConstraints": [spread, {**spread, "labelSelector": foreign}]},
-            (
-                deployment,
-                f"{POD}.topologySpreadConstraints",
-                [
-                    {**spread, "labelSelector": {"matchLabels": selector(component)}},
-                    {**spread, "labelSelector": foreign},
-                ],
-            ),
+            {f"{component}.topologySpreadConstraints": [{**spread, "labelSelector": foreign}, spread]},
+            (deployment, f"{POD}.topologySpreadConstraints.0", {**spread, "labelSelector": foreign}),
+            (deployment, f"{POD}.topologySpreadConstraints.0.labelSelector.matchLabels", ABSENT),
+            (deployment, f"{POD}.topologySpreadConstraints.1", {**spread, "labelSelector": own}),
+            (deployment, f"{POD}.topologySpreadConstraints.1.labelSelector.matchExpressions", ABSENT),
         ),
         case(
             {

@@ -143,7 +143,11 @@ podAntiAffinity:
 {{- $replicas := dict "matchLabels" (fromYaml (include "operator.selector" .)) -}}
 {{- $constraints := list -}}
 {{- range (index .root.Values .component).topologySpreadConstraints }}
-{{- $constraints = append $constraints (merge (dict) . (dict "labelSelector" $replicas)) -}}
+{{- $constraint := . -}}
+{{- if not (hasKey . "labelSelector") -}}
+{{- $constraint = merge (dict "labelSelector" $replicas) . -}}
+{{- end -}}
+{{- $constraints = append $constraints $constraint -}}
 {{- end }}
 {{- toYaml $constraints -}}
 {{- end -}}
