@@ -78,12 +78,12 @@ def of_program(component: str, deployment: str) -> list[Case]:
         case(
             {f"{component}.replicas": 3},
             (deployment, "spec.replicas", 3),
-            (deployment, "spec.strategy.type", "RollingUpdate"),
+            (deployment, "spec.strategy.rollingUpdate", {"maxSurge": 1, "maxUnavailable": 0}),
             (budget, "spec.selector.matchLabels", selector(component)),
         ),
         case(
             {f"{component}.replicas": 1},
-            (deployment, "spec.strategy.type", "Recreate"),
+            (deployment, "spec.strategy.rollingUpdate", {"maxSurge": 0, "maxUnavailable": 1}),
             # It would block the drain of the node.
             (budget, "", ABSENT),
         ),

@@ -51,8 +51,11 @@ def run(settings: Settings, update: bool) -> None:
         check("install, rights cluster-wide", lambda: installed(kube, chart))
         check("examples of Chart.yaml", lambda: examples(kube, chart))
         check("the demo's manifests", lambda: demo_manifests(kube, settings.repository / "examples" / "demo"))
+        before = identities(kube)
         check("upgrade with roles, several leaderboards", lambda: upgraded(kube, chart))
+        check("roll back", lambda: rolled_back(kube))
         check("uninstall keeps the definitions", lambda: uninstalled(kube))
+        check("install again, and nothing is lost", lambda: installed_again(kube, chart, before))
         check("install, rights in one namespace", lambda: namespaced(kube, chart))
 
 
@@ -193,13 +196,13 @@ def installed(kube: Kube, chart: Path) -> str:
 
 
 def examples(kube: Kube, chart: Path) -> str:
-    """Artifact Hub shows them: the server must take them, and their kinds must be the definitions'."""
+    """Artifact Hub shows them: the server must take them, and their kinds must be the definitions'. They stay for what follows."""
     text = (chart / "Chart.yaml").read_text()
     for name in CRDS:
         if f"name: {name}\n" not in annotation(text, "crds"):
             raise LabError(f"artifacthub.io/crds of Chart.yaml lacks {name}")
     indented = "".join(f"  {line}\n" for line in annotation(text, "crdsExamples").splitlines())
-    argv = ["apply", "--server-side", "--dry-run=server", "--validate=strict", "--namespace=default", "--filename=-"]
+    argv = ["apply", "--server-side", "--validate=strict", "--namespace=leaderboard", "--filename=-"]
     taken = kube.run("kubectl", *argv, "--output=name", given=f"apiVersion: v1\nkind: List\nitems:\n{indented}")
     return f"{len(taken.splitlines())} objects"
 
@@ -226,6 +229,27 @@ def demo_manifests(kube: Kube, folder: Path) -> str:
 def upgraded(kube: Kube, chart: Path) -> str:
     helm(kube, chart, f"--values={chart / 'ci' / 'roles.yaml'}")
     return rights(kube, chartcases.WITH_ROLES)
+
+
+def rolled_back(kube: Kube) -> str:
+    """To the first installation, with its rights."""
+    kube.run("helm", "rollback", RELEASE, "1", f"--namespace={SYSTEM}")
+    return rights(kube, chartcases.CLUSTER_WIDE)
+
+
+def identities(kube: Kube) -> dict[str, str]:
+    """What must outlive the release: its objects by their uid, which one that is made anew would not have."""
+    items = kube.json("kubectl", "get", "leaderboards,submissions", "--all-namespaces")["items"]
+    return {f"{item['kind']} {item['metadata']['name']}": item["metadata"]["uid"] for item in items}
+
+
+def installed_again(kube: Kube, chart: Path, before: dict[str, str]) -> str:
+    helm(kube, chart)
+    after = identities(kube)
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
+    if not before or after != before:
+        raise LabError(f"there were {before} and are {after}")
+    return f"{len(after)} objects of hosts and participants"
 
 
 def uninstalled(kube: Kube) -> str:

@@ -164,8 +164,10 @@ metadata:
 spec:
   replicas: {{ $own.replicas }}
   strategy:
-    # One replica: a second one beside it would only wait for the Lease. Several: one of them always stands by.
-    type: {{ ternary "RollingUpdate" "Recreate" (gt (int $own.replicas) 1) }}
+    # Never Recreate: with the API server's defaults of the other type in place, no rollback could go back to it.
+    type: RollingUpdate
+    # One replica: a second one would only wait for the Lease, so the old one ends first. Several: one of them always stands by.
+    rollingUpdate: {{ gt (int $own.replicas) 1 | ternary "{maxSurge: 1, maxUnavailable: 0}" "{maxSurge: 0, maxUnavailable: 1}" }}
   selector:
     matchLabels:
       {{- include "operator.selector" . | nindent 6 }}
