@@ -7,7 +7,7 @@ LAB := ./local/lab
 FUZZ_SECONDS ?= 600
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale cluster down status build static image images crds docs fmt lint deny bench fuzz chart-test chart-docs install-yaml lab-test
+.PHONY: help demo test test-core measure-scale cluster down status build static image images crds docs fmt lint deny bench fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -69,6 +69,7 @@ deny: ## Check licenses, bans, sources and unused dependencies (needs cargo-deny
 chart-test: ## Check the chart: its values, what each of them renders, and what an API server makes of it
 	$(LAB) chart-test
 
+.PHONY: chart-docs install-yaml
 chart-docs: ## Write the table of values in the chart's README
 	$(LAB) chart-docs
 

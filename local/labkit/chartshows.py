@@ -382,6 +382,7 @@ def of_monitor(value: str, kind: str, endpoints: str) -> Case:
                 {
                     "port": "http",
                     "path": "/metrics",
+                    "honorLabels": True,
                     "interval": "30s",
                     "scrapeTimeout": "10s",
                     "relabelings": given["relabelings"],
