@@ -116,10 +116,6 @@ impl Actor<'_> {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
             }
-            Action::SetJobTtl { name, seconds } => {
-                let patch = json!({ "spec": { "ttlSecondsAfterFinished": seconds } });
-                self.patch::<Job>("the time to live", name, &patch).await
-            }
             Action::KeepLog { places } => {
                 self.keep_log(places, status);
                 Ok(())
@@ -133,6 +129,7 @@ impl Actor<'_> {
                 Ok(())
             }
             Action::AskEvalai => {
+                self.context.memory.asks_evalai(self.submission());
                 self.context.external.ask(self.view);
                 Ok(())
             }
@@ -280,7 +277,11 @@ impl Actor<'_> {
         match self.call("creating the Job", &name, call).await {
             // Its name is ours alone; whose it is, the next pass sees.
             Err(error) if is_conflict(&error) => Ok(()),
-            other => other.map(|_| ()),
+            Err(error) => Err(error),
+            Ok(_) => {
+                self.context.memory.created_job(self.submission(), name);
+                Ok(())
+            }
         }
     }
 
@@ -299,6 +300,7 @@ impl Actor<'_> {
             }),
             ..DeleteParams::default()
         };
+        self.context.memory.deletes_job(self.submission());
         let api = self.api::<Job>();
         let call = api.delete(name, &params);
         match self.call("deleting the Job", name, call).await {

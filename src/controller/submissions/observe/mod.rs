@@ -43,6 +43,10 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
         }
         other => other,
     };
+    let job = match job {
+        ObservedJob::Absent if context.memory.awaits_job(&submission, &name) => ObservedJob::Created,
+        other => other,
+    };
     let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
     let node = pod.as_ref().filter(matters).and_then(|pod| pod.node.as_ref());
     let node = node.map_or(ObservedNode::Unknown, |name| context.lookups.node(name, this()));
@@ -61,6 +65,7 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
     } else {
         0
     };
+    let evalai_waited = context.memory.evalai_waited(&submission);
     let partial_sent = context.memory.partial_sent(&submission);
     let rerun_as = context.reruns.of(&submission);
     let evalai_writes_from = context.external.hub.writes_from();
@@ -80,6 +85,7 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
         fence: archive.fence,
         log: archive.log,
         evalai,
+        evalai_waited,
         record,
         partial_sent,
         rerun_as,
@@ -90,7 +96,11 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
 
 /// Whether this may be the reconcile that ends it. Only then what other submissions came to is looked up.
 fn may_end(submission: &Submission, job: &ObservedJob) -> bool {
-    let is_under_way = matches!(job, ObservedJob::Ours(job) if job.end.is_none());
+    let is_under_way = match job {
+        ObservedJob::Ours(job) => job.end.is_none(),
+        ObservedJob::Created => true,
+        ObservedJob::Absent | ObservedJob::Foreign => false,
+    };
     let Some(status) = &submission.status else { return false };
     let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
     status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
