@@ -123,3 +123,23 @@ impl LeaderboardState {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_are_written_at_once_and_then_once_in_five_seconds() {
+        let state = LeaderboardState::default();
+        let at = |second| Timestamp::from_second(second).unwrap();
+        // Each second another submission starts or ends.
+        let written = (0..60).filter(|second| {
+            let may = state.counts_may_be_written("u", at(*second));
+            if may {
+                state.wrote("u", at(*second));
+            }
+            may
+        });
+        assert_eq!(written.take(3).collect::<Vec<_>>(), [0, 5, 10]);
+    }
+}

@@ -124,10 +124,6 @@ impl Actor<'_> {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
             }
-            Action::SetJobTtl { name, seconds } => {
-                let patch = json!({ "spec": { "ttlSecondsAfterFinished": seconds } });
-                self.patch::<Job>("the time to live", name, &patch).await
-            }
             other => {
                 self.request(other, status);
                 Ok(())
@@ -143,7 +139,10 @@ impl Actor<'_> {
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
-            Action::AskEvalai => uses.external.ask(self.view),
+            Action::AskEvalai => {
+                uses.memory.asks_evalai(submission);
+                uses.external.ask(self.view);
+            }
             Action::FollowEvalai => uses.external.follow(self.view, status),
             Action::UpdateEvalai(update) => {
                 uses.external
@@ -161,8 +160,7 @@ impl Actor<'_> {
             | Action::CreateJob { .. }
             | Action::DeleteJob { .. }
             | Action::ForceDeletePod { .. }
-            | Action::AnnotateStop { .. }
-            | Action::SetJobTtl { .. } => {}
+            | Action::AnnotateStop { .. } => {}
         }
     }
 
@@ -240,7 +238,11 @@ impl Actor<'_> {
         match call("creating the Job", &name, api.create(&params, &object)).await {
             // Its name is ours alone; whose it is, the next reconcile sees.
             Err(error) if error.is_conflict() => Ok(()),
-            other => Ok(other.map(|_| ())?),
+            other => {
+                other?;
+                self.uses.memory.created_job(self.submission(), name);
+                Ok(())
+            }
         }
     }
 
@@ -251,6 +253,7 @@ impl Actor<'_> {
         } else {
             DeleteParams::background()
         };
+        self.uses.memory.deletes_job(self.submission());
         self.delete::<Job>("deleting the Job", name, uid, params).await?;
         let reference = ObjectRef::<Job>::new(name).within(&self.namespace);
         let Some(job) = self.uses.stores.jobs.get(&reference) else {

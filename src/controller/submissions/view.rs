@@ -34,6 +34,8 @@ pub struct View {
     pub log: ObservedLog,
     /// None for a submission that is not EvalAI's.
     pub evalai: Option<EvalaiView>,
+    /// How long EvalAI has been asked whether the present attempt is to run.
+    pub evalai_waited: Duration,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
     /// Routes in the last partial result that was sent to EvalAI, in this attempt.
@@ -50,6 +52,8 @@ pub struct View {
 #[derive(Clone, Debug, PartialEq)]
 pub enum ObservedJob {
     Absent,
+    /// We created it a moment ago, and the cache does not show it yet.
+    Created,
     /// It has the right name but another owner: an older object's, going away.
     Foreign,
     Ours(JobView),
@@ -60,7 +64,7 @@ impl ObservedJob {
     pub fn ours(&self) -> Option<&JobView> {
         match self {
             Self::Ours(job) => Some(job),
-            Self::Absent | Self::Foreign => None,
+            Self::Absent | Self::Created | Self::Foreign => None,
         }
     }
 }
@@ -73,7 +77,6 @@ pub struct JobView {
     pub created: Option<Timestamp>,
     pub end: Option<JobEnd>,
     pub deleting: bool,
-    pub has_ttl: bool,
     /// The words of its last FailedCreate event, while it has no Pod.
     pub failed_create: Option<String>,
 }
@@ -89,6 +92,15 @@ pub enum JobEnd {
         reason: String,
         message: String,
     },
+}
+
+impl JobEnd {
+    /// When it ended.
+    pub fn at(&self) -> Option<Timestamp> {
+        match self {
+            Self::Complete { at } | Self::Failed { at, .. } => *at,
+        }
+    }
 }
 
 /// The newest Pod of the Job.

@@ -43,8 +43,6 @@ pub enum Action {
     TakeOwnership,
     /// Ask the Pod to stop.
     AnnotateStop { pod: String, stop: Stop },
-    /// Let Kubernetes remove the finished Job after its time.
-    SetJobTtl { name: String, seconds: i32 },
     /// Keep the tail of the log that explains the failure, from the first of these places that has it.
     KeepLog { places: Vec<LogPlace> },
     /// Read the texts of this report, so that they can be published.

@@ -172,6 +172,7 @@ fn ours(input: &JobInput<'_>) -> Job {
             backoff_limit: Some(backoff_limit(input)),
             // The default starts the next Pod while the old one still writes.
             pod_replacement_policy: Some("Failed".into()),
+            ttl_seconds_after_finished: Some(input.spec().job_seconds()),
             template: template(input),
             ..JobSpec::default()
         }),

@@ -243,8 +243,24 @@ fn the_nets_are_wider_than_the_rules_above_them() {
             job["spec"]["template"]["spec"]["activeDeadlineSeconds"].as_i64(),
             deadline
         );
-        // Nothing takes a Job away before it was read.
-        assert_eq!(job["spec"].get("ttlSecondsAfterFinished"), None);
         assert_eq!(job["spec"].get("activeDeadlineSeconds"), None);
+    }
+}
+
+#[test]
+fn kubernetes_keeps_a_finished_job_long_enough_for_its_end_to_be_read() {
+    for (hosts, kept) in [
+        (json!({}), 604_800),
+        (json!(0), 604_800),
+        (json!(86_400), 604_800),
+        (json!(1_000_000), 1_000_000),
+    ] {
+        let more = if hosts.is_number() {
+            json!({"ttlSecondsAfterFinished": hosts})
+        } else {
+            hosts
+        };
+        let job = Case::new("V2", more).json();
+        assert_eq!(job["spec"]["ttlSecondsAfterFinished"], kept);
     }
 }

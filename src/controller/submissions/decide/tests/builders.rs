@@ -112,6 +112,8 @@ impl World {
                 fence: ObservedFence::Held,
                 log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
+                // Long enough that silence is shown.
+                evalai_waited: std::time::Duration::from_secs(5),
                 record: Some(RecordView::default()),
                 partial_sent: None,
                 rerun_as: None,
@@ -162,7 +164,6 @@ impl World {
             created: Some(self.view.now),
             end: None,
             deleting: false,
-            has_ttl: false,
             failed_create: None,
         });
     }
