@@ -1,5 +1,7 @@
 //! Watches and the preflight on a mock of the API server's client.
 
+mod lists;
+
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -102,8 +104,11 @@ fn rig(answers: Vec<Answer>) -> Rig {
     let (stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
     telemetry.readiness.registered();
-    let trim = |board: &mut Leaderboard| board.metadata.annotations = None;
-    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), trim, &telemetry);
+    let shape = Shape {
+        trim: |board: &mut Leaderboard| board.metadata.annotations = None,
+        ..Shape::default()
+    };
+    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), shape, &telemetry);
     let events = watch.subscribe();
     Rig {
         watch,
@@ -296,7 +301,12 @@ async fn a_watch_on_a_half_open_connection_ends_by_the_read_timeout_and_begins_a
     let client = client_with(config, Duration::from_millis(200)).unwrap();
     let (_stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
-    let watch = spawn_watch::<Leaderboard>(guarded(client, Some("ns")), Config::default(), |_| {}, &telemetry);
+    let watch = spawn_watch::<Leaderboard>(
+        guarded(client, Some("ns")),
+        Config::default(),
+        Shape::default(),
+        &telemetry,
+    );
     for _ in 0..2 {
         timeout(LIMIT, watches.recv()).await.unwrap().unwrap();
     }

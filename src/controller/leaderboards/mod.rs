@@ -16,14 +16,14 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::api::{Patch, PatchParams};
-use kube::{Api, Client, Resource, ResourceExt};
+use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 
 use super::objects::{key_of, uid_of};
 use super::settings::Settings;
 use super::slots::SlotAllocator;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::kubernetes::{CallError, call};
+use crate::kubernetes::{CallError, Writes, call};
 use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
@@ -162,6 +162,6 @@ async fn write_status(
     Ok(RESYNC)
 }
 
-fn api(client: &Client, leaderboard: &Leaderboard) -> Api<Leaderboard> {
-    Api::namespaced(client.clone(), &leaderboard.namespace().unwrap_or_default())
+fn api(client: &Client, leaderboard: &Leaderboard) -> Writes<Leaderboard> {
+    Writes::new(client.clone(), &leaderboard.namespace().unwrap_or_default())
 }

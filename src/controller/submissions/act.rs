@@ -4,22 +4,21 @@
 
 use std::time::Duration;
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
-use kube::api::{
-    ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions, PropagationPolicy,
-};
+use kube::api::{DeleteParams, Patch, PatchParams, PostParams, Preconditions, PropagationPolicy};
 use kube::runtime::events::{Event as KubeEvent, EventType};
-use kube::{Api, Resource, ResourceExt};
+use kube::runtime::reflector::ObjectRef;
+use kube::{Resource, ResourceExt};
 use serde_json::json;
 
 use super::archive::request::LogDemand;
 use super::decide::{Action, Event, LogPlace, Plan};
 use super::job_spec::{self, JobInput};
-use super::observe::{is_pod_of, uid_of};
+use super::observe::uid_of;
 use super::significance::{Change, change, patience};
 use super::view::View;
 use crate::controller::runtime::context::{CALL_TIMEOUT, Context};
+use crate::kubernetes::objects::{Job, Meta, Pod};
+use crate::kubernetes::{Watchable, Writes};
 use leaderboard_api::client_errors;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
@@ -89,12 +88,8 @@ impl Actor<'_> {
         self.submission().name_any()
     }
 
-    fn api<K>(&self) -> Api<K>
-    where
-        K: Resource<Scope = k8s_openapi::NamespaceResourceScope>,
-        K::DynamicType: Default,
-    {
-        Api::namespaced(self.context.client.clone(), &self.namespace)
+    fn writes<K: Watchable>(&self) -> Writes<K> {
+        Writes::new(self.context.client.clone(), &self.namespace)
     }
 
     async fn carry_out(&self, action: &Action, status: &SubmissionStatus) -> Result<(), ActError> {
@@ -190,7 +185,7 @@ impl Actor<'_> {
             field_manager: Some(names::MANAGER_FINALIZER.into()),
             ..PatchParams::default()
         };
-        let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Merge(&patch));
+        let (api, name, body) = (self.writes::<Submission>(), self.name(), Patch::Merge(&patch));
         let call = api.patch(&name, &params, &body);
         match self.call("the finalizer", &self.name(), call).await {
             Err(error) if !wanted && is_gone(&error) => Ok(()),
@@ -226,10 +221,11 @@ impl Actor<'_> {
             "status": status,
         });
         let params = PatchParams::apply(names::MANAGER_STATUS).force();
-        let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Apply(&patch));
+        let (api, name, body) = (self.writes::<Submission>(), self.name(), Patch::Apply(&patch));
         let call = api.patch_status(&name, &params, &body);
         let answer = self.call("the status", &self.name(), call).await?;
-        self.context.memory.wrote(&answer);
+        let version = &answer.metadata.resource_version;
+        self.context.memory.wrote(self.submission(), status, version);
         self.log_transition(status);
         Ok(None)
     }
@@ -270,8 +266,7 @@ impl Actor<'_> {
             now: self.view.now,
         });
         let name = names::job(&self.name(), attempt, retry);
-        let resource = ApiResource::erase::<Job>(&());
-        let api: Api<DynamicObject> = Api::namespaced_with(self.context.client.clone(), &self.namespace, &resource);
+        let api = self.writes::<Job>();
         let params = PostParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PostParams::default()
@@ -299,33 +294,19 @@ impl Actor<'_> {
             }),
             ..DeleteParams::default()
         };
-        let api = self.api::<Job>();
+        let api = self.writes::<Job>();
         let call = api.delete(name, &params);
         match self.call("deleting the Job", name, call).await {
             Err(error) if !is_gone(&error) && !is_conflict(&error) => return Err(error),
             _ => {}
         }
         let stores = &self.context.stores;
-        let pods: Vec<_> = stores
-            .pods
-            .state()
-            .into_iter()
-            .filter(|pod| self.is_of_job(pod, name))
-            .collect();
-        for pod in pods {
-            self.delete_pod(&pod.name_any(), &uid_of(pod.as_ref()), grace_seconds)
-                .await?;
+        let job = stores.jobs.get(&ObjectRef::new(name).within(&self.namespace));
+        for pod in job.map(|job| stores.pods_of(&job)).unwrap_or_default() {
+            let Meta { name, uid, .. } = &pod.metadata;
+            self.delete_pod(name, uid, grace_seconds).await?;
         }
         Ok(())
-    }
-
-    fn is_of_job(&self, pod: &Pod, job: &str) -> bool {
-        let reference = kube::runtime::reflector::ObjectRef::<Job>::new(job).within(&self.namespace);
-        self.context
-            .stores
-            .jobs
-            .get(&reference)
-            .is_some_and(|job| is_pod_of(pod, &job))
     }
 
     async fn delete_pod(&self, name: &str, uid: &str, grace_seconds: i64) -> Result<(), ActError> {
@@ -337,7 +318,7 @@ impl Actor<'_> {
             }),
             ..DeleteParams::default()
         };
-        let api = self.api::<Pod>();
+        let api = self.writes::<Pod>();
         let call = api.delete(name, &params);
         match self.call("deleting the Pod", name, call).await {
             Err(error) if !is_gone(&error) && !is_conflict(&error) => Err(error),
@@ -345,19 +326,17 @@ impl Actor<'_> {
         }
     }
 
-    async fn patch<K>(&self, what: &'static str, name: &str, patch: &serde_json::Value) -> Result<(), ActError>
-    where
-        K: Resource<Scope = k8s_openapi::NamespaceResourceScope>
-            + Clone
-            + std::fmt::Debug
-            + serde::de::DeserializeOwned,
-        K::DynamicType: Default,
-    {
+    async fn patch<K: Watchable>(
+        &self,
+        what: &'static str,
+        name: &str,
+        patch: &serde_json::Value,
+    ) -> Result<(), ActError> {
         let params = PatchParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PatchParams::default()
         };
-        let (api, body) = (self.api::<K>(), Patch::Merge(patch));
+        let (api, body) = (self.writes::<K>(), Patch::Merge(patch));
         let call = api.patch(name, &params, &body);
         match self.call(what, name, call).await {
             Err(error) if is_gone(&error) => Ok(()),

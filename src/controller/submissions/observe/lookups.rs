@@ -1,5 +1,6 @@
-//! What no watch shows and is asked of the API server now and then: whether a node reports, and why a Job has no Pod. Asked by
-//! a task of its own, once for all who want to know; an answer that differs wakes them. No reconcile waits for it.
+//! What no watch shows and is asked of the API server now and then: why a Job has no Pod, and, where nodes are not watched, whether
+//! one reports. Asked by a task of its own, once for all who want to know; an answer that differs wakes them. No reconcile waits
+//! for it.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -44,7 +45,7 @@ impl Question {
     /// How long an answer is passed on.
     fn fresh(&self) -> Duration {
         match self {
-            Self::Node(_) => Duration::from_secs(15),
+            Self::Node(_) => Duration::from_mins(1),
             Self::Refusal { .. } => Duration::from_mins(1),
         }
     }
@@ -235,7 +236,7 @@ mod tests {
             shared.done(&node, Answer::Node(ObservedNode::Reports)).is_empty(),
             "nothing to decide on"
         );
-        tokio::time::advance(Duration::from_secs(14)).await;
+        tokio::time::advance(Duration::from_secs(59)).await;
         assert_eq!(shared.next(Instant::now()), None);
         tokio::time::advance(Duration::from_secs(1)).await;
         assert_eq!(shared.next(Instant::now()), Some(node.clone()));

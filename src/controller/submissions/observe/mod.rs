@@ -9,14 +9,14 @@ pub mod team;
 use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
-use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
 use super::decide::job_name;
 use super::view::{ObservedJob, ObservedNode, ObservedReport, PodView, View};
-pub use crate::controller::objects::{children_selector, is_pod_of, uid_of};
+pub use crate::controller::objects::{children_selector, uid_of};
 use crate::controller::runtime::context::Context;
+use crate::kubernetes::objects::Job;
 use leaderboard_api::{Leaderboard, Submission, conditions};
 
 /// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
@@ -45,7 +45,9 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
     };
     let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
     let node = pod.as_ref().filter(matters).and_then(|pod| pod.node.as_ref());
-    let node = node.map_or(ObservedNode::Unknown, |name| context.lookups.node(name, this()));
+    let node = node.map_or(ObservedNode::Unknown, |name| {
+        node::watched(&context.stores, name).unwrap_or_else(|| context.lookups.node(name, this()))
+    });
     let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
     let archive = context.archive_workers.observe(&submission, pod_uid, is_over);
@@ -56,8 +58,7 @@ pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
     let evalai = context.external.evalai_view(leaderboard.as_deref(), &submission, known);
     let turn = context.slots.turn(&submission, leaderboard.as_deref());
     let simulator_failures_of_team = if may_end(&submission, &job) {
-        let all = context.stores.submissions.state();
-        team::simulator_failures(all.iter().map(AsRef::as_ref), &submission, now)
+        team::simulator_failures(&context.stores.submissions, &submission, now)
     } else {
         0
     };
@@ -115,8 +116,8 @@ fn children(context: &Context, submission: &Submission, namespace: &str, name: &
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {
-    let uid = submission.uid();
-    job.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
+    job.metadata
+        .is_owned_by(submission.metadata.uid.as_deref().unwrap_or_default())
 }
 
 impl ObservedReport {
