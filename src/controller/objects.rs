@@ -1,11 +1,15 @@
 //! What is read off any object: its key, its owner, and what marks it as ours. Pure.
 
 use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 
 use crate::kubernetes::objects::{Job, Pod};
 use crate::services::ObjectKey;
 use leaderboard_api::names;
+
+/// Puts an object into its work queue.
+pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;
 
 /// The key of an object in every map of the controller: its UID, which a name does not replace.
 pub fn uid_of(object: &impl Resource) -> String {

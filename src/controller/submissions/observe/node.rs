@@ -8,13 +8,12 @@ use futures::StreamExt;
 use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client};
 
-use crate::controller::runtime::context::CALL_TIMEOUT;
+use crate::controller::objects::Wake;
 use crate::controller::stores::Stores;
-use crate::controller::submissions::archive::WakeSubmission;
 use crate::controller::submissions::view::ObservedNode;
 use crate::kubernetes::objects::{Node, Pod};
-use crate::kubernetes::{Item, Store, WatchEvents};
-use leaderboard_api::client_errors;
+use crate::kubernetes::{CALL_TIMEOUT, Item, Store, WatchEvents};
+use leaderboard_api::{Submission, client_errors};
 
 /// What a watch shows of a node; None without a watch that can be relied on.
 pub(super) fn watched(stores: &Stores, name: &str) -> Option<ObservedNode> {
@@ -25,7 +24,7 @@ pub(super) fn watched(stores: &Stores, name: &str) -> Option<ObservedNode> {
 
 /// Wakes the submissions of a node when it falls silent, reports again or goes. All Pods are walked then, which is rare: a node
 /// that reports as before is no news.
-pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: WakeSubmission) {
+pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Submission>) {
     let mut known: HashMap<Box<str>, ObservedNode> = HashMap::new();
     while let Some(event) = nodes.next().await {
         let name: &str = &event.object.metadata.name;
