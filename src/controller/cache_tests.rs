@@ -3,7 +3,7 @@
 use kube::ResourceExt;
 use serde_json::{Value, json};
 
-use crate::controller::fixtures::{leaderboard, with_job};
+use crate::controller::fixtures::{leaderboard, settings, with_job};
 use crate::controller::stores::owner_uid;
 use crate::controller::submissions::job_spec::{JobInput, build_object};
 use crate::controller::submissions::observe::team;
@@ -66,9 +66,7 @@ fn job(number: usize) -> Value {
         plan,
         attempt: 1,
         retry: 0,
-        operator_image: "operator:1",
-        image_pull_policy: None,
-        region: None,
+        settings: &settings(),
         now: jiff::Timestamp::now(),
     }));
     object["status"] = json!({"active": 1, "ready": 1, "startTime": "2026-01-01T00:00:00Z"});

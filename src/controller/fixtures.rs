@@ -130,7 +130,8 @@ fn noting<K: Resource<DynamicType = ()> + 'static>(names: &mpsc::UnboundedSender
     })
 }
 
-fn settings() -> Settings {
+/// As the operator is started.
+pub fn settings() -> Settings {
     Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
@@ -173,7 +174,7 @@ fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
 async fn serve(
     mut handle: Handle<Request<Body>, Response<Body>>,
     known: HashMap<String, Value>,
-    tell: mpsc::UnboundedSender<Arrived>,
+    arrived: mpsc::UnboundedSender<Arrived>,
 ) {
     while let Some((request, answer)) = handle.next_request().await {
         let (method, path) = (request.method().clone(), request.uri().path().to_owned());
@@ -181,7 +182,7 @@ async fn serve(
         let body = serde_json::from_slice(&body).unwrap_or_default();
         let reply = reply(&method, &path, body, &known);
         let at = Instant::now();
-        let _ = tell.send(Arrived { at, method, path });
+        let _ = arrived.send(Arrived { at, method, path });
         answer.send_response(Response::new(Body::from(reply.to_string().into_bytes())));
     }
 }

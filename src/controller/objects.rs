@@ -1,6 +1,7 @@
 //! What is read off any object: its key, its owner, and what marks it as ours. Pure.
 
 use k8s_openapi::api::networking::v1::NetworkPolicy;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 
@@ -65,6 +66,18 @@ impl Child for NetworkPolicy {
 
     fn leaderboard(&self) -> Option<&str> {
         self.labels().get(names::LABEL_LEADERBOARD).map(String::as_str)
+    }
+}
+
+/// The reference by which a child goes with its owner.
+pub fn owner_reference<K: Resource<DynamicType = ()>>(owner: &K) -> OwnerReference {
+    OwnerReference {
+        api_version: K::api_version(&()).into_owned(),
+        kind: K::kind(&()).into_owned(),
+        name: owner.meta().name.clone().unwrap_or_default(),
+        uid: uid_of(owner),
+        controller: Some(true),
+        block_owner_deletion: Some(true),
     }
 }
 

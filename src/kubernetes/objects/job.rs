@@ -13,14 +13,7 @@ use super::watchable;
 #[serde(default)]
 pub struct Job {
     pub metadata: Meta,
-    pub spec: JobSpec,
     pub status: JobStatus,
-}
-
-#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
-#[serde(rename_all = "camelCase", default)]
-pub struct JobSpec {
-    pub ttl_seconds_after_finished: Option<i32>,
 }
 
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]

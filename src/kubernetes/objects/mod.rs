@@ -10,7 +10,7 @@ mod node;
 mod pod;
 mod texts;
 
-pub use job::{Job, JobCondition, JobSpec, JobStatus};
+pub use job::{Job, JobCondition, JobStatus};
 pub use meta::{Annotations, Labels, Meta, Owner};
 pub use node::{Node, NodeCondition, NodeStatus};
 pub use pod::{
