@@ -28,7 +28,7 @@ const LIMIT: Duration = Duration::from_mins(20);
 enum Answer {
     Json(u16, Value),
     /// The lines of a watch, which then ends.
-    Watch(Vec<Value>),
+    Watch(Vec<String>),
 }
 
 type Script = mpsc::UnboundedSender<Answer>;
@@ -53,7 +53,7 @@ async fn serve(mut handle: Handle<Request<Body>, Response<Body>>, mut answers: m
         let Some(answer) = answers.recv().await else { return };
         let (code, body) = match answer {
             Answer::Json(code, body) => (code, body.to_string()),
-            Answer::Watch(lines) => (200, lines.iter().map(|line| line.to_string() + "\n").collect()),
+            Answer::Watch(lines) => (200, lines.concat()),
         };
         let response = Response::builder().status(code).body(Body::from(body.into_bytes()));
         send.send_response(response.unwrap());
@@ -80,11 +80,12 @@ fn list(items: &[Value]) -> Answer {
     )
 }
 
-fn line(kind: &str, object: &Value) -> Value {
-    json!({"type": kind, "object": object})
+/// As the API server writes it: the type comes first.
+fn line(kind: &str, object: &Value) -> String {
+    format!("{{\"type\":\"{kind}\",\"object\":{object}}}\n")
 }
 
-fn gone() -> Value {
+fn gone() -> String {
     line(
         "ERROR",
         &json!({"kind": "Status", "status": "Failure", "reason": "Expired", "code": 410, "message": "too old"}),

@@ -17,6 +17,7 @@ const TASKS: [&str; 12] = [
     "gauges",
     "lease",
     "lookups",
+    "nodes",
     "permissions",
     "policies",
     "reconciles",
@@ -24,6 +25,7 @@ const TASKS: [&str; 12] = [
     "watch of jobs",
     "watch of leaderboards",
     "watch of networkpolicies",
+    "watch of nodes",
     "watch of pods",
     "watch of submissions",
 ];
