@@ -93,9 +93,17 @@ fn pod(number: usize) -> Value {
     assert_eq!(init.len() + main.len(), 11);
     let condition =
         |type_: &str| json!({"type": type_, "status": "True", "lastTransitionTime": "2026-01-01T00:00:03Z"});
+    let conditions = [
+        "PodReadyToStartContainers",
+        "Initialized",
+        "Ready",
+        "ContainersReady",
+        "PodScheduled",
+    ]
+    .map(condition);
     template["status"] = json!({
         "phase": "Running", "hostIP": "10.0.0.1", "podIP": "10.1.0.1", "startTime": "2026-01-01T00:00:03Z",
-        "conditions": ["PodReadyToStartContainers", "Initialized", "Ready", "ContainersReady", "PodScheduled"].map(condition),
+        "conditions": conditions,
         "initContainerStatuses": init, "containerStatuses": main,
     });
     stored(template, number)

@@ -13,7 +13,7 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 12] = [
+const TASKS: [&str; 14] = [
     "gauges",
     "lease",
     "lookups",

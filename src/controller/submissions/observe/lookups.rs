@@ -27,6 +27,8 @@ use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 const AT_ONCE: usize = 4;
 /// Who has not asked again for so long does not want to know any more: a live run is reconciled more often.
 const FORGOTTEN: Duration = Duration::from_mins(6);
+/// How long an answer is passed on.
+const FRESH: Duration = Duration::from_mins(1);
 /// How often it is checked which questions are due.
 const TICK: Duration = Duration::from_secs(1);
 
@@ -39,16 +41,6 @@ enum Question {
         namespace: String,
         job: String,
     },
-}
-
-impl Question {
-    /// How long an answer is passed on.
-    fn fresh(&self) -> Duration {
-        match self {
-            Self::Node(_) => Duration::from_mins(1),
-            Self::Refusal { .. } => Duration::from_mins(1),
-        }
-    }
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -133,13 +125,11 @@ impl Shared {
                 .retain(|_, at| now.saturating_duration_since(*at) < FORGOTTEN);
             entry.is_under_way || !entry.wanted_by.is_empty()
         });
-        let is_due = |question: &Question, entry: &Entry| {
-            let is_fresh = entry
-                .asked
-                .is_some_and(|at| now.saturating_duration_since(at) < question.fresh());
+        let is_due = |entry: &Entry| {
+            let is_fresh = entry.asked.is_some_and(|at| now.saturating_duration_since(at) < FRESH);
             !entry.is_under_way && !is_fresh
         };
-        let (question, entry) = entries.iter_mut().find(|(question, entry)| is_due(question, entry))?;
+        let (question, entry) = entries.iter_mut().find(|(_, entry)| is_due(entry))?;
         entry.is_under_way = true;
         entry.asked = Some(now);
         Some(question.clone())
