@@ -156,7 +156,7 @@ def never(controller: str, bridge: str) -> list[Access]:
         *may_not(controller, "get update", "coordination.k8s.io/leases", SYSTEM, "another"),
         *may_not(controller, "create", "coordination.k8s.io/leases", "leaderboard"),
         *may_not(controller, "create", "serviceaccounts:token", SYSTEM),
-        *may_not(controller, "list watch patch delete", "nodes", ""),
+        *may_not(controller, "patch delete", "nodes", ""),
         *may_not(bridge, "get", "pods:log"),
         *may_not(bridge, "get", "nodes", ""),
         *may_not(bridge, "list watch update delete", f"{OWN}/submissions"),
@@ -184,7 +184,7 @@ CLUSTER_WIDE = (
     *never(CONTROLLER, BRIDGE),
     *lease(CONTROLLER),
     *may(CONTROLLER, "get", "secrets", name="evalai"),
-    *may(CONTROLLER, "get", "nodes", ""),
+    *may(CONTROLLER, "get list watch", "nodes", ""),
 )
 # ci/roles.yaml: another account, secrets in two namespaces.
 WITH_ROLES = (
@@ -208,6 +208,6 @@ NAMESPACED = (
     *may_not(CONTROLLER, "get list create", "batch/jobs", "other"),
     *may_not(CONTROLLER, "list", "pods", ""),
     *may_not(CONTROLLER, "get", "pods:log", "other"),
-    *may_not(CONTROLLER, "get", "nodes", ""),
+    *may_not(CONTROLLER, "get list watch", "nodes", ""),
     *may_not(BRIDGE, "get list", f"{OWN}/leaderboards", "other"),
 )

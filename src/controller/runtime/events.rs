@@ -6,8 +6,6 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use futures::stream::{self, BoxStream, StreamExt, select_all};
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
@@ -18,6 +16,7 @@ use crate::controller::leaderboards::isolation;
 use crate::controller::objects::key_of;
 use crate::controller::stores::Stores;
 use crate::kubernetes::WatchEvent;
+use crate::kubernetes::objects::{Job, Pod};
 use crate::services::ObjectKey;
 use crate::services::evalai::Changed;
 use leaderboard_api::{Leaderboard, Submission, conditions};
@@ -106,6 +105,7 @@ fn of_submission(
             shared.forget(&key_of(object));
             return Vec::new();
         }
+        shared.context.memory.is_shown(object);
         let is_news = marks.moved(object, "");
         let own = is_news.then(|| ObjectRef::from_obj(object));
         own.into_iter().chain(original).collect()
@@ -149,7 +149,7 @@ fn of_pod(shared: Arc<Shared>, boards: Boards) -> impl FnMut(WatchEvent<Pod>) ->
     let mut measured = HashSet::new();
     move |event| {
         let pod = event.object.as_ref();
-        let uid = pod.uid().unwrap_or_default();
+        let uid = pod.metadata.uid.clone();
         let board = Stores::leaderboard_of(pod);
         // A Leaderboard that is being deleted waits for the end of its last Pod.
         let known = board

@@ -15,13 +15,11 @@ mod sweep;
 use std::sync::Arc;
 use std::time::Duration;
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
-use kube::runtime::reflector::{ObjectRef, Store};
+use kube::runtime::reflector::ObjectRef;
 use kube::runtime::watcher::Config;
-use kube::{Client, Resource};
+use kube::{Api, Client, Resource};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -30,14 +28,16 @@ use super::leaderboards::isolation;
 use super::leaderboards::state::LeaderboardState;
 use super::objects::{Wake, children_selector};
 use super::settings::Settings;
-use super::stores::Stores;
+use super::stores::{Nodes, Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::observe::{node, team};
 use crate::controller::submissions::reruns::Reruns;
+use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
-use crate::kubernetes::{Watch, guarded, spawn_watch};
+use crate::kubernetes::{Shape, Store, Watch, guarded, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::ObjectKey;
@@ -153,17 +153,50 @@ struct Watches {
     jobs: Watch<Job>,
     pods: Watch<Pod>,
     policies: Watch<NetworkPolicy>,
+    /// None: an operator of one namespace has no right to them.
+    nodes: Option<Watch<Node>>,
 }
 
 impl Watches {
     fn start(client: &Client, namespace: Option<&str>, telemetry: &Observability) -> Self {
         let children = || Config::default().labels(&children_selector());
+        let submissions = Shape {
+            index: team::index,
+            ..Shape::default()
+        };
+        let pods = Shape {
+            index: owner_uid,
+            ..Shape::default()
+        };
         Self {
-            leaderboards: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, telemetry),
-            submissions: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, telemetry),
-            jobs: spawn_watch(guarded(client.clone(), namespace), children(), trim_job, telemetry),
-            pods: spawn_watch(guarded(client.clone(), namespace), children(), trim_pod, telemetry),
-            policies: spawn_watch(guarded(client.clone(), namespace), children(), |_| {}, telemetry),
+            leaderboards: spawn_watch(
+                guarded(client.clone(), namespace),
+                Config::default(),
+                Shape::default(),
+                telemetry,
+            ),
+            submissions: spawn_watch(
+                guarded(client.clone(), namespace),
+                Config::default(),
+                submissions,
+                telemetry,
+            ),
+            jobs: spawn_watch(
+                guarded(client.clone(), namespace),
+                children(),
+                Shape::default(),
+                telemetry,
+            ),
+            pods: spawn_watch(guarded(client.clone(), namespace), children(), pods, telemetry),
+            policies: spawn_watch(
+                guarded(client.clone(), namespace),
+                children(),
+                Shape::default(),
+                telemetry,
+            ),
+            nodes: namespace
+                .is_none()
+                .then(|| spawn_watch(Api::all(client.clone()), Config::default(), Shape::default(), telemetry)),
         }
     }
 
@@ -175,6 +208,10 @@ impl Watches {
             pods: self.pods.store.clone(),
             policies: self.policies.store.clone(),
             policies_synced: self.policies.synced.clone(),
+            nodes: self.nodes.as_ref().map(|nodes| Nodes {
+                store: nodes.store.clone(),
+                synced: nodes.synced.clone(),
+            }),
         }
     }
 
@@ -185,27 +222,6 @@ impl Watches {
         let _ = self.jobs.store.wait_until_ready().await;
         let _ = self.pods.store.wait_until_ready().await;
         let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
-    }
-}
-
-/// Of a Job, decisions read metadata and status.
-fn trim_job(job: &mut Job) {
-    if let Some(spec) = &mut job.spec {
-        spec.template = PodTemplateSpec::default();
-    }
-}
-
-/// Of a Pod, decisions read metadata, its node, the names of its containers and status.
-pub(super) fn trim_pod(pod: &mut Pod) {
-    if let Some(spec) = &mut pod.spec {
-        for container in &mut spec.containers {
-            *container = Container {
-                name: std::mem::take(&mut container.name),
-                ..Container::default()
-            };
-        }
-        spec.init_containers = None;
-        spec.volumes = None;
     }
 }
 
@@ -305,6 +321,10 @@ impl Parts {
             wake: waking(boards),
         };
         context.stores.fill(&context.slots);
+        if let Some(nodes) = &self.watches.nodes {
+            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), waking(answers));
+            tasks.stay("nodes", woken);
+        }
         context
     }
 

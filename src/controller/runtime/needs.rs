@@ -28,7 +28,7 @@ const OF_RUNS: [Right; 13] = [
         "networkpolicies",
         &["get", "list", "watch", "create", "patch"],
     ),
-    ("", "nodes", &["get"]),
+    ("", "nodes", &["get", "list", "watch"]),
 ];
 /// Kinds without a namespace: an operator of one namespace has no right to them and does without.
 const OF_THE_CLUSTER: [&str; 1] = ["nodes"];

@@ -8,7 +8,9 @@ use std::time::{Duration, Instant};
 use futures::stream::{BoxStream, StreamExt};
 use kube::Resource;
 use kube::runtime::controller::{Action, Config, applier};
-use kube::runtime::reflector::ObjectRef;
+use kube::runtime::reflector::store::Writer;
+use kube::runtime::reflector::{self, ObjectRef};
+use kube::runtime::watcher::Event;
 
 use super::Shared;
 use crate::backoff::jittered;
@@ -18,7 +20,7 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
 use crate::controller::submissions::decide::{self, Plan, decide};
 use crate::controller::submissions::observe::observe;
-use crate::kubernetes::CallError;
+use crate::kubernetes::{CallError, Store, Watchable};
 use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::{Leaderboard, Submission};
 
@@ -57,6 +59,8 @@ pub(super) async fn run(
     shared: Arc<Shared>,
 ) {
     let (stop, stores) = (&shared.telemetry.stop, &shared.context.stores);
+    let (submission_reader, submissions) = mirrored(submissions, &stores.submissions);
+    let (leaderboard_reader, leaderboards) = mirrored(leaderboards, &stores.leaderboards);
     let config = Config::default()
         .concurrency(shared.context.settings.concurrency)
         .debounce(DEBOUNCE);
@@ -64,7 +68,7 @@ pub(super) async fn run(
         |object, shared: Arc<Shared>| Box::pin(reconcile_submission(object, shared)),
         |object: Arc<Submission>, _: &ReconcileError, shared| after_error(object.as_ref(), &shared),
         Arc::clone(&shared),
-        stores.submissions.clone(),
+        submission_reader,
         submissions.take_until(Box::pin(stop.wait())).map(Ok::<_, Infallible>),
         config.clone(),
     );
@@ -72,7 +76,7 @@ pub(super) async fn run(
         |object, shared: Arc<Shared>| Box::pin(reconcile_leaderboard(object, shared)),
         |object: Arc<Leaderboard>, _: &ReconcileError, shared| after_error(object.as_ref(), &shared),
         Arc::clone(&shared),
-        stores.leaderboards.clone(),
+        leaderboard_reader,
         leaderboards.take_until(Box::pin(stop.wait())).map(Ok::<_, Infallible>),
         config.concurrency(4),
     );
@@ -83,8 +87,33 @@ pub(super) async fn run(
     );
 }
 
+/// The applier reads its own kind of cache, which is filled with the objects that are in its queue.
+fn mirrored<K: Watchable + Resource<DynamicType = ()>>(
+    keys: BoxStream<'static, ObjectRef<K>>,
+    store: &Store<K>,
+) -> (reflector::Store<K>, BoxStream<'static, ObjectRef<K>>) {
+    let (mut writer, store) = (Writer::<K>::default(), store.clone());
+    let reader = writer.as_reader();
+    writer.apply_watcher_event(&Event::Init);
+    writer.apply_watcher_event(&Event::InitDone);
+    let keys = keys.inspect(move |key| {
+        if let Some(object) = store.get(key) {
+            writer.apply_watcher_event(&Event::Apply((*object).clone()));
+        }
+    });
+    (reader, keys.boxed())
+}
+
 async fn reconcile_submission(submission: Arc<Submission>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
     let started = Instant::now();
+    let Some(submission) = shared
+        .context
+        .stores
+        .submissions
+        .get(&ObjectRef::from_obj(submission.as_ref()))
+    else {
+        return Ok(Action::await_change());
+    };
     let name = key_of(submission.as_ref()).to_string();
     let slots = &shared.context.slots;
     let work = async {
@@ -127,6 +156,14 @@ fn settle(slots: &SlotAllocator, submission: &Submission, plan: &Plan) {
 
 async fn reconcile_leaderboard(leaderboard: Arc<Leaderboard>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
     let started = Instant::now();
+    let Some(leaderboard) = shared
+        .context
+        .stores
+        .leaderboards
+        .get(&ObjectRef::from_obj(leaderboard.as_ref()))
+    else {
+        return Ok(Action::await_change());
+    };
     let (name, uid) = (key_of(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
     let work = leaderboards::reconcile(leaderboard, shared.context.for_leaderboards());
     let result = match tokio::time::timeout(TIME_LIMIT, work).await {
