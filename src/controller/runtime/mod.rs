@@ -9,6 +9,7 @@ mod counts;
 mod events;
 pub mod leader;
 mod needs;
+mod queue;
 mod reconciles;
 mod sweep;
 
@@ -20,7 +21,7 @@ use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::Client;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
-use kube::runtime::reflector::{ObjectRef, Store};
+use kube::runtime::reflector::Store;
 use kube::runtime::watcher::Config;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -30,7 +31,7 @@ use super::leaderboards::isolation;
 use super::objects::children_selector;
 use crate::controller::runtime::backoff::BackoffMap;
 use crate::controller::runtime::context::{Context, Settings, Stores};
-use crate::controller::submissions::archive::{ArchiveWorkers, WakeSubmission};
+use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
@@ -44,6 +45,8 @@ use crate::services::meter::Meter;
 use crate::services::table::Recorder;
 use leader::{Leader, Leadership};
 use leaderboard_api::{Leaderboard, Submission};
+use queue::Class;
+use reconciles::Queues;
 
 /// Reconciles under way may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -63,6 +66,7 @@ pub enum RunError {
 /// What all reconciles share.
 pub(super) struct Shared {
     context: Arc<Context>,
+    queues: Queues,
     backoff: BackoffMap,
     telemetry: Observability,
 }
@@ -221,7 +225,7 @@ impl Parts {
             return Ok(());
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
-        let (boards, woken_boards) = mpsc::unbounded_channel();
+        let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (changed_rows, rows) = mpsc::unbounded_channel();
         let (changed, evalai) = mpsc::unbounded_channel();
         let fence = leader.fence();
@@ -243,19 +247,16 @@ impl Parts {
         );
         self.telemetry.tasks.stay("gauges", gauges);
         let watches = self.watches;
-        let to_queue = boards.clone();
-        let wake = Box::new(move |board| {
-            // Without a receiver the process is ending.
-            let _ = to_queue.send(board);
-        });
-        let (answered, answers) = mpsc::unbounded_channel();
+        let boards = Arc::clone(&queues.leaderboards);
+        let wake = Box::new(move |board| boards.add(&board, Class::Refresh));
+        let answered = || events::waking(&queues.submissions, &watches.submissions.store);
         let archive_workers = ArchiveWorkers::new(
             self.aws.clone(),
             self.client.clone(),
             self.telemetry.tasks.clone(),
-            waking(&answered),
+            answered(),
         );
-        let lookups = Lookups::start(self.client.clone(), &self.telemetry.tasks, waking(&answered));
+        let lookups = Lookups::start(self.client.clone(), &self.telemetry.tasks, answered());
         let events = events(&self.client);
         let context = Context::new(
             self.client,
@@ -268,6 +269,7 @@ impl Parts {
         );
         let shared = Arc::new(Shared {
             context: Arc::new(context),
+            queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
@@ -279,9 +281,9 @@ impl Parts {
         };
         let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
         self.telemetry.tasks.stay("policies", restored);
-        let reports = events::Reports { rows, evalai, answers };
-        let of_submissions = events::of_submissions(&watches, reports, &boards, &shared);
-        let of_leaderboards = events::of_leaderboards(&watches, woken_boards, &shared);
+        let reports = events::Reports { rows, evalai };
+        let of_submissions = events::of_submissions(&watches, reports, &shared);
+        let of_leaderboards = events::of_leaderboards(&watches, &shared);
         let mut leadership = leader.leadership();
         let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
         let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
@@ -298,15 +300,6 @@ impl Parts {
         }
         Ok(())
     }
-}
-
-/// Puts a Submission into the queue.
-fn waking(queue: &mpsc::UnboundedSender<ObjectRef<Submission>>) -> WakeSubmission {
-    let queue = queue.clone();
-    Box::new(move |submission| {
-        // Without a receiver the process is ending.
-        let _ = queue.send(submission);
-    })
 }
 
 /// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.
