@@ -50,8 +50,8 @@ pub(super) struct Lanes {
     urgent: Lane,
     new: HashMap<Arc<str>, Lane>,
     refresh: Lane,
-    /// Reconciles that went first since a lower class has aged.
-    went_first: u32,
+    /// How many others went first since each class has aged.
+    passed_over: [u32; 3],
 }
 
 impl Lanes {
@@ -101,31 +101,20 @@ impl Lanes {
         has_permit: impl Fn(&str) -> bool,
     ) -> Option<(Class, Place, Key)> {
         let heads = Class::ALL.map(|class| self.head(class, &has_permit).filter(|_| may_begin(class)));
-        let present = || {
-            Class::ALL
-                .into_iter()
-                .zip(&heads)
-                .filter_map(|(class, head)| Some((class, head.clone()?)))
-        };
-        let first = present().next()?;
-        let aged = present()
-            .skip(1)
-            .filter(|(_, ((since, _), _))| *since + PATIENCE <= now);
-        let next = match aged.min_by_key(|(_, (place, _))| *place) {
-            None => {
-                self.went_first = 0;
-                first
-            }
-            Some(_) if self.went_first < OTHERS_FIRST => {
-                self.went_first += 1;
-                first
-            }
-            Some(aged) => {
-                self.went_first = 0;
-                aged
-            }
-        };
-        let (class, (place, key)) = next;
+        let first = heads.iter().position(Option::is_some)?;
+        let is_aged =
+            |head: &Option<(Place, Key)>| head.as_ref().is_some_and(|((since, _), _)| *since + PATIENCE <= now);
+        for (class, head) in heads.iter().enumerate() {
+            let waits = class > first && is_aged(head);
+            self.passed_over[class] = if waits { self.passed_over[class] + 1 } else { 0 };
+        }
+        let due = (0..heads.len())
+            .rev()
+            .filter(|class| self.passed_over[*class] > OTHERS_FIRST);
+        let next = due.max_by_key(|class| self.passed_over[*class]).unwrap_or(first);
+        self.passed_over[next] = 0;
+        let class = Class::ALL[next];
+        let (place, key) = heads.into_iter().nth(next).flatten()?;
         self.remove(class, place, &key);
         Some((class, place, key))
     }
