@@ -18,9 +18,8 @@ use tokio::sync::mpsc;
 use super::queue::{Class, Key, Queue, urgency};
 use super::{Shared, Watches};
 use crate::controller::leaderboards::isolation;
-use crate::controller::objects::key_of;
+use crate::controller::objects::{Wake, key_of};
 use crate::controller::stores::Stores;
-use crate::controller::submissions::archive::WakeSubmission;
 use crate::kubernetes::WatchEvent;
 use crate::services::ObjectKey;
 use crate::services::evalai::Changed;
@@ -67,7 +66,7 @@ pub(super) fn of_submissions(watches: &Watches, reports: Reports, shared: &Arc<S
 }
 
 /// Puts a Submission into the queue that has an answer from S3, or of the API server.
-pub(super) fn waking(queue: &Arc<Queue>, submissions: &Store<Submission>) -> WakeSubmission {
+pub(super) fn waking(queue: &Arc<Queue>, submissions: &Store<Submission>) -> Wake<Submission> {
     let (queue, submissions) = (Arc::clone(queue), submissions.clone());
     Box::new(move |object| {
         let (object, class) = ranked(&submissions, object, urgency::of_answer);

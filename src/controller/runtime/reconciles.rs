@@ -15,7 +15,7 @@ use super::Shared;
 use super::events::Events;
 use super::queue::{After, Class, Limits, Queue, Turn, urgency};
 use crate::backoff::jittered;
-use crate::controller::leaderboards::{self, Uses};
+use crate::controller::leaderboards;
 use crate::controller::objects::uid_of;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
@@ -125,7 +125,10 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
     let started = Instant::now();
     let slots = &shared.context.slots;
     let work = async {
-        let view = observe(&shared.context, Arc::clone(&submission));
+        let policies = shared.context.policies();
+        let view = observe(shared.context.for_observe(), Arc::clone(&submission), |board| {
+            policies.is_in_place(board)
+        });
         let plan = decide(&view);
         let creates_job = plan
             .actions
@@ -136,7 +139,7 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
         }
         let (requeue, class) = (plan.requeue, urgency::after(&submission, &plan));
         settle(slots, &submission, &plan);
-        let held_back = act(&shared.context, &view, plan).await?;
+        let held_back = act(shared.context.for_act(), &view, plan).await?;
         let requeue = [requeue, held_back].into_iter().flatten().min();
         Ok(Some((requeue, class)))
     };
@@ -180,14 +183,7 @@ async fn reconcile_leaderboard(turn: Turn, shared: Arc<Shared>) -> After {
         return After::Gone;
     };
     let started = Instant::now();
-    let uses = Uses {
-        policies: context.policies(),
-        settings: &context.settings,
-        slots: &context.slots,
-        external: &context.external,
-        aws: &context.aws,
-    };
-    let work = leaderboards::reconcile(Arc::clone(&leaderboard), uses);
+    let work = leaderboards::reconcile(Arc::clone(&leaderboard), context.for_leaderboards());
     let result = limited(work.map(|result| result.map_err(ReconcileError::from))).await;
     let result = result
         .map(|requeue| (Some(requeue), Class::Refresh))

@@ -53,11 +53,15 @@ async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
     });
     let of_submissions = stream::poll_fn(move |cx| queued.poll_recv(cx)).boxed();
     let reconciles = tokio::spawn(run(of_submissions, stream::pending().boxed(), shared));
-    all.iter().for_each(|submission| event(submission, Class::Refresh));
+    for submission in &all {
+        event(submission, Class::Refresh);
+    }
     // As many reconciles as there may be at once have begun, and the others wait.
     tokio::time::sleep(Duration::from_secs(1)).await;
     let began = tokio::time::Instant::now();
-    cancelled.iter().for_each(|submission| event(submission, Class::Urgent));
+    for submission in &cancelled {
+        event(submission, Class::Urgent);
+    }
     let mut stopped = Vec::new();
     while stopped.len() < CANCELS {
         let request = around.requests.recv().await.unwrap();

@@ -24,10 +24,10 @@ struct Known {
     event: Option<Class>,
     /// When it has to be reconciled at the latest without one.
     time: Option<Instant>,
-    is_running: bool,
+    /// The class that its present reconcile began with.
+    runs: Option<Class>,
+    /// It was deleted since that began.
     is_gone: bool,
-    is_urgent: bool,
-    creates: bool,
     least: Option<Class>,
 }
 
@@ -63,7 +63,7 @@ impl Life {
         let running: Vec<_> = self
             .model
             .iter()
-            .filter(|(_, k)| k.is_running)
+            .filter(|(_, k)| k.runs.is_some())
             .map(|(id, _)| id.clone())
             .collect();
         self.random.choice(running)
@@ -95,7 +95,7 @@ impl Life {
         let id = self.any();
         self.state.forget(&key(&id));
         match self.model.get_mut(&id) {
-            Some(known) if known.is_running => (known.event, known.is_gone) = (None, true),
+            Some(known) if known.runs.is_some() => (known.event, known.is_gone) = (None, true),
             _ => {
                 self.model.remove(&id);
             }
@@ -104,10 +104,13 @@ impl Life {
 
     /// Those that may begin now.
     fn candidates(&self) -> Vec<((String, String), Class)> {
-        let running = self.model.values().filter(|known| known.is_running);
-        let others = running.clone().filter(|known| !known.is_urgent).count();
+        let running = self.model.values().filter(|known| known.runs.is_some());
+        let others = running
+            .clone()
+            .filter(|known| known.runs != Some(Class::Urgent))
+            .count();
         let is_full = running.count() >= LIMITS.reconciles;
-        let ready = self.model.iter().filter(|(_, known)| !known.is_running);
+        let ready = self.model.iter().filter(|(_, known)| known.runs.is_none());
         let ready = ready.filter_map(|(id, known)| {
             let due = known.time.filter(|time| *time <= self.now).and(known.least);
             let class = known.event.into_iter().chain(due).min()?;
@@ -115,7 +118,7 @@ impl Life {
         });
         let free = |class| !is_full && (class == Class::Urgent || others < 5);
         let may_create = |namespace: &str| {
-            let creating = self.model.iter().filter(|(_, known)| known.creates);
+            let creating = self.model.iter().filter(|(_, known)| known.runs == Some(Class::New));
             let here = creating.clone().filter(|((of, _), _)| of == namespace).count();
             creating.count() < LIMITS.creates && here < LIMITS.creates_per_namespace
         };
@@ -137,8 +140,7 @@ impl Life {
             "{id:?} of {candidates:?}"
         );
         let known = self.model.get_mut(&id).unwrap();
-        (known.event, known.time, known.is_running) = (None, None, true);
-        (known.creates, known.is_urgent) = (begun.class == Class::New, begun.class == Class::Urgent);
+        (known.event, known.time, known.runs) = (None, None, Some(begun.class));
     }
 
     fn finish(&mut self) {
@@ -150,7 +152,10 @@ impl Life {
             let wait = Duration::from_millis(self.random.u64(0..3) * 2000);
             After::In(wait, self.class())
         } else {
-            assert!(creates && !known.creates, "only one without a permit is refused");
+            assert!(
+                creates && known.runs != Some(Class::New),
+                "only one without a permit is refused"
+            );
             After::WithPermit
         };
         self.state.finish(&key(&id), after, self.now);
@@ -164,7 +169,7 @@ impl Life {
             self.model.remove(id);
             return;
         }
-        (known.is_running, known.is_gone, known.creates) = (false, false, false);
+        (known.runs, known.is_gone) = (None, false);
         match after {
             After::In(wait, least) => {
                 known.least = Some(least);

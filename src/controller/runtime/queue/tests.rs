@@ -17,10 +17,10 @@ const LIMITS: Limits = Limits {
 const TAKES: Duration = Duration::from_millis(100);
 const LATER: After = After::In(Duration::from_mins(10), Class::Refresh);
 
-fn key(namespace: &str, name: impl ToString) -> Key {
+fn key(namespace: &str, name: impl Into<Arc<str>>) -> Key {
     Key {
         namespace: namespace.into(),
-        name: name.to_string().into(),
+        name: name.into(),
     }
 }
 
