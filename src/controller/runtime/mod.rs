@@ -9,6 +9,7 @@ mod counts;
 mod events;
 pub mod leader;
 mod needs;
+mod queue;
 mod reconciles;
 mod sweep;
 
@@ -16,17 +17,18 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::Client;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::ObjectRef;
 use kube::runtime::watcher::Config;
-use kube::{Api, Client, Resource};
+use kube::{Api, Resource};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::leaderboards::isolation;
 use super::leaderboards::state::LeaderboardState;
-use super::objects::{Wake, children_selector};
+use super::objects::children_selector;
 use super::settings::Settings;
 use super::stores::{Nodes, Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
@@ -49,6 +51,8 @@ use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
 use leaderboard_api::{Leaderboard, Submission};
+use queue::Class;
+use reconciles::Queues;
 
 /// Reconciles under way may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -68,6 +72,7 @@ pub enum RunError {
 /// What all reconciles share.
 pub(super) struct Shared {
     context: Arc<Context>,
+    queues: Queues,
     backoff: BackoffMap,
     telemetry: Observability,
 }
@@ -240,14 +245,14 @@ impl Parts {
             return Ok(());
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
-        let (boards, woken_boards) = mpsc::unbounded_channel();
+        let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (rows, changed_rows) = mpsc::unbounded_channel();
         let (evalai, changed) = mpsc::unbounded_channel();
-        let (answers, answered) = mpsc::unbounded_channel();
         let external = self.external(&leader.fence(), evalai, rows);
         let hub = external.hub.clone();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(external, &answers, &boards)),
+            context: Arc::new(self.context(external, &queues)),
+            queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
@@ -255,10 +260,9 @@ impl Parts {
         let reports = events::Reports {
             rows: changed_rows,
             evalai: changed,
-            answers: answered,
         };
-        let of_submissions = events::of_submissions(&self.watches, reports, &boards, &shared);
-        let of_leaderboards = events::of_leaderboards(&self.watches, woken_boards, &shared);
+        let of_submissions = events::of_submissions(&self.watches, reports, &shared);
+        let of_leaderboards = events::of_leaderboards(&self.watches, &shared);
         let mut leadership = leader.leadership();
         let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
         let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
@@ -297,32 +301,29 @@ impl Parts {
         ExternalSystems::new(hub, recorder)
     }
 
-    /// What all reconciles share. `answers` and `boards` wake Submissions and Leaderboards.
-    fn context(
-        &self,
-        external: ExternalSystems,
-        answers: &mpsc::UnboundedSender<ObjectRef<Submission>>,
-        boards: &mpsc::UnboundedSender<ObjectRef<Leaderboard>>,
-    ) -> Context {
+    /// What all reconciles share.
+    fn context(&self, external: ExternalSystems, queues: &Queues) -> Context {
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
+        let answered = || events::waking(&queues.submissions, &self.watches.submissions.store);
+        let boards = Arc::clone(&queues.leaderboards);
         let context = Context {
             client: client.clone(),
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), waking(answers)),
-            lookups: Lookups::start(client.clone(), tasks, waking(answers)),
+            archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered()),
+            lookups: Lookups::start(client.clone(), tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),
             external,
             aws: aws.clone(),
             recorder: events(client),
-            wake: waking(boards),
+            wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
         };
         context.stores.fill(&context.slots);
         if let Some(nodes) = &self.watches.nodes {
-            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), waking(answers));
+            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), answered());
             tasks.stay("nodes", woken);
         }
         context
@@ -339,15 +340,6 @@ impl Parts {
         let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
         self.telemetry.tasks.stay("policies", restored);
     }
-}
-
-/// Puts an object into its queue.
-fn waking<K: Resource<DynamicType = ()> + 'static>(queue: &mpsc::UnboundedSender<ObjectRef<K>>) -> Wake<K> {
-    let queue = queue.clone();
-    Box::new(move |object| {
-        // Without a receiver the process is ending.
-        let _ = queue.send(object);
-    })
 }
 
 /// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.

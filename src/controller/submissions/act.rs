@@ -24,7 +24,7 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
-use crate::kubernetes::{CallError, Watchable, Writes, call};
+use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use leaderboard_api::text::one_line;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
@@ -43,6 +43,9 @@ pub struct Uses<'a> {
     pub archive: &'a ArchiveWorkers,
     pub external: &'a ExternalSystems,
 }
+
+/// A create that an admission webhook holds up keeps a permit that others wait for.
+const CREATE_LIMIT: Duration = Duration::from_secs(10);
 
 /// What a reconcile could not carry out.
 #[derive(thiserror::Error, Debug)]
@@ -229,7 +232,8 @@ impl Actor<'_> {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PostParams::default()
         };
-        match call("creating the Job", &name, api.create(&params, &object)).await {
+        let create = api.create(&params, &object);
+        match call_within(CREATE_LIMIT, "creating the Job", &name, create).await {
             // Its name is ours alone; whose it is, the next reconcile sees.
             Err(error) if error.is_conflict() => Ok(()),
             other => {
