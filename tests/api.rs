@@ -33,4 +33,5 @@ mod api {
     mod table;
     mod token;
     mod watches;
+    mod world;
 }
