@@ -105,7 +105,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         meter: Meter::default(),
         tasks: tasks.clone(),
     });
-    let sync = ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, wake, tasks.clone()));
+    let external = ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, wake, tasks.clone()));
     let (answered_by, answered) = mpsc::unbounded_channel();
     let answered_by = move || -> WakeSubmission {
         let answered_by = answered_by.clone();
@@ -145,7 +145,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         client,
         settings,
         stores,
-        (sync, archive_workers, lookups),
+        (external, archive_workers, lookups),
         aws,
         events,
         wake,

@@ -315,7 +315,7 @@ async fn a_leaderboard_and_with_it_the_policy_stays_while_a_pod_of_it_runs() {
             policies: context.policies(),
             settings: &context.settings,
             slots: &context.slots,
-            sync: &context.external,
+            external: &context.external,
             aws: &context.aws,
         };
         // The mock's answer to a finalizer is no Leaderboard.

@@ -1,7 +1,7 @@
 //! A pass of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
 //! Applies the policy before it waits for anything else, since no Job is made without it. Reads the token (every five minutes,
-//! or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands the way to EvalAI to `sync`. `decide`
+//! or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands the way to EvalAI to `external`. `decide`
 //! and `reach` are pure.
 
 pub mod decide;
@@ -52,15 +52,15 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
     let probe = state.probe(&uid).refresh(uses, &leaderboard, now).await;
     if let Some(target) = probe.target() {
-        uses.sync.set_target(&leaderboard, Some(target));
+        uses.external.set_target(&leaderboard, Some(target));
     }
     state.keep(&uid, probe.clone());
     let view = observe(uses, &leaderboard, policy, &probe, now);
     let plan = decide(&view);
     set_finalizer(client, &leaderboard, &plan).await?;
     if plan.finalizer == Some(false) {
-        uses.sync.set_target(&leaderboard, None);
-        uses.sync.hub.retire(&key_of(leaderboard.as_ref()));
+        uses.external.set_target(&leaderboard, None);
+        uses.external.hub.retire(&key_of(leaderboard.as_ref()));
         return Ok(RESYNC);
     }
     let again = write_status(client, state, &leaderboard, &plan, now).await?;
@@ -78,7 +78,7 @@ fn observe(
     now: Timestamp,
 ) -> LeaderboardView {
     let (counts, in_use) = uses.slots.census(leaderboard);
-    let (stores, hub) = (uses.policies.stores, &uses.sync.hub);
+    let (stores, hub) = (uses.policies.stores, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
     LeaderboardView {
         now,

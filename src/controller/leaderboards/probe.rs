@@ -74,14 +74,14 @@ impl Probe {
 
     async fn refresh_token(&mut self, uses: Uses<'_>, leaderboard: &Leaderboard, now: Timestamp) {
         let Some(evalai) = &leaderboard.spec.evalai else { return };
-        let refused = uses.sync.hub.token_refused(&key_of(leaderboard)).is_some();
+        let refused = uses.external.hub.token_refused(&key_of(leaderboard)).is_some();
         let good = self.token.as_ref().is_some_and(Result::is_ok) && !refused;
         if due(self.token_at, good, now) {
             self.token = Some(read_token(uses.policies.client, uses.aws, leaderboard, &evalai.token).await);
             self.token_at = Some(now);
         }
         if let Some(Ok(token)) = &self.token {
-            self.target = Some(serve(&uses.sync.hub, leaderboard, evalai, token));
+            self.target = Some(serve(&uses.external.hub, leaderboard, evalai, token));
         }
     }
 

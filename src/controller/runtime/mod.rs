@@ -30,7 +30,6 @@ use super::leaderboards::isolation;
 use super::objects::children_selector;
 use crate::controller::runtime::backoff::BackoffMap;
 use crate::controller::runtime::context::{Context, Settings, Stores};
-use crate::controller::runtime::leader::{self, Leader, Leadership};
 use crate::controller::submissions::archive::{ArchiveWorkers, WakeSubmission};
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::observe::lookups::Lookups;
@@ -43,6 +42,7 @@ use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::meter::Meter;
 use crate::services::table::Recorder;
+use leader::{Leader, Leadership};
 use leaderboard_api::{Leaderboard, Submission};
 
 /// Reconciles under way may take this long to end after a stop.

@@ -130,7 +130,7 @@ async fn reconcile_leaderboard(leaderboard: Arc<Leaderboard>, shared: Arc<Shared
         policies: context.policies(),
         settings: &context.settings,
         slots: &context.slots,
-        sync: &context.external,
+        external: &context.external,
         aws: &context.aws,
     };
     let work = leaderboards::reconcile(leaderboard, uses);

@@ -108,9 +108,9 @@ impl ExternalSystems {
     }
 
     /// Updates EvalAI with what the view shows.
-    pub fn tell(&self, context: &Context, view: &View, status: &SubmissionStatus, tell: EvalaiUpdate) {
+    pub fn update_evalai(&self, context: &Context, view: &View, status: &SubmissionStatus, update: EvalaiUpdate) {
         let Some(subject) = self.subject(view) else { return };
-        let update = match tell {
+        let desired = match update {
             EvalaiUpdate::Queued => Some(DesiredUpdate::Queued),
             EvalaiUpdate::Running => Some(DesiredUpdate::Running),
             EvalaiUpdate::Partial => partial(context, view).map(DesiredUpdate::Partial),
@@ -118,11 +118,11 @@ impl ExternalSystems {
             EvalaiUpdate::Failed => Some(final_update(context, view, status, Outcome::Failed)),
             EvalaiUpdate::Cancelled => Some(final_update(context, view, status, Outcome::Cancelled)),
         };
-        if matches!(tell, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
+        if matches!(update, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
             self.follow(view, status);
         }
-        if let Some(update) = update {
-            log_refused(&view.submission, self.hub.update(&subject, update));
+        if let Some(desired) = desired {
+            log_refused(&view.submission, self.hub.update(&subject, desired));
         }
     }
 

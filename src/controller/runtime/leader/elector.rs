@@ -111,7 +111,7 @@ impl Elector {
         }
         let now = self.settings.clock.now();
         match decide(
-            &self.telemetry,
+            &self.seen,
             &self.settings.identity,
             self.leading.as_ref(),
             &self.settings.timing,
@@ -185,7 +185,7 @@ impl Elector {
     }
 
     fn note(&mut self, lease: Option<Lease>) {
-        self.telemetry
+        self.seen
             .note(lease.as_ref().map(Record::read), self.settings.clock.now());
         self.lease = lease;
         self.is_fresh = true;

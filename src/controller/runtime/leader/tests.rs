@@ -92,7 +92,7 @@ async fn the_first_ever_leads_at_once_and_may_write_to_evalai_at_once() {
     assert_eq!(candidate.leader.fence().term(), Some(1));
     assert!(
         candidate
-            .seen
+            .telemetry
             .metrics
             .text()
             .unwrap()
@@ -296,7 +296,7 @@ async fn a_renewal_whose_answer_was_lost_costs_one_look() {
     assert_eq!(log.iter().filter(|method| *method == "GET").count(), 1, "{log:?}");
     assert!(
         candidate
-            .seen
+            .telemetry
             .metrics
             .text()
             .unwrap()
@@ -320,7 +320,7 @@ async fn silence_closes_the_fence_in_ten_seconds_and_ends_the_term() {
         assert!(!candidate.may_write());
         assert!(
             candidate
-                .seen
+                .telemetry
                 .metrics
                 .text()
                 .unwrap()

@@ -88,7 +88,7 @@ fn in_line(draft: &mut Draft<'_>) {
     match line::decide(draft) {
         line::Step::Start => return start_job(draft),
         line::Step::Join => {}
-        line::Step::Wait => tell(draft),
+        line::Step::Wait => update_evalai(draft),
     }
     draft.requeue_in(BACKSTOP);
 }
@@ -137,7 +137,7 @@ fn start_job(draft: &mut Draft<'_>) {
     if is_new {
         draft.event(false, reasons::JOB_CREATED, format!("Created Job {name}."));
     }
-    tell(draft);
+    update_evalai(draft);
     record(draft);
     draft.requeue_in(LOOK);
 }
@@ -240,7 +240,7 @@ fn with_job(draft: &mut Draft<'_>, job: &JobView) {
     if draft.is_to_stop() {
         return stop::decide(draft, job);
     }
-    tell(draft);
+    update_evalai(draft);
     if draft.is_running() {
         record(draft);
         draft.requeue_in(LIVE_BACKSTOP);
@@ -336,7 +336,7 @@ fn run_since(draft: &Draft<'_>) -> Option<jiff::Timestamp> {
 }
 
 /// What EvalAI hears of a live submission; it is sent once, however often it is requested.
-fn tell(draft: &mut Draft<'_>) {
+fn update_evalai(draft: &mut Draft<'_>) {
     if draft.spec().evalai.is_none() {
         return;
     }

@@ -407,11 +407,11 @@ pub fn final_report() -> Report {
 }
 
 pub fn evalai_updates(plan: &Plan) -> Vec<EvalaiUpdate> {
-    let tell = |action: &Action| match action {
-        Action::UpdateEvalai(update) => Some(*tell),
+    let update_of = |action: &Action| match action {
+        Action::UpdateEvalai(update) => Some(*update),
         _ => None,
     };
-    plan.actions.iter().filter_map(tell).collect()
+    plan.actions.iter().filter_map(update_of).collect()
 }
 
 pub fn has(plan: &Plan, matches: impl Fn(&Action) -> bool) -> bool {
