@@ -59,7 +59,7 @@ def work(controller: str, namespace: str) -> list[Access]:
     """What the controller can't work without, in one namespace."""
     return [
         *may(controller, "get list watch patch", f"{OWN}/leaderboards", namespace),
-        *may(controller, "get list watch create patch", f"{OWN}/submissions", namespace),
+        *may(controller, "get list watch create patch delete", f"{OWN}/submissions", namespace),
         *may(controller, "patch", f"{OWN}/submissions:status", namespace),
         *may(controller, "patch", f"{OWN}/leaderboards:status", namespace),
         *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
@@ -86,7 +86,7 @@ def never(controller: str, bridge: str) -> list[Access]:
     """What neither may do, whatever the values."""
     return [
         *may_not(controller, "create update delete", f"{OWN}/leaderboards"),
-        *may_not(controller, "update delete deletecollection", f"{OWN}/submissions"),
+        *may_not(controller, "update deletecollection", f"{OWN}/submissions"),
         *may_not(controller, "create update", "pods"),
         *may_not(controller, "create", "pods:exec"),
         *may_not(controller, "deletecollection", "batch/jobs"),

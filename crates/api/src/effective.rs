@@ -117,6 +117,7 @@ pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: String, image: String
         contents_image: spec.contents.image.clone(),
         simulator_image: spec.simulator.image.clone(),
         resume,
+        earlier_attempts: 0,
     }
 }
 

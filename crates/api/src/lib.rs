@@ -17,6 +17,7 @@ mod pair_status;
 mod progress;
 pub mod ranges;
 pub mod reasons;
+mod retention;
 mod route_slice;
 pub mod submission;
 pub mod submission_status;
@@ -30,6 +31,7 @@ pub use leaderboard::{EvalaiUse, Leaderboard, LeaderboardSpec, LeaderboardStatus
 pub use leaderboard_parts::*;
 pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};
 pub use progress::{Progress, Score};
+pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
 pub use submission::{EvalaiRef, Submission, SubmissionSpec};
 pub use submission_status::*;

@@ -200,6 +200,9 @@ pub struct RunPlan {
     /// True if the stored results of an earlier run are taken up.
     #[serde(default)]
     pub resume: bool,
+    /// Attempts of an earlier Submission of this run, which is gone: the table's row counts on from them.
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub earlier_attempts: i64,
 }
 
 /// What holds a submission up, and since when.
@@ -281,6 +284,11 @@ pub struct Failure {
     /// The pair that it happened in, from 1; absent if it concerns the whole run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pair: Option<i32>,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]
+fn is_none(attempts: &i64) -> bool {
+    *attempts == 0
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]

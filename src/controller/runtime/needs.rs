@@ -13,7 +13,11 @@ type Right = (&'static str, &'static str, &'static [&'static str]);
 /// In the namespaces of the Leaderboards.
 const OF_RUNS: [Right; 13] = [
     (GROUP, "leaderboards", &["get", "list", "watch", "patch"]),
-    (GROUP, "submissions", &["get", "list", "watch", "create", "patch"]),
+    (
+        GROUP,
+        "submissions",
+        &["get", "list", "watch", "create", "patch", "delete"],
+    ),
     (GROUP, "leaderboards/status", &["get", "patch"]),
     (GROUP, "submissions/status", &["get", "patch"]),
     (GROUP, "leaderboards/finalizers", &["update"]),

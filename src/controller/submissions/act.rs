@@ -159,6 +159,7 @@ impl Actor<'_> {
                 self.context.external.record(self.view, status, *end);
                 Ok(())
             }
+            Action::DeleteSubmission { uid, resource_version } => self.delete_submission(uid, resource_version).await,
         }
     }
 
@@ -315,6 +316,30 @@ impl Actor<'_> {
         for pod in pods {
             self.delete_pod(&pod.name_any(), &uid_of(pod.as_ref()), grace_seconds)
                 .await?;
+        }
+        Ok(())
+    }
+
+    /// Its Job goes with it. A change since the decision, a resume for example, makes this fail, and the next reconcile decides anew.
+    async fn delete_submission(&self, uid: &str, resource_version: &str) -> Result<(), ActError> {
+        let name = self.name();
+        let params = DeleteParams {
+            propagation_policy: Some(PropagationPolicy::Background),
+            preconditions: Some(Preconditions {
+                uid: Some(uid.into()),
+                resource_version: Some(resource_version.into()),
+            }),
+            ..DeleteParams::default()
+        };
+        let api = self.api::<Submission>();
+        let call = api.delete(&name, &params);
+        match self.call("deleting the Submission", &name, call).await {
+            Err(error) if is_gone(&error) || is_conflict(&error) => {}
+            other => {
+                other?;
+                let submission = format_args!("{}/{name}", self.namespace);
+                tracing::info!(%submission, "the Submission is deleted: retention.finishedSeconds have passed since its end");
+            }
         }
         Ok(())
     }

@@ -299,7 +299,11 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
         Some(pinned) => pinned,
         None => {
             let resume = resumed || draft.spec().attempt > 1;
-            effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume)
+            let plan = effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume);
+            leaderboard_api::RunPlan {
+                earlier_attempts: earlier_attempts(draft, info),
+                ..plan
+            }
         }
     };
     draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
@@ -307,6 +311,13 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
     if draft.status.times.accepted.is_none() {
         draft.status.times.accepted = Some(draft.time());
     }
+}
+
+/// How many attempts the table's row of a resumed run counts before ours: those of a Submission that was deleted after its end.
+/// The row takes no attempt that is not above its own.
+fn earlier_attempts(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> i64 {
+    let resumed = info.filter(|info| info.standing == Standing::Resumed);
+    resumed.map_or(0, |info| (info.last_attempt + 1 - draft.spec().attempt).max(0))
 }
 
 fn refuse(draft: &mut Draft<'_>, reason: &str, message: &str) -> bool {

@@ -1,4 +1,4 @@
-//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer.
+//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer or the object's own time.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::draft::{Draft, after, seconds};
 use super::reading::{self, Reading};
-use super::{Action, EvalaiUpdate, accept, log, stop};
+use super::{Action, EvalaiUpdate, accept, log, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, JobView, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -40,6 +40,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
     let complete = published == Delivery::Done && recorded && log_left.is_none();
     if complete && !follow_rerun(draft) {
         draft.act(Action::Forget);
+        retention::decide(draft);
     } else {
         draft.requeue_in(AGAIN);
     }

@@ -2,7 +2,7 @@
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `blame`
-//! decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `failure` names the
+//! decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `retention` deletes what has ended long ago, `failure` names the
 //! causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
@@ -19,6 +19,7 @@ mod live;
 mod log;
 mod next_steps;
 mod reading;
+mod retention;
 mod start;
 mod stop;
 #[cfg(test)]
@@ -89,6 +90,8 @@ pub enum Action {
     Forget,
     /// Write the row.
     Record { end: bool },
+    /// Delete the object, if it is still the one that was decided on.
+    DeleteSubmission { uid: String, resource_version: String },
 }
 
 /// What is sent to EvalAI.

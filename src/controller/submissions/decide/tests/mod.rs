@@ -14,6 +14,7 @@ mod nodes;
 mod properties;
 mod reading;
 mod resume;
+mod retention;
 mod rules;
 mod run;
 mod start;
