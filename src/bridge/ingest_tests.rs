@@ -408,6 +408,8 @@ async fn against(
     });
     let api = Api::namespaced(client, "ns");
     let outcome = apply(&api, BOARD, &incoming).await;
+    // Ends a script that was not asked for to its end.
+    drop(api);
     (outcome, server.await.unwrap())
 }
 

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::Action;
-use super::draft::{Draft, after};
+use super::plan::Action;
+use super::plan_builder::{PlanBuilder, after};
 use crate::controller::submissions::view::ObservedJob;
 use leaderboard_api::{SubmissionStatus, conditions, reasons};
 
@@ -18,7 +18,7 @@ const AGAIN: Duration = Duration::from_secs(30);
 const AT_MOST: Duration = Duration::from_hours(1);
 
 /// Deletes the Submission if its time is over, else comes back at that time.
-pub(super) fn decide(draft: &mut Draft<'_>) {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let Some(until) = until(draft) else { return };
     if draft.now() < until {
         draft.requeue_in(AT_MOST);
@@ -35,7 +35,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
 }
 
 /// When it is to be deleted. None: not at all, or not as it stands.
-fn until(draft: &Draft<'_>) -> Option<Timestamp> {
+fn until(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let kept = draft.leaderboard()?.retention.finished_seconds;
     let status = &draft.status;
     let end = conditions::get(&status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
@@ -52,6 +52,6 @@ fn is_delivered(status: &SubmissionStatus, type_: &str) -> bool {
 }
 
 /// Whether its Job has not ended: with the Submission its Pod would go.
-fn has_job(draft: &Draft<'_>) -> bool {
+fn has_job(draft: &PlanBuilder<'_>) -> bool {
     matches!(&draft.view.job, ObservedJob::Ours(job) if job.end.is_none())
 }
