@@ -69,6 +69,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "get list", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
         *may(controller, "get list watch create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may(controller, "get", "coordination.k8s.io/leases", namespace, "another"),
         *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
     ]
 
@@ -95,7 +96,7 @@ def never(controller: str, bridge: str) -> list[Access]:
         *may_not(controller, "get", "secrets", name="another"),
         *may_not(controller, "get", "secrets", "other", "evalai"),
         *may_not(controller, "get", "secrets", SYSTEM, "aws"),
-        *may_not(controller, "get update", "coordination.k8s.io/leases", SYSTEM, "another"),
+        *may_not(controller, "update", "coordination.k8s.io/leases", SYSTEM, "another"),
         *may_not(controller, "create", "coordination.k8s.io/leases", "leaderboard"),
         *may_not(controller, "create", "serviceaccounts:token", SYSTEM),
         *may_not(controller, "list watch patch delete", "nodes", ""),
@@ -115,6 +116,7 @@ def lease(controller: str) -> list[Access]:
     return [
         *may(controller, "create", "coordination.k8s.io/leases", SYSTEM),
         *may(controller, "get update", "coordination.k8s.io/leases", SYSTEM, RELEASE),
+        *may(controller, "get", "coordination.k8s.io/leases", SYSTEM, "another"),
     ]
 
 

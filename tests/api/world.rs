@@ -25,6 +25,7 @@ use tokio::net::TcpListener;
 use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
+use super::objects::merge;
 use crate::support::apiserver;
 
 /// A line of the routes file.
@@ -80,17 +81,23 @@ impl World {
 
     /// Starts a controller that stops when the sender goes.
     pub(super) fn controller(&self) -> tokio::sync::watch::Sender<bool> {
+        self.installation("operator", "operator:1")
+    }
+
+    /// The same with this Lease and this image.
+    pub(super) fn installation(&self, lease: &str, image: &str) -> tokio::sync::watch::Sender<bool> {
         let (sender, stop) = Stop::new();
         let clients = Clients {
             api: self.client.clone(),
             watch: self.client.clone(),
             lease: self.client.clone(),
         };
-        let lease = leader::Settings::new(&self.namespace, "operator", Identity::random("test"));
+        let lease = leader::Settings::new(&self.namespace, lease, Identity::random("test"));
         let settings = Settings {
-            image: "operator:1".into(),
+            image: image.into(),
             image_pull_policy: None,
             region: None,
+            operator: lease.installation(),
             namespace: Some(self.namespace.clone()),
             concurrency: 4,
         };
@@ -101,7 +108,12 @@ impl World {
 
     /// A Leaderboard of one phase, made as a person writes it.
     pub(super) async fn leaderboard(&self, name: &str, phase: i64, log_tail: &str) {
-        let leaderboard = json!({
+        self.leaderboard_with(name, phase, log_tail, &json!({})).await;
+    }
+
+    /// The same with more of its spec.
+    pub(super) async fn leaderboard_with(&self, name: &str, phase: i64, log_tail: &str, more: &Value) {
+        let mut leaderboard = json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard", "metadata": {"name": name},
             "spec": {
                 "evalai": {
@@ -115,6 +127,7 @@ impl World {
                 "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
             },
         });
+        merge(&mut leaderboard, &json!({ "spec": more }));
         let kind = ApiResource::erase::<Leaderboard>(&());
         let api: Api<DynamicObject> = Api::namespaced_with(self.client.clone(), &self.namespace, &kind);
         let object = serde_json::from_value(leaderboard).unwrap();

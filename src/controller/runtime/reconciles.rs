@@ -6,13 +6,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use futures::stream::{BoxStream, StreamExt};
-use kube::Resource;
 use kube::runtime::controller::{Action, Config, applier};
 use kube::runtime::reflector::ObjectRef;
+use kube::{Resource, ResourceExt};
 
 use super::Shared;
 use crate::backoff::jittered;
-use crate::controller::leaderboards;
+use crate::controller::leaderboards::{self, Reconciled, operator};
 use crate::controller::objects::{key_of, uid_of};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
@@ -20,6 +20,7 @@ use crate::controller::submissions::decide::{self, Plan, decide};
 use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use leaderboard_api::conditions::{self, FINISHED};
+use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 
 /// A reconcile takes at most this long.
@@ -86,7 +87,15 @@ pub(super) async fn run(
 async fn reconcile_submission(submission: Arc<Submission>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
     let started = Instant::now();
     let name = key_of(submission.as_ref()).to_string();
-    let slots = &shared.context.slots;
+    let context = &shared.context;
+    let slots = &context.slots;
+    let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&submission.namespace().unwrap_or_default());
+    let board = context.stores.leaderboards.get(&board);
+    if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
+        let metrics = &shared.telemetry.metrics;
+        metrics.reconciled("submission", OTHER_OPERATOR, started.elapsed());
+        return Ok(Action::requeue(jittered(wait, 0.2)));
+    }
     let work = async {
         let policies = shared.context.policies();
         let view = observe(shared.context.for_observe(), Arc::clone(&submission), |board| {
@@ -130,7 +139,13 @@ async fn reconcile_leaderboard(leaderboard: Arc<Leaderboard>, shared: Arc<Shared
     let (name, uid) = (key_of(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
     let work = leaderboards::reconcile(leaderboard, shared.context.for_leaderboards());
     let result = match tokio::time::timeout(TIME_LIMIT, work).await {
-        Ok(result) => result.map(Some).map_err(ReconcileError::from),
+        Ok(Ok(Reconciled::LeftAlone(wait))) => {
+            let metrics = &shared.telemetry.metrics;
+            metrics.reconciled("leaderboard", OTHER_OPERATOR, started.elapsed());
+            return Ok(Action::requeue(wait));
+        }
+        Ok(Ok(Reconciled::Done(wait))) => Ok(Some(wait)),
+        Ok(Err(error)) => Err(error.into()),
         Err(_) => Err(ReconcileError::TooLong),
     };
     finish("leaderboard", &name, &uid, started, &shared, result)
