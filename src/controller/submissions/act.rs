@@ -265,7 +265,7 @@ impl Actor<'_> {
         Ok(())
     }
 
-    /// Its Job goes with it. A change since the decision, a resume for example, makes this fail, and the next reconcile decides anew.
+    /// The Job goes with it. A change since the decision, a resume for example, makes this fail, and the next reconcile decides anew.
     async fn delete_submission(&self, uid: &str, resource_version: &str) -> Result<(), ActError> {
         let name = self.name();
         let params = DeleteParams::background().preconditions(Preconditions {
