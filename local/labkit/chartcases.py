@@ -121,7 +121,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "patch", f"{OWN}/submissions:status", namespace),
         *may(controller, "patch", f"{OWN}/leaderboards:status", namespace),
         *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
-        *may(controller, "get list watch create patch delete", "batch/jobs", namespace),
+        *may(controller, "get list watch create delete", "batch/jobs", namespace),
         *may(controller, "get list watch patch delete", "pods", namespace),
         *may(controller, "get", "pods:log", namespace),
         *may(controller, "get list", "events", namespace),
