@@ -26,11 +26,14 @@ mod api {
     mod plugin;
     mod pod;
     mod queue;
+    mod retention;
     mod rule_cases;
     mod rules;
     mod scale;
     mod slots;
     mod table;
     mod token;
+    mod two_operators;
     mod watches;
+    mod world;
 }

@@ -42,6 +42,8 @@ use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, Times, e
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";
+/// The installation that drives every Leaderboard here.
+const OPERATOR: &str = "system/operator";
 
 /// What the caches show.
 #[derive(Default)]
@@ -136,6 +138,7 @@ pub fn settings() -> Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        operator: OPERATOR.into(),
         namespace: None,
         concurrency: 16,
     }
@@ -219,6 +222,7 @@ pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
     let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some(NAMESPACE.into());
     object.metadata.uid = Some(format!("uid-of-{name}"));
+    object.status.get_or_insert_default().operator = Some(OPERATOR.into());
     object
 }
 

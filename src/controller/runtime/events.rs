@@ -163,7 +163,8 @@ fn standing(leaderboard: &Leaderboard) -> String {
     let conditions = status.map(|status| status.conditions.as_slice()).unwrap_or_default();
     let condition = |type_: &str| conditions::get(conditions, type_).map(|c| (&c.status, &c.reason, &c.message));
     format!(
-        "{:?} {:?}",
+        "{:?} {:?} {:?}",
+        status.and_then(|status| status.operator.as_deref()),
         condition(conditions::READY),
         condition(conditions::ISOLATED)
     )

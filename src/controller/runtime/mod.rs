@@ -26,8 +26,8 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use super::leaderboards::isolation;
 use super::leaderboards::state::LeaderboardState;
+use super::leaderboards::{isolation, operator};
 use super::objects::children_selector;
 use super::settings::Settings;
 use super::stores::{Nodes, Stores, owner_uid};
@@ -334,7 +334,12 @@ impl Parts {
         let context = Arc::clone(context);
         let keep = move |board| {
             let context = Arc::clone(&context);
-            async move { isolation::keep_missing(context.policies(), &board).await }
+            async move {
+                let known = context.stores.leaderboards.get(&board);
+                if known.is_some_and(|known| operator::is_ours(&known, &context.settings.operator)) {
+                    isolation::keep_missing(context.policies(), &board).await;
+                }
+            }
         };
         let watches = &self.watches;
         let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);

@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 
 use futures::stream::StreamExt;
 use futures::{FutureExt, Stream};
-use kube::Resource;
 use kube::runtime::reflector::ObjectRef;
+use kube::{Resource, ResourceExt};
 
 use super::Shared;
 use super::events::Events;
 use super::queue::{After, Class, Limits, Queue, Turn, urgency};
 use crate::backoff::jittered;
-use crate::controller::leaderboards;
+use crate::controller::leaderboards::{self, Reconciled, operator};
 use crate::controller::objects::uid_of;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
@@ -25,6 +25,7 @@ use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
 use crate::observability::tasks::panic_message;
 use leaderboard_api::conditions::{self, FINISHED};
+use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 
 /// A reconcile takes at most this long.
@@ -123,7 +124,15 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
         return After::Gone;
     };
     let started = Instant::now();
-    let slots = &shared.context.slots;
+    let context = &shared.context;
+    let slots = &context.slots;
+    let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&submission.namespace().unwrap_or_default());
+    let board = context.stores.leaderboards.get(&board);
+    if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
+        let metrics = &shared.telemetry.metrics;
+        metrics.reconciled("submission", OTHER_OPERATOR, started.elapsed());
+        return After::In(jittered(wait, 0.2), Class::Refresh);
+    }
     let work = async {
         let policies = shared.context.policies();
         let view = observe(shared.context.for_observe(), Arc::clone(&submission), |board| {
@@ -184,10 +193,15 @@ async fn reconcile_leaderboard(turn: Turn, shared: Arc<Shared>) -> After {
     };
     let started = Instant::now();
     let work = leaderboards::reconcile(Arc::clone(&leaderboard), context.for_leaderboards());
-    let result = limited(work.map(|result| result.map_err(ReconcileError::from))).await;
-    let result = result
-        .map(|requeue| (Some(requeue), Class::Refresh))
-        .map_err(|error| (error, Class::Refresh));
+    let result = match limited(work.map(|result| result.map_err(ReconcileError::from))).await {
+        Ok(Reconciled::LeftAlone(wait)) => {
+            let metrics = &shared.telemetry.metrics;
+            metrics.reconciled("leaderboard", OTHER_OPERATOR, started.elapsed());
+            return After::In(wait, Class::Refresh);
+        }
+        Ok(Reconciled::Done(wait)) => Ok((Some(wait), Class::Refresh)),
+        Err(error) => Err((error, Class::Refresh)),
+    };
     finish("leaderboard", &turn, leaderboard.as_ref(), started, &shared, result)
 }
 

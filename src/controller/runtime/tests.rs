@@ -83,6 +83,7 @@ async fn leader() -> Process {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        operator: lease.installation(),
         namespace: None,
         concurrency: 4,
     };

@@ -122,6 +122,7 @@ impl Actor<'_> {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
             }
+            Action::DeleteSubmission { uid, resource_version } => self.delete_submission(uid, resource_version).await,
             other => {
                 self.request(other, status);
                 Ok(())
@@ -158,6 +159,7 @@ impl Actor<'_> {
             | Action::CreateJob { .. }
             | Action::DeleteJob { .. }
             | Action::ForceDeletePod { .. }
+            | Action::DeleteSubmission { .. }
             | Action::AnnotateStop { .. } => {}
         }
     }
@@ -261,6 +263,22 @@ impl Actor<'_> {
             let Meta { name, uid, .. } = &pod.metadata;
             self.delete_pod(name, uid, grace_seconds).await?;
         }
+        Ok(())
+    }
+
+    /// The Job goes with it. A change since the decision, a resume for example, makes this fail, and the next reconcile decides anew.
+    async fn delete_submission(&self, uid: &str, resource_version: &str) -> Result<(), ActError> {
+        let name = self.name();
+        let params = DeleteParams::background().preconditions(Preconditions {
+            uid: Some(uid.into()),
+            resource_version: Some(resource_version.into()),
+        });
+        match call("the deletion", &name, self.api::<Submission>().delete(&name, &params)).await {
+            Err(error) if error.is_gone() || error.is_conflict() => return Ok(()),
+            other => other.map(|_| ())?,
+        }
+        let submission = format_args!("{}/{name}", self.namespace);
+        tracing::info!(%submission, "the Submission is deleted: retention.finishedSeconds have passed since its end");
         Ok(())
     }
 
