@@ -37,28 +37,34 @@ impl Server {
             if holds(&self.bench.queue) {
                 return Some(self.bench.at - begun);
             }
-            self.bench.wait(0.1);
             self.answer_lists();
             while let Some((name, ticket)) = self.bench.next() {
                 self.sent.push((self.bench.at - begun, name));
-                match &ticket.request {
-                    Request::List { .. } => {
-                        let due = self.bench.at + Duration::from_secs_f64(self.list_seconds);
-                        self.lists.push((due, ticket));
-                    }
-                    Request::Get(subject) => {
-                        let row = row(subject.pk, Status::Running);
-                        self.bench.answer(&ticket, Reply::Row(Answer::Done(row)));
-                    }
-                    _ => self.bench.answer(&ticket, Reply::Written(Answer::Done(()))),
-                }
+                self.answer(ticket);
             }
+            let lists = self.lists.iter().map(|(due, _)| *due);
+            let next = lists.chain(self.bench.waits_until()).min();
+            self.bench.at = next.unwrap_or(begun + limit).max(self.bench.at);
         }
         None
     }
 
+    fn answer(&mut self, ticket: Ticket) {
+        match &ticket.request {
+            Request::List { .. } => {
+                let due = self.bench.at + Duration::from_secs_f64(self.list_seconds);
+                self.lists.push((due, ticket));
+            }
+            Request::Get(subject) => {
+                let row = row(subject.pk, Status::Running);
+                self.bench.answer(&ticket, Reply::Row(Answer::Done(row)));
+            }
+            _ => self.bench.answer(&ticket, Reply::Written(Answer::Done(()))),
+        }
+    }
+
     fn answer_lists(&mut self) {
-        let (due, later) = std::mem::take(&mut self.lists)
+        let (due, later): (Vec<_>, Vec<_>) = std::mem::take(&mut self.lists)
             .into_iter()
             .partition(|(due, _)| *due <= self.bench.at);
         self.lists = later;
@@ -105,8 +111,12 @@ impl Server {
     }
 }
 
+fn left(queue: &Queue) -> usize {
+    queue.subs.values().filter(|sub| sub.has_end_to_publish()).count()
+}
+
 fn all_published(queue: &Queue) -> bool {
-    (1..=ENDS).all(|pk| queue.view(&key(pk)).is_some_and(|view| view.end.is_some()))
+    left(queue) == 0
 }
 
 #[test]
@@ -133,17 +143,18 @@ fn the_last_end_is_expected_when_it_comes() {
             server.partials();
         }
         server.ends();
-        let left = usize::try_from(ends_left).unwrap();
-        let waits = |queue: &Queue| queue.subs.values().filter(|sub| sub.has_end_to_publish()).count() <= left;
-        server.until(Duration::from_hours(2), waits).unwrap();
+        let ends_left = usize::try_from(ends_left).unwrap();
+        server
+            .until(Duration::from_hours(2), |queue| left(queue) <= ends_left)
+            .unwrap();
         let usage = server.usage();
-        assert_eq!(usage.waiting, left);
+        assert_eq!(usage.waiting, ends_left);
         let expected = usage.last_expected.unwrap().duration_since(server.bench.now().wall);
         let took = server.until(Duration::from_hours(2), all_published).unwrap();
         let difference = expected.as_secs_f64() - took.as_secs_f64();
         assert!(
             (-90.0..150.0).contains(&difference),
-            "{left} ends, live {live}: expected after {expected:?}, took {took:?}"
+            "{ends_left} ends, live {live}: expected after {expected:?}, took {took:?}"
         );
         assert_eq!((server.usage().waiting, server.usage().last_expected), (0, None));
     }
@@ -193,9 +204,7 @@ fn nothing_is_remembered_of_a_thousand_that_are_published_and_forgotten() {
     let mut server = Server::new(0.0);
     server.ends();
     // The object of one goes while its end is on the way.
-    server.until(Duration::from_mins(1), |queue| {
-        queue.lanes.values().any(|lane| lane.busy.is_some())
-    });
+    server.until(Duration::from_mins(1), |_| false);
     server.bench.wait(5.0);
     let (name, ticket) = server.bench.next().unwrap();
     assert_eq!(name, format!("submission {}", ticket.request.submission().unwrap().pk));
@@ -204,11 +213,7 @@ fn nothing_is_remembered_of_a_thousand_that_are_published_and_forgotten() {
     server
         .bench
         .answer(&ticket, Reply::Row(Answer::Done(row(early, Status::Running))));
-    let published = |queue: &Queue| {
-        let mut others = (1..=ENDS).filter(|pk| *pk != early);
-        others.all(|pk| queue.view(&key(pk)).is_some_and(|view| view.end.is_some()))
-    };
-    server.until(Duration::from_hours(2), published).unwrap();
+    server.until(Duration::from_hours(2), all_published).unwrap();
     for pk in (1..=ENDS).filter(|pk| *pk != early) {
         server.bench.forget(pk);
     }
@@ -223,6 +228,9 @@ fn nothing_is_remembered_of_a_thousand_that_are_published_and_forgotten() {
     assert_eq!((left, queue.changes.len(), queue.sweep.len()), ((0, 0, 0, 0), 0, 0));
 }
 
+/// All that follows the start is over by then.
+const SETTLED: Duration = Duration::from_mins(5);
+
 /// Requests of each kind in ten minutes at rest, with so many running submissions and a Leaderboard that serves them.
 fn at_rest(live: i64) -> BTreeMap<String, usize> {
     let mut bench = Bench::new();
@@ -231,9 +239,9 @@ fn at_rest(live: i64) -> BTreeMap<String, usize> {
         bench.live(pk, 1);
     }
     let mut sent = BTreeMap::new();
-    let (begun, settled) = (bench.at, Duration::from_hours(1) + Duration::from_mins(5));
-    while bench.at < begun + settled + Duration::from_mins(10) {
-        bench.wait(0.1);
+    let begun = bench.at + SETTLED;
+    let end = begun + Duration::from_mins(10);
+    while bench.at < end {
         while let Some((name, ticket)) = bench.next() {
             let reply = match &ticket.request {
                 Request::Get(subject) => Reply::Row(Answer::Done(row(subject.pk, Status::Running))),
@@ -245,12 +253,13 @@ fn at_rest(live: i64) -> BTreeMap<String, usize> {
                 Request::Splits(_) => Reply::Splits(Answer::Done(vec![])),
                 _ => Reply::Rows(Answer::Done(vec![])),
             };
-            if bench.at >= begun + settled {
+            if bench.at >= begun {
                 let kind = name.trim_end_matches(|c: char| c.is_ascii_digit() || c == ' ');
                 *sent.entry(kind.to_owned()).or_insert(0) += 1;
             }
             bench.answer(&ticket, reply);
         }
+        bench.at = bench.waits_until().unwrap_or(end).max(bench.at);
     }
     sent
 }

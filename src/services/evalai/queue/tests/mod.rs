@@ -181,6 +181,15 @@ impl Bench {
         }
     }
 
+    /// Until when there is nothing to send.
+    fn waits_until(&mut self) -> Option<Duration> {
+        let now = self.now();
+        match self.queue.next(now, true) {
+            Next::Send(ticket) => panic!("{} is sent, expected nothing", ticket.request.name()),
+            Next::Wait(until) => until,
+        }
+    }
+
     /// The next request has to be this one.
     fn expect(&mut self, name: &str) -> Ticket {
         let (found, ticket) = self
