@@ -12,11 +12,10 @@ use kube::api::{ObjectMeta, Patch, PatchParams, PostParams};
 use serde_json::{Value, json};
 use thiserror::Error;
 
+use crate::kubernetes::{CallError, call_within};
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
-use leaderboard_api::{
-    EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, client_errors, conditions, names,
-};
+use leaderboard_api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 pub const SWEEP_AGE_MS: i64 = 120_000;
@@ -131,19 +130,12 @@ impl std::fmt::Display for Outcome {
 /// Why nothing could be done.
 #[derive(Debug, Error)]
 pub enum IngestError {
-    /// The API server did not answer in time.
-    #[error("the API server did not answer within {} s while Submission {name} was to be {verb}; it is retried", CALL_LIMIT.as_secs())]
-    Timeout { name: String, verb: &'static str },
+    /// A request failed in a way that may pass.
+    #[error("{0}; it is retried")]
+    Call(CallError),
     /// The API server will not take this object.
     #[error("the API server refuses Submission {name}: {text}")]
     Refused { name: String, text: String },
-    /// The API server answered with an error that may pass.
-    #[error("Submission {name} could not be {verb}: {text}; it is retried")]
-    Failed {
-        name: String,
-        verb: &'static str,
-        text: String,
-    },
     /// Others changed the object each time.
     #[error("Submission {name} changed {ROUNDS} times while it was to be bumped; it is retried")]
     Contended { name: String },
@@ -290,7 +282,7 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
     let name = names::submission(incoming.submission);
     // Most are new, so the first try creates; the answer AlreadyExists makes the read necessary.
     let mut existing = match incoming.source {
-        Source::Sweep(Swept::Edited) => call(&name, "read", api.get_opt(&name)).await?,
+        Source::Sweep(Swept::Edited) => call(&name, "the read", api.get_opt(&name)).await?,
         _ => None,
     };
     for _ in 0..ROUNDS {
@@ -330,7 +322,7 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
         if let Some(outcome) = done {
             return Ok(outcome);
         }
-        existing = call(&name, "read", api.get_opt(&name)).await?;
+        existing = call(&name, "the read", api.get_opt(&name)).await?;
     }
     Err(IngestError::Contended { name })
 }
@@ -342,7 +334,7 @@ async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result
         ..PostParams::default()
     };
     let request = api.create(&params, fresh);
-    unless_lost(&[409], name, "created", request).await
+    unless_lost(&[409], name, "the creation", request).await
 }
 
 /// Writes the annotation, and with it what changes of the spec. False if the object is no longer what the decision was made on.
@@ -364,50 +356,36 @@ async fn note(
     };
     let patch = Patch::Merge(patch);
     // 404: it was deleted between the read and the patch.
-    unless_lost(&[404, 409], name, "bumped", api.patch(name, &params, &patch)).await
+    unless_lost(&[404, 409], name, "the update", api.patch(name, &params, &patch)).await
 }
 
 /// True if the request was carried out, false if it lost a race, which these statuses show.
 async fn unless_lost<T>(
     lost: &[u16],
     name: &str,
-    verb: &'static str,
+    what: &'static str,
     request: impl Future<Output = kube::Result<T>>,
 ) -> Result<bool, IngestError> {
-    let answer = async {
-        match request.await {
-            Ok(_) => Ok(true),
-            Err(kube::Error::Api(status)) if lost.contains(&status.code) => Ok(false),
-            Err(error) => Err(error),
-        }
-    };
-    call(name, verb, answer).await
+    match call(name, what, request).await {
+        Err(IngestError::Call(error)) if error.status().is_some_and(|status| lost.contains(&status.code)) => Ok(false),
+        other => other.map(|_| true),
+    }
 }
 
 async fn call<T>(
     name: &str,
-    verb: &'static str,
+    what: &'static str,
     request: impl Future<Output = kube::Result<T>>,
 ) -> Result<T, IngestError> {
-    let name = name.to_owned();
-    match tokio::time::timeout(CALL_LIMIT, request).await {
-        Ok(Ok(value)) => Ok(value),
-        Ok(Err(kube::Error::Api(status))) if matches!(status.code, 400 | 422) => Err(IngestError::Refused {
-            name,
+    let object = format!("Submission {name}");
+    let answer = call_within(CALL_LIMIT, what, &object, request).await;
+    answer.map_err(|error| match error.status() {
+        Some(status) if matches!(status.code, 400 | 422) => IngestError::Refused {
+            name: name.to_owned(),
             text: status.message.clone(),
-        }),
-        Ok(Err(kube::Error::Api(status))) => Err(IngestError::Failed {
-            name,
-            verb,
-            text: status.message.clone(),
-        }),
-        Ok(Err(error)) => Err(IngestError::Failed {
-            name,
-            verb,
-            text: client_errors::chain(&error),
-        }),
-        Err(_) => Err(IngestError::Timeout { name, verb }),
-    }
+        },
+        _ => IngestError::Call(error),
+    })
 }
 
 #[cfg(test)]

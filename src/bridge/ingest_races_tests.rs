@@ -62,7 +62,7 @@ async fn a_refusal_for_good_is_told_from_a_passing_failure() {
     let text = failed.unwrap_err().to_string();
     assert_eq!(
         text,
-        "Submission submission-3 could not be created: Forbidden indeed; it is retried"
+        "the creation of Submission submission-3 failed: the API server answered 403: Forbidden indeed; it is retried"
     );
 }
 
@@ -73,7 +73,13 @@ async fn a_silent_api_server_is_not_waited_for() {
     let api = Api::namespaced(kube::Client::new(service, "ns"), "ns");
     let outcome = apply(&api, BOARD, &message("a", 100)).await;
     assert!(
-        matches!(outcome, Err(IngestError::Timeout { verb: "created", .. })),
+        matches!(
+            outcome,
+            Err(IngestError::Call(CallError::Silent {
+                what: "the creation",
+                ..
+            }))
+        ),
         "{outcome:?}"
     );
 }

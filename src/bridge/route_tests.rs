@@ -1,8 +1,11 @@
 //! Tables of what becomes of each message.
 
+use std::time::Duration;
+
 use serde_json::json;
 
 use super::*;
+use crate::kubernetes::CallError;
 
 /// A Leaderboard of challenge 1 with phases 2 and 3, created at this second.
 pub(in crate::bridge) fn board(name: &str, second: i64) -> Leaderboard {
@@ -240,10 +243,11 @@ fn each_outcome_of_ingest_settles_its_message() {
         })
     };
     let timeout = || {
-        Err(IngestError::Timeout {
-            name: "submission-7".into(),
-            verb: "created",
-        })
+        Err(IngestError::Call(CallError::Silent {
+            what: "the creation",
+            object: "Submission submission-7".into(),
+            limit: Duration::from_secs(8),
+        }))
     };
     let contended = || {
         Err(IngestError::Contended {

@@ -2,6 +2,7 @@
 //! everything, AWS wherever the test says.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use aws_config::{BehaviorVersion, Region};
 use aws_credential_types::Credentials;
@@ -16,16 +17,22 @@ use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::store::Writer;
 use kube::runtime::reflector::{Lookup, ObjectRef, Store};
 use kube::runtime::watcher::Event;
-use kube::{Client, ResourceExt};
+use kube::{Client, Resource, ResourceExt};
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
-use crate::controller::runtime::context::{Context, Settings, Stores};
-use crate::controller::submissions::archive::{ArchiveWorkers, WakeSubmission};
+use crate::controller::leaderboards::state::LeaderboardState;
+use crate::controller::objects::Wake;
+use crate::controller::runtime::context::Context;
+use crate::controller::settings::Settings;
+use crate::controller::stores::Stores;
+use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::reruns::Reruns;
 use crate::kubernetes::Synced;
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
@@ -80,76 +87,33 @@ pub async fn aws(endpoint: &str) -> Aws {
     Aws::from_config(config)
 }
 
-/// Everything a pass shares.
+/// Everything that reconciles share.
 pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let aws = Box::pin(aws(endpoint)).await;
-    let (tell, requests) = mpsc::unbounded_channel();
+    let (arrived, requests) = mpsc::unbounded_channel();
     let (service, handle) = pair::<Request<Body>, Response<Body>>();
     let known = cluster.submissions.iter().map(|s| (s.name_any(), json!(s))).collect();
-    tokio::spawn(serve(handle, known, tell));
+    tokio::spawn(serve(handle, known, arrived));
     let client = Client::new(service, NAMESPACE);
     let (stop, stopped) = Stop::new();
     let tasks = Tasks::new(stopped);
-    let (changed, sweep, wake) = (
-        mpsc::unbounded_channel().0,
-        mpsc::unbounded_channel().0,
-        mpsc::unbounded_channel().0,
-    );
-    let hub = Hub::new(Options {
-        write_guard: std::sync::Arc::new(|| true),
-        not_before: Instant::now(),
-        changed,
-        sweep,
-        timing: Timing::default(),
-        timeouts: Timeouts::default(),
-        meter: Meter::default(),
-        tasks: tasks.clone(),
-    });
-    let external = ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, wake, tasks.clone()));
-    let (answered_by, answered) = mpsc::unbounded_channel();
-    let answered_by = move || -> WakeSubmission {
-        let answered_by = answered_by.clone();
-        Box::new(move |submission| {
-            let _ = answered_by.send(submission.name);
-        })
-    };
-    let archive_workers = ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered_by());
-    let lookups = Lookups::start(client.clone(), &tasks, answered_by());
-    let policies_synced = Synced::default();
-    policies_synced.set(true);
-    let stores = Stores {
-        leaderboards: store(cluster.leaderboards),
-        submissions: store(cluster.submissions),
-        jobs: store(cluster.jobs),
-        pods: store(cluster.pods),
-        policies: store(cluster.policies),
-        policies_synced,
-    };
-    let settings = Settings {
-        image: "operator:1".into(),
-        image_pull_policy: None,
-        region: None,
-        namespace: None,
-        concurrency: 16,
-    };
-    let reporter = Reporter {
-        controller: "test".into(),
-        instance: None,
-    };
-    let events = EventRecorder::new(client.clone(), reporter);
-    let (woken_by, woken) = mpsc::unbounded_channel();
-    let wake = Box::new(move |board: ObjectRef<Leaderboard>| {
-        let _ = woken_by.send(board.name);
-    });
-    let context = Context::new(
+    let (answering, answered) = mpsc::unbounded_channel();
+    let (waking, woken) = mpsc::unbounded_channel();
+    let context = Context {
+        settings: settings(),
+        stores: stores(cluster),
+        memory: Memory::default(),
+        archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), noting(&answering)),
+        lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
+        reruns: Reruns::default(),
+        slots: Arc::default(),
+        leaderboards: LeaderboardState::default(),
+        external: external(&aws, &tasks),
+        recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
+        wake: noting(&waking),
         client,
-        settings,
-        stores,
-        (external, archive_workers, lookups),
         aws,
-        events,
-        wake,
-    );
+    };
     context.stores.fill(&context.slots);
     Surroundings {
         context,
@@ -158,6 +122,53 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         answered,
         _stop: stop,
     }
+}
+
+/// Sends the names of those that are woken.
+fn noting<K: Resource<DynamicType = ()> + 'static>(names: &mpsc::UnboundedSender<String>) -> Wake<K> {
+    let names = names.clone();
+    Box::new(move |object: ObjectRef<K>| {
+        let _ = names.send(object.name);
+    })
+}
+
+fn settings() -> Settings {
+    Settings {
+        image: "operator:1".into(),
+        image_pull_policy: None,
+        region: None,
+        namespace: None,
+        concurrency: 16,
+    }
+}
+
+fn stores(cluster: Cluster) -> Stores {
+    let policies_synced = Synced::default();
+    policies_synced.set(true);
+    Stores {
+        leaderboards: store(cluster.leaderboards),
+        submissions: store(cluster.submissions),
+        jobs: store(cluster.jobs),
+        pods: store(cluster.pods),
+        policies: store(cluster.policies),
+        policies_synced,
+    }
+}
+
+/// Services that nobody listens to.
+fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
+    let hub = Hub::new(Options {
+        write_guard: Arc::new(|| true),
+        not_before: Instant::now(),
+        changed: mpsc::unbounded_channel().0,
+        sweep: mpsc::unbounded_channel().0,
+        timing: Timing::default(),
+        timeouts: Timeouts::default(),
+        meter: Meter::default(),
+        tasks: tasks.clone(),
+    });
+    let rows = mpsc::unbounded_channel().0;
+    ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, rows, tasks.clone()))
 }
 
 fn store<K>(objects: Vec<K>) -> Store<K>

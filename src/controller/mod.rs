@@ -13,3 +13,4 @@ pub mod settings;
 pub mod slots;
 pub mod stores;
 pub mod submissions;
+pub mod writes;

@@ -2,10 +2,14 @@
 
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
+use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 
 use crate::services::ObjectKey;
 use leaderboard_api::names;
+
+/// Puts an object into its work queue.
+pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;
 
 /// The key of an object in every map of the controller: its UID, which a name does not replace.
 pub fn uid_of(object: &impl Resource) -> String {

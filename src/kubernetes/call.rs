@@ -18,8 +18,12 @@ pub enum CallError {
         object: String,
         source: Box<kube::Error>,
     },
-    #[error("{what} of {object}: the API server did not answer within {} s", CALL_TIMEOUT.as_secs())]
-    Silent { what: &'static str, object: String },
+    #[error("{what} of {object}: {}", no_answer(limit))]
+    Silent {
+        what: &'static str,
+        object: String,
+        limit: Duration,
+    },
 }
 
 impl CallError {
@@ -38,7 +42,7 @@ impl CallError {
     pub fn cause(&self) -> String {
         match self {
             Self::Refused { source, .. } => client_errors::kube(source),
-            Self::Silent { .. } => format!("the API server did not answer within {} s", CALL_TIMEOUT.as_secs()),
+            Self::Silent { limit, .. } => no_answer(limit),
         }
     }
 
@@ -50,6 +54,14 @@ impl CallError {
     /// The object was changed meanwhile, or is there already.
     pub fn is_conflict(&self) -> bool {
         self.status().map(|status| status.code) == Some(409)
+    }
+
+    /// The class of the cause, for a metric's label.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Refused { source, .. } => client_errors::reason(source),
+            Self::Silent { .. } => "timeout",
+        }
     }
 
     /// One word for metrics.
@@ -65,12 +77,25 @@ impl CallError {
 ///
 /// # Errors
 /// If the API server refuses it, cannot be reached, or does not answer in time.
-pub async fn call<T>(
+pub fn call<T>(
+    what: &'static str,
+    object: &str,
+    call: impl Future<Output = Result<T, kube::Error>>,
+) -> impl Future<Output = Result<T, CallError>> {
+    call_within(CALL_TIMEOUT, what, object, call)
+}
+
+/// Makes a call with a limit of time of its own.
+///
+/// # Errors
+/// If the API server refuses it, cannot be reached, or does not answer in time.
+pub async fn call_within<T>(
+    limit: Duration,
     what: &'static str,
     object: &str,
     call: impl Future<Output = Result<T, kube::Error>>,
 ) -> Result<T, CallError> {
-    match tokio::time::timeout(CALL_TIMEOUT, call).await {
+    match tokio::time::timeout(limit, call).await {
         Ok(Ok(answer)) => Ok(answer),
         Ok(Err(source)) => Err(CallError::Refused {
             what,
@@ -80,8 +105,13 @@ pub async fn call<T>(
         Err(_) => Err(CallError::Silent {
             what,
             object: object.to_owned(),
+            limit,
         }),
     }
+}
+
+fn no_answer(limit: &Duration) -> String {
+    format!("the API server did not answer within {} s", limit.as_secs_f32().ceil())
 }
 
 #[cfg(test)]
@@ -97,7 +127,10 @@ mod tests {
         };
         let error = call("the status", "one", refused(404)).await.unwrap_err();
         assert!(error.is_gone() && !error.is_conflict() && error.label() == "kubernetes");
-        assert!(error.to_string().starts_with("the status of one failed: "), "{error}");
+        assert_eq!(
+            error.to_string(),
+            "the status of one failed: the API server answered 404: No."
+        );
         assert!(call("the status", "one", refused(409)).await.unwrap_err().is_conflict());
         let error = call("the status", "one", std::future::pending::<Result<(), kube::Error>>())
             .await

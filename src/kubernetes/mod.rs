@@ -17,7 +17,7 @@ use kube::core::{DeserializeGuard, NamespaceResourceScope};
 use kube::{Api, Client, Resource};
 use serde::de::DeserializeOwned;
 
-pub use call::{CALL_TIMEOUT, CallError, call};
+pub use call::{CALL_TIMEOUT, CallError, call, call_within};
 pub use feed::{WatchEvent, WatchEvents};
 pub use watch::{Synced, Unreadable, Watch, spawn_watch};
 

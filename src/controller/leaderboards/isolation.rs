@@ -16,7 +16,7 @@ use kube::{Api, Client, ResourceExt};
 
 use super::state::{Applied, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
 use crate::controller::network_policy::{is_in_place, network_policy};
-use crate::controller::objects::{key_of, uid_of};
+use crate::controller::objects::{Wake, key_of, uid_of};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::{WatchEvents, call};
@@ -28,9 +28,6 @@ use leaderboard_api::{Enforcement, Leaderboard, PolicySource, names, reasons};
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;
 
-/// Wakes a Leaderboard.
-pub type Wake = Box<dyn Fn(ObjectRef<Leaderboard>) + Send + Sync>;
-
 /// What keeps the policies in place.
 #[derive(Clone, Copy)]
 pub struct Policies<'a> {
@@ -38,7 +35,7 @@ pub struct Policies<'a> {
     pub stores: &'a Stores,
     pub state: &'a LeaderboardState,
     pub slots: &'a SlotAllocator,
-    pub wake: &'a Wake,
+    pub wake: &'a Wake<Leaderboard>,
 }
 
 impl Policies<'_> {

@@ -5,8 +5,7 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
-use crate::controller::leaderboards::{Uses, reconcile};
-use crate::controller::runtime::context::Context;
+use crate::controller::leaderboards::reconcile;
 use crate::observability::logging::tests::Lines;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
@@ -206,32 +205,30 @@ async fn in_place() -> (Leaderboard, Surroundings) {
     (board, around)
 }
 
-fn note(context: &Context, board: &Leaderboard, policy: Policy, at: Timestamp) {
+fn note(state: &LeaderboardState, board: &Leaderboard, policy: Policy, at: Timestamp) {
     let applied = Applied {
         at,
         generation: board.metadata.generation,
         policy,
         unseen: None,
     };
-    context.leaderboards.note_applied(&uid_of(board), applied);
+    state.note_applied(&uid_of(board), applied);
 }
 
 #[tokio::test]
 async fn no_job_is_made_while_the_last_apply_is_refused_whatever_the_cache_shows() {
     let (board, around) = in_place().await;
     let context = &around.context;
-    assert!(context.is_policy_in_place(&board));
+    let is_in_place = || context.policies().is_in_place(&board);
+    assert!(is_in_place());
     for failed in [Policy::Refused("no".into()), Policy::NotApplied("no".into())] {
-        note(context, &board, failed, Timestamp::now());
-        assert!(!context.is_policy_in_place(&board));
+        note(&context.leaderboards, &board, failed, Timestamp::now());
+        assert!(!is_in_place());
     }
-    note(context, &board, Policy::InPlace, Timestamp::now());
-    assert!(context.is_policy_in_place(&board));
+    note(&context.leaderboards, &board, Policy::InPlace, Timestamp::now());
+    assert!(is_in_place());
     context.stores.policies_synced.set(false);
-    assert!(
-        !context.is_policy_in_place(&board),
-        "what the cache shows may be long gone"
-    );
+    assert!(!is_in_place(), "what the cache shows may be long gone");
 }
 
 #[tokio::test]
@@ -240,7 +237,7 @@ async fn what_was_refused_stays_so_until_it_is_tried_again_and_then_wakes_who_wa
     let began = Timestamp::now();
     let after = |seconds: i64| began + jiff::SignedDuration::from_secs(seconds);
     let refused = Policy::Refused("no".into());
-    note(&around.context, &board, refused.clone(), began);
+    note(&around.context.leaderboards, &board, refused.clone(), began);
     assert_eq!(keep(around.context.policies(), &board, after(5)).await, refused);
     assert!(around.requests.try_recv().is_err() && around.woken.try_recv().is_err());
     assert_eq!(
@@ -310,16 +307,8 @@ async fn a_leaderboard_and_with_it_the_policy_stays_while_a_pod_of_it_runs() {
             ..Cluster::default()
         };
         let mut around = surroundings(cluster, "http://127.0.0.1:1").await;
-        let context = &around.context;
-        let uses = Uses {
-            policies: context.policies(),
-            settings: &context.settings,
-            slots: &context.slots,
-            external: &context.external,
-            aws: &context.aws,
-        };
         // The mock's answer to a finalizer is no Leaderboard.
-        let _ = reconcile(Arc::new(board), uses).await;
+        let _ = reconcile(Arc::new(board), around.context.for_leaderboards()).await;
         let sent = std::iter::from_fn(|| around.requests.try_recv().ok());
         let is_released = sent
             .into_iter()

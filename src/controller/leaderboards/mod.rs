@@ -15,15 +15,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use kube::api::{Patch, PatchParams};
-use kube::{Api, Client, Resource, ResourceExt};
-use serde_json::json;
+use kube::Client;
 
 use super::objects::{key_of, uid_of};
 use super::settings::Settings;
 use super::slots::SlotAllocator;
+use super::writes::{apply_status, set_finalizer};
 use crate::controller::submissions::external::ExternalSystems;
-use crate::kubernetes::{CallError, call};
+use crate::kubernetes::CallError;
 use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
@@ -57,7 +56,9 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
     state.keep(&uid, probe.clone());
     let view = observe(uses, &leaderboard, policy, &probe, now);
     let plan = decide(&view);
-    set_finalizer(client, &leaderboard, &plan).await?;
+    if let Some(wanted) = plan.finalizer {
+        set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
+    }
     if plan.finalizer == Some(false) {
         uses.external.set_target(&leaderboard, None);
         uses.external.hub.retire(&key_of(leaderboard.as_ref()));
@@ -97,30 +98,6 @@ fn observe(
     }
 }
 
-async fn set_finalizer(client: &Client, leaderboard: &Leaderboard, plan: &LeaderboardPlan) -> Result<(), CallError> {
-    let Some(wanted) = plan.finalizer else { return Ok(()) };
-    let mut finalizers: Vec<String> = leaderboard
-        .finalizers()
-        .iter()
-        .filter(|f| *f != names::FINALIZER_LEADERBOARD)
-        .cloned()
-        .collect();
-    if wanted {
-        finalizers.push(names::FINALIZER_LEADERBOARD.into());
-    }
-    let version = &leaderboard.metadata.resource_version;
-    let patch = Patch::Merge(json!({ "metadata": { "resourceVersion": version, "finalizers": finalizers } }));
-    let params = PatchParams {
-        field_manager: Some(names::MANAGER_FINALIZER.into()),
-        ..PatchParams::default()
-    };
-    let name = leaderboard.name_any();
-    let object = format!("Leaderboard {name}");
-    let api = api(client, leaderboard);
-    let result = call("the finalizer", &object, api.patch(&name, &params, &patch)).await;
-    result.map(|_| ())
-}
-
 /// Writes the status if it says something new; returns when to look again.
 async fn write_status(
     client: &Client,
@@ -145,23 +122,7 @@ async fn write_status(
     if only_numbers && old.counts == plan.status.counts && !state.budget_may_be_written(&uid, now) {
         return Ok(RESYNC);
     }
-    let patch = json!({
-        "apiVersion": Leaderboard::api_version(&()),
-        "kind": Leaderboard::kind(&()),
-        "metadata": { "name": leaderboard.name_any(), "uid": uid },
-        "status": plan.status,
-    });
-    let params = PatchParams::apply(names::MANAGER_STATUS).force();
-    let name = leaderboard.name_any();
-    let object = format!("Leaderboard {name}");
-    let api = api(client, leaderboard);
-    let body = Patch::Apply(&patch);
-    let result = call("the status", &object, api.patch_status(&name, &params, &body)).await;
-    result?;
+    apply_status(client, leaderboard, &plan.status).await?;
     state.wrote(&uid, now);
     Ok(RESYNC)
-}
-
-fn api(client: &Client, leaderboard: &Leaderboard) -> Api<Leaderboard> {
-    Api::namespaced(client.clone(), &leaderboard.namespace().unwrap_or_default())
 }

@@ -1,34 +1,34 @@
-//! What every pass of the controller shares: clients, caches and memory.
+//! What all reconciles share: clients, caches and memory. Each stage gets the parts that it uses, and nothing else.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use kube::Client;
 use kube::runtime::events::Recorder;
 
-use crate::controller::leaderboards::isolation::{Policies, Wake};
+use crate::controller::leaderboards;
+use crate::controller::leaderboards::isolation::Policies;
 use crate::controller::leaderboards::state::LeaderboardState;
-pub use crate::controller::settings::Settings;
+use crate::controller::objects::Wake;
+use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
-pub use crate::controller::stores::Stores;
-use crate::controller::submissions::archive::{ArchiveWorkers, bucket_id};
+use crate::controller::stores::Stores;
+use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::reruns::Reruns;
-use crate::services::archive::Archive;
+use crate::controller::submissions::{act, observe};
+use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use leaderboard_api::{Leaderboard, Storage};
+use leaderboard_api::Leaderboard;
 
-pub use crate::kubernetes::CALL_TIMEOUT;
-
-/// Shared by all passes.
+/// Shared by all reconciles.
 pub struct Context {
     pub client: Client,
     pub settings: Settings,
     pub stores: Stores,
     pub memory: Memory,
-    pub archive_workers: ArchiveWorkers,
+    pub archive: ArchiveWorkers,
     pub lookups: Lookups,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
@@ -36,50 +36,43 @@ pub struct Context {
     pub external: ExternalSystems,
     pub aws: Aws,
     pub recorder: Recorder,
-    wake: Wake,
-    archives: Mutex<HashMap<String, Archive>>,
+    pub wake: Wake<Leaderboard>,
 }
 
 impl Context {
-    pub fn new(
-        client: Client,
-        settings: Settings,
-        stores: Stores,
-        (external, archive_workers, lookups): (ExternalSystems, ArchiveWorkers, Lookups),
-        aws: Aws,
-        recorder: Recorder,
-        wake: Wake,
-    ) -> Self {
-        Self {
-            client,
-            settings,
-            stores,
-            memory: Memory::default(),
-            archive_workers,
-            lookups,
-            reruns: Reruns::default(),
-            slots: Arc::default(),
-            leaderboards: LeaderboardState::default(),
-            external,
-            aws,
-            recorder,
-            wake,
-            archives: Mutex::default(),
+    pub fn for_observe(&self) -> observe::Uses<'_> {
+        observe::Uses {
+            stores: &self.stores,
+            memory: &self.memory,
+            slots: &self.slots,
+            archive: &self.archive,
+            lookups: &self.lookups,
+            reruns: &self.reruns,
+            external: &self.external,
         }
     }
 
-    /// Whether Jobs may be made: the policy of the present spec is seen to be there, and the last apply did not fail.
-    pub fn is_policy_in_place(&self, leaderboard: &Leaderboard) -> bool {
-        self.policies().is_in_place(leaderboard)
+    pub fn for_act(&self) -> act::Uses<'_> {
+        act::Uses {
+            client: &self.client,
+            recorder: &self.recorder,
+            settings: &self.settings,
+            stores: &self.stores,
+            memory: &self.memory,
+            slots: &self.slots,
+            archive: &self.archive,
+            external: &self.external,
+        }
     }
 
-    /// The prefix of a run; clients are kept by region and endpoint.
-    pub fn archive(&self, storage: &Storage, run_id: &str) -> Archive {
-        let mut archives = self.archives.lock().unwrap_or_else(PoisonError::into_inner);
-        let shared = archives
-            .entry(bucket_id(storage))
-            .or_insert_with(|| Archive::of_run(&self.aws, storage, run_id));
-        shared.at_prefix(leaderboard_api::effective::key_prefix(storage, run_id))
+    pub fn for_leaderboards(&self) -> leaderboards::Uses<'_> {
+        leaderboards::Uses {
+            policies: self.policies(),
+            settings: &self.settings,
+            slots: &self.slots,
+            external: &self.external,
+            aws: &self.aws,
+        }
     }
 
     /// What keeps the policies in place.
@@ -93,9 +86,11 @@ impl Context {
         }
     }
 
-    /// Drops everything that is remembered of a Submission that is gone.
-    pub fn forget(&self, uid: &str) {
-        self.memory.forget(uid);
-        self.archive_workers.forget(uid);
+    /// Drops everything that is remembered of an object that is gone.
+    pub fn forget(&self, key: &ObjectKey) {
+        self.memory.forget(&key.uid);
+        self.archive.forget(&key.uid);
+        self.leaderboards.forget(&key.uid);
+        self.external.gone(key);
     }
 }

@@ -18,21 +18,24 @@ use std::time::Duration;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
-use kube::Client;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
+use kube::{Client, Resource};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::leaderboards::isolation;
-use super::objects::children_selector;
-use crate::controller::runtime::backoff::BackoffMap;
-use crate::controller::runtime::context::{Context, Settings, Stores};
-use crate::controller::submissions::archive::{ArchiveWorkers, WakeSubmission};
+use super::leaderboards::state::LeaderboardState;
+use super::objects::{Wake, children_selector};
+use super::settings::Settings;
+use super::stores::Stores;
+use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::reruns::Reruns;
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
 use crate::kubernetes::{Watch, guarded, spawn_watch};
 use crate::observability::Observability;
@@ -42,6 +45,8 @@ use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::meter::Meter;
 use crate::services::table::Recorder;
+use backoff::BackoffMap;
+use context::Context;
 use leader::{Leader, Leadership};
 use leaderboard_api::{Leaderboard, Submission};
 
@@ -70,9 +75,7 @@ pub(super) struct Shared {
 impl Shared {
     /// Drops everything that is remembered of an object that is gone.
     fn forget(&self, key: &ObjectKey) {
-        self.context.forget(&key.uid);
-        self.context.leaderboards.forget(&key.uid);
-        self.context.external.gone(key);
+        self.context.forget(key);
         self.backoff.dropped(&key.uid);
     }
 }
@@ -222,66 +225,24 @@ impl Parts {
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
         let (boards, woken_boards) = mpsc::unbounded_channel();
-        let (changed_rows, rows) = mpsc::unbounded_channel();
-        let (changed, evalai) = mpsc::unbounded_channel();
-        let fence = leader.fence();
-        let hub = hub(
-            &fence,
-            changed,
-            &self.client,
-            &self.watches.leaderboards.store,
-            &self.telemetry,
-        );
-        let may_write = fence.clone();
-        let tasks = self.telemetry.tasks.clone();
-        let recorder = Recorder::new(self.aws.clone(), move || may_write.may_write(), changed_rows, tasks);
-        let sync = ExternalSystems::new(hub.clone(), recorder);
-        let gauges = counts::keep(
-            hub.clone(),
-            self.watches.submissions.store.clone(),
-            self.telemetry.clone(),
-        );
-        self.telemetry.tasks.stay("gauges", gauges);
-        let watches = self.watches;
-        let to_queue = boards.clone();
-        let wake = Box::new(move |board| {
-            // Without a receiver the process is ending.
-            let _ = to_queue.send(board);
-        });
-        let (answered, answers) = mpsc::unbounded_channel();
-        let archive_workers = ArchiveWorkers::new(
-            self.aws.clone(),
-            self.client.clone(),
-            self.telemetry.tasks.clone(),
-            waking(&answered),
-        );
-        let lookups = Lookups::start(self.client.clone(), &self.telemetry.tasks, waking(&answered));
-        let events = events(&self.client);
-        let context = Context::new(
-            self.client,
-            self.settings,
-            watches.stores(),
-            (sync, archive_workers, lookups),
-            self.aws,
-            events,
-            wake,
-        );
+        let (rows, changed_rows) = mpsc::unbounded_channel();
+        let (evalai, changed) = mpsc::unbounded_channel();
+        let (answers, answered) = mpsc::unbounded_channel();
+        let external = self.external(&leader.fence(), evalai, rows);
+        let hub = external.hub.clone();
         let shared = Arc::new(Shared {
-            context: Arc::new(context),
+            context: Arc::new(self.context(external, &answers, &boards)),
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
-        shared.context.stores.fill(&shared.context.slots);
-        let context = Arc::clone(&shared.context);
-        let keep = move |board| {
-            let context = Arc::clone(&context);
-            async move { isolation::keep_missing(context.policies(), &board).await }
+        self.keep_policies(&shared.context);
+        let reports = events::Reports {
+            rows: changed_rows,
+            evalai: changed,
+            answers: answered,
         };
-        let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
-        self.telemetry.tasks.stay("policies", restored);
-        let reports = events::Reports { rows, evalai, answers };
-        let of_submissions = events::of_submissions(&watches, reports, &boards, &shared);
-        let of_leaderboards = events::of_leaderboards(&watches, woken_boards, &shared);
+        let of_submissions = events::of_submissions(&self.watches, reports, &boards, &shared);
+        let of_leaderboards = events::of_leaderboards(&self.watches, woken_boards, &shared);
         let mut leadership = leader.leadership();
         let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
         let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
@@ -298,14 +259,74 @@ impl Parts {
         }
         Ok(())
     }
+
+    /// The services, and what counts them.
+    fn external(
+        &self,
+        fence: &leader::Fence,
+        evalai: mpsc::UnboundedSender<Changed>,
+        rows: mpsc::UnboundedSender<ObjectKey>,
+    ) -> ExternalSystems {
+        let (watches, telemetry) = (&self.watches, &self.telemetry);
+        let hub = hub(fence, evalai, &self.client, &watches.leaderboards.store, telemetry);
+        let fence = fence.clone();
+        let recorder = Recorder::new(
+            self.aws.clone(),
+            move || fence.may_write(),
+            rows,
+            telemetry.tasks.clone(),
+        );
+        let gauges = counts::keep(hub.clone(), watches.submissions.store.clone(), telemetry.clone());
+        telemetry.tasks.stay("gauges", gauges);
+        ExternalSystems::new(hub, recorder)
+    }
+
+    /// What all reconciles share. `answers` and `boards` wake Submissions and Leaderboards.
+    fn context(
+        &self,
+        external: ExternalSystems,
+        answers: &mpsc::UnboundedSender<ObjectRef<Submission>>,
+        boards: &mpsc::UnboundedSender<ObjectRef<Leaderboard>>,
+    ) -> Context {
+        let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
+        let context = Context {
+            client: client.clone(),
+            settings: self.settings.clone(),
+            stores: self.watches.stores(),
+            memory: Memory::default(),
+            archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), waking(answers)),
+            lookups: Lookups::start(client.clone(), tasks, waking(answers)),
+            reruns: Reruns::default(),
+            slots: Arc::default(),
+            leaderboards: LeaderboardState::default(),
+            external,
+            aws: aws.clone(),
+            recorder: events(client),
+            wake: waking(boards),
+        };
+        context.stores.fill(&context.slots);
+        context
+    }
+
+    /// Restores the policies next to the reconciles.
+    fn keep_policies(&self, context: &Arc<Context>) {
+        let context = Arc::clone(context);
+        let keep = move |board| {
+            let context = Arc::clone(&context);
+            async move { isolation::keep_missing(context.policies(), &board).await }
+        };
+        let watches = &self.watches;
+        let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
+        self.telemetry.tasks.stay("policies", restored);
+    }
 }
 
-/// Puts a Submission into the queue.
-fn waking(queue: &mpsc::UnboundedSender<ObjectRef<Submission>>) -> WakeSubmission {
+/// Puts an object into its queue.
+fn waking<K: Resource<DynamicType = ()> + 'static>(queue: &mpsc::UnboundedSender<ObjectRef<K>>) -> Wake<K> {
     let queue = queue.clone();
-    Box::new(move |submission| {
+    Box::new(move |object| {
         // Without a receiver the process is ending.
-        let _ = queue.send(submission);
+        let _ = queue.send(object);
     })
 }
 

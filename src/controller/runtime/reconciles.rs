@@ -12,7 +12,7 @@ use kube::runtime::reflector::ObjectRef;
 
 use super::Shared;
 use crate::backoff::jittered;
-use crate::controller::leaderboards::{self, Uses};
+use crate::controller::leaderboards;
 use crate::controller::objects::{key_of, uid_of};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
@@ -88,11 +88,14 @@ async fn reconcile_submission(submission: Arc<Submission>, shared: Arc<Shared>) 
     let name = key_of(submission.as_ref()).to_string();
     let slots = &shared.context.slots;
     let work = async {
-        let view = observe(&shared.context, Arc::clone(&submission));
+        let policies = shared.context.policies();
+        let view = observe(shared.context.for_observe(), Arc::clone(&submission), |board| {
+            policies.is_in_place(board)
+        });
         let plan = decide(&view);
         let requeue = plan.requeue;
         settle(slots, &submission, &plan);
-        let held_back = act(&shared.context, &view, plan).await?;
+        let held_back = act(shared.context.for_act(), &view, plan).await?;
         Ok([requeue, held_back].into_iter().flatten().min())
     };
     let result = tokio::time::timeout(TIME_LIMIT, work)
@@ -125,15 +128,7 @@ fn settle(slots: &SlotAllocator, submission: &Submission, plan: &Plan) {
 async fn reconcile_leaderboard(leaderboard: Arc<Leaderboard>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
     let started = Instant::now();
     let (name, uid) = (key_of(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
-    let context = &shared.context;
-    let uses = Uses {
-        policies: context.policies(),
-        settings: &context.settings,
-        slots: &context.slots,
-        external: &context.external,
-        aws: &context.aws,
-    };
-    let work = leaderboards::reconcile(leaderboard, uses);
+    let work = leaderboards::reconcile(leaderboard, shared.context.for_leaderboards());
     let result = match tokio::time::timeout(TIME_LIMIT, work).await {
         Ok(result) => result.map(Some).map_err(ReconcileError::from),
         Err(_) => Err(ReconcileError::TooLong),

@@ -1,39 +1,52 @@
 //! Carries a plan out: finalizer, status, children, requests, events, in this order. Decides nothing.
 //!
-//! Every step is safe to repeat. A failed status write ends the pass, because what follows would not be remembered.
+//! Every step is safe to repeat. A failed status write ends the reconcile, because what follows would not be remembered.
 
 use std::time::Duration;
 
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
-use kube::api::{
-    ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions, PropagationPolicy,
-};
-use kube::runtime::events::{Event as KubeEvent, EventType};
-use kube::{Api, Resource, ResourceExt};
+use kube::api::{ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions};
+use kube::core::NamespaceResourceScope;
+use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
+use kube::runtime::reflector::ObjectRef;
+use kube::{Api, Client, Resource, ResourceExt};
 use serde_json::json;
 
-use super::archive::request::LogDemand;
+use super::archive::ArchiveWorkers;
 use super::decide::{Action, Event, LogPlace, Plan};
+use super::external::ExternalSystems;
+use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
-use super::observe::{is_pod_of, uid_of};
+use super::memory::Memory;
 use super::significance::{Change, change, patience};
 use super::view::View;
-use crate::controller::runtime::context::{CALL_TIMEOUT, Context};
-use leaderboard_api::client_errors;
+use crate::controller::objects::{is_pod_of, uid_of};
+use crate::controller::settings::Settings;
+use crate::controller::slots::SlotAllocator;
+use crate::controller::stores::Stores;
+use crate::controller::writes::{apply_status, set_finalizer};
+use crate::kubernetes::{CallError, Watchable, call};
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
-/// What a pass could not carry out.
+/// What carrying a plan out uses.
+#[derive(Clone, Copy)]
+pub struct Uses<'a> {
+    pub client: &'a Client,
+    pub recorder: &'a Recorder,
+    pub settings: &'a Settings,
+    pub stores: &'a Stores,
+    pub memory: &'a Memory,
+    pub slots: &'a SlotAllocator,
+    pub archive: &'a ArchiveWorkers,
+    pub external: &'a ExternalSystems,
+}
+
+/// What a reconcile could not carry out.
 #[derive(thiserror::Error, Debug)]
 pub enum ActError {
-    #[error("{what} of {object} failed: {}", client_errors::kube(source))]
-    Kubernetes {
-        what: &'static str,
-        object: String,
-        source: Box<kube::Error>,
-    },
-    #[error("{what} of {object}: the API server did not answer within {} s", CALL_TIMEOUT.as_secs())]
-    Silent { what: &'static str, object: String },
+    #[error(transparent)]
+    Call(#[from] CallError),
     #[error("{object} has no plan although its Job is to be made; its Leaderboard may have been deleted just now")]
     NoPlan { object: String },
 }
@@ -42,8 +55,7 @@ impl ActError {
     /// One word for metrics.
     pub fn label(&self) -> &'static str {
         match self {
-            Self::Kubernetes { .. } => "kubernetes",
-            Self::Silent { .. } => "timeout",
+            Self::Call(error) => error.label(),
             Self::NoPlan { .. } => "plan",
         }
     }
@@ -52,9 +64,9 @@ impl ActError {
 /// Carries out a plan for what `view` shows.
 ///
 /// Returns when to look again if a status of mere progress was held back.
-pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Duration>, ActError> {
+pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Duration>, ActError> {
     let actor = Actor {
-        context,
+        uses,
         view,
         namespace: view.submission.namespace().unwrap_or_default(),
     };
@@ -65,9 +77,7 @@ pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Du
     for event in &plan.events {
         actor.publish(event).await;
     }
-    context
-        .archive_workers
-        .demand(&view.submission, &plan.status, plan.report);
+    uses.archive.demand(&view.submission, &plan.status, plan.report);
     for action in &plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
@@ -75,7 +85,7 @@ pub async fn act(context: &Context, view: &View, plan: Plan) -> Result<Option<Du
 }
 
 struct Actor<'a> {
-    context: &'a Context,
+    uses: Uses<'a>,
     view: &'a View,
     namespace: String,
 }
@@ -91,15 +101,13 @@ impl Actor<'_> {
 
     fn api<K>(&self) -> Api<K>
     where
-        K: Resource<Scope = k8s_openapi::NamespaceResourceScope>,
-        K::DynamicType: Default,
+        K: Watchable + Resource<Scope = NamespaceResourceScope>,
     {
-        Api::namespaced(self.context.client.clone(), &self.namespace)
+        Api::namespaced(self.uses.client.clone(), &self.namespace)
     }
 
     async fn carry_out(&self, action: &Action, status: &SubmissionStatus) -> Result<(), ActError> {
         match action {
-            Action::AddFinalizer => Ok(()),
             Action::ReleaseFinalizer => self.set_finalizer(false).await,
             Action::CreateJob { attempt, retry } => self.create_job(status, *attempt, *retry).await,
             Action::DeleteJob {
@@ -108,10 +116,6 @@ impl Actor<'_> {
                 grace_seconds,
             } => self.delete_job(name, uid, *grace_seconds).await,
             Action::ForceDeletePod { name, uid } => self.delete_pod(name, uid, 0).await,
-            Action::TakeOwnership => {
-                self.context.archive_workers.want_fence(self.submission(), status);
-                Ok(())
-            }
             Action::AnnotateStop { pod, stop } => {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
@@ -120,82 +124,47 @@ impl Actor<'_> {
                 let patch = json!({ "spec": { "ttlSecondsAfterFinished": seconds } });
                 self.patch::<Job>("the time to live", name, &patch).await
             }
-            Action::KeepLog { places } => {
-                self.keep_log(places, status);
-                Ok(())
-            }
-            Action::ReadTexts { of } => {
-                self.context.archive_workers.want_texts(self.submission(), status, *of);
-                Ok(())
-            }
-            Action::JoinLine(place) => {
-                self.context.slots.join(self.submission(), place.clone());
-                Ok(())
-            }
-            Action::AskEvalai => {
-                self.context.external.ask(self.view);
-                Ok(())
-            }
-            Action::FollowEvalai => {
-                self.context.external.follow(self.view, status);
-                Ok(())
-            }
-            Action::UpdateEvalai(update) => {
-                self.context
-                    .external
-                    .update_evalai(self.context, self.view, status, *update);
-                Ok(())
-            }
-            Action::ForgetEvalai => {
-                self.context.external.forget_evalai(self.submission());
-                Ok(())
-            }
-            Action::Forget => {
-                self.context.external.forget(self.submission());
-                self.context.archive_workers.forget(&uid_of(self.submission()));
-                Ok(())
-            }
-            Action::Record { end } => {
-                self.context.external.record(self.view, status, *end);
+            other => {
+                self.request(other, status);
                 Ok(())
             }
         }
     }
 
-    fn keep_log(&self, places: &[LogPlace], status: &SubmissionStatus) {
-        let demand = LogDemand {
-            attempt: status.attempt.unwrap_or(1),
-            retry: status.retry,
-            places: places.to_vec(),
-            is_over: status.times.finished.is_some(),
-        };
-        self.context.archive_workers.want_log(self.submission(), status, demand);
+    /// Hands on what others do: the slots, the workers of S3, EvalAI and the table. Nothing here waits.
+    fn request(&self, action: &Action, status: &SubmissionStatus) {
+        let (uses, submission) = (self.uses, self.submission());
+        match action {
+            Action::JoinLine(place) => uses.slots.join(submission, place.clone()),
+            Action::TakeOwnership => uses.archive.want_fence(submission, status),
+            Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
+            Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
+            Action::AskEvalai => uses.external.ask(self.view),
+            Action::FollowEvalai => uses.external.follow(self.view, status),
+            Action::UpdateEvalai(update) => {
+                uses.external
+                    .update_evalai(uses.memory, uses.archive, self.view, status, *update);
+            }
+            Action::ForgetEvalai => uses.external.forget_evalai(submission),
+            Action::Forget => {
+                uses.external.forget(submission);
+                uses.archive.forget(&uid_of(submission));
+            }
+            Action::Record { end } => uses.external.record(self.view, status, *end),
+            // The finalizer goes before the status; the others are requests to the API server.
+            Action::AddFinalizer
+            | Action::ReleaseFinalizer
+            | Action::CreateJob { .. }
+            | Action::DeleteJob { .. }
+            | Action::ForceDeletePod { .. }
+            | Action::AnnotateStop { .. }
+            | Action::SetJobTtl { .. } => {}
+        }
     }
 
     async fn set_finalizer(&self, wanted: bool) -> Result<(), ActError> {
-        let present = self.submission().finalizers().to_vec();
-        let mut finalizers: Vec<String> = present
-            .into_iter()
-            .filter(|f| f != names::FINALIZER_SUBMISSION)
-            .collect();
-        if wanted {
-            finalizers.push(names::FINALIZER_SUBMISSION.into());
-        }
-        // The resource version keeps other controllers' finalizers safe: a concurrent change makes this write fail.
-        let patch = json!({ "metadata": {
-            "resourceVersion": self.submission().metadata.resource_version,
-            "finalizers": finalizers,
-        } });
-        let params = PatchParams {
-            field_manager: Some(names::MANAGER_FINALIZER.into()),
-            ..PatchParams::default()
-        };
-        let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Merge(&patch));
-        let call = api.patch(&name, &params, &body);
-        match self.call("the finalizer", &self.name(), call).await {
-            Err(error) if !wanted && is_gone(&error) => Ok(()),
-            other => other.map(|_| ()),
-        }
+        let set = set_finalizer(self.uses.client, self.submission(), names::FINALIZER_SUBMISSION, wanted);
+        Ok(set.await?)
     }
 
     async fn write_status(&self, status: &SubmissionStatus) -> Result<Option<Duration>, ActError> {
@@ -205,31 +174,22 @@ impl Actor<'_> {
             Change::Place => {
                 let position = status.waiting.as_ref().map_or(0, |w| w.position);
                 let now = tokio::time::Instant::now();
-                let waits = self.context.memory.place_waits(self.submission(), position, now);
+                let waits = self.uses.memory.place_waits(self.submission(), position, now);
                 if waits.is_some() {
                     return Ok(waits);
                 }
             }
             Change::Progress => {
                 let patience = patience(self.view.leaderboard.as_ref().map(|l| &l.spec));
-                let since = self.context.memory.since_write(self.submission());
+                let since = self.uses.memory.since_write(self.submission());
                 if let Some(left) = since.and_then(|since| patience.checked_sub(since)) {
                     return Ok(Some(left));
                 }
             }
             Change::Real => {}
         }
-        let patch = json!({
-            "apiVersion": Submission::api_version(&()),
-            "kind": Submission::kind(&()),
-            "metadata": { "name": self.name(), "uid": uid_of(self.submission()) },
-            "status": status,
-        });
-        let params = PatchParams::apply(names::MANAGER_STATUS).force();
-        let (api, name, body) = (self.api::<Submission>(), self.name(), Patch::Apply(&patch));
-        let call = api.patch_status(&name, &params, &body);
-        let answer = self.call("the status", &self.name(), call).await?;
-        self.context.memory.wrote(&answer);
+        let answer = apply_status(self.uses.client, self.submission(), status).await?;
+        self.uses.memory.wrote(&answer);
         self.log_transition(status);
         Ok(None)
     }
@@ -257,7 +217,7 @@ impl Actor<'_> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
         };
-        let settings = &self.context.settings;
+        let settings = &self.uses.settings;
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
@@ -271,121 +231,76 @@ impl Actor<'_> {
         });
         let name = names::job(&self.name(), attempt, retry);
         let resource = ApiResource::erase::<Job>(&());
-        let api: Api<DynamicObject> = Api::namespaced_with(self.context.client.clone(), &self.namespace, &resource);
+        let api: Api<DynamicObject> = Api::namespaced_with(self.uses.client.clone(), &self.namespace, &resource);
         let params = PostParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PostParams::default()
         };
-        let call = api.create(&params, &object);
-        match self.call("creating the Job", &name, call).await {
-            // Its name is ours alone; whose it is, the next pass sees.
-            Err(error) if is_conflict(&error) => Ok(()),
-            other => other.map(|_| ()),
+        match call("creating the Job", &name, api.create(&params, &object)).await {
+            // Its name is ours alone; whose it is, the next reconcile sees.
+            Err(error) if error.is_conflict() => Ok(()),
+            other => Ok(other.map(|_| ())?),
         }
     }
 
     async fn delete_job(&self, name: &str, uid: &str, grace_seconds: i64) -> Result<(), ActError> {
         // In the foreground the Job stays until its Pods are gone; a Pod that will never go must not hold it.
-        let propagation = if grace_seconds > 0 {
-            PropagationPolicy::Foreground
+        let params = if grace_seconds > 0 {
+            DeleteParams::foreground()
         } else {
-            PropagationPolicy::Background
+            DeleteParams::background()
         };
-        let params = DeleteParams {
-            propagation_policy: Some(propagation),
-            preconditions: Some(Preconditions {
-                uid: Some(uid.into()),
-                resource_version: None,
-            }),
-            ..DeleteParams::default()
+        self.delete::<Job>("deleting the Job", name, uid, params).await?;
+        let reference = ObjectRef::<Job>::new(name).within(&self.namespace);
+        let Some(job) = self.uses.stores.jobs.get(&reference) else {
+            return Ok(());
         };
-        let api = self.api::<Job>();
-        let call = api.delete(name, &params);
-        match self.call("deleting the Job", name, call).await {
-            Err(error) if !is_gone(&error) && !is_conflict(&error) => return Err(error),
-            _ => {}
-        }
-        let stores = &self.context.stores;
-        let pods: Vec<_> = stores
-            .pods
-            .state()
-            .into_iter()
-            .filter(|pod| self.is_of_job(pod, name))
-            .collect();
-        for pod in pods {
+        let pods = self.uses.stores.pods.state();
+        for pod in pods.iter().filter(|pod| is_pod_of(pod, &job)) {
             self.delete_pod(&pod.name_any(), &uid_of(pod.as_ref()), grace_seconds)
                 .await?;
         }
         Ok(())
     }
 
-    fn is_of_job(&self, pod: &Pod, job: &str) -> bool {
-        let reference = kube::runtime::reflector::ObjectRef::<Job>::new(job).within(&self.namespace);
-        self.context
-            .stores
-            .jobs
-            .get(&reference)
-            .is_some_and(|job| is_pod_of(pod, &job))
-    }
-
     async fn delete_pod(&self, name: &str, uid: &str, grace_seconds: i64) -> Result<(), ActError> {
         let params = DeleteParams {
             grace_period_seconds: u32::try_from(grace_seconds).ok(),
-            preconditions: Some(Preconditions {
-                uid: Some(uid.into()),
-                resource_version: None,
-            }),
             ..DeleteParams::default()
         };
-        let api = self.api::<Pod>();
-        let call = api.delete(name, &params);
-        match self.call("deleting the Pod", name, call).await {
-            Err(error) if !is_gone(&error) && !is_conflict(&error) => Err(error),
+        self.delete::<Pod>("deleting the Pod", name, uid, params).await
+    }
+
+    /// Deletes the object of this UID. Nothing is left to do where it is gone, or another one has its name.
+    async fn delete<K>(&self, what: &'static str, name: &str, uid: &str, params: DeleteParams) -> Result<(), ActError>
+    where
+        K: Watchable + Resource<Scope = NamespaceResourceScope>,
+    {
+        let params = params.preconditions(Preconditions {
+            uid: Some(uid.into()),
+            resource_version: None,
+        });
+        match call(what, name, self.api::<K>().delete(name, &params)).await {
+            Err(error) if !error.is_gone() && !error.is_conflict() => Err(error.into()),
             _ => Ok(()),
         }
     }
 
     async fn patch<K>(&self, what: &'static str, name: &str, patch: &serde_json::Value) -> Result<(), ActError>
     where
-        K: Resource<Scope = k8s_openapi::NamespaceResourceScope>
-            + Clone
-            + std::fmt::Debug
-            + serde::de::DeserializeOwned,
-        K::DynamicType: Default,
+        K: Watchable + Resource<Scope = NamespaceResourceScope>,
     {
         let params = PatchParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PatchParams::default()
         };
-        let (api, body) = (self.api::<K>(), Patch::Merge(patch));
-        let call = api.patch(name, &params, &body);
-        match self.call(what, name, call).await {
-            Err(error) if is_gone(&error) => Ok(()),
-            other => other.map(|_| ()),
+        match call(what, name, self.api::<K>().patch(name, &params, &Patch::Merge(patch))).await {
+            Err(error) if error.is_gone() => Ok(()),
+            other => Ok(other.map(|_| ())?),
         }
     }
 
-    async fn call<T>(
-        &self,
-        what: &'static str,
-        object: &str,
-        call: impl Future<Output = Result<T, kube::Error>>,
-    ) -> Result<T, ActError> {
-        match tokio::time::timeout(CALL_TIMEOUT, call).await {
-            Ok(Ok(answer)) => Ok(answer),
-            Ok(Err(source)) => Err(ActError::Kubernetes {
-                what,
-                object: object.into(),
-                source: Box::new(source),
-            }),
-            Err(_) => Err(ActError::Silent {
-                what,
-                object: object.into(),
-            }),
-        }
-    }
-
-    /// An event that cannot be told never fails a pass.
+    /// An event that cannot be written never fails a reconcile.
     async fn publish(&self, event: &Event) {
         let reference = self.submission().object_ref(&());
         let note = KubeEvent {
@@ -399,15 +314,19 @@ impl Actor<'_> {
             action: event.reason.clone(),
             secondary: None,
         };
-        let call = self.context.recorder.publish(&note, &reference);
-        match tokio::time::timeout(CALL_TIMEOUT, call).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => {
-                let error = client_errors::kube(&error);
-                tracing::warn!(submission = %self.name(), reason = %event.reason, error, "an event could not be written");
-            }
-            Err(_) => tracing::warn!(submission = %self.name(), reason = %event.reason, "an event was not answered"),
+        let published = self.uses.recorder.publish(&note, &reference);
+        if let Err(error) = call("an event", &self.name(), published).await {
+            tracing::warn!(submission = %self.name(), reason = %event.reason, "{error}");
         }
+    }
+}
+
+fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {
+    LogDemand {
+        attempt: status.attempt.unwrap_or(1),
+        retry: status.retry,
+        places: places.to_vec(),
+        is_over: status.times.finished.is_some(),
     }
 }
 
@@ -417,14 +336,6 @@ fn truncate(text: &str) -> String {
         Some((end, _)) => format!("{} …", &text[..end]),
         None => text.to_owned(),
     }
-}
-
-fn is_gone(error: &ActError) -> bool {
-    matches!(error, ActError::Kubernetes { source, .. } if matches!(source.as_ref(), kube::Error::Api(status) if status.code == 404))
-}
-
-fn is_conflict(error: &ActError) -> bool {
-    matches!(error, ActError::Kubernetes { source, .. } if matches!(source.as_ref(), kube::Error::Api(status) if status.code == 409))
 }
 
 #[cfg(test)]

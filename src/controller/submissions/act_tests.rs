@@ -21,7 +21,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         ..Cluster::default()
     };
     let around = surroundings(cluster, "http://127.0.0.1:9").await;
-    let view = observe(&around.context, Arc::new(submission));
+    let view = observe(around.context.for_observe(), Arc::new(submission), |_| true);
     let lines = Lines::default();
     let _guard = lines.collect();
     let write = async |status: SubmissionStatus| {
@@ -32,7 +32,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
             report: None,
             requeue: None,
         };
-        act(&around.context, &view, plan).await.unwrap();
+        act(around.context.for_act(), &view, plan).await.unwrap();
     };
 
     write(old.clone()).await;
@@ -78,18 +78,4 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
     ] {
         assert_eq!(line[field], value, "{field} of {text}");
     }
-}
-
-#[test]
-fn an_answer_of_the_api_server_is_logged_without_a_dump() {
-    let status = kube::core::Status::failure("jobs is forbidden", "Forbidden").with_code(403);
-    let error = ActError::Kubernetes {
-        what: "creating the Job",
-        object: "a-1".into(),
-        source: Box::new(kube::Error::Api(status.boxed())),
-    };
-    assert_eq!(
-        error.to_string(),
-        "creating the Job of a-1 failed: the API server answered 403: jobs is forbidden"
-    );
 }

@@ -7,15 +7,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 use jiff::Timestamp;
 use kube::ResourceExt;
 
+use super::archive::ArchiveWorkers;
 use super::decide::EvalaiUpdate;
-use super::observe::uid_of;
+use super::memory::Memory;
 use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
-use crate::controller::runtime::context::Context;
+use crate::controller::objects::{key_of, uid_of};
 use crate::services::ObjectKey;
 use crate::services::evalai::{
-    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Payload, Run, Status, Subject, SubmissionState, Target,
+    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
@@ -62,7 +63,7 @@ impl ExternalSystems {
         known: impl Fn(&str) -> Option<Arc<Submission>>,
     ) -> Option<EvalaiView> {
         submission.spec.evalai?;
-        let Some(seen) = self.hub.view(&object_key(submission)) else {
+        let Some(seen) = self.hub.view(&key_of(submission)) else {
             let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
             let error = (!ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned());
             return Some(EvalaiView {
@@ -83,7 +84,7 @@ impl ExternalSystems {
         let attempt = submission.status.as_ref().and_then(|s| s.attempt);
         let seen = self
             .recorder
-            .view(&object_key(submission))
+            .view(&key_of(submission))
             .filter(|seen| Some(seen.attempt) == attempt);
         Some(seen.map_or_else(RecordView::default, |s| RecordView {
             end_written: s.end_written,
@@ -107,16 +108,24 @@ impl ExternalSystems {
         log_refused(&view.submission, followed);
     }
 
-    /// Updates EvalAI with what the view shows.
-    pub fn update_evalai(&self, context: &Context, view: &View, status: &SubmissionStatus, update: EvalaiUpdate) {
+    /// Updates EvalAI with what the view shows. `memory` notes a partial result, `archive` has the log of a failure.
+    pub fn update_evalai(
+        &self,
+        memory: &Memory,
+        archive: &ArchiveWorkers,
+        view: &View,
+        status: &SubmissionStatus,
+        update: EvalaiUpdate,
+    ) {
         let Some(subject) = self.subject(view) else { return };
+        let with_end = |outcome| Some(final_update(archive, view, status, outcome));
         let desired = match update {
             EvalaiUpdate::Queued => Some(DesiredUpdate::Queued),
             EvalaiUpdate::Running => Some(DesiredUpdate::Running),
-            EvalaiUpdate::Partial => partial(context, view).map(DesiredUpdate::Partial),
-            EvalaiUpdate::Finished => Some(final_update(context, view, status, Outcome::Finished)),
-            EvalaiUpdate::Failed => Some(final_update(context, view, status, Outcome::Failed)),
-            EvalaiUpdate::Cancelled => Some(final_update(context, view, status, Outcome::Cancelled)),
+            EvalaiUpdate::Partial => self.partial(memory, view),
+            EvalaiUpdate::Finished => with_end(Outcome::Finished),
+            EvalaiUpdate::Failed => with_end(Outcome::Failed),
+            EvalaiUpdate::Cancelled => with_end(Outcome::Cancelled),
         };
         if matches!(update, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
             self.follow(view, status);
@@ -126,14 +135,24 @@ impl ExternalSystems {
         }
     }
 
+    fn partial(&self, memory: &Memory, view: &View) -> Option<DesiredUpdate> {
+        let report = view.report.ours()?;
+        let leaderboard = key_of(view.leaderboard.as_deref()?);
+        let is_shown = self.hub.shows_partial(&leaderboard, result_texts::phase(view));
+        let payload = result_texts::partial_payload(view, is_shown)?;
+        let attempt = view.submission.spec.attempt;
+        memory.told_partial(&view.submission, attempt, report.done);
+        Some(DesiredUpdate::Partial(Arc::new(payload)))
+    }
+
     /// Both systems have what this object has for them.
     pub fn forget(&self, submission: &Submission) {
-        self.gone(&object_key(submission));
+        self.gone(&key_of(submission));
     }
 
     /// Nothing more is wanted of EvalAI; what is known is forgotten.
     pub fn forget_evalai(&self, submission: &Submission) {
-        self.hub.forget(&object_key(submission));
+        self.hub.forget(&key_of(submission));
     }
 
     /// Writes the row, or lets the next write carry it.
@@ -141,8 +160,7 @@ impl ExternalSystems {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
         if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
-            self.recorder
-                .record(table, &object_key(view.submission.as_ref()), row, end);
+            self.recorder.record(table, &key_of(view.submission.as_ref()), row, end);
         }
     }
 
@@ -157,7 +175,7 @@ impl ExternalSystems {
         let target = self.target(view.leaderboard.as_deref()?)?;
         Some(Subject {
             target,
-            key: object_key(view.submission.as_ref()),
+            key: key_of(view.submission.as_ref()),
             pk: evalai.submission,
             run: run_of(&view.submission),
         })
@@ -177,24 +195,11 @@ fn run_of(submission: &Submission) -> Run {
     }
 }
 
-fn partial(context: &Context, view: &View) -> Option<Arc<Payload>> {
-    let report = view.report.ours()?;
-    let leaderboard = object_key(view.leaderboard.as_deref()?);
-    let is_shown = context
-        .external
-        .hub
-        .shows_partial(&leaderboard, result_texts::phase(view));
-    let payload = result_texts::partial_payload(view, is_shown)?;
-    let attempt = view.submission.spec.attempt;
-    context.memory.told_partial(&view.submission, attempt, report.done);
-    Some(Arc::new(payload))
-}
-
-fn final_update(context: &Context, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
+fn final_update(archive: &ArchiveWorkers, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
     let mut payload = result_texts::payload(view);
     payload.stderr = result_texts::stderr(status);
     if outcome == Outcome::Failed {
-        let tail = context.archive_workers.tail(&view.submission, status);
+        let tail = archive.tail(&view.submission, status);
         result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
     }
     DesiredUpdate::Final(outcome, Arc::new(payload))
@@ -270,14 +275,6 @@ fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
 fn log_refused(submission: &Submission, result: Result<(), evalai::client::ClientError>) {
     if let Err(error) = result {
         tracing::error!(submission = %submission.name_any(), %error, "cannot create EvalAI client");
-    }
-}
-
-fn object_key(object: &impl ResourceExt) -> ObjectKey {
-    ObjectKey {
-        namespace: object.namespace().unwrap_or_default(),
-        name: object.name_any(),
-        uid: uid_of(object),
     }
 }
 

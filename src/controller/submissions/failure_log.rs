@@ -12,7 +12,6 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::api::LogParams;
 use kube::{Api, Client};
 
-use super::archive::request::{LogAnswer, LogDemand};
 use super::decide::{LogAt, LogPlace};
 use crate::services::archive::Archive;
 use leaderboard_api::client_errors;
@@ -28,6 +27,16 @@ const NODE_LINES: i64 = 200;
 const NODE_BYTES: u64 = 1 << 20;
 /// Time that reading one place, or storing, may take.
 const TRY: Duration = Duration::from_secs(5);
+
+/// Which log is to be kept.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LogDemand {
+    pub attempt: i64,
+    pub retry: i32,
+    pub places: Vec<LogPlace>,
+    /// The submission has come to its end, so that its log is stored too.
+    pub is_over: bool,
+}
 
 /// The last lines of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -62,6 +71,14 @@ impl Tail {
             self.container, self.attempt, self.text
         )
     }
+}
+
+/// What came of looking for a log.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LogAnswer {
+    pub tail: Option<Tail>,
+    /// One that may have it did not answer, or storing failed.
+    pub is_unclear: bool,
 }
 
 /// What became of looking for a log.

@@ -201,6 +201,11 @@ impl ObservedReport {
             _ => None,
         }
     }
+
+    /// Nothing was stored for this attempt.
+    pub fn is_nothing(&self) -> bool {
+        matches!(self, Self::Absent | Self::Foreign)
+    }
 }
 
 /// The texts of a result, as they are published.

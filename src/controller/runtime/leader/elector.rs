@@ -11,16 +11,16 @@ use k8s_openapi::api::coordination::v1::Lease;
 use kube::api::PostParams;
 use kube::{Api, Client};
 use tokio::sync::{oneshot, watch};
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, sleep};
 
 use super::decide::{Decision, Leading, Loss, Seen, decide, is_overdue};
 use super::record::{Record, held, released};
 use super::{Fence, Leadership, Settings};
 use crate::backoff::jittered;
+use crate::kubernetes::{CallError, call_within};
 use crate::observability::Observability;
 use crate::observability::liveness::Liveness;
 use crate::observability::metrics::Metrics;
-use leaderboard_api::client_errors;
 
 /// Looks at a Lease that changes while it is being released.
 const RELEASE_TRIES: u32 = 3;
@@ -44,17 +44,6 @@ pub(super) struct Elector {
     /// The last look or write was answered, and nothing has been sent since.
     is_fresh: bool,
     leading: Option<Leading>,
-}
-
-/// Why a call brought no answer that helps.
-#[derive(Debug)]
-enum CallError {
-    /// Somebody else was quicker, or the Lease is gone: look again.
-    Stale,
-    Failed {
-        reason: &'static str,
-        text: String,
-    },
 }
 
 /// How the election goes on.
@@ -107,7 +96,7 @@ impl Elector {
         if (self.leading.is_none() || !self.is_fresh)
             && let Err(error) = self.look().await
         {
-            return self.failed("read", error);
+            return self.failed(&error);
         }
         let now = self.settings.clock.now();
         match decide(
@@ -126,7 +115,7 @@ impl Elector {
     async fn look(&mut self) -> Result<(), CallError> {
         let name = self.settings.name.clone();
         let api = self.api.clone();
-        let lease = self.call(async move { api.get_opt(&name).await }).await?;
+        let lease = self.call("the read", async move { api.get_opt(&name).await }).await?;
         self.note(lease);
         Ok(())
     }
@@ -141,7 +130,7 @@ impl Elector {
                 self.lead(term, sent);
                 Next::After(self.retry())
             }
-            Err(error) => self.failed("written", error),
+            Err(error) => self.failed(&error),
         }
     }
 
@@ -149,39 +138,29 @@ impl Elector {
         let (api, params) = (self.api.clone(), PostParams::default());
         match lease.metadata.resource_version {
             Some(_) => {
-                self.call(async move { api.replace(&self.settings.name, &params, lease).await })
+                let replaced = async move { api.replace(&self.settings.name, &params, lease).await };
+                self.call("the renewal", replaced).await
+            }
+            None => {
+                self.call("the creation", async move { api.create(&params, lease).await })
                     .await
             }
-            None => self.call(async move { api.create(&params, lease).await }).await,
         }
     }
 
     /// Bounds a call, also by the moment at which a leader has to know that it has lost.
-    async fn call<T>(&self, call: impl Future<Output = Result<T, kube::Error>>) -> Result<T, CallError> {
+    async fn call<T>(
+        &self,
+        what: &'static str,
+        call: impl Future<Output = Result<T, kube::Error>>,
+    ) -> Result<T, CallError> {
         let limit = self.settings.timing.call.min(self.time_left());
-        match timeout(limit, call).await {
-            Ok(Ok(answer)) => {
-                self.liveness.answered();
-                Ok(answer)
-            }
-            Ok(Err(kube::Error::Api(status)))
-                if status.is_conflict() || status.is_already_exists() || status.is_not_found() =>
-            {
-                self.liveness.answered();
-                Err(CallError::Stale)
-            }
-            Ok(Err(error)) => Err(CallError::Failed {
-                reason: client_errors::reason(&error),
-                text: client_errors::kube(&error),
-            }),
-            Err(_) => {
-                let text = format!("no answer within {:.1} s", limit.as_secs_f32());
-                Err(CallError::Failed {
-                    reason: "timeout",
-                    text,
-                })
-            }
+        let object = format!("Lease {}", self.settings.name);
+        let answer = call_within(limit, what, &object, call).await;
+        if answer.as_ref().err().is_none_or(is_stale) {
+            self.liveness.answered();
         }
+        answer
     }
 
     fn note(&mut self, lease: Option<Lease>) {
@@ -226,16 +205,15 @@ impl Elector {
             .send_replace(Leadership::Lost { why: why.to_owned() });
     }
 
-    fn failed(&self, what: &'static str, error: CallError) -> Next {
-        let timing = &self.settings.timing;
-        let pause = match error {
+    fn failed(&self, error: &CallError) -> Next {
+        let retry = self.settings.timing.retry;
+        let pause = if is_stale(error) {
             // Two candidates that met once are kept from meeting again.
-            CallError::Stale => jittered(timing.retry / 8, 0.1),
-            CallError::Failed { reason, text } => {
-                self.metrics.lease_failed(reason);
-                tracing::warn!(lease = self.settings.name, "the Lease could not be {what}: {text}");
-                jittered(timing.retry / 2, 0.1)
-            }
+            jittered(retry / 8, 0.1)
+        } else {
+            self.metrics.lease_failed(error.reason());
+            tracing::warn!("{error}");
+            jittered(retry / 2, 0.1)
         };
         Next::After(pause.min(self.time_left()))
     }
@@ -274,8 +252,7 @@ impl Elector {
                     tracing::info!(term, is_drained, lease = self.settings.name, "released the Lease");
                     return Ok(());
                 }
-                Err(CallError::Stale) => "it was changed at the same time".clone_into(&mut why),
-                Err(CallError::Failed { text, .. }) => why = text,
+                Err(error) => why = error.to_string(),
             }
         }
         Err(why)
@@ -298,4 +275,9 @@ impl Elector {
             .await
             .map(|_| ())
     }
+}
+
+/// Somebody else was quicker, or the Lease is gone: look again.
+fn is_stale(error: &CallError) -> bool {
+    error.is_conflict() || error.is_gone()
 }

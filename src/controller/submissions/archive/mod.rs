@@ -20,19 +20,16 @@ use kube::{Client, ResourceExt};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use super::failure_log::Tail;
-use super::observe::uid_of;
+use super::failure_log::{LogDemand, Tail};
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
+use crate::controller::objects::{Wake, uid_of};
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
 use digest::ReportId;
 use leaderboard_api::{Storage, Submission, SubmissionStatus, effective};
-use request::{LogDemand, Target, Uid, Work};
+use request::{Target, Uid, Work};
 use state::{SeenReport, State};
-
-/// Wakes a Submission.
-pub type WakeSubmission = Box<dyn Fn(ObjectRef<Submission>) + Send + Sync>;
 
 /// The workers of all buckets. Cheap to ask in each reconcile: nothing here waits.
 pub struct ArchiveWorkers {
@@ -43,7 +40,7 @@ pub struct ArchiveWorkers {
 struct Shared {
     aws: Aws,
     client: Client,
-    wake: WakeSubmission,
+    wake: Wake<Submission>,
     tasks: Tasks,
 }
 
@@ -82,7 +79,7 @@ struct Run {
 
 impl ArchiveWorkers {
     /// `wake` gets each object that has something new to decide on.
-    pub fn new(aws: Aws, client: Client, tasks: Tasks, wake: WakeSubmission) -> Self {
+    pub fn new(aws: Aws, client: Client, tasks: Tasks, wake: Wake<Submission>) -> Self {
         let shared = Shared {
             aws,
             client,

@@ -4,8 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::digest::ReportDigest;
-use crate::controller::submissions::decide::LogPlace;
-use crate::controller::submissions::failure_log::Tail;
+use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::view::{ReportDemand, TextProblem, Texts};
 use leaderboard_api::Storage;
 
@@ -32,16 +31,6 @@ pub struct Target {
     pub name: String,
     pub storage: Storage,
     pub run_id: String,
-}
-
-/// Which log is to be kept.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LogDemand {
-    pub attempt: i64,
-    pub retry: i32,
-    pub places: Vec<LogPlace>,
-    /// The submission has come to its end, so that its log is stored too.
-    pub is_over: bool,
 }
 
 /// Something to do now.
@@ -96,14 +85,6 @@ pub(super) enum Answer {
         report: Arc<ReportDigest>,
     },
     Failed(String),
-}
-
-/// What came of looking for a log.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LogAnswer {
-    pub tail: Option<Tail>,
-    /// One that may have it did not answer, or storing failed.
-    pub is_unclear: bool,
 }
 
 /// What came of work.

@@ -11,9 +11,9 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::digest::ReportId;
-use super::request::{Done, KINDS, Kind, LIMITS, LogAnswer, LogDemand, Target, Uid, What, Work};
+use super::request::{Done, KINDS, Kind, LIMITS, Target, Uid, What, Work};
 use super::run::{Content, FenceRun, LogRun, ReportRun, Run, TextsRun, answers};
-use crate::controller::submissions::failure_log::Tail;
+use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::view::{
     ObservedFence, ObservedLog, ObservedReport, ObservedTexts, ReportDemand, Stage,
 };

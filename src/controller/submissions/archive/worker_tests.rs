@@ -69,7 +69,7 @@ impl Bench {
     }
 
     fn workers(&self) -> &ArchiveWorkers {
-        &self.around.context.archive_workers
+        &self.around.context.archive
     }
 
     fn status(&self) -> SubmissionStatus {

@@ -4,14 +4,15 @@ use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::{Draft, after};
 use super::failure::{self, infrastructure};
 use super::isolation::Missing;
-use super::{Action, end, isolation};
+use super::plan::Action;
+use super::plan_builder::{PlanBuilder, after};
+use super::{end, isolation};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{ImageReference, LeaderboardSpec, State, Team, TeamStatus, Track, effective, reasons};
+use leaderboard_api::{ImageReference, LeaderboardSpec, Team, TeamStatus, Track, effective, reasons};
 
 /// How long EvalAI may take before its silence is shown.
 const RETRY: Duration = Duration::from_secs(30);
@@ -23,7 +24,7 @@ const POLICY_SECONDS: i64 = 5;
 
 /// Whether the submission may go on to its turn. Otherwise the draft says why not. EvalAI's own end goes before all that it may
 /// wait for.
-pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
         let message = no_leaderboard(draft);
         return refuse(draft, reasons::LEADERBOARD_NOT_FOUND, &message);
@@ -74,7 +75,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> bool {
 }
 
 /// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
-fn wait_for_policy(draft: &mut Draft<'_>, missing: &Missing) -> bool {
+fn wait_for_policy(draft: &mut PlanBuilder<'_>, missing: &Missing) -> bool {
     let created = draft.submission().metadata.creation_timestamp.as_ref();
     let until = after(created.map_or(draft.now(), |time| time.0), POLICY_SECONDS);
     if draft.now() < until && !missing.is_refused {
@@ -103,13 +104,13 @@ fn ended_in_evalai(status: &str) -> String {
 }
 
 /// What is said while the Leaderboard does not exist.
-pub(super) fn no_leaderboard(draft: &Draft<'_>) -> String {
+pub(super) fn no_leaderboard(draft: &PlanBuilder<'_>) -> String {
     let name = &draft.spec().leaderboard_name;
     format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
 }
 
 /// Faults of the Leaderboard with which no Job can be made, or none may. The others speak for themselves where they hurt.
-fn not_ready(draft: &Draft<'_>) -> Option<String> {
+fn not_ready(draft: &PlanBuilder<'_>) -> Option<String> {
     let status = draft.view.leaderboard.as_ref()?.status.as_ref()?;
     let ready = conditions::get(&status.conditions, conditions::READY).filter(|c| c.status == "False")?;
     let blocks = [reasons::INVALID_POD, reasons::PREFIX_CONFLICT].contains(&ready.reason.as_str());
@@ -136,7 +137,7 @@ enum Image {
 }
 
 /// The image that was pinned, else the object's, else that of the file in EvalAI.
-fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
+fn image(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Image {
     let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
     let named = pinned
         .filter(|image| !image.is_empty())
@@ -159,7 +160,7 @@ fn image(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Image {
 }
 
 /// What is said while the file in EvalAI cannot be read.
-fn image_unread(draft: &Draft<'_>) -> String {
+fn image_unread(draft: &PlanBuilder<'_>) -> String {
     let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
     let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
     format!(
@@ -169,7 +170,7 @@ fn image_unread(draft: &Draft<'_>) -> String {
 }
 
 /// What is said of a row that belongs to another phase than the Submission: its run would count for neither.
-fn foreign_phase(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Option<String> {
+fn foreign_phase(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Option<String> {
     let evalai = draft.spec().evalai?;
     let (pk, ours) = (evalai.submission, evalai.phase);
     let theirs = info?.phase.filter(|theirs| *theirs != ours)?;
@@ -180,7 +181,7 @@ fn foreign_phase(draft: &Draft<'_>, info: Option<&EvalaiInfo>) -> Option<String>
 
 /// Waits until the row is of our phase again. The object may have been applied with a wrong phase, so nothing is reported at
 /// once; but the participant's submission does not wait for an end without limit.
-fn wait_for_phase(draft: &mut Draft<'_>, what: &str) -> bool {
+fn wait_for_phase(draft: &mut PlanBuilder<'_>, what: &str) -> bool {
     let message = format!(
         "{what} Set phase {} back in EvalAI, or delete this Submission and apply it with the right phase; after {} min it \
          fails, uncharged.",
@@ -205,7 +206,7 @@ enum Answer {
     Wanted(EvalaiInfo),
 }
 
-fn ask_evalai(draft: &mut Draft<'_>) -> Answer {
+fn ask_evalai(draft: &mut PlanBuilder<'_>) -> Answer {
     if draft.spec().evalai.is_none() {
         return Answer::NotNeeded;
     }
@@ -220,7 +221,7 @@ fn ask_evalai(draft: &mut Draft<'_>) -> Answer {
                 Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(&error))),
                 None => asking(None),
             };
-            draft.say(State::Pending, reasons::ASKING_EVALAI, message);
+            draft.show(reasons::ASKING_EVALAI, message);
             draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::ASKING_EVALAI, "");
             Answer::Waiting
         }
@@ -235,7 +236,7 @@ fn asking(error: Option<&str>) -> String {
     )
 }
 
-fn find_track<'a>(draft: &Draft<'_>, leaderboard: &'a LeaderboardSpec) -> Option<&'a Track> {
+fn find_track<'a>(draft: &PlanBuilder<'_>, leaderboard: &'a LeaderboardSpec) -> Option<&'a Track> {
     match (&draft.spec().evalai, &draft.spec().track) {
         (Some(evalai), _) => leaderboard.tracks.iter().find(|t| t.phase == Some(evalai.phase)),
         (None, Some(name)) => leaderboard.tracks.iter().find(|t| t.name == *name),
@@ -243,7 +244,7 @@ fn find_track<'a>(draft: &Draft<'_>, leaderboard: &'a LeaderboardSpec) -> Option
     }
 }
 
-fn missing_track(draft: &Draft<'_>, leaderboard: &LeaderboardSpec) -> String {
+fn missing_track(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> String {
     let known: Vec<&str> = leaderboard.tracks.iter().map(|t| t.name.as_str()).collect();
     let what = match (&draft.spec().evalai, &draft.spec().track) {
         (Some(evalai), _) => format!("No track has the phase {}", evalai.phase),
@@ -265,7 +266,7 @@ fn shown(team: &Team) -> Team {
     }
 }
 
-fn take_team(draft: &mut Draft<'_>, info: Option<&EvalaiInfo>) {
+fn take_team(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) {
     let given = draft.spec().team.as_ref().map(shown);
     let is_pinned = draft.status.plan.is_some() && draft.status.team.is_some();
     if is_pinned {
@@ -284,7 +285,13 @@ fn take_team(draft: &mut Draft<'_>, info: Option<&EvalaiInfo>) {
     }
 }
 
-fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String, info: Option<&EvalaiInfo>) {
+fn pin(
+    draft: &mut PlanBuilder<'_>,
+    leaderboard: &LeaderboardSpec,
+    track: &Track,
+    image: String,
+    info: Option<&EvalaiInfo>,
+) {
     let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
     let plan = match draft.status.plan.take() {
         // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
@@ -309,8 +316,8 @@ fn pin(draft: &mut Draft<'_>, leaderboard: &LeaderboardSpec, track: &Track, imag
     }
 }
 
-fn refuse(draft: &mut Draft<'_>, reason: &str, message: &str) -> bool {
+fn refuse(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) -> bool {
     draft.condition(conditions::ACCEPTED, Truth::False, reason, message);
-    draft.say(State::Pending, reason, message);
+    draft.show(reason, message);
     false
 }

@@ -5,9 +5,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::{Draft, after, seconds};
+use super::plan::{Action, EvalaiUpdate};
+use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
-use super::{Action, EvalaiUpdate, accept, log, stop};
+use super::{accept, log, state, stop};
 use crate::controller::submissions::view::{EvalaiEnd, JobView, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -26,7 +27,7 @@ const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: o
                            needed.";
 
 /// Decides for a submission in a terminal state.
-pub(super) fn decide(draft: &mut Draft<'_>) {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     leave_job(draft);
     show_refused_attempt(draft);
     // Before EvalAI has the end, since its hosts read it there.
@@ -47,7 +48,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
 }
 
 /// Shows once that EvalAI's row asks for another attempt which does not begin.
-fn show_refused_attempt(draft: &mut Draft<'_>) {
+fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
     let refused = Ingested::of(draft.submission()).and_then(|record| record.refused);
     let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt + 1) else {
         return;
@@ -77,7 +78,7 @@ enum Delivery {
 }
 
 /// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
-pub(super) fn leave_job(draft: &mut Draft<'_>) {
+pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
     let ObservedJob::Ours(job) = &draft.view.job else {
         return;
     };
@@ -97,7 +98,7 @@ pub(super) fn leave_job(draft: &mut Draft<'_>) {
 }
 
 /// Until when a Pod whose run has ended may take to say its farewell; None if nothing is to be waited for.
-fn farewell(draft: &Draft<'_>) -> Option<Timestamp> {
+fn farewell(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
     pod.run_ended?;
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
@@ -105,12 +106,12 @@ fn farewell(draft: &Draft<'_>) -> Option<Timestamp> {
     (draft.now() < until).then_some(until)
 }
 
-fn is_not_wanted(draft: &Draft<'_>, type_: &str) -> bool {
+fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
     conditions::get(&draft.status.conditions, type_).is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
 }
 
 /// A Leaderboard that is gone can't say what is wanted: what was decided before stands, and what never ran needs nothing.
-fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Delivery {
+fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
     if is_not_wanted(draft, type_) {
         return Delivery::Done;
     }
@@ -125,7 +126,7 @@ fn without_leaderboard(draft: &mut Draft<'_>, type_: &str) -> Delivery {
 
 /// Notes that EvalAI has cancelled a result because it was re-run, of which nobody is notified. Returns whether EvalAI has to be
 /// asked for that: the re-run's row can be edited by its participant, so it alone is no proof.
-fn follow_rerun(draft: &mut Draft<'_>) -> bool {
+fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
     let rerun = draft.view.rerun_as.clone().filter(|_| draft.status.rerun_as.is_none());
     let Some(rerun) = rerun.filter(|_| !draft.is_deleting() && draft.leaderboard().is_some()) else {
         return false;
@@ -164,7 +165,7 @@ fn follow_rerun(draft: &mut Draft<'_>) -> bool {
 }
 
 /// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
-fn record_again(draft: &mut Draft<'_>) -> bool {
+fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
     let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
     if is_recorded {
         draft.act(Action::Record { end: true });
@@ -182,7 +183,7 @@ fn may_be_older(read_at: Option<Timestamp>, rerun: Option<&Time>, now: Timestamp
     rerun.0 <= latest && read_at <= after(rerun.0, RERUN_SECONDS)
 }
 
-fn publish(draft: &mut Draft<'_>, log_left: Option<Duration>) -> Delivery {
+fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
@@ -220,14 +221,14 @@ fn publish(draft: &mut Draft<'_>, log_left: Option<Duration>) -> Delivery {
 }
 
 /// Sends the end with all that belongs to it, once that is there.
-fn send_end(draft: &mut Draft<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
+fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
     let mut unread = None;
     match reading::result_of_end(draft) {
         Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why)),
         Reading::Done if log_left.is_some() => {}
-        Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state {
-            Some(State::Finished) => EvalaiUpdate::Finished,
-            Some(State::Cancelled) => EvalaiUpdate::Cancelled,
+        Reading::Done => draft.act(Action::UpdateEvalai(match state::of(&draft.status) {
+            State::Finished => EvalaiUpdate::Finished,
+            State::Cancelled => EvalaiUpdate::Cancelled,
             _ => EvalaiUpdate::Failed,
         })),
     }
@@ -252,7 +253,7 @@ fn send_end(draft: &mut Draft<'_>, error: Option<String>, is_overtaken: bool, lo
 }
 
 /// EvalAI has the end. Its row may by now be another team's, to whom EvalAI shows the result: participants can edit it.
-fn published(draft: &mut Draft<'_>, team: Option<&str>) {
+fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
     let ours = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
     let moved = ours.zip(team).filter(|(ours, theirs)| ours != theirs);
     let message = moved.map(|(ours, theirs)| {
@@ -270,10 +271,10 @@ fn published(draft: &mut Draft<'_>, team: Option<&str>) {
 }
 
 /// Whether it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
-fn is_of_another_phase(draft: &Draft<'_>) -> bool {
+fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
     let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
     let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
-    differs && draft.status.plan.is_none() && draft.status.state == Some(State::Cancelled)
+    differs && draft.status.plan.is_none() && state::of(&draft.status) == State::Cancelled
 }
 
 /// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
@@ -286,7 +287,7 @@ pub fn previous_controller(until: Timestamp) -> String {
 }
 
 /// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
-fn cannot_be_read(draft: &Draft<'_>, type_: &str, why: &str) -> String {
+fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     const BEGINS: &str = "The stored result cannot be read:";
     let known = conditions::get(&draft.status.conditions, type_).map(|c| c.message.clone());
     let known = known.filter(|message| message.starts_with(BEGINS));
@@ -299,13 +300,13 @@ fn cannot_be_read(draft: &Draft<'_>, type_: &str, why: &str) -> String {
 }
 
 /// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
-fn is_overtaken(draft: &Draft<'_>) -> bool {
+fn is_overtaken(draft: &PlanBuilder<'_>) -> bool {
     let published = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
     draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
         || published.is_some_and(|c| c.reason == reasons::CONCURRENT_UPDATE)
 }
 
-fn refused(draft: &mut Draft<'_>, message: &str) {
+fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
     let message = format!(
         "EvalAI does not take the result: {} Compare its metrics with the leaderboard of the phase; it is tried again \
          from time to time.",
@@ -320,15 +321,15 @@ fn refused(draft: &mut Draft<'_>, message: &str) {
 }
 
 /// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
-fn amend(draft: &mut Draft<'_>, status: &str) -> Delivery {
+fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
-    if draft.status.state == Some(State::Cancelled) {
+    if state::of(&draft.status) == State::Cancelled {
         return Delivery::Done;
     }
     draft.status.failure = None;
     let message = format!("EvalAI says {status}, so the result is not published.");
     draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
-    draft.say(State::Cancelled, reasons::ENDED_IN_EVALAI, message);
+    draft.show(reasons::ENDED_IN_EVALAI, message);
     if !conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
         return Delivery::Done;
     }
@@ -338,7 +339,7 @@ fn amend(draft: &mut Draft<'_>, status: &str) -> Delivery {
     Delivery::Waiting
 }
 
-fn record(draft: &mut Draft<'_>) -> Delivery {
+fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
     if conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
         return Delivery::Done;
     }
@@ -383,7 +384,7 @@ fn record(draft: &mut Draft<'_>) -> Delivery {
 }
 
 /// Whether all that the row shows is there: only that of a finished submission has metrics.
-fn row_of_end(draft: &mut Draft<'_>) -> Reading {
+fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     if draft.is_successful() {
         reading::report_of_end(draft)
     } else {
@@ -391,7 +392,7 @@ fn row_of_end(draft: &mut Draft<'_>) -> Reading {
     }
 }
 
-fn keep_job_for_its_time(draft: &mut Draft<'_>, job: &JobView) {
+fn keep_job_for_its_time(draft: &mut PlanBuilder<'_>, job: &JobView) {
     if !job.has_ttl && !job.deleting {
         let seconds = draft.leaderboard().map_or(86_400, |l| l.ttl_seconds_after_finished);
         draft.act(Action::SetJobTtl {
@@ -401,7 +402,7 @@ fn keep_job_for_its_time(draft: &mut Draft<'_>, job: &JobView) {
     }
 }
 
-fn release(draft: &mut Draft<'_>, complete: bool) {
+fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
     let Some(deleted) = draft.submission().metadata.deletion_timestamp.clone() else {
         return;
     };

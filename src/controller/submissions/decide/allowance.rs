@@ -3,19 +3,19 @@
 //!
 //! Called by `end`.
 
-use super::draft::Draft;
+use super::plan_builder::PlanBuilder;
 use leaderboard_api::{Failure, reasons};
 
 /// Submissions of a team that may end so in a Leaderboard within a day, each with all its Jobs.
 const FREE_SUBMISSIONS: usize = 3;
 
 /// Whether no further Job follows a failure, because of what the team had before.
-pub(super) fn is_used_up(draft: &Draft<'_>, found: &Failure) -> bool {
+pub(super) fn is_used_up(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
     found.reason == reasons::SIMULATION_CRASHED && draft.view.simulator_failures_of_team >= FREE_SUBMISSIONS
 }
 
 /// Adds the team's count to what hosts read of a submission that ends so.
-pub(super) fn counted(draft: &Draft<'_>, found: Failure) -> Failure {
+pub(super) fn counted(draft: &PlanBuilder<'_>, found: Failure) -> Failure {
     let team = draft.status.team.as_ref();
     let Some(team) = team.and_then(|team| team.id.as_deref().or(team.name.as_deref())) else {
         return found;

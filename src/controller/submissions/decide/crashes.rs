@@ -7,9 +7,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use leaderboard_runner::protocol::{Member, Pair, Side};
 
 use super::blame::{self, Crash};
-use super::draft::{Draft, after};
 use super::failure::{infrastructure, participant};
-use super::next_steps::{Steps, for_both, in_the_log_of, smaller};
+use super::next_steps::{Steps, for_both, in_the_log_of, of_participant, smaller};
+use super::plan_builder::{PlanBuilder, after};
 use crate::controller::submissions::archive::digest::ReportDigest;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
@@ -83,7 +83,7 @@ fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
 }
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
-pub(super) fn too_many(draft: &mut Draft<'_>) -> Option<Failure> {
+pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     let limit = draft.retries().per_pair.saturating_add(1);
     let is_too_many =
         |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair) == Some(EndReason::CannotStart));
@@ -175,7 +175,7 @@ fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, St
         EndReason::CannotStart | EndReason::StartError => (
             reasons::CANNOT_START,
             format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
-            for_both("Rebuild the image for linux/amd64."),
+            for_both(&of_participant(reasons::CANNOT_START)),
         ),
         EndReason::BlamesSimulator => (
             reasons::AGENT_CRASHED,

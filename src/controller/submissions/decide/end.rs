@@ -5,13 +5,13 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::{Draft, after};
+use super::plan_builder::{PlanBuilder, after};
 use super::{allowance, crashes, failure, reading};
 use crate::controller::submissions::archive::digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, State, reasons};
+use leaderboard_api::{Failure, FailureClass, reasons};
 
 /// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
 const NO_ANSWER: &str = "its bucket has not answered yet.";
@@ -27,7 +27,7 @@ const READ_SECONDS: i64 = 86_400;
 const READ_AT_LEAST_SECONDS: i64 = 60;
 
 /// The Job is terminal, or gone because we ended it (`None`).
-pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     let view = draft.view;
     // A mark that comes late would stop the next Pod.
     if let Some(left) = reading::requested_fence_left(draft) {
@@ -73,7 +73,7 @@ pub(super) fn decide(draft: &mut Draft<'_>, job_end: Option<&JobEnd>) {
 
 /// Finishes a run whose agents and simulators have ended well and whose complete results are stored and count: nothing that its
 /// Pod still does can change them. Returns whether it did. Every other end waits for the Job.
-pub(super) fn of_complete_run(draft: &mut Draft<'_>) -> bool {
+pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
     let view = draft.view;
     let Some(pod) = view.pod.as_ref().filter(|pod| pod.run_ended.is_some()) else {
         return false;
@@ -99,7 +99,7 @@ pub(super) fn is_verdict(report: &ReportDigest) -> bool {
 }
 
 /// Whether the end still waits until the bucket can be read.
-fn wait_for_bucket(draft: &mut Draft<'_>, why: &str) -> bool {
+fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
     let limit = if draft.is_cancelled() {
         draft.deadlines().cancel_seconds.max(READ_AT_LEAST_SECONDS)
     } else {
@@ -115,20 +115,20 @@ fn wait_for_bucket(draft: &mut Draft<'_>, why: &str) -> bool {
     if draft.now() >= until {
         return false;
     }
-    draft.say(draft.live_state(), reasons::NOT_STORED, message);
+    draft.show(reasons::NOT_STORED, message);
     draft.requeue_at(until);
     draft.requeue_in(Duration::from_secs(10));
     true
 }
 
 /// Ends as Cancelled; nothing needs to be stopped any more.
-pub(super) fn cancelled(draft: &mut Draft<'_>, reason: &str, message: &str) {
+pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     draft.status.failure = None;
-    close(draft, State::Cancelled, reason, message);
+    close(draft, reason, message);
 }
 
 /// Why a cancelled submission was cancelled.
-pub(super) fn cancel_reason(draft: &Draft<'_>) -> &'static str {
+pub(super) fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
     if draft.spec().cancel {
         reasons::CANCELLED
     } else if draft.is_deleting() {
@@ -141,7 +141,7 @@ pub(super) fn cancel_reason(draft: &Draft<'_>) -> &'static str {
 }
 
 fn cause(
-    draft: &Draft<'_>,
+    draft: &PlanBuilder<'_>,
     report: Option<&ReportDigest>,
     complete: Option<&ReportDigest>,
     job_end: Option<&JobEnd>,
@@ -154,13 +154,34 @@ fn cause(
         return failure::not_eligible(&report.entry_status);
     }
     match job_end {
-        Some(end) => failure::of_job(draft, end),
+        Some(end) => of_job(draft, end),
         None => failure::job_deleted(),
     }
 }
 
+/// The failure of a Job that ended without final results.
+fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
+    if let Some(found) = draft.view.pod.as_ref().and_then(failure::disk_full) {
+        return found;
+    }
+    match end {
+        JobEnd::Complete { .. } => failure::results_not_stored(),
+        // Without a limit on the run the deadline is not ours.
+        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds > 0 => {
+            failure::charged(
+                reasons::TIME_LIMIT,
+                "The Pod reached its time limit; finished routes are kept.",
+            )
+        }
+        JobEnd::Failed { reason, message, .. } => crashes::worst(&draft.status).unwrap_or_else(|| {
+            let what = format!("The Job failed with {reason}: {}", sentence(message));
+            failure::infrastructure(reasons::JOB_FAILED, &what)
+        }),
+    }
+}
+
 /// Failures that a second try may fix.
-fn may_retry(draft: &Draft<'_>, found: &Failure) -> bool {
+fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
     const NOT_MENDABLE: [&str; 3] = [reasons::PREFIX_IN_USE, reasons::JOB_DELETED, reasons::SCHEDULE_DEADLINE];
     let is_mendable = !NOT_MENDABLE.contains(&found.reason.as_str());
     // A higher attempt that is already requested takes the place of a retry.
@@ -171,7 +192,7 @@ fn may_retry(draft: &Draft<'_>, found: &Failure) -> bool {
         && draft.status.retry < draft.retries().infrastructure
 }
 
-fn retry(draft: &mut Draft<'_>, found: &Failure) {
+fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     let delay = RETRY_SECONDS << draft.status.retry.clamp(0, MAX_DOUBLINGS);
     let at = after(draft.now(), delay);
     draft.status.retry += 1;
@@ -190,26 +211,26 @@ fn retry(draft: &mut Draft<'_>, found: &Failure) {
     let message = format!("{what} It is tried again in {delay} s; this costs no attempt.");
     draft.moves();
     draft.condition(conditions::RUNNING, Truth::False, &found.reason, what);
-    draft.say(State::Pending, reasons::REPLACING, message);
+    draft.show(reasons::REPLACING, message);
     draft.requeue_at(at);
 }
 
-fn finished(draft: &mut Draft<'_>, report: &ReportDigest) {
+fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     draft.status.failure = None;
     let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
     let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
-    close(draft, State::Finished, reasons::FINISHED, &message);
+    close(draft, reasons::FINISHED, &message);
 }
 
 /// Ends as Failed; nothing needs to be stopped any more.
-pub(super) fn failed(draft: &mut Draft<'_>, found: Failure) {
+pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
     let found = failure::at_the_end(found);
     let (reason, message) = (found.reason.clone(), found.message.clone());
     draft.status.failure = Some(found);
-    close(draft, State::Failed, &reason, &message);
+    close(draft, &reason, &message);
 }
 
-fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
+fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
     draft.status.times.finished = Some(Time(ended));
@@ -233,7 +254,7 @@ fn close(draft: &mut Draft<'_>, state: State, reason: &str, message: &str) {
     if draft.view.record.is_some() {
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     }
-    draft.say(state, reason, message);
+    draft.show(reason, message);
 }
 
 /// A time span in its two largest units.

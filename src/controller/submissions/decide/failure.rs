@@ -3,10 +3,8 @@
 //! Called by the stages of `decide`. The class says whose failure it is; only a participant's is charged. Those of crashed
 //! pairs are in `crashes`.
 
-use super::crashes;
-use super::draft::Draft;
-use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure};
-use crate::controller::submissions::view::{JobEnd, ObservedNode, PodView};
+use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure, of_participant};
+use crate::controller::submissions::view::{ObservedNode, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, reasons};
@@ -24,6 +22,11 @@ pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
         charged: true,
         pair: None,
     }
+}
+
+/// The same with the next step of the table of reasons, which both readers can take.
+pub(super) fn charged(reason: &str, what: &str) -> Failure {
+    participant(reason, what, &for_both(&of_participant(reason)))
 }
 
 /// A failure that is not: `what` happened, in one sentence for hosts. As long as another Job may follow there is no next step.
@@ -56,8 +59,7 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
 
 /// What was submitted names no image that could ever be pulled.
 pub(super) fn image_invalid(what: &str) -> Failure {
-    let next = for_both("Submit again with an image as in registry.example/team/agent:1.");
-    participant(reasons::IMAGE_INVALID, what, &next)
+    charged(reasons::IMAGE_INVALID, what)
 }
 
 pub(super) fn job_deleted() -> Failure {
@@ -76,11 +78,7 @@ pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure
 
 pub(super) fn time_limit(seconds: i64) -> Failure {
     let what = format!("The run took longer than {seconds} s and was stopped; finished routes are kept.");
-    participant(reasons::TIME_LIMIT, &what, &faster())
-}
-
-fn faster() -> Steps {
-    for_both("Make the agent faster, or ask the host for more time.")
+    charged(reasons::TIME_LIMIT, &what)
 }
 
 pub(super) fn results_not_stored() -> Failure {
@@ -92,10 +90,9 @@ pub(super) fn results_not_stored() -> Failure {
 
 pub(super) fn invalid_results(why: &str) -> Failure {
     let what = format!("The results cannot be used: {}", sentence(why));
-    let next = for_both("Check what the agent writes into its checkpoint, and submit again.");
     Failure {
         pair: pair_named(why),
-        ..participant(reasons::INVALID_RESULTS, &what, &next)
+        ..charged(reasons::INVALID_RESULTS, &what)
     }
 }
 
@@ -114,8 +111,7 @@ pub(super) fn not_eligible(entry_status: &str) -> Failure {
         );
     }
     let what = format!("The run ended as {entry_status}, so its results do not count.");
-    let next = for_both("Compare the agent's sensors with those the track allows, and submit again.");
-    participant(reasons::NOT_ELIGIBLE, &what, &next)
+    charged(reasons::NOT_ELIGIBLE, &what)
 }
 
 /// A Pod that was evicted because the agent's side filled its disk. Another Pod would run into it again.
@@ -124,8 +120,7 @@ pub(super) fn disk_full(pod: &PodView) -> Option<Failure> {
     let is_agents = reason == "Evicted" && is_agents_disk(message);
     is_agents.then(|| {
         let what = format!("The Pod was evicted because it filled its disk: {}", sentence(message));
-        let next = for_both("Write less to disk or to the log.");
-        participant(reasons::DISK_FULL, &what, &next)
+        charged(reasons::DISK_FULL, &what)
     })
 }
 
@@ -145,27 +140,5 @@ pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
         Stop::RunDeadline
     } else {
         Stop::Retries
-    }
-}
-
-/// The failure of a Job that ended without final results.
-pub(super) fn of_job(draft: &Draft<'_>, end: &JobEnd) -> Failure {
-    if let Some(failure) = draft.view.pod.as_ref().and_then(disk_full) {
-        return failure;
-    }
-    match end {
-        JobEnd::Complete { .. } => results_not_stored(),
-        // Without a limit on the run the deadline is not ours.
-        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds > 0 => {
-            participant(
-                reasons::TIME_LIMIT,
-                "The Pod reached its time limit; finished routes are kept.",
-                &faster(),
-            )
-        }
-        JobEnd::Failed { reason, message, .. } => crashes::worst(&draft.status).unwrap_or_else(|| {
-            let what = format!("The Job failed with {reason}: {}", sentence(message));
-            infrastructure(reasons::JOB_FAILED, &what)
-        }),
     }
 }

@@ -1,6 +1,6 @@
 //! No Job without the NetworkPolicy of its Leaderboard, as the Leaderboard's present spec asks for it.
 
-use super::draft::Draft;
+use super::plan_builder::PlanBuilder;
 use leaderboard_api::PolicySource;
 use leaderboard_api::conditions;
 use leaderboard_api::text::sentence;
@@ -15,7 +15,7 @@ pub(super) struct Missing {
 
 /// Why no Job may be made, if the policy is not in place. It is restored by the Leaderboard's reconcile, which wakes the
 /// submission.
-pub(super) fn missing(draft: &Draft<'_>) -> Option<Missing> {
+pub(super) fn missing(draft: &PlanBuilder<'_>) -> Option<Missing> {
     let leaderboard = draft.view.leaderboard.as_ref()?;
     let is_managed = leaderboard.spec.network.policy == PolicySource::Managed;
     if !is_managed || draft.view.is_policy_in_place {

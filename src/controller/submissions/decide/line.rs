@@ -1,9 +1,9 @@
 //! In line for a slot: joins it, and shows the place. Who is next is decided by `slots`.
 
-use super::Action;
-use super::draft::Draft;
+use super::plan::Action;
+use super::plan_builder::PlanBuilder;
 use crate::controller::slots::turns::{InLine, Turn};
-use leaderboard_api::{Eta, State, Waiting, reasons};
+use leaderboard_api::{Eta, Waiting, reasons};
 
 /// What follows from its turn.
 pub(super) enum Step {
@@ -16,7 +16,7 @@ pub(super) enum Step {
 }
 
 /// Decides for a submission that waits for nothing but a slot.
-pub(super) fn decide(draft: &mut Draft<'_>) -> Step {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> Step {
     let (position, eta, reason, message) = match draft.view.turn.clone() {
         Turn::Go => return Step::Start,
         Turn::NotInLine => {
@@ -40,13 +40,13 @@ pub(super) fn decide(draft: &mut Draft<'_>) -> Step {
     };
     draft.status.waiting = Some(Waiting::new(position, eta));
     draft.moves();
-    draft.say(State::Pending, reason, message);
+    draft.show(reason, message);
     // Its priority may have been edited since.
     join(draft);
     Step::Wait
 }
 
-fn join(draft: &mut Draft<'_>) {
+fn join(draft: &mut PlanBuilder<'_>) {
     let status = &draft.status;
     let team = status.team.as_ref();
     let team = team.and_then(|team| team.id.clone().or_else(|| team.name.clone()));
@@ -61,7 +61,7 @@ fn join(draft: &mut Draft<'_>) {
 }
 
 /// The wait that is shown of this place. One that is only estimated anew is not worth a write; it follows the place.
-fn known_eta(draft: &Draft<'_>, position: i32) -> Option<Eta> {
+fn known_eta(draft: &PlanBuilder<'_>, position: i32) -> Option<Eta> {
     let known = draft.status.waiting.as_ref().filter(|known| known.position == position);
     known.and_then(Waiting::eta)
 }

@@ -2,15 +2,16 @@
 
 use std::time::Duration;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::{Draft, after};
-use super::{Action, EvalaiUpdate, accept, crashes, end, failure, isolation, job_name, line, reading, start, stop};
+use super::plan::{Action, EvalaiUpdate, job_name};
+use super::plan_builder::{PlanBuilder, after};
+use super::{accept, crashes, end, failure, isolation, line, reading, start, stop};
 use crate::controller::submissions::archive::digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{PairStatus, Progress, Score, State, reasons};
+use leaderboard_api::{PairStatus, Progress, Score, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
@@ -22,7 +23,7 @@ const LIVE_BACKSTOP: Duration = Duration::from_mins(5);
 const LOOK: Duration = Duration::from_secs(15);
 
 /// Decides for a live submission.
-pub(super) fn decide(draft: &mut Draft<'_>) {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let view = draft.view;
     // Without a plan (a status that was lost) nothing can be made again before it is accepted.
     let has_job = draft.status.job_name.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
@@ -38,7 +39,7 @@ pub(super) fn decide(draft: &mut Draft<'_>) {
 }
 
 /// Looks for its end in EvalAI also while it waits and nothing is sent to EvalAI, whatever it waits for.
-fn follow(draft: &mut Draft<'_>) {
+fn follow(draft: &mut PlanBuilder<'_>) {
     let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
     // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
     let is_known = draft.status.times.submitted.is_some();
@@ -48,22 +49,22 @@ fn follow(draft: &mut Draft<'_>) {
     }
 }
 
-fn own_job_name(draft: &Draft<'_>) -> String {
+fn own_job_name(draft: &PlanBuilder<'_>) -> String {
     let name = draft.submission().metadata.name.as_deref().unwrap_or_default();
     job_name(name, &draft.status)
 }
 
-fn name_taken(draft: &mut Draft<'_>) {
+fn name_taken(draft: &mut PlanBuilder<'_>) {
     let message = format!(
         "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
         own_job_name(draft)
     );
     let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
-    draft.say(draft.live_state(), reasons::JOB_NAME_TAKEN, message);
+    draft.show(reasons::JOB_NAME_TAKEN, message);
     draft.requeue_in(Duration::from_secs(5));
 }
 
-fn in_line(draft: &mut Draft<'_>) {
+fn in_line(draft: &mut PlanBuilder<'_>) {
     if draft.is_cancelled() {
         let reason = end::cancel_reason(draft);
         let what = if reason == reasons::ENDED_IN_EVALAI {
@@ -94,14 +95,14 @@ fn in_line(draft: &mut Draft<'_>) {
 }
 
 /// Remembers which submission this one re-runs, so that the other learns of it.
-fn note_original(draft: &mut Draft<'_>) {
+fn note_original(draft: &mut PlanBuilder<'_>) {
     let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
     if draft.status.rerun_of.is_none() {
         draft.status.rerun_of = info.and_then(|info| info.rerun_of.clone());
     }
 }
 
-fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {
+fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(at) = draft.status.next_retry_time.as_ref().map(|t| t.0) else {
         return false;
     };
@@ -112,13 +113,13 @@ fn waits_for_next_try(draft: &mut Draft<'_>) -> bool {
     }
     if draft.status.reason.as_deref() != Some(reasons::REPLACING) {
         let message = "It is tried again after a failure that is not the participant's.";
-        draft.say(State::Pending, reasons::REPLACING, message);
+        draft.show(reasons::REPLACING, message);
     }
     draft.requeue_at(at);
     true
 }
 
-fn start_job(draft: &mut Draft<'_>) {
+fn start_job(draft: &mut PlanBuilder<'_>) {
     let name = own_job_name(draft);
     let (attempt, retry) = (draft.status.attempt.unwrap_or(1), draft.status.retry);
     let is_new = draft.status.job_name.is_none();
@@ -132,7 +133,7 @@ fn start_job(draft: &mut Draft<'_>) {
         start::replacing(draft, message);
     } else {
         draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
-        draft.say(State::Pending, reasons::PREPARING, start::PREPARED);
+        draft.show(reasons::PREPARING, start::PREPARED);
     }
     if is_new {
         draft.event(false, reasons::JOB_CREATED, format!("Created Job {name}."));
@@ -142,28 +143,12 @@ fn start_job(draft: &mut Draft<'_>) {
     draft.requeue_in(LOOK);
 }
 
-/// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
-/// crash or a slow watch looks the same. `start_job` sets the mark, `start::watch` takes it away.
-pub(super) fn was_seen(draft: &Draft<'_>) -> bool {
-    const BEFORE_IT: [&str; 3] = [
-        reasons::JOB_NAME_TAKEN,
-        reasons::LEADERBOARD_NOT_FOUND,
-        reasons::NOT_ISOLATED,
-    ];
-    let seen = |c: &Condition| match c.status.as_str() {
-        "True" => !BEFORE_IT.contains(&c.reason.as_str()),
-        _ => c.reason != reasons::PREPARING,
-    };
-    let stalled = conditions::get(&draft.status.conditions, conditions::STALLED);
-    draft.status.times.scheduled.is_some() || stalled.is_some_and(seen)
-}
-
 /// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
-fn without_its_job(draft: &mut Draft<'_>) {
+fn without_its_job(draft: &mut PlanBuilder<'_>) {
     // What the run has stored last decides whether it is made again.
     let is_read = reading::is_of(draft, Stage::JobEnded);
     if !draft.is_to_stop()
-        && was_seen(draft)
+        && draft.was_job_seen()
         && !is_read
         && let Some(left) = reading::answer_left(draft)
     {
@@ -171,24 +156,24 @@ fn without_its_job(draft: &mut Draft<'_>) {
     }
     // A report from before this Job was seen is its predecessor's.
     let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
-    if draft.is_to_stop() || (is_verdict && was_seen(draft)) {
+    if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
         return end::decide(draft, None);
     }
     if draft.leaderboard().is_none() {
         let message = accept::no_leaderboard(draft);
         let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
-        draft.say(draft.live_state(), reasons::LEADERBOARD_NOT_FOUND, message);
+        draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
         return draft.requeue_in(BACKSTOP);
     }
     if let Some(missing) = isolation::missing(draft) {
         draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
-        draft.say(draft.live_state(), reasons::NOT_ISOLATED, missing.message);
+        draft.show(reasons::NOT_ISOLATED, missing.message);
         return draft.requeue_in(BACKSTOP);
     }
     if let Some(left) = reading::requested_fence_left(draft) {
         return draft.requeue_in(left);
     }
-    if was_seen(draft) {
+    if draft.was_job_seen() {
         if draft.status.recreated >= MAX_RECREATED {
             draft.fail(failure::job_deleted());
             return end::decide(draft, None);
@@ -204,7 +189,7 @@ fn without_its_job(draft: &mut Draft<'_>) {
     start_job(draft);
 }
 
-fn with_job(draft: &mut Draft<'_>, job: &JobView) {
+fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     draft.status.job_name = Some(job.name.clone());
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
@@ -249,7 +234,7 @@ fn with_job(draft: &mut Draft<'_>, job: &JobView) {
     }
 }
 
-fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
+fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     let known = draft.status.node_name.take();
     draft.status.node_name = pod.node.clone().or(known);
     let times = &mut draft.status.times;
@@ -259,7 +244,7 @@ fn take_pod(draft: &mut Draft<'_>, pod: &PodView) {
     crashes::note(&mut draft.status, pod, now);
 }
 
-fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
+fn take_report(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let clamp = |n: u32| i32::try_from(n).unwrap_or(i32::MAX);
     draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
     if let Some(score) = report.score {
@@ -290,7 +275,7 @@ fn take_report(draft: &mut Draft<'_>, report: &ReportDigest) {
 }
 
 /// Says that scores do not follow from the infractions, and that they do again.
-fn note_scores(draft: &mut Draft<'_>, report: &ReportDigest) {
+fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let (truth, reason, message) = match &report.warning {
         Some(first) => {
             let message = format!("Scores do not follow from the infractions: {}", sentence(first));
@@ -303,7 +288,7 @@ fn note_scores(draft: &mut Draft<'_>, report: &ReportDigest) {
 }
 
 /// Limits of a run under way: disk, crashes, time.
-fn watch_run(draft: &mut Draft<'_>) {
+fn watch_run(draft: &mut PlanBuilder<'_>) {
     let evicted = draft.view.pod.as_ref().and_then(failure::disk_full);
     if let Some(found) = evicted.or_else(|| crashes::too_many(draft)) {
         return draft.fail(found);
@@ -326,7 +311,7 @@ fn watch_run(draft: &mut Draft<'_>) {
 
 /// When the clock of the run began: with its first agent. A Job that replaces one which the infrastructure took away has
 /// the whole time again, from its Pod's scheduling: waiting for a node costs the participant nothing.
-fn run_since(draft: &Draft<'_>) -> Option<jiff::Timestamp> {
+fn run_since(draft: &PlanBuilder<'_>) -> Option<jiff::Timestamp> {
     let times = &draft.status.times;
     let started = times.started.as_ref()?.0;
     match &times.scheduled {
@@ -336,7 +321,7 @@ fn run_since(draft: &Draft<'_>) -> Option<jiff::Timestamp> {
 }
 
 /// What EvalAI hears of a live submission; it is sent once, however often it is requested.
-fn update_evalai(draft: &mut Draft<'_>) {
+fn update_evalai(draft: &mut PlanBuilder<'_>) {
     if draft.spec().evalai.is_none() {
         return;
     }
@@ -355,7 +340,7 @@ fn update_evalai(draft: &mut Draft<'_>) {
     }
 }
 
-fn record(draft: &mut Draft<'_>) {
+fn record(draft: &mut PlanBuilder<'_>) {
     if draft.view.record.is_some() {
         draft.act(Action::Record { end: false });
     }

@@ -5,35 +5,19 @@
 
 use std::time::Duration;
 
-use super::draft::Draft;
-use super::{Action, trouble};
+use super::plan::{Action, LogAt, LogPlace};
+use super::plan_builder::PlanBuilder;
+use super::trouble;
 use crate::controller::submissions::view::{ObservedLog, PodView};
 use crate::pod::run::console;
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
-
-/// A place where a log may be.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct LogPlace {
-    /// Whose log it is.
-    pub container: String,
-    pub at: LogAt,
-}
-
-/// Where a log is kept.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum LogAt {
-    /// On the Pod's node; `previous`: of the container's last run, since it runs again.
-    Node { pod: String, previous: bool },
-    /// In S3, at this key below the run's prefix.
-    Bucket { key: String },
-}
 
 /// How long a log is waited for before its Pod goes, or EvalAI has the end without it.
 const LONGEST: Duration = Duration::from_secs(15);
 
 /// Requests the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away. Returns how
 /// long that end waits for it.
-pub(super) fn keep_while_there(draft: &mut Draft<'_>) -> Option<Duration> {
+pub(super) fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     if draft.is_cancelled() {
         return None;
     }
@@ -58,7 +42,7 @@ fn left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
 
 /// Requests the log of a run that has failed, until EvalAI's answer to the end is known: its hosts read it there. Returns how
 /// long EvalAI waits for it.
-pub(super) fn keep_at_end(draft: &mut Draft<'_>) -> Option<Duration> {
+pub(super) fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     let before = draft.view.submission.status.as_ref();
     let has_just_ended = !before.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
     let published = before.and_then(|s| conditions::get(&s.conditions, conditions::PUBLISHED));

@@ -9,14 +9,14 @@ use leaderboard_api::reasons;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Steps {
     pub(super) hosts: String,
-    pub(super) participant: &'static str,
+    pub(super) participant: String,
 }
 
 /// Both can do the same.
-pub(super) fn for_both(step: &'static str) -> Steps {
+pub(super) fn for_both(step: &str) -> Steps {
     Steps {
         hosts: step.to_owned(),
-        participant: step,
+        participant: step.to_owned(),
     }
 }
 
@@ -24,7 +24,9 @@ pub(super) fn for_both(step: &'static str) -> Steps {
 pub(super) fn in_the_log_of(agent: i32) -> Steps {
     Steps {
         hosts: of_participant(reasons::AGENT_CRASHED).replace("<n>", &agent.to_string()),
-        participant: "Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have its log.",
+        participant:
+            "Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have its log."
+                .to_owned(),
     }
 }
 
@@ -32,11 +34,12 @@ pub(super) fn in_the_log_of(agent: i32) -> Steps {
 pub(super) fn smaller() -> Steps {
     Steps {
         hosts: of_participant(reasons::OUT_OF_MEMORY),
-        participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.",
+        participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.".to_owned(),
     }
 }
 
-fn of_participant(reason: &str) -> String {
+/// The next step of the table of reasons.
+pub(super) fn of_participant(reason: &str) -> String {
     reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.next_step))
 }
 

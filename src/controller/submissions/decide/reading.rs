@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::Action;
-use super::draft::Draft;
+use super::plan::Action;
+use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::archive::digest::ReportDigest;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
@@ -35,7 +35,7 @@ pub(super) enum Reading {
 }
 
 /// Which report the present state of the run needs.
-pub(super) fn demand(draft: &Draft<'_>) -> Option<ReportDemand> {
+pub(super) fn demand(draft: &PlanBuilder<'_>) -> Option<ReportDemand> {
     let status = &draft.status;
     status.plan.as_ref()?;
     let stage = if draft.is_finished() {
@@ -53,7 +53,7 @@ pub(super) fn demand(draft: &Draft<'_>) -> Option<ReportDemand> {
 }
 
 /// An end that was decided on a complete run waits for its Job no more.
-fn stage_after_end(draft: &Draft<'_>) -> Stage {
+fn stage_after_end(draft: &PlanBuilder<'_>) -> Stage {
     let is_live = draft.view.job.ours().is_some_and(|job| job.end.is_none());
     let has_ended = draft.view.pod.as_ref().is_some_and(|pod| pod.run_ended.is_some());
     if is_live && has_ended && draft.is_successful() {
@@ -63,7 +63,7 @@ fn stage_after_end(draft: &Draft<'_>) -> Stage {
     }
 }
 
-fn stage_of_live(draft: &Draft<'_>) -> Option<Stage> {
+fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
     draft.status.job_name.as_ref()?;
     match &draft.view.job {
         ObservedJob::Ours(job) if job.end.is_some() => Some(Stage::JobEnded),
@@ -73,25 +73,25 @@ fn stage_of_live(draft: &Draft<'_>) -> Option<Stage> {
         ObservedJob::Ours(_) => draft.status.times.scheduled.as_ref().map(|_| Stage::Live),
         // One that was asked for just now is not there either.
         ObservedJob::Absent | ObservedJob::Foreign => {
-            (draft.is_to_stop() || super::live::was_seen(draft)).then_some(Stage::JobEnded)
+            (draft.is_to_stop() || draft.was_job_seen()).then_some(Stage::JobEnded)
         }
     }
 }
 
 /// Whether the report that is known was asked for at this stage of the run, or later.
-pub(super) fn is_of(draft: &Draft<'_>, stage: Stage) -> bool {
+pub(super) fn is_of(draft: &PlanBuilder<'_>, stage: Stage) -> bool {
     draft.view.report_stage >= Some(stage)
 }
 
 /// How long is still waited for an answer before anything is shown.
-pub(super) fn answer_left(draft: &Draft<'_>) -> Option<Duration> {
+pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     ANSWER
         .checked_sub(draft.view.report_waited)
         .filter(|left| !left.is_zero())
 }
 
 /// How long a lost Pod still waits for the fence.
-pub(super) fn fence_left(draft: &Draft<'_>) -> Option<Duration> {
+pub(super) fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     let waited = match draft.view.fence {
         // Without a plan nobody knows where it would be.
         _ if draft.status.plan.is_none() => return None,
@@ -103,12 +103,12 @@ pub(super) fn fence_left(draft: &Draft<'_>) -> Option<Duration> {
 }
 
 /// The same for what follows the Pod: only a fence that was requested is waited for.
-pub(super) fn requested_fence_left(draft: &Draft<'_>) -> Option<Duration> {
+pub(super) fn requested_fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     fence_left(draft).filter(|_| draft.view.fence != ObservedFence::NotRequested)
 }
 
 /// Whether the report of an ended run is there. Asks for it.
-pub(super) fn report_of_end(draft: &mut Draft<'_>) -> Reading {
+pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     // What never had a Job has stored nothing.
     let had_job = draft.status.job_name.is_some() || draft.status.retry > 0;
     if draft.status.plan.is_none() || !had_job {
@@ -128,7 +128,7 @@ pub(super) fn report_of_end(draft: &mut Draft<'_>) -> Reading {
 }
 
 /// Whether all that an end is published with is there. Asks for it.
-pub(super) fn result_of_end(draft: &mut Draft<'_>) -> Reading {
+pub(super) fn result_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     let reading = report_of_end(draft);
     let view = draft.view;
     let (Reading::Done, Some(report)) = (&reading, view.report.ours()) else {
@@ -152,7 +152,7 @@ pub(super) fn result_of_end(draft: &mut Draft<'_>) -> Reading {
 
 /// Whether the texts of a live report are there. Asks for them once: what is missing is left out, the next route has a result of
 /// its own.
-pub(super) fn has_texts(draft: &mut Draft<'_>, report: &ReportDigest) -> bool {
+pub(super) fn has_texts(draft: &mut PlanBuilder<'_>, report: &ReportDigest) -> bool {
     match &draft.view.texts {
         ObservedTexts::Read(texts) if texts.of == report.id => texts.problem.is_none(),
         _ => {
@@ -163,7 +163,7 @@ pub(super) fn has_texts(draft: &mut Draft<'_>, report: &ReportDigest) -> bool {
 }
 
 /// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
-fn may_wait(draft: &Draft<'_>, longest: SignedDuration) -> bool {
+fn may_wait(draft: &PlanBuilder<'_>, longest: SignedDuration) -> bool {
     let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
     let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
     let patience = until(end.map_or(draft.now(), |c| c.last_transition_time.0), longest);

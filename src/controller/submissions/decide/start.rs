@@ -6,14 +6,15 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::draft::{Draft, after};
 use super::failure::{self, infrastructure, participant};
 use super::next_steps::for_both;
+use super::plan_builder::{PlanBuilder, after};
+use super::state;
 use super::trouble::{self, Trouble};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, State, names, reasons};
+use leaderboard_api::{Failure, names, reasons};
 
 /// The message for a Pod that starts as it should.
 pub(super) const PREPARED: &str = "The Pod is being prepared.";
@@ -29,7 +30,7 @@ const SETTLE_SECONDS: i64 = 5;
 const POD_SECONDS: i64 = 45;
 
 /// Reports how far a Job's Pod is, and fails the attempt when a start has taken too long.
-pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
+pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let view = draft.view;
     let Some(pod) = &view.pod else {
         return without_pod(draft, job);
@@ -72,7 +73,7 @@ pub(super) fn watch(draft: &mut Draft<'_>, job: &JobView) {
 }
 
 /// The message for a run whose node is away, before Kubernetes has given its Pod up.
-fn left_by_node(draft: &Draft<'_>, pod: &PodView) -> Option<String> {
+fn left_by_node(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
     let node = pod.node.as_deref().filter(|_| draft.is_running())?;
     match draft.view.node {
         ObservedNode::Gone => Some(format!(
@@ -86,39 +87,45 @@ fn left_by_node(draft: &Draft<'_>, pod: &PodView) -> Option<String> {
 }
 
 /// Shows a live submission whose agents are gone and come back.
-pub(super) fn replacing(draft: &mut Draft<'_>, message: &str) {
-    draft.condition(conditions::RUNNING, Truth::False, reasons::REPLACING, "");
-    draft.say(draft.live_state(), reasons::REPLACING, message);
+pub(super) fn replacing(draft: &mut PlanBuilder<'_>, message: &str) {
+    if draft.is_running() {
+        draft.condition(conditions::RUNNING, Truth::False, reasons::REPLACING, "");
+    }
+    draft.show(reasons::REPLACING, message);
 }
 
-fn show_running(draft: &mut Draft<'_>) {
-    let is_resumed = draft.status.plan.as_ref().is_some_and(|p| p.resume) || draft.status.attempt > Some(1);
-    let (state, reason) = if is_resumed {
-        (State::Resumed, reasons::RESUMED)
+fn show_running(draft: &mut PlanBuilder<'_>) {
+    let reason = if state::is_resumed(&draft.status) {
+        reasons::RESUMED
     } else {
-        (State::Running, reasons::RUNNING)
+        reasons::RUNNING
     };
     let progress = draft.status.progress.as_ref();
     let message = progress.map(|p| format!("{} routes done.", p.text)).unwrap_or_default();
     draft.moves();
     draft.condition(conditions::RUNNING, Truth::True, reason, "");
-    // A changed count is progress, not a transition: `say` sends events only when state or reason changed.
-    draft.say(state, reason, message);
+    draft.show(reason, message);
 }
 
-fn show_trouble(draft: &mut Draft<'_>, found: &Trouble, has_started: bool) {
-    draft.condition(conditions::STALLED, Truth::True, found.reason, &found.message);
-    if draft.is_running() && !has_started {
-        replacing(
-            draft,
-            &format!("The Pod was lost, and the new one waits. {}", found.message),
-        );
+/// Shows what a Pod waits for whose agents have not started.
+fn show_wait(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+    if draft.is_running() {
+        replacing(draft, &format!("The Pod was lost, and the new one waits. {message}"));
     } else {
-        draft.say(draft.live_state(), found.reason, found.message.clone());
+        draft.show(reason, message);
     }
 }
 
-fn show_preparing(draft: &mut Draft<'_>, pod: &PodView, since: Timestamp) {
+fn show_trouble(draft: &mut PlanBuilder<'_>, found: &Trouble, has_started: bool) {
+    draft.condition(conditions::STALLED, Truth::True, found.reason, &found.message);
+    if has_started {
+        draft.show(found.reason, found.message.clone());
+    } else {
+        show_wait(draft, found.reason, &found.message);
+    }
+}
+
+fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
     draft.moves();
     let silent = draft.now().duration_since(since).as_secs();
     let message = if silent < SILENCE {
@@ -133,7 +140,7 @@ fn show_preparing(draft: &mut Draft<'_>, pod: &PodView, since: Timestamp) {
     if draft.is_running() {
         replacing(draft, &format!("The Pod was lost. {message}"));
     } else {
-        draft.say(State::Pending, reasons::PREPARING, message);
+        draft.show(reasons::PREPARING, message);
     }
 }
 
@@ -157,7 +164,7 @@ fn stage(pod: &PodView) -> &'static str {
     }
 }
 
-fn without_pod(draft: &mut Draft<'_>, job: &JobView) {
+fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let had_pod = draft.status.times.scheduled.is_some();
     if let Some(words) = &job.failed_create {
         let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
@@ -174,12 +181,12 @@ fn without_pod(draft: &mut Draft<'_>, job: &JobView) {
         let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
                        cluster's controller manager runs.";
         draft.condition(conditions::STALLED, Truth::True, reasons::PREPARING, message);
-        draft.say(State::Pending, reasons::PREPARING, message);
+        show_wait(draft, reasons::PREPARING, message);
     }
     draft.requeue_in(Duration::from_secs(15));
 }
 
-fn unschedulable(draft: &mut Draft<'_>, job: &JobView, words: &str) {
+fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str) {
     let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
     if let Some(settled) = settled.filter(|at| draft.now() < *at) {
         return draft.requeue_at(settled);
@@ -188,7 +195,7 @@ fn unschedulable(draft: &mut Draft<'_>, job: &JobView, words: &str) {
 }
 
 /// No node has the Pod: waits as long as `scheduleSeconds` says, and says why.
-fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &str) {
+fn wait_for_node(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) {
     let had_pod = draft.status.times.scheduled.is_some();
     let since = if had_pod {
         draft.stalled_since(reason)
@@ -205,11 +212,7 @@ fn wait_for_node(draft: &mut Draft<'_>, job: &JobView, reason: &str, message: &s
         draft.requeue_at(deadline);
     }
     draft.condition(conditions::STALLED, Truth::True, reason, message);
-    if draft.is_running() {
-        replacing(draft, &format!("The Pod was lost, and the new one waits. {message}"));
-    } else {
-        draft.say(State::Pending, reason, message);
-    }
+    show_wait(draft, reason, message);
 }
 
 fn too_late(found: &Trouble, seconds: i64) -> Failure {

@@ -5,8 +5,9 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::draft::{Draft, after};
-use super::{Action, failure, log, reading, start};
+use super::plan::Action;
+use super::plan_builder::{PlanBuilder, after};
+use super::{failure, log, reading, start};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::reasons;
@@ -26,7 +27,7 @@ const SILENT_SECONDS: i64 = 30;
 const SOON: Duration = Duration::from_secs(2);
 
 /// Brings a Job to its end: first by word, then by deletion, then by force.
-pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
+pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let since = stopping_since(draft);
     show(draft);
     let log_left = log::keep_while_there(draft);
@@ -56,7 +57,7 @@ pub(super) fn decide(draft: &mut Draft<'_>, job: &JobView) {
 }
 
 /// Deletes a Job, once the log that goes with its Pod is kept or was waited for long enough.
-fn end_job(draft: &mut Draft<'_>, job: &JobView, grace_seconds: i64, log_left: Option<Duration>) {
+fn end_job(draft: &mut PlanBuilder<'_>, job: &JobView, grace_seconds: i64, log_left: Option<Duration>) {
     if let Some(left) = log_left {
         return draft.requeue_in(left);
     }
@@ -65,14 +66,14 @@ fn end_job(draft: &mut Draft<'_>, job: &JobView, grace_seconds: i64, log_left: O
 }
 
 /// When the stop began. A clock that was set back must not put its end off, so the stop begins anew then.
-fn stopping_since(draft: &mut Draft<'_>) -> Timestamp {
+fn stopping_since(draft: &mut PlanBuilder<'_>) -> Timestamp {
     let now = draft.now();
     let since = draft.status.times.stopping.as_ref().map_or(now, |t| t.0.min(now));
     draft.status.times.stopping = Some(Time(since));
     since
 }
 
-fn show(draft: &mut Draft<'_>) {
+fn show(draft: &mut PlanBuilder<'_>) {
     let failure = draft.status.failure.as_ref().filter(|_| !draft.is_cancelled());
     let message = match failure {
         Some(failure) if failure.reason == reasons::NODE_LOST => {
@@ -85,10 +86,10 @@ fn show(draft: &mut Draft<'_>) {
         ),
         None => "Stopping as requested; completed routes are kept.".to_owned(),
     };
-    draft.say(draft.live_state(), reasons::STOPPING, message);
+    draft.show(reasons::STOPPING, message);
 }
 
-fn annotate(draft: &mut Draft<'_>, pod: &PodView) {
+fn annotate(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     if pod.stop.is_some() {
         return;
     }
@@ -113,7 +114,7 @@ pub(super) fn delete(job: &JobView, grace_seconds: i64) -> Action {
 }
 
 /// Removes a Pod that we can't reach. The fence goes first: what it still writes counts for nobody. Returns whether it did.
-fn force(draft: &mut Draft<'_>, pod: &PodView) -> bool {
+fn force(draft: &mut PlanBuilder<'_>, pod: &PodView) -> bool {
     draft.act(Action::TakeOwnership);
     if let Some(left) = reading::fence_left(draft) {
         draft.requeue_in(left);
@@ -127,7 +128,7 @@ fn force(draft: &mut Draft<'_>, pod: &PodView) -> bool {
 }
 
 /// We, or somebody else, deleted the Job; it goes with its Pod.
-pub(super) fn being_deleted(draft: &mut Draft<'_>) {
+pub(super) fn being_deleted(draft: &mut PlanBuilder<'_>) {
     if draft.is_to_stop() {
         stopping_since(draft);
         show(draft);
@@ -139,7 +140,7 @@ pub(super) fn being_deleted(draft: &mut Draft<'_>) {
 }
 
 /// Removes by force a Pod that outstays its grace.
-pub(super) fn remove_overdue_pod(draft: &mut Draft<'_>) {
+pub(super) fn remove_overdue_pod(draft: &mut PlanBuilder<'_>) {
     let view = draft.view;
     let overdue = |pod: &&PodView| {
         pod.delete_by
@@ -151,7 +152,7 @@ pub(super) fn remove_overdue_pod(draft: &mut Draft<'_>) {
 }
 
 /// A Pod that goes away although nobody told it to stop, on a node that is gone: the Job would wait for the node.
-pub(super) fn lost_pod<'a>(draft: &mut Draft<'a>) -> Option<&'a PodView> {
+pub(super) fn lost_pod<'a>(draft: &mut PlanBuilder<'a>) -> Option<&'a PodView> {
     let is_given_up = |f: &leaderboard_api::Failure| f.reason == reasons::NODE_LOST;
     let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));
     let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
@@ -178,7 +179,7 @@ fn given_up_at(node: ObservedNode, pod: &PodView) -> Option<Timestamp> {
 }
 
 /// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
-pub(super) fn leave_lost_pod(draft: &mut Draft<'_>, job: &JobView, pod: &PodView) {
+pub(super) fn leave_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView, pod: &PodView) {
     let found = failure::node_lost(pod.node.as_deref(), draft.view.node);
     start::replacing(draft, &found.message);
     draft.fail(found);

@@ -15,9 +15,9 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use super::node;
-use crate::controller::runtime::context::CALL_TIMEOUT;
-use crate::controller::submissions::archive::WakeSubmission;
+use crate::controller::objects::Wake;
 use crate::controller::submissions::view::ObservedNode;
+use crate::kubernetes::CALL_TIMEOUT;
 use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
@@ -77,7 +77,7 @@ pub struct Lookups(Arc<Shared>);
 
 impl Lookups {
     /// Starts the task that asks.
-    pub fn start(client: Client, tasks: &Tasks, wake: WakeSubmission) -> Self {
+    pub fn start(client: Client, tasks: &Tasks, wake: Wake<Submission>) -> Self {
         let shared = Arc::new(Shared::default());
         let stop = tasks.stop().clone();
         let asking = ask(client, Arc::clone(&shared), wake);
@@ -168,7 +168,7 @@ impl Shared {
     }
 }
 
-async fn ask(client: Client, shared: Arc<Shared>, wake: WakeSubmission) {
+async fn ask(client: Client, shared: Arc<Shared>, wake: Wake<Submission>) {
     let mut under_way = FuturesUnordered::new();
     let mut tick = tokio::time::interval(TICK);
     loop {

@@ -13,115 +13,119 @@ use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
+use super::archive::ArchiveWorkers;
 use super::decide::job_name;
-use super::view::{ObservedJob, ObservedNode, ObservedReport, PodView, View};
-pub use crate::controller::objects::{children_selector, is_pod_of, uid_of};
-use crate::controller::runtime::context::Context;
-use leaderboard_api::{Leaderboard, Submission, conditions};
+use super::external::ExternalSystems;
+use super::memory::Memory;
+use super::reruns::Reruns;
+use super::view::{ObservedJob, ObservedNode, PodView, View};
+use crate::controller::slots::SlotAllocator;
+use crate::controller::stores::Stores;
+use leaderboard_api::{Leaderboard, Submission, SubmissionStatus, conditions};
+use lookups::Lookups;
 
 /// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
 /// than all the rest.
 const REFUSED_AFTER: SignedDuration = SignedDuration::from_secs(45);
 
-/// Sees everything a pass may depend on.
-pub fn observe(context: &Context, submission: Arc<Submission>) -> View {
-    let submission = context.memory.with_own_status(submission);
+/// What reading the world of a submission uses.
+#[derive(Clone, Copy)]
+pub struct Uses<'a> {
+    pub stores: &'a Stores,
+    pub memory: &'a Memory,
+    pub slots: &'a SlotAllocator,
+    pub archive: &'a ArchiveWorkers,
+    pub lookups: &'a Lookups,
+    pub reruns: &'a Reruns,
+    pub external: &'a ExternalSystems,
+}
+
+/// Reads everything a reconcile may depend on. `is_policy_in_place` knows whether the NetworkPolicy of a Leaderboard is.
+pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: impl Fn(&Leaderboard) -> bool) -> View {
+    let submission = uses.memory.with_own_status(submission);
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
-    let leaderboard = leaderboard(context, &submission, &namespace);
-    let is_policy_in_place = leaderboard.as_ref().is_some_and(|l| context.is_policy_in_place(l));
-    let status = submission.status.clone().unwrap_or_default();
-    let name = job_name(&submission.name_any(), &status);
-    let this = || ObjectRef::from_obj(submission.as_ref());
-    let (job, pod) = children(context, &submission, &namespace, &name);
-    let job = match job {
-        ObservedJob::Ours(mut job) if pod.is_none() && job.end.is_none() => {
-            if job.created.is_some_and(|at| now.duration_since(at) >= REFUSED_AFTER) {
-                job.failed_create = context.lookups.refusal(&namespace, &job.name, this());
-            }
-            ObservedJob::Ours(job)
-        }
-        other => other,
-    };
-    let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
-    let node = pod.as_ref().filter(matters).and_then(|pod| pod.node.as_ref());
-    let node = node.map_or(ObservedNode::Unknown, |name| context.lookups.node(name, this()));
-    let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
+    let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
+    let leaderboard = uses.stores.leaderboards.get(&board);
+    let (job, pod) = children(uses, &submission, now);
+    let status = submission.status.as_ref();
+    let is_over = status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::FINISHED));
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
-    let archive = context.archive_workers.observe(&submission, pod_uid, is_over);
-    let record = leaderboard
-        .as_ref()
-        .and_then(|l| context.external.record_view(l, &submission));
-    let known = |name: &str| context.stores.submissions.get(&ObjectRef::new(name).within(&namespace));
-    let evalai = context.external.evalai_view(leaderboard.as_deref(), &submission, known);
-    let turn = context.slots.turn(&submission, leaderboard.as_deref());
-    let simulator_failures_of_team = if may_end(&submission, &job) {
-        let all = context.stores.submissions.state();
-        team::simulator_failures(all.iter().map(AsRef::as_ref), &submission, now)
-    } else {
-        0
-    };
-    let partial_sent = context.memory.partial_sent(&submission);
-    let rerun_as = context.reruns.of(&submission);
-    let evalai_writes_from = context.external.hub.writes_from();
+    let archive = uses.archive.observe(&submission, pod_uid, is_over);
+    let known = |name: &str| uses.stores.submissions.get(&ObjectRef::new(name).within(&namespace));
     View {
         now,
-        submission,
-        leaderboard,
-        is_policy_in_place,
-        turn,
-        job,
-        pod,
-        node,
+        is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
+        turn: uses.slots.turn(&submission, leaderboard.as_deref()),
+        node: node(uses.lookups, &submission, pod.as_ref()),
         report: archive.report.report,
         report_stage: archive.report.stage,
         report_waited: archive.report.waited,
         texts: archive.texts,
         fence: archive.fence,
         log: archive.log,
-        evalai,
-        record,
-        partial_sent,
-        rerun_as,
-        simulator_failures_of_team,
-        evalai_writes_from,
+        evalai: uses.external.evalai_view(leaderboard.as_deref(), &submission, known),
+        record: leaderboard
+            .as_deref()
+            .and_then(|board| uses.external.record_view(board, &submission)),
+        partial_sent: uses.memory.partial_sent(&submission),
+        rerun_as: uses.reruns.of(&submission),
+        simulator_failures_of_team: simulator_failures(uses.stores, &submission, &job, now),
+        evalai_writes_from: uses.external.hub.writes_from(),
+        submission,
+        leaderboard,
+        job,
+        pod,
     }
 }
 
-/// Whether this may be the reconcile that ends it. Only then what other submissions came to is looked up.
-fn may_end(submission: &Submission, job: &ObservedJob) -> bool {
-    let is_under_way = matches!(job, ObservedJob::Ours(job) if job.end.is_none());
-    let Some(status) = &submission.status else { return false };
-    let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
-    status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
-}
-
-fn leaderboard(context: &Context, submission: &Submission, namespace: &str) -> Option<Arc<Leaderboard>> {
-    let reference = ObjectRef::new(&submission.spec.leaderboard_name).within(namespace);
-    context.stores.leaderboards.get(&reference)
-}
-
-fn children(context: &Context, submission: &Submission, namespace: &str, name: &str) -> (ObservedJob, Option<PodView>) {
-    let reference = ObjectRef::<Job>::new(name).within(namespace);
-    let Some(found) = context.stores.jobs.get(&reference) else {
+/// The Job that the present attempt should have, and its newest Pod.
+fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (ObservedJob, Option<PodView>) {
+    let namespace = submission.namespace().unwrap_or_default();
+    let nothing = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let name = job_name(&submission.name_any(), status);
+    let reference = ObjectRef::<Job>::new(&name).within(&namespace);
+    let Some(found) = uses.stores.jobs.get(&reference) else {
         return (ObservedJob::Absent, None);
     };
     if !is_owned_by(&found, submission) {
         return (ObservedJob::Foreign, None);
     }
-    let pod = context.stores.newest_pod(&found);
-    let job = job::view(&found, pod.as_deref());
+    let pod = uses.stores.newest_pod(&found);
+    let mut job = job::view(&found, pod.as_deref());
+    let is_old = job.created.is_some_and(|at| now.duration_since(at) >= REFUSED_AFTER);
+    if pod.is_none() && job.end.is_none() && is_old {
+        let by = ObjectRef::from_obj(submission);
+        job.failed_create = uses.lookups.refusal(&namespace, &name, by);
+    }
     (ObservedJob::Ours(job), pod.map(|pod| pod::view(&pod)))
+}
+
+/// The node of a Pod that runs or is being deleted.
+fn node(lookups: &Lookups, submission: &Submission, pod: Option<&PodView>) -> ObservedNode {
+    let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
+    let name = pod.filter(matters).and_then(|pod| pod.node.as_ref());
+    name.map_or(ObservedNode::Unknown, |name| {
+        lookups.node(name, ObjectRef::from_obj(submission))
+    })
+}
+
+/// How often the simulators of its team have failed. Counted only if this may be the reconcile that ends it.
+fn simulator_failures(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Timestamp) -> usize {
+    let is_under_way = matches!(job, ObservedJob::Ours(job) if job.end.is_none());
+    let may_end = submission.status.as_ref().is_some_and(|status| {
+        let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
+        status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
+    });
+    if !may_end {
+        return 0;
+    }
+    let all = stores.submissions.state();
+    team::simulator_failures(all.iter().map(AsRef::as_ref), submission, now)
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {
     let uid = submission.uid();
     job.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
-}
-
-impl ObservedReport {
-    /// Nothing was stored for this attempt.
-    pub fn is_nothing(&self) -> bool {
-        matches!(self, Self::Absent | Self::Foreign)
-    }
 }

@@ -4,8 +4,8 @@
 use k8s_openapi::api::core::v1::Node;
 use kube::{Api, Client};
 
-use crate::controller::runtime::context::CALL_TIMEOUT;
 use crate::controller::submissions::view::ObservedNode;
+use crate::kubernetes::CALL_TIMEOUT;
 use leaderboard_api::client_errors;
 
 /// Reads a node. Without the right to (an operator of one namespace has none) it stays unknown.

@@ -1,12 +1,13 @@
-//! The plan while it is being made: the new status, and what is to be done.
+//! The plan while it is being made: the new status, and what is to be done. It knows no stage of life.
 
 use std::time::Duration;
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 
-use super::{Action, EvalaiUpdate, Event, Plan, reading};
-use crate::controller::submissions::view::View;
+use super::plan::{Action, EvalaiUpdate, Event, Plan};
+use super::state;
+use crate::controller::submissions::view::{ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
     BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
@@ -14,7 +15,7 @@ use leaderboard_api::{
 };
 
 /// A plan in the making.
-pub(super) struct Draft<'a> {
+pub(super) struct PlanBuilder<'a> {
     pub(super) view: &'a View,
     pub(super) status: SubmissionStatus,
     actions: Vec<Action>,
@@ -24,7 +25,7 @@ pub(super) struct Draft<'a> {
     pub(super) needs_report: bool,
 }
 
-impl<'a> Draft<'a> {
+impl<'a> PlanBuilder<'a> {
     pub(super) fn new(view: &'a View) -> Self {
         let mut status = view.submission.status.clone().unwrap_or_default();
         status.observed_generation = view.submission.metadata.generation;
@@ -100,7 +101,7 @@ impl<'a> Draft<'a> {
 
     /// Its results count.
     pub(super) fn is_successful(&self) -> bool {
-        self.status.state == Some(State::Finished)
+        state::of(&self.status) == State::Finished
     }
 
     /// How often the report of a live run is read.
@@ -108,16 +109,25 @@ impl<'a> Draft<'a> {
         Duration::from_secs(self.leaderboard().map_or(10, |l| l.sync_period_seconds).unsigned_abs())
     }
 
+    /// Its agents run, or have run and come back.
     pub(super) fn is_running(&self) -> bool {
-        matches!(self.status.state, Some(State::Running | State::Resumed))
+        matches!(state::of(&self.status), State::Running | State::Resumed)
     }
 
-    /// The state of a live submission: once its agents ran it is never Pending again while it has a Job.
-    pub(super) fn live_state(&self) -> State {
-        self.status
-            .state
-            .filter(|_| self.is_running())
-            .unwrap_or(State::Pending)
+    /// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
+    /// crash or a slow watch looks the same.
+    pub(super) fn was_job_seen(&self) -> bool {
+        const BEFORE_IT: [&str; 3] = [
+            reasons::JOB_NAME_TAKEN,
+            reasons::LEADERBOARD_NOT_FOUND,
+            reasons::NOT_ISOLATED,
+        ];
+        let seen = |c: &Condition| match c.status.as_str() {
+            "True" => !BEFORE_IT.contains(&c.reason.as_str()),
+            _ => c.reason != reasons::PREPARING,
+        };
+        let stalled = conditions::get(&self.status.conditions, conditions::STALLED);
+        self.status.times.scheduled.is_some() || stalled.is_some_and(seen)
     }
 
     /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished.
@@ -165,7 +175,7 @@ impl<'a> Draft<'a> {
             ..Default::default()
         };
         self.condition(conditions::FINISHED, Truth::False, reasons::PREPARING, "");
-        self.say(State::Pending, reasons::PREPARING, "The submission was just taken in.");
+        self.show(reasons::PREPARING, "The submission was just taken in.");
     }
 
     /// Shows that no message has announced an attempt: its row may have been edited by the participant.
@@ -244,23 +254,9 @@ impl<'a> Draft<'a> {
         }
     }
 
-    /// Shows a state with its reason, and tells the event of a transition once.
-    pub(super) fn say(&mut self, state: State, reason: &str, message: impl Into<String>) {
+    /// Shows why the submission is in its state.
+    pub(super) fn show(&mut self, reason: &str, message: impl Into<String>) {
         let message = message.into();
-        let moved = self.status.state != Some(state) || self.status.reason.as_deref() != Some(reason);
-        if moved {
-            let warning = state == State::Failed;
-            self.event(
-                warning,
-                reason,
-                if message.is_empty() {
-                    state.as_str().to_owned()
-                } else {
-                    message.clone()
-                },
-            );
-        }
-        self.status.state = Some(state);
         self.status.reason = Some(reason.to_owned());
         self.status.message = (!message.is_empty()).then_some(message);
     }
@@ -307,15 +303,33 @@ impl<'a> Draft<'a> {
         }
     }
 
-    pub(super) fn into_plan(mut self) -> Plan {
+    pub(super) fn into_plan(mut self, report: Option<ReportDemand>) -> Plan {
+        // Without an attempt nothing was decided yet.
+        if self.status.attempt.is_some() {
+            self.status.state = Some(state::of(&self.status));
+            self.note_transition();
+        }
         self.status.fit();
         Plan {
-            report: reading::demand(&self),
+            report,
             status: self.status,
             actions: self.actions,
             events: self.events,
             requeue: self.requeue,
         }
+    }
+
+    /// Publishes a changed state or reason, once.
+    fn note_transition(&mut self) {
+        let new = (state::of(&self.status), self.status.reason.clone());
+        let old = self.submission().status.as_ref();
+        if old.is_some_and(|old| (state::of(old), &old.reason) == (new.0, &new.1)) {
+            return;
+        }
+        let (state, Some(reason)) = new else { return };
+        let message = self.status.message.clone();
+        let message = message.unwrap_or_else(|| state.as_str().to_owned());
+        self.event(state == State::Failed, &reason, message);
     }
 }
 

@@ -1,0 +1,105 @@
+//! What a reconcile has to do for one submission: the result of `decide`, which `act` carries out.
+
+use std::time::Duration;
+
+use crate::controller::slots::turns::InLine;
+use crate::controller::submissions::archive::digest::ReportId;
+use crate::controller::submissions::view::ReportDemand;
+use crate::pod::run::Stop;
+use leaderboard_api::{SubmissionStatus, names};
+
+/// What a pass wants: the status to show, then the actions in order, then the events.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    pub status: SubmissionStatus,
+    pub actions: Vec<Action>,
+    pub events: Vec<Event>,
+    /// The report that the next decision needs; None: none.
+    pub report: Option<ReportDemand>,
+    /// When to look again without any other cause.
+    pub requeue: Option<Duration>,
+}
+
+/// One thing to do. All are safe to repeat.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Action {
+    /// Put our finalizer on the object; goes before the status.
+    AddFinalizer,
+    /// Take our finalizer off the object.
+    ReleaseFinalizer,
+    /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
+    JoinLine(InLine),
+    /// Create the Job of this attempt and retry.
+    CreateJob { attempt: i64, retry: i32 },
+    /// Delete a Job and its Pods with this grace period.
+    DeleteJob {
+        name: String,
+        uid: String,
+        grace_seconds: i64,
+    },
+    /// Remove a Pod that does not end.
+    ForceDeletePod { name: String, uid: String },
+    /// Write our own mark into `logcopy/owner`, so that a Pod we lost sight of stops itself.
+    TakeOwnership,
+    /// Ask the Pod to stop.
+    AnnotateStop { pod: String, stop: Stop },
+    /// Let Kubernetes remove the finished Job after its time.
+    SetJobTtl { name: String, seconds: i32 },
+    /// Keep the tail of the log that explains the failure, from the first of these places that has it.
+    KeepLog { places: Vec<LogPlace> },
+    /// Read the texts of this report, so that they can be published.
+    ReadTexts { of: ReportId },
+    /// Ask EvalAI for the submission.
+    AskEvalai,
+    /// Look for its end in EvalAI from now on, although nothing was sent to EvalAI yet.
+    FollowEvalai,
+    /// Send an update to EvalAI.
+    UpdateEvalai(EvalaiUpdate),
+    /// Forget what EvalAI last said, so that it is asked anew.
+    ForgetEvalai,
+    /// Every system has the end: drop all that is remembered for it.
+    Forget,
+    /// Write the row.
+    Record { end: bool },
+}
+
+/// What is sent to EvalAI.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EvalaiUpdate {
+    Queued,
+    Running,
+    Partial,
+    Finished,
+    Failed,
+    Cancelled,
+}
+
+/// An event of Kubernetes, published after the status was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Event {
+    pub warning: bool,
+    pub reason: String,
+    pub message: String,
+}
+
+/// A place where a log may be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogPlace {
+    /// Whose log it is.
+    pub container: String,
+    pub at: LogAt,
+}
+
+/// Where a log is kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LogAt {
+    /// On the Pod's node; `previous`: of the container's last run, since it runs again.
+    Node { pod: String, previous: bool },
+    /// In S3, at this key below the run's prefix.
+    Bucket { key: String },
+}
+
+/// Name of the Job that the present attempt has or will have.
+pub fn job_name(submission: &str, status: &SubmissionStatus) -> String {
+    names::job(submission, status.attempt.unwrap_or(1), status.retry)
+}

@@ -1,0 +1,61 @@
+//! The writes that Submissions and Leaderboards share: the finalizer and the status. Both are safe to repeat.
+
+use kube::api::{Patch, PatchParams};
+use kube::core::NamespaceResourceScope;
+use kube::{Api, Client, Resource, ResourceExt};
+use serde::Serialize;
+use serde_json::json;
+
+use super::objects::uid_of;
+use crate::kubernetes::{CallError, Watchable, call};
+use leaderboard_api::names;
+
+/// Puts our finalizer on an object, or takes it off.
+pub async fn set_finalizer<K>(client: &Client, object: &K, finalizer: &str, wanted: bool) -> Result<(), CallError>
+where
+    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+{
+    let mut finalizers = object.finalizers().to_vec();
+    finalizers.retain(|known| known != finalizer);
+    finalizers.extend(wanted.then(|| finalizer.to_owned()));
+    // The resource version keeps other controllers' finalizers safe: a concurrent change makes this write fail.
+    let version = &object.meta().resource_version;
+    let patch = Patch::Merge(json!({ "metadata": { "resourceVersion": version, "finalizers": finalizers } }));
+    let params = PatchParams {
+        field_manager: Some(names::MANAGER_FINALIZER.into()),
+        ..PatchParams::default()
+    };
+    let (api, name) = (api(client, object), object.name_any());
+    match call("the finalizer", &described(object), api.patch(&name, &params, &patch)).await {
+        Err(error) if !wanted && error.is_gone() => Ok(()),
+        other => other.map(|_| ()),
+    }
+}
+
+/// Applies a status. Returns the object as the API server has it then.
+pub async fn apply_status<K>(client: &Client, object: &K, status: &impl Serialize) -> Result<K, CallError>
+where
+    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+{
+    let (api, name) = (api(client, object), object.name_any());
+    let patch = Patch::Apply(json!({
+        "apiVersion": K::api_version(&()),
+        "kind": K::kind(&()),
+        "metadata": { "name": name, "uid": uid_of(object) },
+        "status": status,
+    }));
+    let params = PatchParams::apply(names::MANAGER_STATUS).force();
+    let applied = api.patch_status(&name, &params, &patch);
+    call("the status", &described(object), applied).await
+}
+
+fn described<K: Watchable>(object: &K) -> String {
+    format!("{} {}", K::kind(&()), object.name_any())
+}
+
+fn api<K>(client: &Client, object: &K) -> Api<K>
+where
+    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+{
+    Api::namespaced(client.clone(), &object.namespace().unwrap_or_default())
+}
