@@ -433,7 +433,9 @@ mod tests {
             hub.forget(&subject(pk).key);
         }
         tokio::time::sleep(Duration::from_mins(2)).await;
-        assert_eq!((hub.state().places.len(), hub.state().tokens.len()), (0, 0));
+        let state = hub.state();
+        assert_eq!((state.places.len(), state.tokens.len()), (0, 0));
+        drop(state);
         assert!(hub.view(&key("1")).is_none());
     }
 

@@ -167,6 +167,11 @@ impl Bench {
 
     /// The next request as text, and its ticket.
     fn next(&mut self) -> Option<(String, Ticket)> {
+        self.next_or_wait().ok()
+    }
+
+    /// The same, or until when there is nothing to send.
+    fn next_or_wait(&mut self) -> Result<(String, Ticket), Option<Duration>> {
         let now = self.now();
         match self.queue.next(now, true) {
             Next::Send(ticket) => {
@@ -175,18 +180,9 @@ impl Bench {
                     .submission()
                     .map(|subject| format!(" {}", subject.pk))
                     .unwrap_or_default();
-                Some((format!("{}{pk}", ticket.request.name()), ticket))
+                Ok((format!("{}{pk}", ticket.request.name()), ticket))
             }
-            Next::Wait(_) => None,
-        }
-    }
-
-    /// Until when there is nothing to send.
-    fn waits_until(&mut self) -> Option<Duration> {
-        let now = self.now();
-        match self.queue.next(now, true) {
-            Next::Send(ticket) => panic!("{} is sent, expected nothing", ticket.request.name()),
-            Next::Wait(until) => until,
+            Next::Wait(until) => Err(until),
         }
     }
 
