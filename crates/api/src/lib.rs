@@ -21,7 +21,9 @@ pub mod text;
 
 pub use image::{ImageReference, NotAnImage};
 pub use ingested::{Ingested, RefusedAttempt};
-pub use leaderboard::{EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus};
+pub use leaderboard::{
+    EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,
+};
 pub use leaderboard_parts::*;
 pub use submission::{EvalaiRef, Submission, SubmissionSpec, Team};
 pub use submission_status::*;
