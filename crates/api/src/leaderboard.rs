@@ -4,7 +4,7 @@
 //! What depends on another field has no schema default: `api::effective` computes it.
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use kube::CustomResource;
 use kube::KubeSchema;
 use kube::ResourceExt;
@@ -197,13 +197,26 @@ pub struct LeaderboardStatus {
 }
 
 /// Requests to EvalAI with this Leaderboard's token.
-#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct EvalaiUse {
     /// Sent in the last minute.
     pub requests_last_minute: i32,
     /// The limit, `spec.evalai.requestsPerMinute`.
     pub requests_per_minute: i32,
+    /// Results that EvalAI does not have yet; absent if it has all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub backlog: Option<EvalaiBacklog>,
+}
+
+/// Ends of submissions that wait for a request to EvalAI, of all Leaderboards with the same token.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct EvalaiBacklog {
+    /// How many.
+    pub waiting: i32,
+    /// When the last of them is expected to be in EvalAI, to the minute.
+    pub last_expected_time: Time,
 }
 
 /// What a track effectively runs.

@@ -27,7 +27,9 @@ mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
 pub use ingested::{Ingested, RefusedAttempt};
-pub use leaderboard::{EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus};
+pub use leaderboard::{
+    EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,
+};
 pub use leaderboard_parts::*;
 pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};
 pub use progress::{Progress, Score};

@@ -12,10 +12,11 @@ use super::reach::Unreachable;
 use super::state::Policy;
 use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
+use crate::services::evalai::Usage;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
+    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
 };
 
 /// What one reconcile has read of a Leaderboard.
@@ -41,8 +42,8 @@ pub struct LeaderboardView {
     pub evalai: EvalaiStanding,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
-    /// Requests of the last minute and the limit.
-    pub budget: Option<(u32, u32)>,
+    /// How the requests of its token are used.
+    pub usage: Option<Usage>,
 }
 
 /// What a reconcile has to do.
@@ -60,10 +61,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let generation = leaderboard.metadata.generation;
     status.observed_generation = generation;
     status.counts = Some(view.counts);
-    status.evalai = view.budget.map(|(used, limit)| EvalaiUse {
-        requests_last_minute: i32::try_from(used).unwrap_or(i32::MAX),
-        requests_per_minute: i32::try_from(limit).unwrap_or(i32::MAX),
-    });
+    status.evalai = view.usage.map(evalai_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
@@ -95,6 +93,18 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
         _ => None,
     };
     LeaderboardPlan { status, finalizer }
+}
+
+fn evalai_use(usage: Usage) -> EvalaiUse {
+    let waiting = i32::try_from(usage.waiting).unwrap_or(i32::MAX);
+    EvalaiUse {
+        requests_last_minute: i32::try_from(usage.used).unwrap_or(i32::MAX),
+        requests_per_minute: i32::try_from(usage.limit).unwrap_or(i32::MAX),
+        backlog: usage.last_expected.map(|at| EvalaiBacklog {
+            waiting,
+            last_expected_time: Time(at),
+        }),
+    }
 }
 
 /// What keeps a Leaderboard that is being deleted. With it goes its NetworkPolicy, which has to outlive the last Pod.

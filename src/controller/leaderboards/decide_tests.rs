@@ -17,6 +17,29 @@ fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) 
     Arc::new(object)
 }
 
+const USAGE: Usage = Usage {
+    used: 3,
+    limit: 54,
+    waiting: 0,
+    last_expected: None,
+};
+
+#[test]
+fn the_status_shows_how_many_results_wait_for_evalai_and_when_the_last_is_expected() {
+    let at = Timestamp::from_second(3600).unwrap();
+    let waiting = Usage {
+        waiting: 812,
+        last_expected: Some(at),
+        ..USAGE
+    };
+    let backlog = EvalaiBacklog {
+        waiting: 812,
+        last_expected_time: Time(at),
+    };
+    assert_eq!(evalai_use(waiting).backlog, Some(backlog));
+    assert_eq!(evalai_use(USAGE).backlog, None);
+}
+
 fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
     LeaderboardView {
         now: Timestamp::from_second(1000).unwrap(),
@@ -31,7 +54,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         unreachable: None,
         evalai: EvalaiStanding::Fits { note: None },
         evalai_writes_from: None,
-        budget: Some((3, 54)),
+        usage: Some(USAGE),
     }
 }
 

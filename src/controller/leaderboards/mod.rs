@@ -117,7 +117,7 @@ fn observe(
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(hub, leaderboard, &key, now),
         evalai_writes_from: hub.writes_from(),
-        budget: hub.budget_used(&key),
+        usage: hub.usage(&key),
     }
 }
 
@@ -135,7 +135,7 @@ async fn write_status(
     }
     let only_numbers = leaderboard_api::LeaderboardStatus {
         counts: old.counts,
-        evalai: old.evalai,
+        evalai: old.evalai.clone(),
         ..plan.status.clone()
     } == old;
     let uid = uid_of(leaderboard);

@@ -191,6 +191,7 @@ fn run_of(submission: &Submission) -> Run {
         job: names::job(&submission.name_any(), attempt, 0),
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
         has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
+        ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
     }
 }
 
