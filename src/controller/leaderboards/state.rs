@@ -134,7 +134,7 @@ mod tests {
         let at = |second| Timestamp::from_second(second).unwrap();
         // Each second another submission starts or ends.
         let written = (0..60).filter(|second| {
-            let may = state.counts_may_be_written("u", at(*second));
+            let may = state.is_older("u", at(*second), COUNTS_EVERY);
             if may {
                 state.wrote("u", at(*second));
             }
