@@ -217,22 +217,26 @@ struct Marks(HashMap<String, u64>);
 
 impl Marks {
     fn moved(&mut self, object: &impl ResourceExt, mark: &str) -> bool {
+        self.moved_uid(object.uid().unwrap_or_default(), mark)
+    }
+
+    fn moved_uid(&mut self, uid: String, mark: &str) -> bool {
         let mut hasher = DefaultHasher::new();
         hasher.write(mark.as_bytes());
         let mark = hasher.finish();
-        self.0.insert(object.uid().unwrap_or_default(), mark) != Some(mark)
+        self.0.insert(uid, mark) != Some(mark)
     }
 
     /// Of a Job only its end and its deletion are news: it was made by us, and what else happens shows in its Pod.
     fn job_has_news(&mut self, job: &Job, is_gone: bool) -> bool {
+        let (uid, deleted) = (&*job.metadata.uid, &job.metadata.deletion_timestamp);
         if is_gone {
-            self.forget(job);
+            self.0.remove(uid);
             return true;
         }
-        let conditions = job.status.as_ref().and_then(|status| status.conditions.as_ref());
-        let deleted = &job.metadata.deletion_timestamp;
-        let has_moved = self.moved(job, &format!("{deleted:?} {conditions:?}"));
-        has_moved && (conditions.is_some() || deleted.is_some())
+        let conditions = &job.status.conditions;
+        let has_moved = self.moved_uid(uid.to_owned(), &format!("{deleted:?} {conditions:?}"));
+        has_moved && (!conditions.is_empty() || deleted.is_some())
     }
 
     fn forget(&mut self, object: &impl ResourceExt) {

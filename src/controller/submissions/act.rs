@@ -273,7 +273,13 @@ impl Actor<'_> {
             uid: Some(uid.into()),
             resource_version: Some(resource_version.into()),
         });
-        match call("the deletion", &name, self.api::<Submission>().delete(&name, &params)).await {
+        match call(
+            "the deletion",
+            &name,
+            self.writes::<Submission>().delete(&name, &params),
+        )
+        .await
+        {
             Err(error) if error.is_gone() || error.is_conflict() => return Ok(()),
             other => other.map(|_| ())?,
         }

@@ -1,11 +1,9 @@
 //! How urgent an event is: by what the object, its Job or its Pod shows. Pure.
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
-
 use super::Class;
 use crate::controller::submissions::decide::Plan;
 use crate::controller::submissions::view::Stage;
+use crate::kubernetes::objects::{ContainerStatus, Job, Pod};
 use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::{Submission, SubmissionStatus};
 
@@ -35,23 +33,19 @@ pub fn of_evalai(submission: &Submission) -> Class {
 
 /// A change of its Job.
 pub fn of_job(job: &Job, is_gone: bool) -> Class {
-    let conditions = job.status.iter().flat_map(|status| status.conditions.iter().flatten());
-    let mut ends = conditions.filter(|c| c.status == "True" && JOB_ENDS.contains(&c.type_.as_str()));
+    let conditions = job.status.conditions.iter();
+    let mut ends = conditions.filter(|c| &*c.status == "True" && JOB_ENDS.contains(&&*c.type_));
     let has_ended = is_gone || job.metadata.deletion_timestamp.is_some() || ends.next().is_some();
     urgent_or(has_ended, Class::Refresh)
 }
 
 /// A change of its Pod. Containers that run next to the agents, such as logcopy, may end later.
 pub fn of_pod(pod: &Pod, is_gone: bool) -> Class {
-    let status = pod.status.as_ref();
-    let phase = status.and_then(|status| status.phase.as_deref());
+    let phase = pod.status.phase.as_deref();
     let is_over = phase.is_some_and(|phase| ["Succeeded", "Failed"].contains(&phase));
-    let mut containers = status
-        .iter()
-        .flat_map(|status| status.container_statuses.iter().flatten())
-        .peekable();
-    let has_ended = |c: &ContainerStatus| c.state.as_ref().is_some_and(|state| state.terminated.is_some());
-    let all_ended = containers.peek().is_some() && containers.all(has_ended);
+    let containers = &pod.status.container_statuses;
+    let has_ended = |c: &ContainerStatus| c.state.terminated.is_some();
+    let all_ended = !containers.is_empty() && containers.iter().all(has_ended);
     let is_deleting = pod.metadata.deletion_timestamp.is_some();
     urgent_or(is_gone || is_over || all_ended || is_deleting, Class::Refresh)
 }
