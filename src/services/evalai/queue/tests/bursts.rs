@@ -192,7 +192,8 @@ fn lists_of_2000_rows_that_take_23_seconds_hold_no_end_up() {
         .map(|pair| pair[1].saturating_sub(pair[0]))
         .max()
         .unwrap();
-    assert!(gap < Duration::from_secs(6), "{gap:?} without an end");
+    // After a burst the budget itself allows nothing for ten seconds of a minute.
+    assert!(gap < Duration::from_secs(16), "{gap:?} without an end");
     let lists = slow.times("list of cancelled");
     assert!(lists.len() > 60, "{} lists of cancelled submissions", lists.len());
 }
