@@ -253,7 +253,7 @@ impl Actor<'_> {
         } else {
             DeleteParams::background()
         };
-        self.uses.memory.deletes_job(self.submission());
+        self.uses.memory.forget_job(self.submission());
         self.delete::<Job>("deleting the Job", name, uid, params).await?;
         let reference = ObjectRef::<Job>::new(name).within(&self.namespace);
         let Some(job) = self.uses.stores.jobs.get(&reference) else {

@@ -123,9 +123,11 @@ impl Memory {
         self.lock().entry(uid_of(submission)).or_default().job = Some((name, Instant::now()));
     }
 
-    /// Forgets the Job that was created: it is being deleted.
-    pub fn deletes_job(&self, submission: &Submission) {
-        self.lock().entry(uid_of(submission)).or_default().job = None;
+    /// Forgets the Job that was created: the cache shows it, or it is being deleted.
+    pub fn forget_job(&self, submission: &Submission) {
+        if let Some(entry) = self.lock().get_mut(&uid_of(submission)) {
+            entry.job = None;
+        }
     }
 
     /// Whether the cache may not show yet that the Job of this name was created.
@@ -220,7 +222,7 @@ mod tests {
         tokio::time::advance(Duration::from_secs(15)).await;
         assert!(!memory.awaits_job(&object, "s-1"), "it was deleted before it showed");
         memory.created_job(&object, "s-1".into());
-        memory.deletes_job(&object);
+        memory.forget_job(&object);
         assert!(!memory.awaits_job(&object, "s-1"));
     }
 

@@ -99,6 +99,7 @@ fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (Observe
     if !is_owned_by(&found, submission) {
         return (ObservedJob::Foreign, None);
     }
+    uses.memory.forget_job(submission);
     let pod = uses.stores.newest_pod(&found);
     let mut job = job::view(&found, pod.as_deref());
     let is_old = job.created.is_some_and(|at| now.duration_since(at) >= REFUSED_AFTER);
