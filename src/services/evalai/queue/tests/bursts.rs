@@ -41,11 +41,11 @@ impl Server {
             self.answer_lists();
             let next = loop {
                 if holds(&self.bench.queue) {
-                    return Some(self.bench.at - begun);
+                    return Some(self.bench.at.saturating_sub(begun));
                 }
                 match self.bench.next_or_wait() {
                     Ok((name, ticket)) => {
-                        self.sent.push((self.bench.at - begun, name));
+                        self.sent.push((self.bench.at.saturating_sub(begun), name));
                         self.answer(ticket);
                     }
                     Err(until) => break until,
