@@ -342,7 +342,7 @@ mod tests {
             ("it is gone", json!({}), true, true),
         ] {
             let mut job: Job = serde_json::from_value(change).unwrap();
-            job.metadata.uid = Some("u".into());
+            job.metadata.uid = "u".into();
             assert_eq!(marks.job_has_news(&job, is_gone), expected, "{what}");
         }
     }
