@@ -106,8 +106,8 @@ impl SlotAllocator {
 
     /// A submission waits for nothing but a slot. It is woken by the answer, and by each change of it.
     pub fn join(&self, submission: &Submission, place: InLine) {
-        let (name, attempt) = (submission.name_any(), submission.spec.attempt);
-        self.change(&board_of(submission), |line| line.join(name, attempt, place));
+        let attempt = submission.spec.attempt;
+        self.change(&board_of(submission), |line| line.join(attempt, place));
     }
 
     /// The Job is about to be created, or exists.

@@ -78,6 +78,7 @@ impl World {
         let created = submission.metadata.creation_timestamp.as_ref().unwrap();
         let place = InLine {
             uid: uid_of(submission),
+            name: submission.name_any(),
             team: submission.spec.team.as_ref().unwrap().id.clone().unwrap(),
             track: "sensors".into(),
             priority: submission.spec.priority,
