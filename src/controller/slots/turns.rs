@@ -288,7 +288,11 @@ mod tests {
             name: name.into(),
             ..waiting(uid, "x", 1)
         };
-        let all = turns(&[named("second", "b"), named("third", "a")], &occupied(&["x"]), limits(1));
+        let all = turns(
+            &[named("second", "b"), named("third", "a")],
+            &occupied(&["x"]),
+            limits(1),
+        );
         assert_eq!((&all["b"], &all["a"]), (&wait(1), &wait(2)));
     }
 
