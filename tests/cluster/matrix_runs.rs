@@ -197,8 +197,12 @@ fn of_simulators() -> Vec<Row> {
             "simulator hangs",
             with(
                 simulator("hang@2"),
-                // A restarted simulator counts its routes anew, and would not hang again.
-                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 0}}),
+                // A restarted simulator counts its routes anew, and would not hang again: the route it drives then lasts longer than
+                // the way of the stop.
+                json!({
+                    "deadlines": {"idleSeconds": 15}, "retries": {"perPair": 0},
+                    "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]},
+                }),
             ),
             "Failed SimulationCrashed (infrastructure, not charged); 1/2 routes; EvalAI failed",
         ),
