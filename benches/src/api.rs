@@ -1,7 +1,7 @@
 //! Requests to the API server without types in between: what is measured must not be this program's own decoding.
 
 use futures::future::ready;
-use futures::{Stream, StreamExt, TryStreamExt};
+use futures::{Stream, StreamExt};
 use http::{Method, Request};
 use kube::Client;
 use kube::core::WatchEvent;
@@ -106,12 +106,10 @@ where
         .request_events::<Slim<S>>(Request::get(uri).body(Vec::new())?)
         .await?;
     // An error ends the watch sooner or later, and the next one begins with every object again.
-    Ok(events
-        .into_stream()
-        .filter_map(|event: kube::Result<WatchEvent<Slim<S>>>| {
-            ready(match event {
-                Ok(WatchEvent::Added(object) | WatchEvent::Modified(object)) => Some(object),
-                _ => None,
-            })
-        }))
+    Ok(events.filter_map(|event: kube::Result<WatchEvent<Slim<S>>>| {
+        ready(match event {
+            Ok(WatchEvent::Added(object) | WatchEvent::Modified(object)) => Some(object),
+            _ => None,
+        })
+    }))
 }

@@ -94,7 +94,7 @@ impl Seen {
             }),
             tokio::spawn(async move {
                 endless(&of_submissions, "submissions", |one: Slim<SubmissionStatus>| {
-                    submissions.submission(one)
+                    submissions.submission(one);
                 })
                 .await;
             }),

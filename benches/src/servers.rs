@@ -204,11 +204,10 @@ fn kubeconfig(folder: &Path, user: &str) -> PathBuf {
 
 /// The users' tokens, what is logged of their requests, and the key that signs the tokens of service accounts.
 fn prepare(folder: &Path, audit: Audit) -> Outcome<()> {
-    let tokens: String = USERS
-        .iter()
-        .map(|user| format!("{user},{user},{user},system:masters\n"))
-        .collect();
-    fs::write(folder.join("tokens.csv"), tokens)?;
+    let tokens: Vec<String> = USERS
+        .map(|user| format!("{user},{user},{user},system:masters"))
+        .to_vec();
+    fs::write(folder.join("tokens.csv"), tokens.join("\n"))?;
     let mut rules = vec![json!({"level": "Metadata"})];
     if audit == Audit::Bodies {
         rules.insert(0, json!({"level": "Request", "users": [OPERATOR]}));

@@ -46,13 +46,6 @@ pub fn ratios(of: &[f64], to: &[f64]) -> Vec<f64> {
     pairs.map(|(of, to)| of / to).collect()
 }
 
-/// Events per second from the first of `times` to the last; they are in seconds.
-pub fn rate(times: &[f64]) -> Option<f64> {
-    let sorted = sorted(times);
-    let span = sorted.last()? - sorted.first()?;
-    (span > 0.0).then(|| (sorted.len() - 1) as f64 / span)
-}
-
 fn sorted(values: &[f64]) -> Vec<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -100,12 +93,5 @@ mod tests {
     fn only_neighbors_are_compared() {
         assert_eq!(ratios(&[1.0, 6.0], &[2.0, 3.0]), [0.5, 2.0]);
         assert_eq!(ratios(&[1.0, 6.0, 9.0], &[0.0, 3.0]), [2.0]);
-    }
-
-    #[test]
-    fn a_rate_needs_two_moments() {
-        assert_eq!(rate(&[4.0, 2.0, 3.0]), Some(1.0));
-        assert_eq!(rate(&[2.0]), None);
-        assert_eq!(rate(&[2.0, 2.0]), None);
     }
 }
