@@ -1,4 +1,4 @@
-//! What the API server's audit log says of the operator: its requests by verb and resource, their times and bodies.
+//! What the API server's audit log shows of the operator: its requests by verb and resource, their times and bodies.
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,4 +1,4 @@
-//! What /proc says of this machine and of the processes under test: time of the CPU, memory, and what others took meanwhile.
+//! What /proc shows of this machine and of the processes under test: time of the CPU, memory, and what others took meanwhile.
 
 use std::fs;
 use std::time::Instant;

@@ -6,13 +6,13 @@ mod api;
 mod audit;
 mod cases;
 mod machine;
+mod observed;
 mod operator;
 mod player;
 mod raw;
 mod record;
 mod report;
 mod scale;
-mod seen;
 mod servers;
 mod stats;
 mod storage;
@@ -31,7 +31,7 @@ use machine::Machine;
 use record::Line;
 
 type Fault = Box<dyn std::error::Error + Send + Sync>;
-/// What can go wrong is told to a person, whatever it was.
+/// Every error is for a person to read.
 pub type Outcome<T> = Result<T, Fault>;
 
 /// Measures leaderboard-operator.

@@ -15,7 +15,7 @@ use tokio::task::JoinHandle;
 
 use crate::Outcome;
 use crate::api::{self, Meta, Slim};
-use crate::seen::{JobStatus, Seen, endless};
+use crate::observed::{JobStatus, Observed, endless};
 use crate::storage::{PAIRS, Storage};
 
 /// The node of all Pods.
@@ -50,7 +50,7 @@ pub struct Player {
 struct Stage {
     client: Client,
     storage: Arc<Storage>,
-    seen: Seen,
+    observed: Observed,
     pods: Pods,
     makes_pods: bool,
     turns: Semaphore,
@@ -66,11 +66,11 @@ impl Drop for Player {
 
 impl Player {
     /// `makes_pods` where no Job controller runs.
-    pub fn start(client: &Client, storage: &Arc<Storage>, seen: &Seen, pods: Pods, makes_pods: bool) -> Self {
+    pub fn start(client: &Client, storage: &Arc<Storage>, observed: &Observed, pods: Pods, makes_pods: bool) -> Self {
         let stage = Arc::new(Stage {
             client: client.clone(),
             storage: Arc::clone(storage),
-            seen: seen.clone(),
+            observed: observed.clone(),
             pods,
             makes_pods,
             turns: Semaphore::new(AT_ONCE),
@@ -183,11 +183,11 @@ impl Stage {
         let label = |name: &str| pod.labels.get(name).cloned().unwrap_or_default();
         let (submission, run) = (label(names::LABEL_SUBMISSION), label(names::LABEL_RUN));
         // Its Job is observed by another watch, which may lag a little.
-        self.seen
+        self.observed
             .until(LAG, |moments| moments.uids.contains_key(&submission))
             .await;
         let uid = self
-            .seen
+            .observed
             .get()
             .uids
             .get(&submission)
@@ -231,7 +231,7 @@ impl Stage {
         let Some(submission) = pod.labels.get(names::LABEL_SUBMISSION).cloned() else {
             return;
         };
-        self.seen.note(|moments| {
+        self.observed.note(|moments| {
             moments
                 .ended
                 .entry(submission)

@@ -69,7 +69,7 @@ impl Bodies {
         let world = World::start(bench, &setup).await?;
         let uid = create_submission(&world.client, SAMPLE).await?.uid;
         if !world
-            .seen
+            .observed
             .until(LIMIT, |moments| moments.jobs.contains_key(SAMPLE))
             .await
         {

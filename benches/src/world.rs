@@ -10,10 +10,10 @@ use tokio::task::JoinHandle;
 
 use crate::api::{self, Condition, Slim};
 use crate::machine::Used;
+use crate::observed::Observed;
 use crate::operator::Operator;
 use crate::player::{NODE, Player, Pods};
 use crate::raw::{Bodies, WARM_NAME, create_submission, name};
-use crate::seen::Seen;
 use crate::servers::{Audit, Servers};
 use crate::storage::{BUCKET, PAIRS, ROUTES, Storage};
 use crate::{Bench, Outcome};
@@ -50,7 +50,7 @@ impl Default for Setup {
 /// A running one. Everything in it ends when it is dropped.
 pub struct World {
     pub client: Client,
-    pub seen: Seen,
+    pub observed: Observed,
     pub storage: Arc<Storage>,
     pub operator: Option<Operator>,
     /// Seconds from the operator's start until it was ready.
@@ -74,14 +74,14 @@ impl World {
         let client = servers.client()?;
         let storage = Arc::new(Storage::start().await?);
         prepare(&client, setup, &storage.url).await?;
-        let seen = Seen::default();
-        let watches = seen.follow(&client);
+        let observed = Observed::default();
+        let watches = observed.follow(&client);
         let player = setup
             .pods
-            .map(|pods| Player::start(&client, &storage, &seen, pods, !setup.has_controllers));
+            .map(|pods| Player::start(&client, &storage, &observed, pods, !setup.has_controllers));
         let mut world = Self {
             client,
-            seen,
+            observed,
             storage,
             operator: None,
             ready: 0.0,
@@ -113,7 +113,7 @@ impl World {
             bodies.submit(&self.client, name).await?;
         }
         let is_raw = self.operator.is_none();
-        let warm = self.seen.until(WARM_LIMIT, |moments| match (has_ends, is_raw) {
+        let warm = self.observed.until(WARM_LIMIT, |moments| match (has_ends, is_raw) {
             (false, _) => moments.jobs.contains_key(name),
             (true, true) => moments.complete.contains_key(name),
             (true, false) => moments.finished.contains_key(name),
@@ -121,7 +121,7 @@ impl World {
         if warm.await {
             return Ok(());
         }
-        let reasons = format!("{:?}", self.seen.get().reasons.get(name));
+        let reasons = format!("{:?}", self.observed.get().reasons.get(name));
         Err(format!(
             "the first submission does not come to its end within {} s: {reasons}",
             WARM_LIMIT.as_secs()

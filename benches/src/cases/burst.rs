@@ -9,11 +9,11 @@ use super::costs;
 use super::latency::{add_percentiles, to_finished};
 use super::lifecycles::POD;
 use crate::machine::{cpu, memory};
+use crate::observed::Moments;
 use crate::operator::Operator;
 use crate::player::Pods;
 use crate::raw::{Bodies, WARM_NAME};
 use crate::record::Figures;
-use crate::seen::Moments;
 use crate::stats::percentile;
 use crate::world::{Setup, World};
 use crate::{Bench, Outcome, audit};
@@ -37,10 +37,10 @@ pub async fn measure(bench: &Bench, bodies: &Bodies, has_restart: bool) -> Outco
     let before = world.used()?;
     let began = world.burst(0..count).await?;
     let mut killed = None;
-    while world.seen.get().finished.len() <= count && began.elapsed() < CAP {
+    while world.observed.get().finished.len() <= count && began.elapsed() < CAP {
         tokio::time::sleep(SAMPLE).await;
         sample(&world, &mut figures, began);
-        if has_restart && killed.is_none() && world.seen.get().finished.len() > count / 2 {
+        if has_restart && killed.is_none() && world.observed.get().finished.len() > count / 2 {
             killed = Some(Instant::now());
             restart(bench, &mut world, &mut figures, began).await?;
         }
@@ -48,7 +48,7 @@ pub async fn measure(bench: &Bench, bodies: &Bodies, has_restart: bool) -> Outco
     }
     let after = world.used()?;
     costs(&mut figures, bench, "operator", &before, &after, count);
-    let moments = world.seen.get();
+    let moments = world.observed.get();
     let ends: Vec<f64> = since(&moments.finished, began);
     let missing = count - ends.len().min(count);
     figures.add("not finished", missing as f64);
@@ -99,7 +99,7 @@ async fn restart(bench: &Bench, world: &mut World, figures: &mut Figures, began:
 
 fn sample(world: &World, figures: &mut Figures, began: Instant) {
     let at = began.elapsed().as_secs_f64();
-    let moments = world.seen.get();
+    let moments = world.observed.get();
     let counts = [
         ("Jobs", moments.jobs.len()),
         ("running", moments.running.len()),
@@ -146,7 +146,7 @@ fn to_patch(moments: &Moments, log: &std::path::Path) -> Outcome<Vec<f64>> {
 }
 
 fn next_end(world: &World, killed: Instant) -> Option<f64> {
-    let moments = world.seen.get();
+    let moments = world.observed.get();
     let after = moments
         .finished
         .values()

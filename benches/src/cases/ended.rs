@@ -62,10 +62,10 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, ended: usize
         clock.tick().await;
         create_submission(&world.client, &name(number)).await?;
         world
-            .seen
+            .observed
             .note(|moments| moments.created.insert(name(number), std::time::Instant::now()));
     }
-    let is_done = world.seen.until(CAP, |moments| {
+    let is_done = world.observed.until(CAP, |moments| {
         (0..count).all(|n| moments.finished.contains_key(&name(n)))
     });
     if !is_done.await {
@@ -76,7 +76,7 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, ended: usize
     costs(figures, bench, &format!("{ended} ended"), &before, &after, count);
     let cost = after.since(&before).operator * 1e3 / count as f64;
     figures.add(&format!("operator CPU, ms a submission, {ended} ended"), cost);
-    let moments = world.seen.get();
+    let moments = world.observed.get();
     let to_job = moments.created.iter().filter_map(|(name, created)| {
         Some(
             moments
@@ -107,7 +107,7 @@ async fn make_ended(world: &World, bodies: &Bodies, sample: &Value, count: usize
         bodies.job_of(client, &name, &own).await
     };
     world.by_clients(FIRST..FIRST + count, make).await?;
-    let is_done = world.seen.until(CAP, |moments| {
+    let is_done = world.observed.until(CAP, |moments| {
         let ended = moments
             .complete
             .keys()

@@ -57,13 +57,13 @@ async fn one(
             .await?;
         began
     };
-    let is_done = world.seen.until(CAP, |moments| moments.jobs.len() > count).await;
+    let is_done = world.observed.until(CAP, |moments| moments.jobs.len() > count).await;
     world.check()?;
     let after = world.used()?;
     let side = if is_operator { "operator" } else { "limit" };
     costs(figures, bench, side, &before, &after, count);
     let mut times: Vec<f64> = {
-        let moments = world.seen.get();
+        let moments = world.observed.get();
         let measured = moments.jobs.iter().filter(|(name, _)| *name != WARM_NAME);
         measured.map(|(_, at)| at.duration_since(began).as_secs_f64()).collect()
     };

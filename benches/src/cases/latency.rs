@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use super::costs;
 use super::lifecycles::POD;
+use crate::observed::Moments;
 use crate::player::Pods;
 use crate::raw::{Bodies, WARM_NAME, create_submission, name};
 use crate::record::Figures;
-use crate::seen::Moments;
 use crate::stats::percentile;
 use crate::world::{Setup, World};
 use crate::{Bench, Outcome, audit};
@@ -51,7 +51,7 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
         let name = name(number);
         let uid = create_submission(&world.client, &name).await?.uid;
         world
-            .seen
+            .observed
             .note(|moments| moments.created.insert(name.clone(), Instant::now()));
         if !is_operator {
             bodies.accept(&world.client, &name, &uid).await?;
@@ -64,19 +64,23 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
             moments.complete.len()
         }
     };
-    if !world.seen.until(CAP, |moments| ends(moments) > count).await {
+    if !world.observed.until(CAP, |moments| ends(moments) > count).await {
         figures.note(format!(
             "{} of {count} have not come to their end",
-            count + 1 - ends(&world.seen.get())
+            count + 1 - ends(&world.observed.get())
         ));
     }
     world.check()?;
     let after = world.used()?;
     let side = if is_operator { "operator" } else { "limit" };
     costs(figures, bench, side, &before, &after, count);
-    add_percentiles(figures, &format!("{side}, created to Job"), &to_job(&world.seen.get()));
+    add_percentiles(
+        figures,
+        &format!("{side}, created to Job"),
+        &to_job(&world.observed.get()),
+    );
     if is_operator {
-        add_percentiles(figures, "end to Finished", &to_finished(&world.seen.get()));
+        add_percentiles(figures, "end to Finished", &to_finished(&world.observed.get()));
         figures.add(
             "reconciles a lifecycle",
             (reconciles(&world).await? - known) / count as f64,

@@ -45,7 +45,7 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
         let job = async |client: &kube::Client, name: String| bodies.job(client, &name).await;
         world.by_clients(0..count, job).await?;
     }
-    let ends = |moments: &crate::seen::Moments| {
+    let ends = |moments: &crate::observed::Moments| {
         let ends = if is_operator {
             &moments.finished
         } else {
@@ -56,12 +56,12 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
             .map(|(_, at)| at.duration_since(began).as_secs_f64())
             .collect::<Vec<_>>()
     };
-    let is_done = world.seen.until(CAP, |moments| ends(moments).len() >= count).await;
+    let is_done = world.observed.until(CAP, |moments| ends(moments).len() >= count).await;
     world.check()?;
     let after = world.used()?;
     let side = if is_operator { "operator" } else { "limit" };
     costs(figures, bench, side, &before, &after, count);
-    let times = ends(&world.seen.get());
+    let times = ends(&world.observed.get());
     let span = if is_done {
         percentile(&times, 100.0).unwrap_or_default()
     } else {
@@ -82,7 +82,7 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
             "operator writes a lifecycle, all at once",
             writes as f64 / (count + 1) as f64,
         );
-        let failed = world.seen.get().failed.values().next().cloned();
+        let failed = world.observed.get().failed.values().next().cloned();
         if let Some(why) = failed {
             figures.note(format!("a submission has not finished: {why}"));
         }

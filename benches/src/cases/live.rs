@@ -58,7 +58,10 @@ pub async fn measure(bench: &Bench) -> Outcome<Figures> {
 /// Takes some more in; false if they do not all run in time.
 async fn block(world: &World, figures: &mut Figures, from: usize, to: usize) -> Outcome<bool> {
     let began = world.burst(from..to).await?;
-    let is_done = world.seen.until(BLOCK_CAP, |moments| moments.running.len() >= to).await;
+    let is_done = world
+        .observed
+        .until(BLOCK_CAP, |moments| moments.running.len() >= to)
+        .await;
     let rate = (to - from) as f64 / began.elapsed().as_secs_f64();
     figures
         .series

@@ -46,8 +46,8 @@ pub async fn measure(bench: &Bench, storm: Storm) -> Outcome<Figures> {
     let expected = storm.reason();
     let before = world.used()?;
     let began = world.burst(0..count).await?;
-    let has_jobs = world.seen.until(CAP, |moments| moments.jobs.len() >= count).await;
-    let shown = |moments: &crate::seen::Moments| {
+    let has_jobs = world.observed.until(CAP, |moments| moments.jobs.len() >= count).await;
+    let shown = |moments: &crate::observed::Moments| {
         let right = moments
             .reasons
             .iter()
@@ -56,10 +56,10 @@ pub async fn measure(bench: &Bench, storm: Storm) -> Outcome<Figures> {
     };
     let left =
         (IN_TIME + Duration::from_secs(30)).saturating_sub(began.elapsed().saturating_sub(last_job(&world, began)));
-    world.seen.until(left, |moments| shown(moments) >= count).await;
+    world.observed.until(left, |moments| shown(moments) >= count).await;
     world.check()?;
     let in_time = {
-        let moments = world.seen.get();
+        let moments = world.observed.get();
         let right = moments.reasons.iter().filter(|(_, (reason, _))| reason == expected);
         let in_time = right.filter(|(name, (_, at))| {
             moments
@@ -74,7 +74,7 @@ pub async fn measure(bench: &Bench, storm: Storm) -> Outcome<Figures> {
     if !has_jobs {
         figures.note(format!(
             "{} Jobs after {:.0} s",
-            world.seen.get().jobs.len(),
+            world.observed.get().jobs.len(),
             began.elapsed().as_secs_f64()
         ));
     }
@@ -93,7 +93,7 @@ pub async fn measure(bench: &Bench, storm: Storm) -> Outcome<Figures> {
 
 /// From the first request until the last Job.
 fn last_job(world: &World, began: std::time::Instant) -> Duration {
-    let moments = world.seen.get();
+    let moments = world.observed.get();
     let times = moments.jobs.values().map(|at| at.saturating_duration_since(began));
     times.max().unwrap_or_default()
 }

@@ -51,12 +51,12 @@ pub struct Moments {
 
 /// The moments, shared by those who observe and who wait.
 #[derive(Clone, Default)]
-pub struct Seen {
+pub struct Observed {
     moments: Arc<Mutex<Moments>>,
     news: Arc<Notify>,
 }
 
-impl Seen {
+impl Observed {
     pub fn get(&self) -> MutexGuard<'_, Moments> {
         self.moments.lock().unwrap_or_else(PoisonError::into_inner)
     }
