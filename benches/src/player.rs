@@ -182,7 +182,7 @@ impl Stage {
         }
         let label = |name: &str| pod.labels.get(name).cloned().unwrap_or_default();
         let (submission, run) = (label(names::LABEL_SUBMISSION), label(names::LABEL_RUN));
-        // Its Job is observed by another watch, which may lag a little.
+        // The Job is observed by another watch, which may lag a little.
         self.observed
             .until(LAG, |moments| moments.uids.contains_key(&submission))
             .await;
