@@ -71,8 +71,15 @@ deny: ## Check licenses, bans, sources and unused dependencies (needs cargo-deny
 	cargo deny --offline check bans licenses sources
 	cargo machete
 
-chart-test: ## Lint the chart and check what it renders against the schemas
+chart-test: ## Check the chart: its values, what each of them renders, and what an API server makes of it
 	$(LAB) chart-test
+
+.PHONY: chart-docs install-yaml
+chart-docs: ## Write the table of values in the chart's README
+	$(LAB) chart-docs
+
+install-yaml: ## Print one file that installs the operator without Helm; ARGS are for helm template
+	@$(LAB) install-yaml -- $(ARGS)
 
 bench: ## Measure the operator next to the limit of its API server (30 min after the build; BENCH_FLAGS, BENCH_PROFILE)
 	cargo build --locked --profile $(BENCH_PROFILE) -p leaderboard-operator -p leaderboard-bench --bins

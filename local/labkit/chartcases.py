@@ -1,6 +1,7 @@
 """Owns what the chart must refuse, and what its two accounts must be allowed and not be allowed to do. Data only, read by `charttest`."""
 
 from dataclasses import dataclass
+from typing import Any
 
 RELEASE = "leaderboard-operator"
 SYSTEM = "leaderboard-system"
@@ -29,6 +30,63 @@ REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
     (('controller.roleArn="leaderboard-controller"',), "roleArn"),
     (('log.format="yaml"',), "format"),
     (('crds.install="no"',), "boolean"),
+    (("controller.podLabel.team=a",), "podLabel"),
+    (('controller.podLabels={"app.kubernetes.io/component":"bridge"}',), "podLabels"),
+    (('commonLabels={"app.kubernetes.io/name":"another"}',), "commonLabels"),
+    (('commonLabels={"team":"no label"}',), "commonLabels"),
+    (('commonAnnotations={"team":1}',), "string"),
+    (('nameOverride="My_Name"',), "nameOverride"),
+    ((f'fullnameOverride="{"a" * 49}"',), "fullnameOverride"),
+    (('controller.topologySpreadConstraints=[{"maxSkew":1}]',), "topologyKey"),
+    (("controller.podDisruptionBudget.maxUnavailable=0",), "maxUnavailable"),
+    (('controller.podDisruptionBudget.maxUnavailable="half"',), "maxUnavailable"),
+    (("controller.podDisruptionBudget.minAvailable=1",), "minAvailable"),
+    (('bridge.extraVolumes=[{"name":"ca"}]',), "extraVolumes"),
+    (('bridge.extraVolumeMounts=[{"name":"ca"}]',), "mountPath"),
+    (('service.type="ExternalName"',), "type"),
+    (("service.port=0",), "port"),
+    (('networkPolicy.egress.services.cidrs=["10.0.0.1"]',), "cidrs"),
+    (("networkPolicy.egress.apiServer.ports=[]",), "ports"),
+    (("networkPolicy.egres=true",), "egres"),
+    (('podMonitor.interval="30"',), "interval"),
+    (("podMonitor.intervall=1",), "intervall"),
+    (("prometheusRule.enable=true",), "enable"),
+    (('dashboard.namespace="My_Namespace"',), "namespace"),
+    (('extraObjects=[{"kind":"ConfigMap"}]',), "extraObjects"),
+    # What the templates refuse: a cluster without the kind, and two values that exclude each other.
+    (("podMonitor.enabled=true",), "--api-versions monitoring.coreos.com/v1/PodMonitor"),
+    (("serviceMonitor.enabled=true",), "--api-versions monitoring.coreos.com/v1/ServiceMonitor"),
+    (("prometheusRule.enabled=true",), "--api-versions monitoring.coreos.com/v1/PrometheusRule"),
+    (("podMonitor.enabled=true", "serviceMonitor.enabled=true"), "scraped twice"),
+)
+
+# Values, and what the text after an installation then says and does not say.
+NOTES: tuple[tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]], ...] = (
+    (
+        {},
+        (
+            "all namespaces",
+            f"deployment/{BRIDGE}",
+            "-n NAMESPACE get leaderboards",
+            "may read no Secret",
+            "--set 'leaderboards[0].secrets={evalai}'",
+            "controller.roleArn and bridge.roleArn",
+            "image.repository",
+        ),
+        (),
+    ),
+    (
+        {
+            "image.repository": "registry.example/operator",
+            "leaderboards": [{"namespace": "boards", "secrets": ["evalai"]}],
+            "aws.secretName": "aws",
+        },
+        ("-n boards get leaderboards",),
+        ("NAMESPACE", "may read no Secret", "roleArn", "image.repository"),
+    ),
+    ({"watchNamespace": "boards"}, ("the namespace boards", "-n boards get leaderboards"), ("-n NAMESPACE",)),
+    ({"controller.roleArn": "arn:aws:iam::123456789012:role/one"}, ("bridge.roleArn",), ("controller.roleArn",)),
+    ({"bridge.enabled": False}, ("controller.roleArn",), (f"deployment/{BRIDGE}", "bridge.roleArn")),
 )
 
 
@@ -63,7 +121,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "patch", f"{OWN}/submissions:status", namespace),
         *may(controller, "patch", f"{OWN}/leaderboards:status", namespace),
         *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
-        *may(controller, "get list watch create patch delete", "batch/jobs", namespace),
+        *may(controller, "get list watch create delete", "batch/jobs", namespace),
         *may(controller, "get list watch patch delete", "pods", namespace),
         *may(controller, "get", "pods:log", namespace),
         *may(controller, "get list", "events", namespace),

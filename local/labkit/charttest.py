@@ -4,15 +4,18 @@ Called by `lab chart-test`. The API server is a throwaway one without nodes; it 
 """
 
 import json
+import re
 import shutil
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from . import apiserver, chartcases, schemas, tools
+from . import apiserver, chartcases, chartdocs, chartrender, schemas, tools
 from .chartcases import RELEASE, SYSTEM, Access
+from .chartrender import documents
 from .console import say, seconds
 from .errors import LabError
 from .kube import Kube
@@ -23,13 +26,15 @@ CRDS = ("leaderboards.leaderboard.carla.org", "submissions.leaderboard.carla.org
 
 def run(settings: Settings, update: bool) -> None:
     """All checks; raises with the first ones that fail."""
-    chart = settings.repository / "charts" / RELEASE
+    chart = chartrender.folder(settings.repository)
     generated, copied = settings.repository / "crds", chart / "files" / "crds"
     if update:
         copy_definitions(generated, copied)
     folder = tools.ensure(settings, apiserver.TOOLS)
     check("the chart's copy of crds/", lambda: same_definitions(generated, copied))
     check("a reason above every rule", lambda: rules_have_reasons(chart))
+    check("values.yaml and the README's table", lambda: chartdocs.same_table(chart))
+    check("values.yaml and its schema", lambda: chartdocs.same_schema(chart))
     started = time.monotonic()
     with apiserver.running(settings, folder) as kube:
         say(f"an API server of its own is ready ({seconds(time.monotonic() - started)})")
@@ -37,12 +42,20 @@ def run(settings: Settings, update: bool) -> None:
             kube.run("kubectl", "create", "namespace", name)
         check("helm lint --strict", lambda: lint(kube, chart))
         check("values that must be refused", lambda: refused_values(kube, chart))
+        check("what each value shows in the objects", lambda: chartrender.every_value(kube, chart))
+        check("NOTES.txt", lambda: chartrender.notes(kube, chart))
+        check("alerts and dashboard", lambda: chartrender.queries(kube, chart, settings.repository))
         check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart))
         check("server-side dry run", lambda: dry_run(kube, chart))
+        check("one file without Helm", lambda: chartrender.applied(kube, chart))
         check("install, rights cluster-wide", lambda: installed(kube, chart))
+        check("examples of Chart.yaml", lambda: examples(kube, chart))
         check("the demo's manifests", lambda: demo_manifests(kube, settings.repository / "examples" / "demo"))
+        before = identities(kube)
         check("upgrade with roles, several leaderboards", lambda: upgraded(kube, chart))
+        check("roll back", lambda: rolled_back(kube))
         check("uninstall keeps the definitions", lambda: uninstalled(kube))
+        check("install again, and nothing is lost", lambda: installed_again(kube, chart, before))
         check("install, rights in one namespace", lambda: namespaced(kube, chart))
 
 
@@ -182,6 +195,26 @@ def installed(kube: Kube, chart: Path) -> str:
     return rights(kube, chartcases.CLUSTER_WIDE)
 
 
+def examples(kube: Kube, chart: Path) -> str:
+    """Artifact Hub shows them: the server must take them, and their kinds must be the definitions'. They stay for what follows."""
+    text = (chart / "Chart.yaml").read_text()
+    for name in CRDS:
+        if f"name: {name}\n" not in annotation(text, "crds"):
+            raise LabError(f"artifacthub.io/crds of Chart.yaml lacks {name}")
+    indented = "".join(f"  {line}\n" for line in annotation(text, "crdsExamples").splitlines())
+    argv = ["apply", "--server-side", "--validate=strict", "--namespace=leaderboard", "--filename=-"]
+    taken = kube.run("kubectl", *argv, "--output=name", given=f"apiVersion: v1\nkind: List\nitems:\n{indented}")
+    return f"{len(taken.splitlines())} objects"
+
+
+def annotation(text: str, name: str) -> str:
+    """The lines of an annotation of Artifact Hub, which is itself YAML."""
+    block = re.search(rf"^  artifacthub\.io/{name}: \|\n((?:    .*\n)+)", text, re.MULTILINE)
+    if block is None:
+        raise LabError(f"Chart.yaml has no annotation artifacthub.io/{name}")
+    return textwrap.dedent(block[1])
+
+
 def demo_manifests(kube: Kube, folder: Path) -> str:
     """They are applied by the demo alone, which few run; the server must take them, without a word."""
     files = [file for file in sorted(folder.glob("*.yaml")) if file.name != "values.yaml"]
@@ -196,6 +229,27 @@ def demo_manifests(kube: Kube, folder: Path) -> str:
 def upgraded(kube: Kube, chart: Path) -> str:
     helm(kube, chart, f"--values={chart / 'ci' / 'roles.yaml'}")
     return rights(kube, chartcases.WITH_ROLES)
+
+
+def rolled_back(kube: Kube) -> str:
+    """To the first installation, with its rights."""
+    kube.run("helm", "rollback", RELEASE, "1", f"--namespace={SYSTEM}")
+    return rights(kube, chartcases.CLUSTER_WIDE)
+
+
+def identities(kube: Kube) -> dict[str, str]:
+    """What must outlive the release: its objects by their uid, which one that is made anew would not have."""
+    items = kube.json("kubectl", "get", "leaderboards,submissions", "--all-namespaces")["items"]
+    return {f"{item['kind']} {item['metadata']['name']}": item["metadata"]["uid"] for item in items}
+
+
+def installed_again(kube: Kube, chart: Path, before: dict[str, str]) -> str:
+    helm(kube, chart)
+    after = identities(kube)
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
+    if not before or after != before:
+        raise LabError(f"there were {before} and are {after}")
+    return f"{len(after)} objects of hosts and participants"
 
 
 def uninstalled(kube: Kube) -> str:
@@ -252,19 +306,3 @@ def review(case: Access) -> dict[str, Any]:
         "kind": "SubjectAccessReview",
         "spec": {"user": user, "groups": groups, "resourceAttributes": attributes},
     }
-
-
-def documents(text: str) -> list[dict[str, Any]]:
-    """JSON objects one after the other, or one List of them."""
-    found, decoder, place = [], json.JSONDecoder(), 0
-    while place < len(text):
-        value, place = decoder.raw_decode(text, place)
-        found += value["items"] if value.get("kind") == "List" else [value]
-        place = skip_blanks(text, place)
-    return found
-
-
-def skip_blanks(text: str, place: int) -> int:
-    while place < len(text) and text[place].isspace():
-        place += 1
-    return place

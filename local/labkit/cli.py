@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from . import aws, charttest, cluster, crash, demo, image, pythonenv, testrun, tools
+from . import aws, chartdocs, chartrender, charttest, cluster, crash, demo, image, kube, pythonenv, testrun, tools
 from .console import say
 from .errors import LabError
 from .settings import API_SERVICE_ADDRESS, HOST_ADDRESS, PORTS, Settings, client_environment, load
@@ -51,6 +51,9 @@ def parser() -> argparse.ArgumentParser:
     )
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
+    commands.add_parser("chart-docs", help="write the table of values in the chart's README")
+    one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
+    one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     images = commands.add_parser(
         "image", help="make images and push them to the cluster's registry; prints their references"
     )
@@ -90,6 +93,11 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             return 0 if testrun.run(settings, arguments.core, arguments.filter, arguments.only) else 1
         case "chart-test":
             charttest.run(settings, arguments.update)
+        case "chart-docs":
+            chartdocs.update(chartrender.folder(settings.repository))
+        case "install-yaml":
+            helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
+            print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")
         case "image":
             target = image.target_folder(settings.repository, os.environ)
             search = image.Search(image.given_binaries(arguments.bin), target, arguments.profile)

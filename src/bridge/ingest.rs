@@ -122,7 +122,7 @@ impl std::fmt::Display for Outcome {
             Self::NotNew => f.write_str("it was run before and no message has announced another run, so none is made"),
             Self::Repeat => f.write_str("known already"),
             Self::Deleting => f.write_str("the old one is still being deleted"),
-            Self::IdTaken(owner) => write!(f, "the name is taken by {owner}"),
+            Self::IdTaken(owner) => write!(f, "the name is taken by {owner}; rename or delete that"),
         }
     }
 }

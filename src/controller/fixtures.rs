@@ -188,7 +188,7 @@ where
 async fn serve(
     mut handle: Handle<Request<Body>, Response<Body>>,
     known: HashMap<String, Value>,
-    tell: mpsc::UnboundedSender<Arrived>,
+    arrived: mpsc::UnboundedSender<Arrived>,
 ) {
     while let Some((request, answer)) = handle.next_request().await {
         let (method, path) = (request.method().clone(), request.uri().path().to_owned());
@@ -196,7 +196,7 @@ async fn serve(
         let body = serde_json::from_slice(&body).unwrap_or_default();
         let reply = reply(&method, &path, body, &known);
         let at = Instant::now();
-        let _ = tell.send(Arrived { at, method, path });
+        let _ = arrived.send(Arrived { at, method, path });
         answer.send_response(Response::new(Body::from(reply.to_string().into_bytes())));
     }
 }

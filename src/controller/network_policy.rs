@@ -9,10 +9,10 @@ use std::collections::BTreeMap;
 use k8s_openapi::api::networking::v1::{
     IPBlock, NetworkPolicy, NetworkPolicyEgressRule, NetworkPolicyPeer, NetworkPolicyPort, NetworkPolicySpec,
 };
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{LabelSelector, ObjectMeta, OwnerReference};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{LabelSelector, ObjectMeta};
 use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
-use kube::Resource;
 
+use super::objects::owner_reference;
 use leaderboard_api::ranges::{self, Range};
 use leaderboard_api::{Egress, Leaderboard, names};
 
@@ -31,33 +31,20 @@ pub fn name(leaderboard: &Leaderboard) -> String {
 /// The policy for all Pods of a Leaderboard, owned by it.
 pub fn network_policy(leaderboard: &Leaderboard) -> NetworkPolicy {
     let name = leaderboard.metadata.name.clone().unwrap_or_default();
-    let labels = |value: &str, key: &str| BTreeMap::from([(key.to_owned(), value.to_owned())]);
     NetworkPolicy {
         metadata: ObjectMeta {
             name: Some(self::name(leaderboard)),
             namespace: leaderboard.metadata.namespace.clone(),
-            labels: Some(
-                [
-                    labels(names::OPERATOR, names::LABEL_MANAGED_BY),
-                    labels(&name, names::LABEL_LEADERBOARD),
-                ]
-                .into_iter()
-                .flatten()
-                .collect(),
-            ),
-            owner_references: Some(vec![OwnerReference {
-                api_version: Leaderboard::api_version(&()).into_owned(),
-                kind: Leaderboard::kind(&()).into_owned(),
-                name: name.clone(),
-                uid: leaderboard.metadata.uid.clone().unwrap_or_default(),
-                controller: Some(true),
-                block_owner_deletion: Some(true),
-            }]),
+            labels: Some(BTreeMap::from([
+                (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
+                (names::LABEL_LEADERBOARD.into(), name.clone()),
+            ])),
+            owner_references: Some(vec![owner_reference(leaderboard)]),
             ..ObjectMeta::default()
         },
         spec: Some(NetworkPolicySpec {
             pod_selector: Some(LabelSelector {
-                match_labels: Some(labels(&name, names::LABEL_LEADERBOARD)),
+                match_labels: Some(BTreeMap::from([(names::LABEL_LEADERBOARD.into(), name)])),
                 match_expressions: None,
             }),
             policy_types: Some(vec!["Ingress".into(), "Egress".into()]),

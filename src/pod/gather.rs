@@ -8,14 +8,14 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use leaderboard_results::{Checkpoint, Files, Format, Merged, Plan, Refusal, Slice, Strictness};
+use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness};
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Progress, Side};
 
 use super::report::{ReportPair, StoredFile};
-use super::run::{Run, STATUS_FOLDER};
+use super::run::{Run, STATUS_FOLDER, results_format};
 use super::tree::{Stamp, Tree, TreeError};
 use super::upload::Object;
-use leaderboard_api::{LeaderboardVersion, PairState, Verify};
+use leaderboard_api::{PairState, Verify};
 
 /// Key of the merged file.
 pub const MERGED: &str = "agent/agent_results.json";
@@ -36,10 +36,7 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
         })
         .collect();
     let plan = Plan {
-        format: match run.plan.leaderboard_version {
-            LeaderboardVersion::V1 => Format::V1,
-            LeaderboardVersion::V2 => Format::V2,
-        },
+        format: results_format(run.plan.leaderboard_version),
         strictness: Strictness::Pod,
         routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),
         pairs,

@@ -5,7 +5,8 @@
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 
-use leaderboard_api::{Enforcement, LogGroup, RunPlan, Verify};
+use leaderboard_api::{Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
+use leaderboard_results::Format;
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";
@@ -42,6 +43,14 @@ pub fn console_name(pair: impl Display) -> String {
 /// The same below the `logs` volume, and below the run's prefix.
 pub fn console(pair: impl Display) -> String {
     format!("simulator/{}", console_name(pair))
+}
+
+/// The format of the results of a version.
+pub fn results_format(version: LeaderboardVersion) -> Format {
+    match version {
+        LeaderboardVersion::V1 => Format::V1,
+        LeaderboardVersion::V2 => Format::V2,
+    }
 }
 
 /// One attempt of one submission, as its Pod needs to know it.

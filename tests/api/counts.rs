@@ -28,6 +28,8 @@ const TRIES: usize = 3;
 pub struct Cost {
     /// Requests to the API server by verb and resource. Watches, the Lease and questions after rights are the process's own.
     pub writes: BTreeMap<String, u64>,
+    /// Writes of its Leaderboard's counts, which all submissions share: at most one in five seconds.
+    pub leaderboard_writes: BTreeMap<String, u64>,
     pub reads: BTreeMap<String, u64>,
     pub s3_requests: u64,
     pub reconciles: u64,
@@ -93,6 +95,11 @@ fn differences(expected: &Table, seen: &Table) -> Vec<String> {
             ));
         }
         for (what, expected, seen) in [
+            (
+                "writes of the Leaderboard's counts",
+                expected.leaderboard_writes.values().sum(),
+                cost.leaderboard_writes.values().sum(),
+            ),
             ("reads", expected.reads.values().sum(), cost.reads.values().sum()),
             ("S3 requests", expected.s3_requests, cost.s3_requests),
             ("reconciles", expected.reconciles, cost.reconciles),

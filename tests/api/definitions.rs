@@ -91,7 +91,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "paused": false,
         "verify": "Warn",
         "syncPeriodSeconds": 10,
-        "ttlSecondsAfterFinished": 86400,
+        "ttlSecondsAfterFinished": 604_800,
                 })
     );
 }

@@ -2,7 +2,8 @@
 //! counts what the old one started.
 
 use k8s_openapi::api::batch::v1::Job;
-use kube::api::{Api, Patch, PatchParams};
+use kube::ResourceExt;
+use kube::api::{Api, DeleteParams, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_api::{Leaderboard, Submission, reasons};
 use serde_json::json;
@@ -100,5 +101,28 @@ async fn one_slot_is_one_job_also_after_a_takeover() {
     world.shows("third", reasons::WAITING_FOR_SLOT, 1).await;
     world.edit(json!({"concurrency": null})).await;
     world.has_job("third").await;
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_that_no_other_system_knows_of_is_deleted_at_once() {
+    let world = World::new().await;
+    let operator = world.operator().await;
+    world.submit("first").await;
+    world.has_job("first").await;
+    world.submit("second").await;
+    world.shows("second", reasons::WAITING_FOR_SLOT, 1).await;
+    let client = server().await.client();
+    let submissions: Api<Submission> = Api::namespaced(client.clone(), &world.namespace);
+    let jobs: Api<Job> = Api::namespaced(client, &world.namespace);
+
+    let uid = submissions.get("first").await.unwrap().uid().unwrap();
+    let deleted = submissions.delete("first", &DeleteParams::default()).await.unwrap();
+    assert!(deleted.is_right(), "no finalizer holds it: {deleted:?}");
+    // The Job goes with it.
+    let job = jobs.get("first-1").await.unwrap();
+    assert_eq!(job.owner_references()[0].uid, uid);
+    assert_eq!(job.spec.unwrap().ttl_seconds_after_finished, Some(604_800));
+    world.has_job("second").await;
     operator.end().await;
 }

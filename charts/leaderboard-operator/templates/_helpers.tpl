@@ -1,25 +1,51 @@
-{{/* <release>, or <release>-leaderboard-operator where the release is called something else. */}}
+{{/* The chart's name in labels. */}}
+{{- define "operator.name" -}}
+{{- .Values.nameOverride | default .Chart.Name | trunc 63 | trimSuffix "-" -}}
+{{- end -}}
+
+{{/* <release>, or <release>-leaderboard-operator where the release is called something else; fullnameOverride goes before both. */}}
 {{- define "operator.fullname" -}}
-{{- if contains .Chart.Name .Release.Name -}}
+{{- $name := include "operator.name" . -}}
+{{- if .Values.fullnameOverride -}}
+{{- .Values.fullnameOverride | trunc 48 | trimSuffix "-" -}}
+{{- else if contains $name .Release.Name -}}
 {{- .Release.Name | trunc 48 | trimSuffix "-" -}}
 {{- else -}}
-{{- printf "%s-%s" .Release.Name .Chart.Name | trunc 48 | trimSuffix "-" -}}
+{{- printf "%s-%s" .Release.Name $name | trunc 48 | trimSuffix "-" -}}
 {{- end -}}
 {{- end -}}
 
+{{/* Of both programs; with a component of that one alone. */}}
 {{- define "operator.selector" -}}
-app.kubernetes.io/name: {{ .root.Chart.Name }}
+app.kubernetes.io/name: {{ include "operator.name" .root }}
 app.kubernetes.io/instance: {{ .root.Release.Name }}
-app.kubernetes.io/component: {{ .component }}
+{{- with .component }}
+app.kubernetes.io/component: {{ . }}
+{{- end }}
 {{- end -}}
 
+{{/* The chart's own labels, then those of `labels`, then the common ones: {root, component, labels}. The first of a name counts. */}}
 {{- define "operator.labels" -}}
-app.kubernetes.io/name: {{ .Chart.Name }}
-app.kubernetes.io/instance: {{ .Release.Name }}
-app.kubernetes.io/version: {{ .Chart.AppVersion | quote }}
-app.kubernetes.io/part-of: {{ .Chart.Name }}
-app.kubernetes.io/managed-by: {{ .Release.Service }}
-helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version | replace "+" "_" }}
+{{- $own := fromYaml (include "operator.selector" .) -}}
+{{- $own = set $own "app.kubernetes.io/version" .root.Chart.AppVersion -}}
+{{- $own = set $own "app.kubernetes.io/part-of" .root.Chart.Name -}}
+{{- $own = set $own "app.kubernetes.io/managed-by" .root.Release.Service -}}
+{{- $own = set $own "helm.sh/chart" (printf "%s-%s" .root.Chart.Name .root.Chart.Version | replace "+" "_") -}}
+{{- toYaml (merge $own (.labels | default dict) .root.Values.commonLabels) -}}
+{{- end -}}
+
+{{/* What stands below `metadata:` {root, name, namespace, component, labels, annotations}; all but root and name may be missing. */}}
+{{- define "operator.metadata" -}}
+name: {{ .name }}
+{{- with .namespace }}
+namespace: {{ . }}
+{{- end }}
+labels:
+  {{- include "operator.labels" . | nindent 2 }}
+{{- with merge (dict) (.annotations | default dict) .root.Values.commonAnnotations }}
+annotations:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
 {{- end -}}
 
 {{/* The digest decides where there is one; the tag stays for people to read. */}}
@@ -38,27 +64,18 @@ helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version | replace "+" "_" }}
 {{- $root := .root -}}
 {{- $name := printf "%s-%s" (include "operator.fullname" $root) .component -}}
 {{- $watched := $root.Values.watchNamespace -}}
+{{- $metadata := include "operator.metadata" (dict "root" $root "name" $name "namespace" $watched) -}}
 apiVersion: rbac.authorization.k8s.io/v1
 kind: {{ ternary "Role" "ClusterRole" (ne $watched "") }}
 metadata:
-  name: {{ $name }}
-  {{- with $watched }}
-  namespace: {{ . }}
-  {{- end }}
-  labels:
-    {{- include "operator.labels" $root | nindent 4 }}
+  {{- $metadata | nindent 2 }}
 rules:
 {{ .rules | trimAll "\n" }}
 ---
 apiVersion: rbac.authorization.k8s.io/v1
 kind: {{ ternary "RoleBinding" "ClusterRoleBinding" (ne $watched "") }}
 metadata:
-  name: {{ $name }}
-  {{- with $watched }}
-  namespace: {{ . }}
-  {{- end }}
-  labels:
-    {{- include "operator.labels" $root | nindent 4 }}
+  {{- $metadata | nindent 2 }}
 roleRef:
   apiGroup: rbac.authorization.k8s.io
   kind: {{ ternary "Role" "ClusterRole" (ne $watched "") }}
@@ -105,6 +122,36 @@ subjects:
 {{- end }}
 {{- end -}}
 
+{{/* Own affinity, or: replicas prefer different nodes, so that the loss of one does not take both. {root, component} */}}
+{{- define "operator.affinity" -}}
+{{- with (index .root.Values .component).affinity }}
+{{- toYaml . }}
+{{- else -}}
+podAntiAffinity:
+  preferredDuringSchedulingIgnoredDuringExecution:
+    - weight: 100
+      podAffinityTerm:
+        topologyKey: kubernetes.io/hostname
+        labelSelector:
+          matchLabels:
+            {{- include "operator.selector" . | nindent 12 }}
+{{- end }}
+{{- end -}}
+
+{{/* The constraints as given; one without a labelSelector is about the replicas of this program. {root, component} */}}
+{{- define "operator.spread" -}}
+{{- $replicas := dict "matchLabels" (fromYaml (include "operator.selector" .)) -}}
+{{- $constraints := list -}}
+{{- range (index .root.Values .component).topologySpreadConstraints }}
+{{- $constraint := . -}}
+{{- if not (hasKey . "labelSelector") -}}
+{{- $constraint = merge (dict "labelSelector" $replicas) . -}}
+{{- end -}}
+{{- $constraints = append $constraints $constraint -}}
+{{- end }}
+{{- toYaml $constraints -}}
+{{- end -}}
+
 {{/* A Deployment of one of the two programs: {root, component, env}. */}}
 {{- define "operator.deployment" -}}
 {{- $root := .root -}}
@@ -112,24 +159,22 @@ subjects:
 apiVersion: apps/v1
 kind: Deployment
 metadata:
-  name: {{ include "operator.fullname" $root }}-{{ .component }}
-  namespace: {{ $root.Release.Namespace }}
-  labels:
-    {{- include "operator.labels" $root | nindent 4 }}
-    app.kubernetes.io/component: {{ .component }}
+  {{- $name := printf "%s-%s" (include "operator.fullname" $root) .component }}
+  {{- include "operator.metadata" (dict "root" $root "name" $name "namespace" $root.Release.Namespace "component" .component) | nindent 2 }}
 spec:
   replicas: {{ $own.replicas }}
   strategy:
-    # One replica: a second one beside it would only wait for the Lease. Several: one of them always stands by.
-    type: {{ ternary "RollingUpdate" "Recreate" (gt (int $own.replicas) 1) }}
+    # Never Recreate: with the API server's defaults of the other type in place, no rollback could go back to it.
+    type: RollingUpdate
+    # One replica: a second one would only wait for the Lease, so the old one ends first. Several: one of them always stands by.
+    rollingUpdate: {{ gt (int $own.replicas) 1 | ternary "{maxSurge: 1, maxUnavailable: 0}" "{maxSurge: 0, maxUnavailable: 1}" }}
   selector:
     matchLabels:
       {{- include "operator.selector" . | nindent 6 }}
   template:
     metadata:
       labels:
-        {{- include "operator.labels" $root | nindent 8 }}
-        app.kubernetes.io/component: {{ .component }}
+        {{- include "operator.labels" (dict "root" $root "component" .component "labels" $own.podLabels) | nindent 8 }}
       annotations:
         kubectl.kubernetes.io/default-container: {{ .component }}
         {{- with $own.podAnnotations }}
@@ -149,13 +194,7 @@ spec:
         {{- toYaml . | nindent 8 }}
       {{- end }}
       securityContext:
-        runAsNonRoot: true
-        runAsUser: 65532
-        runAsGroup: 65532
-        # The projected token is then readable by this group, as IRSA needs it.
-        fsGroup: 65532
-        seccompProfile:
-          type: RuntimeDefault
+        {{- toYaml $root.Values.podSecurityContext | nindent 8 }}
       containers:
         - name: {{ .component }}
           image: {{ include "operator.image" $root | quote }}
@@ -185,10 +224,15 @@ spec:
           resources:
             {{- toYaml $own.resources | nindent 12 }}
           securityContext:
-            allowPrivilegeEscalation: false
-            readOnlyRootFilesystem: true
-            capabilities:
-              drop: [ALL]
+            {{- toYaml $root.Values.securityContext | nindent 12 }}
+          {{- with $own.extraVolumeMounts }}
+          volumeMounts:
+            {{- toYaml . | nindent 12 }}
+          {{- end }}
+      {{- with $own.extraVolumes }}
+      volumes:
+        {{- toYaml . | nindent 8 }}
+      {{- end }}
       {{- with $own.nodeSelector }}
       nodeSelector:
         {{- toYaml . | nindent 8 }}
@@ -197,8 +241,22 @@ spec:
       tolerations:
         {{- toYaml . | nindent 8 }}
       {{- end }}
-      {{- with $own.affinity }}
       affinity:
-        {{- toYaml . | nindent 8 }}
+        {{- include "operator.affinity" . | nindent 8 }}
+      {{- if $own.topologySpreadConstraints }}
+      topologySpreadConstraints:
+        {{- include "operator.spread" . | nindent 8 }}
       {{- end }}
+{{- end -}}
+
+{{/* The programs that are installed, by a space. */}}
+{{- define "operator.components" -}}
+controller{{ if .Values.bridge.enabled }} bridge{{ end }}
+{{- end -}}
+
+{{/* Ends the rendering where an object's kind is unknown to the cluster: {root, value, api}. */}}
+{{- define "operator.needs" -}}
+{{- if not (.root.Capabilities.APIVersions.Has .api) }}
+{{- fail (printf "%s.enabled: the cluster has no %s, which comes with the Prometheus Operator: install that first, or with `helm template` add --api-versions %s" .value .api .api) }}
+{{- end }}
 {{- end -}}

@@ -132,10 +132,21 @@ pub struct LeaderboardSpec {
     #[serde(default = "defaults::sync_period_seconds")]
     #[schemars(range(min = 1, max = 600))]
     pub sync_period_seconds: i64,
-    /// How long a finished Job is kept.
+    /// How long a finished Job is kept, once every system has its end.
     #[serde(default = "defaults::ttl_seconds_after_finished")]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub ttl_seconds_after_finished: i32,
+}
+
+/// Kubernetes keeps a finished Job at least so long: within it a controller that was away, or a bucket that could not be read, is
+/// back, and the end is read.
+pub const JOB_SECONDS: i32 = 7 * 86_400;
+
+impl LeaderboardSpec {
+    /// How long Kubernetes keeps a finished Job. A shorter time of the host's is carried out by the controller.
+    pub fn job_seconds(&self) -> i32 {
+        self.ttl_seconds_after_finished.max(JOB_SECONDS)
+    }
 }
 
 impl Leaderboard {
@@ -221,6 +232,6 @@ mod defaults {
         10
     }
     pub(super) fn ttl_seconds_after_finished() -> i32 {
-        86_400
+        super::JOB_SECONDS
     }
 }

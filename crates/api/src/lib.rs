@@ -21,7 +21,7 @@ pub mod text;
 
 pub use image::{ImageReference, NotAnImage};
 pub use ingested::{Ingested, RefusedAttempt};
-pub use leaderboard::{EvalaiUse, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus};
+pub use leaderboard::{EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus};
 pub use leaderboard_parts::*;
 pub use submission::{EvalaiRef, Submission, SubmissionSpec, Team};
 pub use submission_status::*;

@@ -259,6 +259,10 @@ reasons! {
         JOB_DELETED = "JobDeleted",
             "Somebody deleted the Job four times between two retries. There is no further retry.",
             "Find out who deletes Jobs in this namespace, then resume the submission.";
+        JOB_EXPIRED = "JobExpired",
+            "The Job ended while the operator was away, or the bucket could not be read, for longer than the Job is kept (at least 7 \
+             days): Kubernetes removed it before its end was read. There is no further Job.",
+            "Look at the stored results and logs, then resume the submission.";
         JOB_FAILED = "JobFailed",
             "Kubernetes ended the Job for a reason that no container explains.",
             "Look at the Job's events, then resume the submission.",
@@ -311,9 +315,6 @@ reasons! {
             "Nothing.";
     }
     Event {
-        JOB_CREATED = "JobCreated",
-            "The Job of the attempt was created.",
-            "Nothing.";
         JOB_RECREATED = "JobRecreated",
             "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",
             "Find out who deletes Jobs.";

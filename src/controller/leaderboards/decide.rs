@@ -1,4 +1,4 @@
-//! What a Leaderboard's status says, and when it may go: a pure function of what one pass saw.
+//! What a Leaderboard's status says, and when it may go: a pure function of what one reconcile has read.
 
 use std::sync::Arc;
 
@@ -18,12 +18,12 @@ use leaderboard_api::{
     Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
 };
 
-/// What one pass saw of a Leaderboard.
+/// What one reconcile has read of a Leaderboard.
 #[derive(Clone, Debug)]
 pub struct LeaderboardView {
     pub now: Timestamp,
     pub leaderboard: Arc<Leaderboard>,
-    /// All Leaderboards that the operator sees, this one included.
+    /// All Leaderboards that the operator watches, this one included.
     pub all: Vec<Arc<Leaderboard>>,
     pub counts: Counts,
     /// Submissions that are live or not yet published and recorded.
@@ -45,7 +45,7 @@ pub struct LeaderboardView {
     pub budget: Option<(u32, u32)>,
 }
 
-/// What a pass wants.
+/// What a reconcile has to do.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LeaderboardPlan {
     pub status: LeaderboardStatus,
@@ -53,7 +53,7 @@ pub struct LeaderboardPlan {
     pub finalizer: Option<bool>,
 }
 
-/// Decides one pass.
+/// Decides one reconcile.
 pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let leaderboard = &view.leaderboard;
     let mut status = leaderboard.status.clone().unwrap_or_default();
@@ -67,7 +67,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
-    let ready = with_note(view, with_delay(view, ready(view)));
+    let ready = with_notes(view, ready(view));
     for (type_, (truth, reason, message)) in [(conditions::READY, ready), (conditions::ISOLATED, isolated)] {
         conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
     }
@@ -125,17 +125,19 @@ fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
     }
 }
 
-/// A Leaderboard stays ready while a new controller waits with its first write to EvalAI, and says so.
-fn with_delay(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
+/// A Leaderboard that is ready shows what its host should know all the same: that a new controller waits with its first write to
+/// EvalAI, and which runs have no limit.
+fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
     let (truth, reason, message) = ready;
-    let until = view
-        .evalai_writes_from
-        .filter(|_| view.leaderboard.spec.evalai.is_some());
-    let Some(until) = until.filter(|_| truth == Truth::True) else {
+    if truth != Truth::True {
         return (truth, reason, message);
-    };
-    let message = format!("{message} {}", previous_controller(until));
-    (truth, reason, message.trim_start().to_owned())
+    }
+    let spec = &view.leaderboard.spec;
+    let delay = view.evalai_writes_from.filter(|_| spec.evalai.is_some());
+    let notes = [delay.map(previous_controller), without_limit(&view.leaderboard)];
+    let texts = [Some(message)].into_iter().chain(notes).flatten();
+    let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
+    (truth, reason, texts.join(" "))
 }
 
 /// What is wrong with the Leaderboard as it is written.
@@ -267,15 +269,6 @@ fn without_limit(leaderboard: &Leaderboard) -> Option<String> {
         "{runs} {names} have no time limit: an agent that does not end keeps its nodes until it is cancelled; set \
          deadlines.runSeconds."
     ))
-}
-
-/// A Leaderboard that is ready shows what its host should know all the same.
-fn with_note(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
-    let (truth, reason, message) = ready;
-    match without_limit(&view.leaderboard).filter(|_| truth == Truth::True) {
-        Some(note) => (truth, reason, format!("{message} {note}").trim_start().to_owned()),
-        None => (truth, reason, message),
-    }
 }
 
 #[cfg(test)]

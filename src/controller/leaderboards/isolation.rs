@@ -89,7 +89,7 @@ pub(super) async fn keep(policies: Policies<'_>, leaderboard: &Leaderboard, now:
         policy: policy.clone(),
         unseen,
     };
-    tell(leaderboard, last.as_ref(), &applied);
+    log(leaderboard, last.as_ref(), &applied);
     policies.state.note_applied(&uid, applied);
     if policy == Policy::InPlace && last.is_some_and(|last| last.has_failed()) {
         // An apply that changes nothing is no event.
@@ -116,7 +116,7 @@ fn settled(answer: Policy, is_shown: bool, is_blind: bool) -> Policy {
 }
 
 /// Logs what has changed.
-fn tell(leaderboard: &Leaderboard, last: Option<&Applied>, new: &Applied) {
+fn log(leaderboard: &Leaderboard, last: Option<&Applied>, new: &Applied) {
     if last.is_some_and(|last| last.policy == new.policy) {
         return;
     }

@@ -273,9 +273,13 @@ async fn an_apply_that_is_never_seen_is_tried_every_ten_seconds_and_called_missi
         requests += 1;
     }
     assert_eq!(requests, 10 + 5);
-    let told = lines.take();
-    assert_eq!(told.matches("the NetworkPolicy is not in place").count(), 1, "{told}");
-    assert!(told.contains("one/carla"), "{told}");
+    let logged = lines.take();
+    assert_eq!(
+        logged.matches("the NetworkPolicy is not in place").count(),
+        1,
+        "{logged}"
+    );
+    assert!(logged.contains("one/carla"), "{logged}");
     around.context.stores.policies_synced.set(false);
     board.metadata.generation = Some(2);
     let policy = keep(around.context.policies(), &board, began).await;

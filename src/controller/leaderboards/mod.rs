@@ -1,7 +1,7 @@
-//! A pass of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
+//! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
 //! Applies the policy before it waits for anything else, since no Job is made without it. Reads the token (every five minutes,
-//! or when EvalAI refuses it), looks whether bucket, table and queues answer, and hands the way to EvalAI to `external`. `decide`
+//! or when EvalAI refuses it), checks whether bucket, table and queues answer, and gives the way to EvalAI to `external`. `decide`
 //! and `reach` are pure.
 
 pub mod decide;
@@ -116,10 +116,11 @@ async fn write_status(
         ..plan.status.clone()
     } == old;
     let uid = uid_of(leaderboard);
-    if only_numbers && !state.counts_may_be_written(&uid, now) {
+    if only_numbers && !state.is_older(&uid, now, COUNTS_EVERY) {
         return Ok(COUNTS_EVERY);
     }
-    if only_numbers && old.counts == plan.status.counts && !state.budget_may_be_written(&uid, now) {
+    // The number of requests moves with each of them; alone it is worth a write a minute.
+    if only_numbers && old.counts == plan.status.counts && !state.is_older(&uid, now, RESYNC) {
         return Ok(RESYNC);
     }
     apply_status(client, leaderboard, &plan.status).await?;

@@ -11,18 +11,18 @@ use leaderboard_results::metrics;
 
 use super::Uses;
 use super::places;
-use super::reach::{Reach, Unreachable};
+use super::reach::{Reach, Unreachable, sentence};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::controller::submissions::job_spec::{self, JobInput};
 use crate::controller::submissions::pod_overlay;
 use crate::kubernetes::call;
+use crate::pod::run::results_format;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Labels, Target};
 use crate::services::token::{Token, TokenSource};
-use leaderboard_api::text::sentence;
-use leaderboard_api::{Evalai, Leaderboard, LeaderboardVersion, Submission, Token as TokenPlace, effective};
+use leaderboard_api::{Evalai, Leaderboard, Submission, Token as TokenPlace, effective};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -138,11 +138,7 @@ impl Probe {
 
 /// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
 fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
-    let of_labels = labels.problems.iter().map(|problem| {
-        let text = problem.to_string();
-        let capital: String = text.chars().take(1).flat_map(char::to_uppercase).collect();
-        sentence(&format!("{capital}{}", text.chars().skip(1).collect::<String>()))
-    });
+    let of_labels = labels.problems.iter().map(|problem| sentence(&problem.to_string()));
     let notes: Vec<String> = of_labels.chain(of_token).collect();
     (!notes.is_empty()).then(|| notes.join(" "))
 }
@@ -197,10 +193,7 @@ async fn read_token(
 }
 
 fn serve(hub: &Hub, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) -> Arc<Target> {
-    let format = match leaderboard.spec.leaderboard_version {
-        LeaderboardVersion::V1 => leaderboard_results::Format::V1,
-        LeaderboardVersion::V2 => leaderboard_results::Format::V2,
-    };
+    let format = results_format(leaderboard.spec.leaderboard_version);
     let target = Target {
         api_server: evalai.server(),
         challenge: evalai.challenge,
@@ -267,9 +260,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard) -> Option<DynamicO
         plan: &plan,
         attempt: 1,
         retry: 0,
-        operator_image: &settings.image,
-        image_pull_policy: settings.image_pull_policy.as_deref(),
-        region: settings.region.as_deref(),
+        settings,
         now: Timestamp::now(),
     }))
 }

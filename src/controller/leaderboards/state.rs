@@ -45,11 +45,6 @@ impl Applied {
     pub(super) fn has_failed(&self) -> bool {
         matches!(self.policy, Policy::Refused(_) | Policy::NotApplied(_))
     }
-
-    /// The cache shows it.
-    pub(super) fn is_seen(&mut self) {
-        self.unseen = None;
-    }
 }
 
 /// What was measured last, of which generation.
@@ -85,16 +80,6 @@ impl LeaderboardState {
         self.change(uid, |entry| entry.probe = probe);
     }
 
-    /// Whether a status whose counts alone have changed may be written.
-    pub(super) fn counts_may_be_written(&self, uid: &str, now: Timestamp) -> bool {
-        self.is_older(uid, now, COUNTS_EVERY)
-    }
-
-    /// The number of requests moves with each of them; alone it is worth a write a minute.
-    pub(super) fn budget_may_be_written(&self, uid: &str, now: Timestamp) -> bool {
-        self.is_older(uid, now, RESYNC)
-    }
-
     pub(super) fn wrote(&self, uid: &str, now: Timestamp) {
         self.change(uid, |entry| entry.written = Some(now));
     }
@@ -111,7 +96,7 @@ impl LeaderboardState {
     pub(super) fn note_seen(&self, uid: &str) {
         self.change(uid, |entry| {
             if let Some(applied) = &mut entry.applied {
-                applied.is_seen();
+                applied.unseen = None;
             }
         });
     }
@@ -124,7 +109,8 @@ impl LeaderboardState {
         self.change(uid, |entry| entry.measured = Some(found));
     }
 
-    fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
+    /// Whether its status was not written for so long.
+    pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
         let written = self.lock().get(uid).and_then(|entry| entry.written);
         written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
     }
@@ -135,5 +121,25 @@ impl LeaderboardState {
 
     fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_are_written_at_once_and_then_once_in_five_seconds() {
+        let state = LeaderboardState::default();
+        let at = |second| Timestamp::from_second(second).unwrap();
+        // Each second another submission starts or ends.
+        let written = (0..60).filter(|second| {
+            let may = state.is_older("u", at(*second), COUNTS_EVERY);
+            if may {
+                state.wrote("u", at(*second));
+            }
+            may
+        });
+        assert_eq!(written.take(3).collect::<Vec<_>>(), [0, 5, 10]);
     }
 }

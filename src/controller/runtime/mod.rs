@@ -80,7 +80,7 @@ impl Shared {
     }
 }
 
-/// Runs until told to stop, or until it no longer leads.
+/// Runs until the stop, or until it no longer leads.
 pub async fn run(
     clients: Clients,
     lease: leader::Settings,
@@ -345,7 +345,7 @@ fn events(client: &Client) -> EventRecorder {
     EventRecorder::new(client.clone(), reporter)
 }
 
-/// Waits to become the leader. False if told to stop before.
+/// Waits to become the leader. False if the stop comes before.
 async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, RunError> {
     let mut leadership = leader.leadership();
     loop {

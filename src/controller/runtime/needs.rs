@@ -18,7 +18,7 @@ const OF_RUNS: [Right; 13] = [
     (GROUP, "submissions/status", &["get", "patch"]),
     (GROUP, "leaderboards/finalizers", &["update"]),
     (GROUP, "submissions/finalizers", &["update"]),
-    ("batch", "jobs", &["get", "list", "watch", "create", "patch", "delete"]),
+    ("batch", "jobs", &["get", "list", "watch", "create", "delete"]),
     ("", "pods", &["get", "list", "watch", "patch", "delete"]),
     ("", "pods/log", &["get"]),
     ("", "events", &["get", "list"]),

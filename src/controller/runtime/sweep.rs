@@ -40,39 +40,11 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
     let submission = format!("{namespace}/{}", names::submission(row.submission));
     match ingest::apply(&api, &leaderboard, &incoming).await {
         Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "the submission is known already"),
-        Ok(Outcome::Refused) => {
-            tracing::warn!(
-                server,
-                submission,
-                leaderboard,
-                "EvalAI's row asks for another attempt, and no message has announced it: none begins"
-            );
-        }
-        Ok(Outcome::NotNew) => {
-            tracing::warn!(
-                server,
-                submission,
-                leaderboard,
-                "EvalAI's row was run before and asks for another run, and no message has announced it: none is made"
-            );
-        }
-        Ok(Outcome::IdTaken(owner)) => {
-            tracing::warn!(
-                server,
-                submission,
-                leaderboard,
-                owner,
-                "another object has the name of this submission; rename or delete it"
-            );
+        Ok(outcome @ (Outcome::Refused | Outcome::NotNew | Outcome::IdTaken(_))) => {
+            tracing::warn!(server, submission, leaderboard, %outcome, "EvalAI waits for a run of a submission, and none begins");
         }
         Ok(outcome) => {
-            tracing::info!(
-                server,
-                submission,
-                leaderboard,
-                %outcome,
-                "EvalAI waits for a submission whose message was lost"
-            );
+            tracing::info!(server, submission, leaderboard, %outcome, "EvalAI waits for a submission whose message was lost");
         }
         Err(error) => {
             tracing::warn!(server, submission, leaderboard, %error, "EvalAI waits for a submission that could not be created or resumed");
@@ -151,12 +123,12 @@ mod tests {
     /// Answers with what was sent, and hands back each path.
     fn cluster() -> (Client, mpsc::UnboundedReceiver<(String, Value)>) {
         let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
-        let (tell, asked) = mpsc::unbounded_channel();
+        let (sender, asked) = mpsc::unbounded_channel();
         tokio::spawn(async move {
             while let Some((request, answer)) = handle.next_request().await {
                 let line = format!("{} {}", request.method(), request.uri().path());
                 let body = request.into_body().collect_bytes().await.unwrap();
-                let _ = tell.send((line, serde_json::from_slice(&body).unwrap()));
+                let _ = sender.send((line, serde_json::from_slice(&body).unwrap()));
                 answer.send_response(Response::new(Body::from(body.to_vec())));
             }
         });

@@ -14,20 +14,24 @@ use kube::{Api, Client, Resource, ResourceExt};
 use serde_json::json;
 
 use super::archive::ArchiveWorkers;
-use super::decide::{Action, Event, LogPlace, Plan};
+use super::decide::{Action, Event, Plan};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::significance::{Change, change, patience};
-use super::view::View;
+use super::view::{LogPlace, View};
 use crate::controller::objects::{is_pod_of, uid_of};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::{CallError, Watchable, call};
+use leaderboard_api::text::one_line;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
+
+/// Kubernetes refuses notes above 1 kB.
+const LONGEST_NOTE: usize = 900;
 
 /// What carrying a plan out uses.
 #[derive(Clone, Copy)]
@@ -120,10 +124,6 @@ impl Actor<'_> {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
             }
-            Action::SetJobTtl { name, seconds } => {
-                let patch = json!({ "spec": { "ttlSecondsAfterFinished": seconds } });
-                self.patch::<Job>("the time to live", name, &patch).await
-            }
             other => {
                 self.request(other, status);
                 Ok(())
@@ -139,7 +139,10 @@ impl Actor<'_> {
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
-            Action::AskEvalai => uses.external.ask(self.view),
+            Action::AskEvalai => {
+                uses.memory.asks_evalai(submission);
+                uses.external.ask(self.view);
+            }
             Action::FollowEvalai => uses.external.follow(self.view, status),
             Action::UpdateEvalai(update) => {
                 uses.external
@@ -157,8 +160,7 @@ impl Actor<'_> {
             | Action::CreateJob { .. }
             | Action::DeleteJob { .. }
             | Action::ForceDeletePod { .. }
-            | Action::AnnotateStop { .. }
-            | Action::SetJobTtl { .. } => {}
+            | Action::AnnotateStop { .. } => {}
         }
     }
 
@@ -217,16 +219,13 @@ impl Actor<'_> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
         };
-        let settings = &self.uses.settings;
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
             plan,
             attempt,
             retry,
-            operator_image: &settings.image,
-            image_pull_policy: settings.image_pull_policy.as_deref(),
-            region: settings.region.as_deref(),
+            settings: self.uses.settings,
             now: self.view.now,
         });
         let name = names::job(&self.name(), attempt, retry);
@@ -239,7 +238,11 @@ impl Actor<'_> {
         match call("creating the Job", &name, api.create(&params, &object)).await {
             // Its name is ours alone; whose it is, the next reconcile sees.
             Err(error) if error.is_conflict() => Ok(()),
-            other => Ok(other.map(|_| ())?),
+            other => {
+                other?;
+                self.uses.memory.created_job(self.submission(), name);
+                Ok(())
+            }
         }
     }
 
@@ -250,6 +253,7 @@ impl Actor<'_> {
         } else {
             DeleteParams::background()
         };
+        self.uses.memory.forget_job(self.submission());
         self.delete::<Job>("deleting the Job", name, uid, params).await?;
         let reference = ObjectRef::<Job>::new(name).within(&self.namespace);
         let Some(job) = self.uses.stores.jobs.get(&reference) else {
@@ -310,7 +314,7 @@ impl Actor<'_> {
                 EventType::Normal
             },
             reason: event.reason.clone(),
-            note: Some(truncate(&event.message)),
+            note: Some(one_line(&event.message, LONGEST_NOTE)),
             action: event.reason.clone(),
             secondary: None,
         };
@@ -327,14 +331,6 @@ fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {
         retry: status.retry,
         places: places.to_vec(),
         is_over: status.times.finished.is_some(),
-    }
-}
-
-/// Kubernetes refuses notes above 1 kB.
-fn truncate(text: &str) -> String {
-    match text.char_indices().nth(900) {
-        Some((end, _)) => format!("{} …", &text[..end]),
-        None => text.to_owned(),
     }
 }
 

@@ -3,17 +3,16 @@
 use std::sync::Arc;
 
 use super::*;
-use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
+use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::decide::Plan;
 use crate::controller::submissions::observe::observe;
 use crate::observability::logging::tests::Lines;
 use leaderboard_api::Progress;
 
-#[tokio::test(start_paused = true)]
-async fn each_transition_is_one_line_with_all_that_identifies_it() {
+/// A submission whose Job was made, as one reconcile has read it.
+async fn bench() -> (Surroundings, View) {
     let board = leaderboard("board", "http://127.0.0.1:9");
     let (submission, job) = with_job("first", &board);
-    let old = submission.status.clone().unwrap();
     let cluster = Cluster {
         leaderboards: vec![board],
         submissions: vec![submission.clone()],
@@ -22,6 +21,13 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
     };
     let around = surroundings(cluster, "http://127.0.0.1:9").await;
     let view = observe(around.context.for_observe(), Arc::new(submission), |_| true);
+    (around, view)
+}
+
+#[tokio::test(start_paused = true)]
+async fn each_transition_is_one_line_with_all_that_identifies_it() {
+    let (around, view) = bench().await;
+    let old = view.submission.status.clone().unwrap();
     let lines = Lines::default();
     let _guard = lines.collect();
     let write = async |status: SubmissionStatus| {

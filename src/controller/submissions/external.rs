@@ -141,7 +141,7 @@ impl ExternalSystems {
         let is_shown = self.hub.shows_partial(&leaderboard, result_texts::phase(view));
         let payload = result_texts::partial_payload(view, is_shown)?;
         let attempt = view.submission.spec.attempt;
-        memory.told_partial(&view.submission, attempt, report.done);
+        memory.sent_partial(&view.submission, attempt, report.done);
         Some(DesiredUpdate::Partial(Arc::new(payload)))
     }
 

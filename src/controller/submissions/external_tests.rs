@@ -99,6 +99,7 @@ async fn bench(state: State) -> Bench {
         is_policy_in_place: true,
         turn: Turn::Go,
         job: ObservedJob::Absent,
+        evalai_waited: std::time::Duration::ZERO,
         pod: None,
         node: ObservedNode::Unknown,
         report: ObservedReport::NotRead,

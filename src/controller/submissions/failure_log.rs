@@ -1,7 +1,7 @@
 //! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
 //! stored in S3 for people.
 //!
-//! Called by the bucket's worker in `archive`, for what `decide` asks for; `sync` hands the text on to EvalAI's hosts. A log may
+//! Called by the bucket's worker in `archive`, for what `decide` asks for; `external` hands the text on to EvalAI's hosts. A log may
 //! hold private routes, so it never gets into status, events or our own log.
 
 use std::pin::pin;
@@ -12,7 +12,7 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::api::LogParams;
 use kube::{Api, Client};
 
-use super::decide::{LogAt, LogPlace};
+use super::view::{LogAt, LogPlace};
 use crate::services::archive::Archive;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;

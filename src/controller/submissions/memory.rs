@@ -1,6 +1,6 @@
-//! What the leader remembers between passes of one object: the status it last wrote, and what it told.
+//! What the leader remembers between two reconciles of one object: the status it last wrote, and the partial result it last sent.
 //!
-//! Needed because a cache may lag behind our own writes: a pass must never decide on a status older than its own.
+//! Needed because a cache may lag behind our own writes: a reconcile must never decide on a status older than its own.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -29,9 +29,16 @@ pub struct Memory {
 struct Entry {
     written: Option<Written>,
     partial: Option<(i64, u32)>,
+    /// The Job that was created last, and when.
+    job: Option<(String, Instant)>,
+    /// Of which attempt EvalAI has been asked whether it is to run, and since when.
+    asked: Option<(i64, Instant)>,
     /// When its place may be written.
     place_at: Option<Instant>,
 }
+
+/// How long a Job that the API server has created is waited for in the cache. One that was deleted at once never shows there.
+const JOB_SHOWS: Duration = Duration::from_secs(15);
 
 #[derive(Clone)]
 struct Written {
@@ -78,7 +85,7 @@ impl Memory {
             .map(|w| w.at.elapsed())
     }
 
-    /// How long a changed place has to wait for its write; None: not at all. The first in line are told at once; of the others
+    /// How long a changed place has to wait for its write; None: not at all. The first in line are written at once; of the others
     /// each has a moment of its own, so that a step of a thousand is not a thousand writes.
     pub fn place_waits(&self, submission: &Submission, position: i32, now: Instant) -> Option<Duration> {
         let mut entries = self.lock();
@@ -107,8 +114,45 @@ impl Memory {
     }
 
     /// Remembers a partial result.
-    pub fn told_partial(&self, submission: &Submission, attempt: i64, done: u32) {
+    pub fn sent_partial(&self, submission: &Submission, attempt: i64, done: u32) {
         self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
+    }
+
+    /// Remembers a Job that was created.
+    pub fn created_job(&self, submission: &Submission, name: String) {
+        self.lock().entry(uid_of(submission)).or_default().job = Some((name, Instant::now()));
+    }
+
+    /// Forgets the Job that was created: the cache shows it, or it is being deleted.
+    pub fn forget_job(&self, submission: &Submission) {
+        if let Some(entry) = self.lock().get_mut(&uid_of(submission)) {
+            entry.job = None;
+        }
+    }
+
+    /// Whether the cache may not show yet that the Job of this name was created.
+    pub fn awaits_job(&self, submission: &Submission, name: &str) -> bool {
+        let entries = self.lock();
+        let job = entries.get(&uid_of(submission)).and_then(|entry| entry.job.as_ref());
+        job.is_some_and(|(known, at)| known == name && at.elapsed() < JOB_SHOWS)
+    }
+
+    /// Remembers since when EvalAI has been asked about an attempt.
+    pub fn asks_evalai(&self, submission: &Submission) {
+        let attempt = submission.spec.attempt;
+        let mut entries = self.lock();
+        let entry = entries.entry(uid_of(submission)).or_default();
+        if entry.asked.is_none_or(|(of, _)| of != attempt) {
+            entry.asked = Some((attempt, Instant::now()));
+        }
+    }
+
+    /// How long EvalAI has been asked about the present attempt.
+    pub fn evalai_waited(&self, submission: &Submission) -> Duration {
+        let entries = self.lock();
+        let asked = entries.get(&uid_of(submission)).and_then(|entry| entry.asked);
+        let asked = asked.filter(|(of, _)| *of == submission.spec.attempt);
+        asked.map_or(Duration::ZERO, |(_, at)| at.elapsed())
     }
 
     /// Drops an object that is gone.
@@ -166,6 +210,34 @@ mod tests {
         }
         assert!(writes.iter().all(|count| *count <= 1), "{writes:?}");
         assert!(writes.iter().sum::<u32>() >= 190, "nobody is forgotten: {writes:?}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_created_job_is_remembered_until_it_must_have_shown() {
+        let (memory, object) = (Memory::default(), object("1", "Preparing"));
+        assert!(!memory.awaits_job(&object, "s-1"));
+        memory.created_job(&object, "s-1".into());
+        assert!(memory.awaits_job(&object, "s-1"));
+        assert!(!memory.awaits_job(&object, "s-1-r1"));
+        tokio::time::advance(Duration::from_secs(15)).await;
+        assert!(!memory.awaits_job(&object, "s-1"), "it was deleted before it showed");
+        memory.created_job(&object, "s-1".into());
+        memory.forget_job(&object);
+        assert!(!memory.awaits_job(&object, "s-1"));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn evalais_silence_counts_from_the_first_question_of_an_attempt() {
+        let (memory, mut object) = (Memory::default(), object("1", "Preparing"));
+        assert_eq!(memory.evalai_waited(&object), Duration::ZERO);
+        memory.asks_evalai(&object);
+        tokio::time::advance(Duration::from_secs(4)).await;
+        memory.asks_evalai(&object);
+        assert_eq!(memory.evalai_waited(&object), Duration::from_secs(4));
+        object.spec.attempt = 2;
+        assert_eq!(memory.evalai_waited(&object), Duration::ZERO);
+        memory.asks_evalai(&object);
+        assert_eq!(memory.evalai_waited(&object), Duration::ZERO);
     }
 
     #[test]

@@ -14,6 +14,7 @@ pub mod memory;
 pub mod observe;
 mod pod_layout;
 pub mod pod_overlay;
+pub mod report_digest;
 pub mod reruns;
 mod result_texts;
 pub mod significance;

@@ -1,11 +1,12 @@
 //! The texts of a result: what EvalAI shows, and the row of the table. Pure: what S3 holds was read by its worker (`archive`).
 
-use leaderboard_results::{Format, metrics, number_text};
+use leaderboard_results::{metrics, number_text};
 use serde_json::Value;
 
-use super::archive::digest::ReportDigest;
 use super::failure_log::Tail;
+use super::report_digest::ReportDigest;
 use super::view::{ObservedTexts, Texts, View};
+use crate::pod::run::results_format;
 use crate::services::evalai::Payload;
 use crate::services::table::Row;
 use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus};
@@ -135,17 +136,13 @@ fn table_status(state: Option<State>) -> &'static str {
 }
 
 /// The metric columns, as text with the digits of results.json; those without a value are to be removed.
-fn columns(report: Option<&ReportDigest>, format: LeaderboardVersion) -> Vec<(String, Option<String>)> {
-    let format = match format {
-        LeaderboardVersion::V1 => Format::V1,
-        LeaderboardVersion::V2 => Format::V2,
-    };
+fn columns(report: Option<&ReportDigest>, version: LeaderboardVersion) -> Vec<(String, Option<String>)> {
     let accuracies = report.and_then(|report| report.metrics.as_ref());
     let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
         Some(number) => number_text(number),
         None => value.to_string(),
     };
-    let all = metrics(format).iter().map(|metric| {
+    let all = metrics(results_format(version)).iter().map(|metric| {
         (
             metric.column.to_owned(),
             accuracies.and_then(|all| all.get(metric.name)).map(text),
@@ -230,8 +227,8 @@ mod tests {
         for container in ["agent-1", "simulator-1", "contents"] {
             assert!(!shown(container, LogTail::Hosts).contains("route"), "{container}");
         }
-        let told = "it crashed.\n\nThe end of agent-1's log in attempt 1:\nroute 7";
-        assert!(shown("agent-1", LogTail::Participants).ends_with(told));
+        let text = "it crashed.\n\nThe end of agent-1's log in attempt 1:\nroute 7";
+        assert!(shown("agent-1", LogTail::Participants).ends_with(text));
         for container in ["simulator-1", "contents", "workspace", "logcopy"] {
             assert!(
                 !shown(container, LogTail::Participants).contains("route"),

@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use leaderboard_api::conditions::STALLED;
 use leaderboard_api::{LeaderboardSpec, PairState, SubmissionStatus};
 
 /// Longest wait of progress.
@@ -17,7 +18,7 @@ pub enum Change {
     Nothing,
     /// Only its place in line, which moves for many at once.
     Place,
-    /// Only how far it is, and the words for it.
+    /// Only how far it is, and the text for it.
     Progress,
     Real,
 }
@@ -50,9 +51,10 @@ pub fn patience(leaderboard: Option<&LeaderboardSpec>) -> Duration {
     LONGEST.min(Duration::from_secs(period) * PERIODS)
 }
 
-/// A status without what moves while a submission waits or runs.
+/// A status without what moves while a submission waits, starts or runs.
 fn steady(status: &SubmissionStatus) -> SubmissionStatus {
     let mut steady = SubmissionStatus {
+        node_name: None,
         progress: None,
         score: None,
         message: None,
@@ -65,7 +67,12 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
     }
     // A pair that has not crashed carries nothing that would be missed.
     steady.pairs.retain(|pair| pair.crashes > 0 || pair.last.is_some());
+    steady.times.scheduled = None;
     for condition in &mut steady.conditions {
+        // Why nothing is stalled is no news.
+        if condition.type_ == STALLED && condition.status != "True" {
+            condition.reason = String::new();
+        }
         condition.message = String::new();
         condition.observed_generation = None;
     }
@@ -74,8 +81,12 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
 
 #[cfg(test)]
 mod tests {
+    use jiff::Timestamp;
+    use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
     use super::*;
-    use leaderboard_api::{PairStatus, Progress, State};
+    use leaderboard_api::conditions::{self, Truth};
+    use leaderboard_api::{PairStatus, Progress, State, reasons};
 
     fn running(done: i32) -> SubmissionStatus {
         SubmissionStatus {
@@ -95,6 +106,28 @@ mod tests {
             ..running(20)
         };
         assert_eq!(change(&running(19), &finished), Change::Real);
+    }
+
+    #[test]
+    fn the_way_to_a_node_is_no_news() {
+        let preparing = |truth: Truth, reason: &str, node: Option<&str>| {
+            let mut status = SubmissionStatus {
+                state: Some(State::Pending),
+                node_name: node.map(str::to_owned),
+                ..SubmissionStatus::default()
+            };
+            let now = Time(Timestamp::UNIX_EPOCH);
+            status.times.scheduled = node.map(|_| now.clone());
+            conditions::set(&mut status.conditions, STALLED, truth, reason, "", None, &now);
+            status
+        };
+        let before = preparing(Truth::False, reasons::PREPARING, None);
+        let on_node = preparing(Truth::False, reasons::NOT_STALLED, Some("node-a"));
+        assert_eq!(change(&before, &on_node), Change::Progress);
+        let blocked = preparing(Truth::True, reasons::IMAGE_PULL, Some("node-a"));
+        assert_eq!(change(&before, &blocked), Change::Real);
+        let other = preparing(Truth::True, reasons::CONTAINER_CONFIG, Some("node-a"));
+        assert_eq!(change(&blocked, &other), Change::Real);
     }
 
     #[test]

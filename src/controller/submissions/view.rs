@@ -1,4 +1,4 @@
-//! The world of one submission, as one pass saw it. `observe` fills it, `decide` reads it; it holds no client and no clock.
+//! The world of one submission, as one reconcile has read it. `observe` fills it, `decide` reads it; it holds no client and no clock.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
-use super::archive::digest::{ReportDigest, ReportId};
+use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use leaderboard_api::{Leaderboard, Rerun, Submission};
@@ -34,9 +34,11 @@ pub struct View {
     pub log: ObservedLog,
     /// None for a submission that is not EvalAI's.
     pub evalai: Option<EvalaiView>,
+    /// How long EvalAI has been asked whether the present attempt is to run.
+    pub evalai_waited: Duration,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
-    /// Routes that the last partial result told EvalAI of, in this attempt.
+    /// Routes in the last partial result that was sent to EvalAI, in this attempt.
     pub partial_sent: Option<u32>,
     /// The submission that re-runs this one, as its status says.
     pub rerun_as: Option<Rerun>,
@@ -50,6 +52,8 @@ pub struct View {
 #[derive(Clone, Debug, PartialEq)]
 pub enum ObservedJob {
     Absent,
+    /// We created it a moment ago, and the cache does not show it yet.
+    Created,
     /// It has the right name but another owner: an older object's, going away.
     Foreign,
     Ours(JobView),
@@ -60,7 +64,7 @@ impl ObservedJob {
     pub fn ours(&self) -> Option<&JobView> {
         match self {
             Self::Ours(job) => Some(job),
-            Self::Absent | Self::Foreign => None,
+            Self::Absent | Self::Created | Self::Foreign => None,
         }
     }
 }
@@ -73,7 +77,6 @@ pub struct JobView {
     pub created: Option<Timestamp>,
     pub end: Option<JobEnd>,
     pub deleting: bool,
-    pub has_ttl: bool,
     /// The words of its last FailedCreate event, while it has no Pod.
     pub failed_create: Option<String>,
 }
@@ -89,6 +92,15 @@ pub enum JobEnd {
         reason: String,
         message: String,
     },
+}
+
+impl JobEnd {
+    /// When it ended.
+    pub fn at(&self) -> Option<Timestamp> {
+        match self {
+            Self::Complete { at } | Self::Failed { at, .. } => *at,
+        }
+    }
 }
 
 /// The newest Pod of the Job.
@@ -115,7 +127,7 @@ pub struct PodView {
     pub stop: Option<Stop>,
 }
 
-/// The Pod's node, which is looked at while the Pod runs or is being deleted.
+/// The Pod's node, which is read while the Pod runs or is being deleted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedNode {
     /// There was no reason to look, or no right to.
@@ -178,6 +190,23 @@ pub struct ReportDemand {
     pub stage: Stage,
     /// How often the report of a live run is read.
     pub period: Duration,
+}
+
+/// A place where a log may be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogPlace {
+    /// Whose log it is.
+    pub container: String,
+    pub at: LogAt,
+}
+
+/// Where a log is kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LogAt {
+    /// On the Pod's node; `previous`: of the container's last run, since it runs again.
+    Node { pod: String, previous: bool },
+    /// In S3, at this key below the run's prefix.
+    Bucket { key: String },
 }
 
 /// The report in S3, as far as it was read.

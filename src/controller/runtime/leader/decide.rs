@@ -210,16 +210,17 @@ mod tests {
                 "{what}"
             );
         }
+    }
+
+    #[test]
+    fn a_holder_with_more_patience_is_given_it() {
+        let me = Identity::of_pod("pod", "uid");
         let longer = Record {
             duration: secs(60),
             ..record(Some("other"), 3)
         };
         let decision = decide(&seen(Some(longer), Some(3)), &me, None, &TIMING, secs(120));
-        assert_eq!(
-            decision,
-            Decision::Wait { until: secs(160) },
-            "a holder with more patience is given it"
-        );
+        assert_eq!(decision, Decision::Wait { until: secs(160) });
     }
 
     #[test]

@@ -25,7 +25,7 @@ use crate::observability::metrics::Metrics;
 /// Looks at a Lease that changes while it is being released.
 const RELEASE_TRIES: u32 = 3;
 
-/// What the election tells.
+/// Where the election publishes.
 pub(super) struct Outlets {
     pub publish: watch::Sender<Leadership>,
     pub fence: Fence,
@@ -39,7 +39,7 @@ pub(super) struct Elector {
     metrics: Arc<Metrics>,
     liveness: Liveness,
     seen: Seen,
-    /// The Lease as the server last told it. None: there is none, if `is_fresh`.
+    /// The Lease as the server last answered it. None: there is none, if `is_fresh`.
     lease: Option<Lease>,
     /// The last look or write was answered, and nothing has been sent since.
     is_fresh: bool,
@@ -76,7 +76,7 @@ impl Elector {
             };
             tokio::select! {
                 () = sleep(pause) => {}
-                wish = &mut release => return match wish {
+                asked = &mut release => return match asked {
                     Ok(answer) => self.hand_over(answer).await,
                     Err(_) => self.lose("the election was abandoned by its process"),
                 },

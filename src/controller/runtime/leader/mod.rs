@@ -1,4 +1,4 @@
-//! Which replica leads: a Lease of our own, and the fence that every write outside the cluster passes.
+//! Which replica leads: a Lease of our own, and the fence that every write outside the cluster asks.
 //!
 //! `main` starts it once; every writer to EvalAI or DynamoDB asks `Fence::may_write` right before. `decide` is pure,
 //! `record` translates between Leases and what `decide` reads, `elector` does the calls. Knows no Submission.

@@ -4,14 +4,14 @@
 //! Four kinds of work: the report of a run, the texts of a result, the fence against a lost Pod, the log of a failure. Each has
 //! limits of its own, so that a bucket which hangs keeps nothing else waiting. What is due when is `state`'s to say.
 
-pub mod digest;
-pub mod request;
+mod request;
 mod run;
-pub mod state;
+mod state;
 mod work;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use futures::stream::FuturesUnordered;
 use futures::{FutureExt, StreamExt};
@@ -21,27 +21,35 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use super::failure_log::{LogDemand, Tail};
+use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
 use crate::controller::objects::{Wake, uid_of};
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use digest::ReportId;
 use leaderboard_api::{Storage, Submission, SubmissionStatus, effective};
-use request::{Target, Uid, Work};
+use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
 
+/// A worker whose bucket nobody uses ends after this long: the next submission of a quiet Leaderboard finds it ready.
+const LINGERS: Duration = Duration::from_mins(1);
+
 /// The workers of all buckets. Cheap to ask in each reconcile: nothing here waits.
-pub struct ArchiveWorkers {
-    shared: Arc<Shared>,
-    buckets: Mutex<HashMap<String, Arc<Bucket>>>,
-}
+pub struct ArchiveWorkers(Arc<Shared>);
 
 struct Shared {
     aws: Aws,
     client: Client,
     wake: Wake<Submission>,
     tasks: Tasks,
+    buckets: Mutex<HashMap<String, Arc<Bucket>>>,
+}
+
+impl Shared {
+    /// A worker ends under this lock, and is asked for more under it.
+    fn buckets(&self) -> MutexGuard<'_, HashMap<String, Arc<Bucket>>> {
+        lock(&self.buckets)
+    }
 }
 
 /// What one worker shares with those that ask it.
@@ -53,12 +61,12 @@ struct Bucket {
 
 impl Bucket {
     fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 
-/// What tells a bucket from another one.
-pub fn bucket_id(storage: &Storage) -> String {
+/// The key of a bucket.
+fn bucket_id(storage: &Storage) -> String {
     format!("{:?}/{:?}/{}", storage.region, storage.endpoint, storage.bucket)
 }
 
@@ -70,26 +78,16 @@ pub struct Observed {
     pub log: ObservedLog,
 }
 
-/// One run, as its worker is asked about it.
-struct Run {
-    bucket: Arc<Bucket>,
-    uid: Uid,
-    target: Arc<Target>,
-}
-
 impl ArchiveWorkers {
     /// `wake` gets each object that has something new to decide on.
     pub fn new(aws: Aws, client: Client, tasks: Tasks, wake: Wake<Submission>) -> Self {
-        let shared = Shared {
+        Self(Arc::new(Shared {
             aws,
             client,
             wake,
             tasks,
-        };
-        Self {
-            shared: Arc::new(shared),
             buckets: Mutex::default(),
-        }
+        }))
     }
 
     /// What is known of a run. Nothing, without a plan.
@@ -112,49 +110,34 @@ impl ArchiveWorkers {
 
     /// Notes which report is needed; None: none any more.
     pub fn demand(&self, submission: &Submission, status: &SubmissionStatus, demand: Option<ReportDemand>) {
-        if demand.is_none() && self.known_bucket(status).is_none() {
-            return;
+        if demand.is_some() || self.known_bucket(status).is_some() {
+            self.ask(submission, status, |state, uid, target, now| {
+                state.demand(uid, target, demand, now);
+            });
         }
-        let Some(run) = self.run(submission, status) else {
-            return;
-        };
-        run.bucket.state().demand(&run.uid, &run.target, demand, Instant::now());
-        run.bucket.notify.notify_one();
     }
 
     /// Asks for the texts of a report.
     pub fn want_texts(&self, submission: &Submission, status: &SubmissionStatus, of: ReportId) {
-        let Some(run) = self.run(submission, status) else {
-            return;
-        };
-        run.bucket.state().want_texts(&run.uid, &run.target, of, Instant::now());
-        run.bucket.notify.notify_one();
+        self.ask(submission, status, |state, uid, target, now| {
+            state.want_texts(uid, target, of, now);
+        });
     }
 
     /// Asks for our own mark in the place of a lost Pod's.
     pub fn want_fence(&self, submission: &Submission, status: &SubmissionStatus) {
-        let Some(run) = self.run(submission, status) else {
-            return;
-        };
-        let (attempt, retry) = try_of(Some(status));
         let since = status.times.stopping.as_ref().map_or(0, |t| t.0.as_second());
         let mark = format!("controller-{since}");
-        let now = Instant::now();
-        run.bucket
-            .state()
-            .want_fence(&run.uid, &run.target, (attempt, retry), mark, now);
-        run.bucket.notify.notify_one();
+        self.ask(submission, status, |state, uid, target, now| {
+            state.want_fence(uid, target, try_of(Some(status)), mark, now);
+        });
     }
 
     /// Asks for the log that explains a failure.
     pub fn want_log(&self, submission: &Submission, status: &SubmissionStatus, demand: LogDemand) {
-        let Some(run) = self.run(submission, status) else {
-            return;
-        };
-        run.bucket
-            .state()
-            .want_log(&run.uid, &run.target, demand, Instant::now());
-        run.bucket.notify.notify_one();
+        self.ask(submission, status, |state, uid, target, now| {
+            state.want_log(uid, target, demand, now);
+        });
     }
 
     /// The log of the failure that a status describes.
@@ -167,45 +150,39 @@ impl ArchiveWorkers {
 
     /// Drops all that is known of an object.
     pub fn forget(&self, uid: &str) {
-        for bucket in lock(&self.buckets).values() {
+        for bucket in self.0.buckets().values() {
             bucket.state().forget(uid);
+            bucket.notify.notify_one();
         }
     }
 
     fn known_bucket(&self, status: &SubmissionStatus) -> Option<Arc<Bucket>> {
         let plan = status.plan.as_ref()?;
-        lock(&self.buckets).get(&bucket_id(&plan.storage)).cloned()
+        self.0.buckets().get(&bucket_id(&plan.storage)).cloned()
     }
 
-    fn run(&self, submission: &Submission, status: &SubmissionStatus) -> Option<Run> {
-        let plan = status.plan.as_ref()?;
+    /// Changes what the worker of a run's bucket has to do. Nothing, without a plan.
+    fn ask(
+        &self,
+        submission: &Submission,
+        status: &SubmissionStatus,
+        change: impl FnOnce(&mut State, &Uid, &Arc<Target>, Instant),
+    ) {
+        let Some(plan) = &status.plan else { return };
         let target = Target {
             namespace: submission.namespace().unwrap_or_default(),
             name: submission.name_any(),
             storage: plan.storage.clone(),
             run_id: plan.run_id.clone(),
         };
-        Some(Run {
-            bucket: self.bucket(&plan.storage),
-            uid: uid_of(submission).into(),
-            target: Arc::new(target),
-        })
-    }
-
-    fn bucket(&self, storage: &Storage) -> Arc<Bucket> {
-        let mut buckets = lock(&self.buckets);
-        let found = buckets.entry(bucket_id(storage)).or_insert_with(|| {
-            let bucket = Arc::new(Bucket::default());
-            let worker = ArchiveWorker {
-                archive: Archive::of_run(&self.shared.aws, storage, ""),
-                shared: Arc::clone(&self.shared),
-                bucket: Arc::clone(&bucket),
-            };
-            let name = format!("archive {}", storage.bucket);
-            self.shared.tasks.stay(name, worker.run());
-            bucket
-        });
-        Arc::clone(found)
+        let id = bucket_id(&plan.storage);
+        let mut buckets = self.0.buckets();
+        let bucket = buckets
+            .entry(id.clone())
+            .or_insert_with(|| ArchiveWorker::start(&self.0, id, &plan.storage));
+        let uid = uid_of(submission).into();
+        change(&mut bucket.state(), &uid, &Arc::new(target), Instant::now());
+        bucket.notify.notify_one();
     }
 }
 
@@ -217,31 +194,43 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Does the work of one bucket until the stop.
+/// Does the work of one bucket until the stop, or until nobody uses the bucket.
 struct ArchiveWorker {
+    id: String,
     shared: Arc<Shared>,
     bucket: Arc<Bucket>,
     archive: Archive,
 }
 
 impl ArchiveWorker {
+    fn start(shared: &Arc<Shared>, id: String, storage: &Storage) -> Arc<Bucket> {
+        let bucket = Arc::new(Bucket::default());
+        let worker = Self {
+            id,
+            archive: Archive::of_run(&shared.aws, storage, ""),
+            shared: Arc::clone(shared),
+            bucket: Arc::clone(&bucket),
+        };
+        let name = format!("archive {}", storage.bucket);
+        shared.tasks.may_end(name, worker.run());
+        bucket
+    }
+
     async fn run(self) {
         let stop = self.shared.tasks.stop().clone();
         let mut under_way = FuturesUnordered::new();
+        let mut idle_since = None;
         loop {
             while let Some(work) = self.next() {
-                let target = Arc::clone(&work.target);
-                let archive = self
-                    .archive
-                    .at_prefix(effective::key_prefix(&target.storage, &target.run_id));
-                let client = &self.shared.client;
-                let done = async move {
-                    let done = work::carry_out(client, &archive, &work).await;
-                    (work, done)
-                };
-                under_way.push(done.boxed());
+                under_way.push(self.done(work).boxed());
             }
-            let wake_at = self.bucket.state().wake_at();
+            let is_idle = self.bucket.state().is_idle();
+            idle_since = is_idle.then(|| idle_since.unwrap_or_else(Instant::now));
+            let ends_at = idle_since.map(|since| since + LINGERS);
+            if ends_at.is_some_and(|at| at <= Instant::now()) && self.leaves() {
+                return;
+            }
+            let wake_at = self.bucket.state().wake_at().or(ends_at);
             let due = async {
                 match wake_at {
                     Some(at) => tokio::time::sleep_until(at).await,
@@ -260,6 +249,25 @@ impl ArchiveWorker {
                 () = due => {}
             }
         }
+    }
+
+    async fn done(&self, work: Work) -> (Work, Done) {
+        let target = &work.target;
+        let archive = self
+            .archive
+            .at_prefix(effective::key_prefix(&target.storage, &target.run_id));
+        let done = work::carry_out(&self.shared.client, &archive, &work).await;
+        (work, done)
+    }
+
+    /// Takes the bucket away, unless somebody has asked for something meanwhile.
+    fn leaves(&self) -> bool {
+        let mut buckets = self.shared.buckets();
+        let is_idle = self.bucket.state().is_idle();
+        if is_idle {
+            buckets.remove(&self.id);
+        }
+        is_idle
     }
 
     fn next(&self) -> Option<Work> {

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::digest::ReportDigest;
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, TextProblem, Texts};
 use leaderboard_api::Storage;
 

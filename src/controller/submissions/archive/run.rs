@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use tokio::time::Instant;
 
-use super::digest::{ReportDigest, ReportId};
 use super::request::{Answer, KINDS, Sent, Target};
 use crate::controller::submissions::failure_log::{LogDemand, Tail};
+use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
 use crate::controller::submissions::view::{ObservedLog, ObservedTexts, ReportDemand, Stage, Texts};
 
 pub(super) struct Run {

@@ -10,10 +10,10 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::digest::ReportId;
 use super::request::{Done, KINDS, Kind, LIMITS, Target, Uid, What, Work};
 use super::run::{Content, FenceRun, LogRun, ReportRun, Run, TextsRun, answers};
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
+use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedLog, ObservedReport, ObservedTexts, ReportDemand, Stage,
 };
@@ -279,6 +279,11 @@ impl State {
             Some(pace.map_or(*at, |pace| pace.max(*at)))
         };
         KINDS.into_iter().filter_map(of).min()
+    }
+
+    /// Nobody needs anything, and nothing is under way.
+    pub fn is_idle(&self) -> bool {
+        self.runs.is_empty() && self.under_way.iter().all(|count| *count == 0)
     }
 
     /// Takes in what came of work. Returns whether its object has something new to decide on.

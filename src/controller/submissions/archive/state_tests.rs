@@ -3,10 +3,9 @@
 use serde_json::json;
 
 use super::*;
-use crate::controller::submissions::archive::digest::ReportDigest;
 use crate::controller::submissions::archive::request::Answer;
-use crate::controller::submissions::decide::{LogAt, LogPlace};
-use crate::controller::submissions::view::Texts;
+use crate::controller::submissions::report_digest::ReportDigest;
+use crate::controller::submissions::view::{LogAt, LogPlace, Texts};
 
 struct Bench {
     state: State,

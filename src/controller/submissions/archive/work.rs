@@ -6,9 +6,9 @@ use std::time::Duration;
 use kube::Client;
 use sha2::{Digest, Sha256};
 
-use super::digest::{ReportDigest, ReportId};
 use super::request::{Answer, Done, Target, What, Work};
 use crate::controller::submissions::failure_log;
+use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
 use crate::controller::submissions::view::{TextProblem, Texts};
 use crate::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use crate::pod::upload::hex;

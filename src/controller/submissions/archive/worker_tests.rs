@@ -170,3 +170,21 @@ async fn texts_count_only_with_the_digest_that_the_report_names() {
         bench.workers().forget("uid-of-sub");
     }
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_worker_ends_when_nobody_uses_its_bucket_and_begins_anew_with_the_next() {
+    let around = surroundings(Cluster::default(), "http://127.0.0.1:9").await;
+    let (submission, _) = with_job("sub", &leaderboard("one", "http://127.0.0.1:9"));
+    let (workers, status) = (&around.context.archive, submission.status.clone().unwrap());
+    let runs = || workers.0.tasks.names().contains(&"archive one-bucket".to_owned());
+    for _ in 0..2 {
+        workers.want_texts(&submission, &status, ReportId::default());
+        tokio::time::sleep(2 * LINGERS).await;
+        assert!(runs(), "its texts are needed");
+        workers.forget("uid-of-sub");
+        tokio::time::sleep(LINGERS / 2).await;
+        assert!(runs(), "the next submission may come");
+        tokio::time::sleep(2 * LINGERS).await;
+        assert!(!runs() && workers.0.buckets().is_empty());
+    }
+}

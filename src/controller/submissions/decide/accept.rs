@@ -14,7 +14,9 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{ImageReference, LeaderboardSpec, Team, TeamStatus, Track, effective, reasons};
 
-/// How long EvalAI may take before its silence is shown.
+/// How long EvalAI may take before its silence is shown: an answer within it costs no write.
+const SILENCE: Duration = Duration::from_secs(5);
+/// When EvalAI is asked again, should its answer not come.
 const RETRY: Duration = Duration::from_secs(30);
 /// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
 /// participant, whose team has that submission in progress.
@@ -216,6 +218,14 @@ fn ask_evalai(draft: &mut PlanBuilder<'_>) -> Answer {
         Some(info) => Answer::Wanted(info),
         None => {
             draft.act(Action::AskEvalai);
+            if let Some(left) = SILENCE
+                .checked_sub(draft.view.evalai_waited)
+                .filter(|left| !left.is_zero())
+            {
+                draft.keeps_status();
+                draft.requeue_in(left);
+                return Answer::Waiting;
+            }
             draft.requeue_in(RETRY);
             let message = match view.error {
                 Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(&error))),

@@ -9,15 +9,17 @@ use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
 use super::{accept, log, state, stop};
-use crate::controller::submissions::view::{EvalaiEnd, JobView, ObservedJob};
+use crate::controller::submissions::view::{EvalaiEnd, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Ingested, State, reasons};
+use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
 
 /// How often an unpublished end is looked at again.
 const AGAIN: Duration = Duration::from_secs(30);
 /// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
 const FAREWELL_SECONDS: i64 = 120;
+/// How long EvalAI's answer waits for the table's, to be shown with it.
+const TOGETHER_SECONDS: i64 = 10;
 /// How long after the time of a re-run a row may have been read that does not show it: the clocks differ.
 const RERUN_SECONDS: i64 = 60;
 /// What EvalAI calls a row that was cancelled.
@@ -35,14 +37,21 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let published = publish(draft, log_left);
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = published != Delivery::Waiting && record(draft) == Delivery::Done;
+    if let Delivery::Answered(at) = published {
+        show_published(draft, at, recorded);
+    }
     if let Some(left) = log_left {
         draft.requeue_in(left);
     }
-    let complete = published == Delivery::Done && recorded && log_left.is_none();
+    let is_published = matches!(published, Delivery::Done | Delivery::Answered(_));
+    let complete = is_published && recorded && log_left.is_none();
     if complete && !follow_rerun(draft) {
         draft.act(Action::Forget);
     } else {
         draft.requeue_in(AGAIN);
+    }
+    if complete {
+        remove_job_in_time(draft);
     }
     release(draft, complete);
 }
@@ -72,9 +81,22 @@ fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
 enum Delivery {
     /// It knows the end, or need not.
     Done,
+    /// It has answered so at this time, which the status does not show yet.
+    Answered(Timestamp),
     /// It will not take it.
     Refused,
     Waiting,
+}
+
+/// Shows that EvalAI has the end. The table's answer is waited for, so that both are one write.
+fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
+    let until = after(at, TOGETHER_SECONDS);
+    if !recorded && draft.now() < until {
+        return draft.requeue_at(until);
+    }
+    draft.status.times.published = Some(Time(at));
+    let team = draft.view.evalai.as_ref().and_then(|evalai| evalai.team_id.clone());
+    published(draft, team.as_deref());
 }
 
 /// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
@@ -83,11 +105,10 @@ pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
         return;
     };
     if job.end.is_some() {
-        return keep_job_for_its_time(draft, job);
+        return;
     }
     if let Some(until) = farewell(draft) {
-        draft.requeue_at(until);
-        return keep_job_for_its_time(draft, job);
+        return draft.requeue_at(until);
     }
     if job.deleting {
         stop::remove_overdue_pod(draft);
@@ -203,11 +224,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     }
     let view = draft.view.evalai.clone().unwrap_or_default();
     match view.end {
-        Some(EvalaiEnd::Published { at }) => {
-            draft.status.times.published = Some(Time(at));
-            published(draft, view.team_id.as_deref());
-            Delivery::Done
-        }
+        Some(EvalaiEnd::Published { at }) => Delivery::Answered(at),
         Some(EvalaiEnd::Ended { status }) => amend(draft, &status),
         Some(EvalaiEnd::Refused { message }) => {
             refused(draft, &message);
@@ -264,7 +281,6 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
     });
     let shown = message.clone().unwrap_or_default();
     draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
-    draft.event(false, reasons::PUBLISHED, "EvalAI has the result.");
     if let Some(message) = message {
         draft.event(true, reasons::TEAM_DIFFERS, message);
     }
@@ -392,13 +408,25 @@ fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     }
 }
 
-fn keep_job_for_its_time(draft: &mut PlanBuilder<'_>, job: &JobView) {
-    if !job.has_ttl && !job.deleting {
-        let seconds = draft.leaderboard().map_or(86_400, |l| l.ttl_seconds_after_finished);
-        draft.act(Action::SetJobTtl {
-            name: job.name.clone(),
-            seconds,
-        });
+/// Removes a Job whose host wants it gone before Kubernetes removes it: that is late enough for every end to be read first.
+fn remove_job_in_time(draft: &mut PlanBuilder<'_>) {
+    let ended = draft.view.job.ours().filter(|job| !job.deleting);
+    let Some((job, end)) = ended.and_then(|job| job.end.as_ref().map(|end| (job, end))) else {
+        return;
+    };
+    let seconds = draft
+        .leaderboard()
+        .map_or(JOB_SECONDS, |l| l.ttl_seconds_after_finished);
+    if seconds >= JOB_SECONDS {
+        return;
+    }
+    let finished = draft.status.times.finished.as_ref().map(|time| time.0);
+    let until = after(end.at().or(finished).unwrap_or(draft.now()), seconds.into());
+    if draft.now() < until {
+        draft.requeue_at(until);
+    } else {
+        draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
+        draft.requeue_in(AGAIN);
     }
 }
 

@@ -10,7 +10,7 @@ use super::blame::{self, Crash};
 use super::failure::{infrastructure, participant};
 use super::next_steps::{Steps, for_both, in_the_log_of, of_participant, smaller};
 use super::plan_builder::{PlanBuilder, after};
-use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
 

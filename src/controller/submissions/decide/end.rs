@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
 use super::{allowance, crashes, failure, reading};
-use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -182,11 +182,16 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const NOT_MENDABLE: [&str; 3] = [reasons::PREFIX_IN_USE, reasons::JOB_DELETED, reasons::SCHEDULE_DEADLINE];
-    let is_mendable = !NOT_MENDABLE.contains(&found.reason.as_str());
+    const FINAL: [&str; 4] = [
+        reasons::PREFIX_IN_USE,
+        reasons::JOB_DELETED,
+        reasons::JOB_EXPIRED,
+        reasons::SCHEDULE_DEADLINE,
+    ];
+    let can_recover = !FINAL.contains(&found.reason.as_str());
     // A higher attempt that is already requested takes the place of a retry.
     let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
-    is_mendable
+    can_recover
         && is_latest
         && !allowance::is_used_up(draft, found)
         && draft.status.retry < draft.retries().infrastructure
@@ -271,7 +276,7 @@ fn duration(seconds: i64) -> String {
 impl View {
     fn ended_at(&self) -> Option<Timestamp> {
         match self.job.ours()?.end.as_ref() {
-            Some(JobEnd::Complete { at } | JobEnd::Failed { at, .. }) => *at,
+            Some(end) => end.at(),
             None => self.pod.as_ref()?.run_ended,
         }
     }

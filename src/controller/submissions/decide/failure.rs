@@ -66,6 +66,13 @@ pub(super) fn job_deleted() -> Failure {
     infrastructure(reasons::JOB_DELETED, "The Job was deleted repeatedly by somebody else.")
 }
 
+pub(super) fn job_expired() -> Failure {
+    infrastructure(
+        reasons::JOB_EXPIRED,
+        "The Job ended and was removed after its time to live, and nobody had read its end; what was stored is kept.",
+    )
+}
+
 pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure {
     let node = node.map_or_else(|| "Its node".to_owned(), |node| format!("Node {node}"));
     let what = if node_state == ObservedNode::Reports {

@@ -7,11 +7,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate, job_name};
 use super::plan_builder::{PlanBuilder, after};
 use super::{accept, crashes, end, failure, isolation, line, reading, start, stop};
-use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{PairStatus, Progress, Score, reasons};
+use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, PairStatus, Progress, Score, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
@@ -31,6 +31,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
         // What was seen is of an earlier try; the next pass looks at the present one.
         ObservedJob::Ours(job) if job.name != own_job_name(draft) => draft.requeue_in(Duration::from_secs(1)),
         ObservedJob::Ours(job) => with_job(draft, job),
+        ObservedJob::Created => draft.requeue_in(LOOK),
         ObservedJob::Foreign if !draft.is_to_stop() => name_taken(draft),
         ObservedJob::Absent | ObservedJob::Foreign if has_job => without_its_job(draft),
         ObservedJob::Absent | ObservedJob::Foreign => in_line(draft),
@@ -44,9 +45,17 @@ fn follow(draft: &mut PlanBuilder<'_>) {
     // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
     let is_known = draft.status.times.submitted.is_some();
     let may_run = is_known && info.is_some_and(|info| info.standing != Standing::Ended);
-    if may_run && !draft.is_finished() && !draft.is_to_stop() && !draft.tells_progress() {
+    if may_run && !draft.is_finished() && !draft.is_to_stop() && !draft.does(is_progress) {
         draft.act(Action::FollowEvalai);
     }
+}
+
+/// An update with which EvalAI's side looks for the end by itself.
+fn is_progress(action: &Action) -> bool {
+    matches!(
+        action,
+        Action::UpdateEvalai(EvalaiUpdate::Queued | EvalaiUpdate::Running)
+    )
 }
 
 fn own_job_name(draft: &PlanBuilder<'_>) -> String {
@@ -122,10 +131,9 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
 fn start_job(draft: &mut PlanBuilder<'_>) {
     let name = own_job_name(draft);
     let (attempt, retry) = (draft.status.attempt.unwrap_or(1), draft.status.retry);
-    let is_new = draft.status.job_name.is_none();
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
-    draft.status.job_name = Some(name.clone());
+    draft.status.job_name = Some(name);
     draft.act(Action::CreateJob { attempt, retry });
     draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
     if draft.is_running() {
@@ -134,9 +142,6 @@ fn start_job(draft: &mut PlanBuilder<'_>) {
     } else {
         draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
         draft.show(reasons::PREPARING, start::PREPARED);
-    }
-    if is_new {
-        draft.event(false, reasons::JOB_CREATED, format!("Created Job {name}."));
     }
     update_evalai(draft);
     record(draft);
@@ -148,7 +153,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     // What the run has stored last decides whether it is made again.
     let is_read = reading::is_of(draft, Stage::JobEnded);
     if !draft.is_to_stop()
-        && draft.was_job_seen()
+        && (draft.was_job_seen() || draft.is_first_job())
         && !is_read
         && let Some(left) = reading::answer_left(draft)
     {
@@ -157,6 +162,10 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     // A report from before this Job was seen is its predecessor's.
     let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
     if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
+        return end::decide(draft, None);
+    }
+    if draft.was_job_seen() && has_expired(draft) {
+        draft.fail(failure::job_expired());
         return end::decide(draft, None);
     }
     if draft.leaderboard().is_none() {
@@ -187,6 +196,15 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         );
     }
     start_job(draft);
+}
+
+/// Whether Kubernetes may have removed the Job by its time to live, after an end that nobody has read.
+fn has_expired(draft: &PlanBuilder<'_>) -> bool {
+    let times = &draft.status.times;
+    let known = [&times.scheduled, &times.started, &times.accepted];
+    let since = known.into_iter().flatten().next().map_or(draft.now(), |time| time.0);
+    let seconds = draft.leaderboard().map_or(JOB_SECONDS, LeaderboardSpec::job_seconds);
+    draft.now() >= after(since, seconds.into())
 }
 
 fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {

@@ -5,10 +5,10 @@
 
 use std::time::Duration;
 
-use super::plan::{Action, LogAt, LogPlace};
+use super::plan::Action;
 use super::plan_builder::PlanBuilder;
 use super::trouble;
-use crate::controller::submissions::view::{ObservedLog, PodView};
+use crate::controller::submissions::view::{LogAt, LogPlace, ObservedLog, PodView};
 use crate::pod::run::console;
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
 

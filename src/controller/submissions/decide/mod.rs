@@ -31,21 +31,21 @@ use std::time::Duration;
 
 use super::view::View;
 pub use after::previous_controller;
-pub use plan::{Action, EvalaiUpdate, Event, LogAt, LogPlace, Plan, job_name};
+pub use plan::{Action, EvalaiUpdate, Event, Plan, job_name};
 use plan_builder::PlanBuilder;
 
 /// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
     let mut draft = PlanBuilder::new(view);
-    if !draft.has_finalizer() && !draft.is_deleting() {
-        draft.act(Action::AddFinalizer);
-    }
     if draft.begin_attempt() {
         // What was observed is of another attempt.
         after::leave_job(&mut draft);
         draft.requeue_in(Duration::ZERO);
     } else {
         decide_stage(&mut draft);
+        if needs_finalizer(&draft) {
+            draft.act_first(Action::AddFinalizer);
+        }
     }
     let report = reading::demand(&draft);
     draft.into_plan(report)
@@ -58,4 +58,13 @@ fn decide_stage(draft: &mut PlanBuilder<'_>) {
     if draft.is_finished() {
         after::decide(draft);
     }
+}
+
+/// A deletion waits only for another system that has heard of the submission, or will, and not of its end.
+fn needs_finalizer(draft: &PlanBuilder<'_>) -> bool {
+    let is_owed = draft.spec().evalai.is_some() || draft.view.record.is_some();
+    let has_begun = draft.status.job_name.is_some() || draft.status.retry > 0;
+    let is_told = draft.does(|action| matches!(action, Action::UpdateEvalai(_) | Action::Record { .. }));
+    let is_settled = draft.does(|action| *action == Action::Forget);
+    is_owed && (has_begun || is_told) && !is_settled && !draft.has_finalizer() && !draft.is_deleting()
 }

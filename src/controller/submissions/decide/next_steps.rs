@@ -62,7 +62,7 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::SIMULATION_CRASHED => "The simulator crashed.",
         reasons::START_DEADLINE => "The run could not be started in time.",
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
-        reasons::JOB_DELETED | reasons::JOB_FAILED => "The cluster ended the run.",
+        reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",
         reasons::PHASE_DIFFERS => "The submission's phase in EvalAI is not the one it was submitted to.",
         reasons::NOT_ISOLATED => "The run could not be isolated from the network.",
         reasons::PREFIX_IN_USE => "The place for the results is in use.",

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
-use crate::controller::submissions::archive::digest::ReportId;
-use crate::controller::submissions::view::ReportDemand;
+use crate::controller::submissions::report_digest::ReportId;
+use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
 use leaderboard_api::{SubmissionStatus, names};
 
@@ -43,8 +43,6 @@ pub enum Action {
     TakeOwnership,
     /// Ask the Pod to stop.
     AnnotateStop { pod: String, stop: Stop },
-    /// Let Kubernetes remove the finished Job after its time.
-    SetJobTtl { name: String, seconds: i32 },
     /// Keep the tail of the log that explains the failure, from the first of these places that has it.
     KeepLog { places: Vec<LogPlace> },
     /// Read the texts of this report, so that they can be published.
@@ -80,23 +78,6 @@ pub struct Event {
     pub warning: bool,
     pub reason: String,
     pub message: String,
-}
-
-/// A place where a log may be.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct LogPlace {
-    /// Whose log it is.
-    pub container: String,
-    pub at: LogAt,
-}
-
-/// Where a log is kept.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum LogAt {
-    /// On the Pod's node; `previous`: of the container's last run, since it runs again.
-    Node { pod: String, previous: bool },
-    /// In S3, at this key below the run's prefix.
-    Bucket { key: String },
 }
 
 /// Name of the Job that the present attempt has or will have.

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, EvalaiUpdate, Event, Plan};
+use super::plan::{Action, Event, Plan};
 use super::state;
 use crate::controller::submissions::view::{ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
@@ -13,6 +13,14 @@ use leaderboard_api::{
     BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
     SubmissionStatus, effective, names, reasons,
 };
+
+/// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
+const WITHOUT_EVENT: [&str; 4] = [
+    reasons::PREPARING,
+    reasons::ASKING_EVALAI,
+    reasons::RUNNING,
+    reasons::RESUMED,
+];
 
 /// A plan in the making.
 pub(super) struct PlanBuilder<'a> {
@@ -114,20 +122,15 @@ impl<'a> PlanBuilder<'a> {
         matches!(state::of(&self.status), State::Running | State::Resumed)
     }
 
-    /// Whether the present Job was seen since it was asked for. Only then does its absence mean that somebody deleted it: a
-    /// crash or a slow watch looks the same.
+    /// Whether the present Job was there. Only then does its absence mean that it was deleted: a crash of the controller before
+    /// its creation looks the same. A report proves the first Job of an attempt; that of a later one may be its predecessor's.
     pub(super) fn was_job_seen(&self) -> bool {
-        const BEFORE_IT: [&str; 3] = [
-            reasons::JOB_NAME_TAKEN,
-            reasons::LEADERBOARD_NOT_FOUND,
-            reasons::NOT_ISOLATED,
-        ];
-        let seen = |c: &Condition| match c.status.as_str() {
-            "True" => !BEFORE_IT.contains(&c.reason.as_str()),
-            _ => c.reason != reasons::PREPARING,
-        };
-        let stalled = conditions::get(&self.status.conditions, conditions::STALLED);
-        self.status.times.scheduled.is_some() || stalled.is_some_and(seen)
+        self.status.times.scheduled.is_some() || (self.is_first_job() && self.view.report.ours().is_some())
+    }
+
+    /// Whether the attempt has had no other Job than the present one.
+    pub(super) fn is_first_job(&self) -> bool {
+        self.status.retry == 0 && self.status.recreated == 0
     }
 
     /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished.
@@ -194,15 +197,12 @@ impl<'a> PlanBuilder<'a> {
         self.actions.push(action);
     }
 
-    /// Whether EvalAI receives its progress.
-    pub(super) fn tells_progress(&self) -> bool {
-        let is_progress = |action: &Action| {
-            matches!(
-                action,
-                Action::UpdateEvalai(EvalaiUpdate::Queued | EvalaiUpdate::Running)
-            )
-        };
-        self.actions.iter().any(is_progress)
+    pub(super) fn act_first(&mut self, action: Action) {
+        self.actions.insert(0, action);
+    }
+
+    pub(super) fn does(&self, is_meant: impl Fn(&Action) -> bool) -> bool {
+        self.actions.iter().any(is_meant)
     }
 
     pub(super) fn event(&mut self, warning: bool, reason: &str, message: impl Into<String>) {
@@ -327,6 +327,9 @@ impl<'a> PlanBuilder<'a> {
             return;
         }
         let (state, Some(reason)) = new else { return };
+        if WITHOUT_EVENT.contains(&reason.as_str()) {
+            return;
+        }
         let message = self.status.message.clone();
         let message = message.unwrap_or_else(|| state.as_str().to_owned());
         self.event(state == State::Failed, &reason, message);

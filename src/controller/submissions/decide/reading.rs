@@ -9,7 +9,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
-use crate::controller::submissions::archive::digest::ReportDigest;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
 };
@@ -71,7 +71,11 @@ fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
             Some(Stage::RunEnded)
         }
         ObservedJob::Ours(_) => draft.status.times.scheduled.as_ref().map(|_| Stage::Live),
-        // One that was asked for just now is not there either.
+        ObservedJob::Created => None,
+        // One that is created only now is not there either, and what is stored is not its own.
+        ObservedJob::Absent if draft.does(|action| matches!(action, Action::CreateJob { .. })) => None,
+        // Whether the first Job of an attempt was there, its report shows.
+        ObservedJob::Absent if draft.is_first_job() => Some(Stage::JobEnded),
         ObservedJob::Absent | ObservedJob::Foreign => {
             (draft.is_to_stop() || draft.was_job_seen()).then_some(Stage::JobEnded)
         }

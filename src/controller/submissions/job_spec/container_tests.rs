@@ -2,8 +2,8 @@
 
 use serde_json::{Value, json};
 
+use super::run_document;
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
-use super::{JobInput, build_json, run_document};
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
 use leaderboard_api::names;
@@ -333,20 +333,20 @@ fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
         ("Warn", "Forbidden", 3, lately, false),
         ("Require", "NotEnforced", 3, lately, false),
     ] {
-        let told = asked(json!({"enforcement": enforcement}), Some((reason, generation, since)));
-        assert_eq!(told["isKnownOpen"], expected, "{enforcement} {reason} of {generation}");
+        let isolation = asked(json!({"enforcement": enforcement}), Some((reason, generation, since)));
+        assert_eq!(
+            isolation["isKnownOpen"], expected,
+            "{enforcement} {reason} of {generation}"
+        );
     }
 }
 
 #[test]
 fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
-    let case = Case::new("V2", json!({}));
-    let input = JobInput {
-        image_pull_policy: Some("Always"),
-        region: Some("us-west-2"),
-        ..case.input()
-    };
-    let job = build_json(&input);
+    let mut case = Case::new("V2", json!({}));
+    case.settings.image_pull_policy = Some("Always".into());
+    case.settings.region = Some("us-west-2".into());
+    let job = case.json();
     for container in containers(&job) {
         assert_eq!(container.get("imagePullPolicy").is_some(), is_own(container));
         if is_own(container) {

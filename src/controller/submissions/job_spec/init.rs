@@ -57,8 +57,8 @@ pub(super) fn logcopy(input: &JobInput<'_>) -> Container {
 fn own(input: &JobInput<'_>, name: &str) -> Container {
     Container {
         name: name.into(),
-        image: Some(input.operator_image.into()),
-        image_pull_policy: input.image_pull_policy.map(Into::into),
+        image: Some(input.settings.image.clone()),
+        image_pull_policy: input.settings.image_pull_policy.clone(),
         command: Some(vec!["leaderboard-operator".into(), name.into()]),
         env: Some(own_env(input)),
         security_context: Some(SecurityContext {
@@ -90,7 +90,7 @@ fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
         // The node's own role is no identity of ours: what answers us at the metadata address answers the agents too.
         variable("AWS_EC2_METADATA_DISABLED", "true"),
     ];
-    let region = input.region.or(input.plan.storage.region.as_deref());
+    let region = input.settings.region.as_ref().or(input.plan.storage.region.as_ref());
     env.extend(region.map(|region| variable("AWS_REGION", region)));
     if let Some(identity) = &input.spec().pod_identity {
         env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));

@@ -22,13 +22,14 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::{Job, JobSpec};
 use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
-use kube::Resource;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
 use kube::api::{DynamicObject, TypeMeta};
 use serde_json::{Value, json};
 
 use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
+use crate::controller::objects::owner_reference;
+use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 use leaderboard_api::{
     Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions,
@@ -59,12 +60,8 @@ pub struct JobInput<'a> {
     pub attempt: i64,
     /// Jobs of this attempt that infrastructure failures ended.
     pub retry: i32,
-    /// The operator's own image: `workspace` and `logcopy` are in it.
-    pub operator_image: &'a str,
-    /// Pull policy of that image; `None` is Kubernetes' default.
-    pub image_pull_policy: Option<&'a str>,
-    /// The operator's own AWS region, for what the Leaderboard gives no region.
-    pub region: Option<&'a str>,
+    /// The operator's own image, with `workspace` and `logcopy` in it, and its region.
+    pub settings: &'a Settings,
     /// When it is made.
     pub now: Timestamp,
 }
@@ -92,18 +89,11 @@ impl JobInput<'_> {
     }
 }
 
-/// The Job with the Leaderboard's `podOverrides` laid over it, as far as this client's types know its fields.
-///
-/// For reading. Create what [`build_json`] or [`build_object`] return: newer Pod fields survive there. An overlay that
-/// does not fit the types, which `pod_overlay::validate_overlay` refuses, is left out.
-pub fn build(input: &JobInput<'_>) -> Job {
-    serde_json::from_value(build_json(input)).unwrap_or_else(|_| ours(input))
-}
-
-/// The Job as it is created: ours, with the Leaderboard's `podOverrides` laid over its template.
+/// The Job as it is created: ours, with the Leaderboard's `podOverrides` laid over its template. As JSON, since newer Pod fields
+/// survive there.
 ///
 /// An overlay that `pod_overlay::validate_overlay` refuses is not applied at all, so that nothing gets around its rules.
-pub fn build_json(input: &JobInput<'_>) -> Value {
+fn build_json(input: &JobInput<'_>) -> Value {
     // Maps with text as keys and finite numbers always become JSON.
     let mut job = serde_json::to_value(ours(input)).unwrap_or_default();
     let overlay = input
@@ -131,7 +121,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
 }
 
 /// What the Pod receives as `LEADERBOARD_RUN`.
-pub fn run_document(input: &JobInput<'_>) -> Run {
+fn run_document(input: &JobInput<'_>) -> Run {
     let unsigned = |seconds: i64| u64::try_from(seconds).unwrap_or_default();
     let (spec, meta) = (input.spec(), &input.submission.metadata);
     Run {
@@ -182,6 +172,7 @@ fn ours(input: &JobInput<'_>) -> Job {
             backoff_limit: Some(backoff_limit(input)),
             // The default starts the next Pod while the old one still writes.
             pod_replacement_policy: Some("Failed".into()),
+            ttl_seconds_after_finished: Some(input.spec().job_seconds()),
             template: template(input),
             ..JobSpec::default()
         }),
@@ -198,14 +189,7 @@ fn metadata(input: &JobInput<'_>) -> ObjectMeta {
             names::ANNOTATION_RETRY.into(),
             input.retry.to_string(),
         )])),
-        owner_references: Some(vec![OwnerReference {
-            api_version: Submission::api_version(&()).into_owned(),
-            kind: Submission::kind(&()).into_owned(),
-            name: input.submission_name().to_owned(),
-            uid: input.submission.metadata.uid.clone().unwrap_or_default(),
-            controller: Some(true),
-            block_owner_deletion: Some(true),
-        }]),
+        owner_references: Some(vec![owner_reference(input.submission)]),
         ..ObjectMeta::default()
     }
 }

@@ -17,6 +17,7 @@ pub(super) struct Case {
     pub(super) plan: RunPlan,
     pub(super) attempt: i64,
     pub(super) retry: i32,
+    pub(super) settings: Settings,
 }
 
 impl Case {
@@ -59,6 +60,13 @@ impl Case {
             plan,
             attempt: 1,
             retry: 0,
+            settings: Settings {
+                image: OPERATOR_IMAGE.into(),
+                image_pull_policy: None,
+                region: None,
+                namespace: None,
+                concurrency: 16,
+            },
         }
     }
 
@@ -69,9 +77,7 @@ impl Case {
             plan: &self.plan,
             attempt: self.attempt,
             retry: self.retry,
-            operator_image: OPERATOR_IMAGE,
-            image_pull_policy: None,
-            region: None,
+            settings: &self.settings,
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }
     }
@@ -147,7 +153,8 @@ fn the_job_of_leaderboard_2_is_as_committed() {
 fn typed_and_dynamic_job_are_the_same() {
     let case = Case::new("V2", json!({"podIdentity": role()}));
     let json = case.json();
-    assert_eq!(serde_json::to_value(build(&case.input())).unwrap(), json);
+    let typed: Job = serde_json::from_value(json.clone()).unwrap();
+    assert_eq!(serde_json::to_value(typed).unwrap(), json);
     assert_eq!(serde_json::to_value(build_object(&case.input())).unwrap(), json);
 }
 
@@ -171,8 +178,7 @@ fn an_overlay_that_is_refused_is_not_applied() {
         json!({"podOverrides": {"spec": {"hostNetwork": true, "priorityClassName": "high"}}}),
     );
     assert_eq!(case.json(), Case::new("V2", json!({})).json());
-    let pod = build(&case.input()).spec.unwrap().template.spec.unwrap();
-    assert_eq!(pod.containers.len(), 8);
+    assert_eq!(containers(&case.json()).len(), 3 + 8);
 }
 
 #[test]
@@ -237,8 +243,24 @@ fn the_nets_are_wider_than_the_rules_above_them() {
             job["spec"]["template"]["spec"]["activeDeadlineSeconds"].as_i64(),
             deadline
         );
-        // Nothing takes a Job away before it was read.
-        assert_eq!(job["spec"].get("ttlSecondsAfterFinished"), None);
         assert_eq!(job["spec"].get("activeDeadlineSeconds"), None);
+    }
+}
+
+#[test]
+fn kubernetes_keeps_a_finished_job_long_enough_for_its_end_to_be_read() {
+    for (hosts, kept) in [
+        (json!({}), 604_800),
+        (json!(0), 604_800),
+        (json!(86_400), 604_800),
+        (json!(1_000_000), 1_000_000),
+    ] {
+        let more = if hosts.is_number() {
+            json!({"ttlSecondsAfterFinished": hosts})
+        } else {
+            hosts
+        };
+        let job = Case::new("V2", more).json();
+        assert_eq!(job["spec"]["ttlSecondsAfterFinished"], kept);
     }
 }

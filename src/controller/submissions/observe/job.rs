@@ -15,10 +15,6 @@ pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
         created: job.metadata.creation_timestamp.as_ref().map(|t| t.0),
         end: end(job).or_else(|| pod.and_then(completion)),
         deleting: job.metadata.deletion_timestamp.is_some(),
-        has_ttl: job
-            .spec
-            .as_ref()
-            .is_some_and(|s| s.ttl_seconds_after_finished.is_some()),
         failed_create: None,
     }
 }

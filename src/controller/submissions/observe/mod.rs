@@ -68,6 +68,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         record: leaderboard
             .as_deref()
             .and_then(|board| uses.external.record_view(board, &submission)),
+        evalai_waited: uses.memory.evalai_waited(&submission),
         partial_sent: uses.memory.partial_sent(&submission),
         rerun_as: uses.reruns.of(&submission),
         simulator_failures_of_team: simulator_failures(uses.stores, &submission, &job, now),
@@ -87,11 +88,18 @@ fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (Observe
     let name = job_name(&submission.name_any(), status);
     let reference = ObjectRef::<Job>::new(&name).within(&namespace);
     let Some(found) = uses.stores.jobs.get(&reference) else {
-        return (ObservedJob::Absent, None);
+        let is_awaited = uses.memory.awaits_job(submission, &name);
+        let job = if is_awaited {
+            ObservedJob::Created
+        } else {
+            ObservedJob::Absent
+        };
+        return (job, None);
     };
     if !is_owned_by(&found, submission) {
         return (ObservedJob::Foreign, None);
     }
+    uses.memory.forget_job(submission);
     let pod = uses.stores.newest_pod(&found);
     let mut job = job::view(&found, pod.as_deref());
     let is_old = job.created.is_some_and(|at| now.duration_since(at) >= REFUSED_AFTER);
@@ -113,7 +121,11 @@ fn node(lookups: &Lookups, submission: &Submission, pod: Option<&PodView>) -> Ob
 
 /// How often the simulators of its team have failed. Counted only if this may be the reconcile that ends it.
 fn simulator_failures(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Timestamp) -> usize {
-    let is_under_way = matches!(job, ObservedJob::Ours(job) if job.end.is_none());
+    let is_under_way = match job {
+        ObservedJob::Ours(job) => job.end.is_none(),
+        ObservedJob::Created => true,
+        ObservedJob::Absent | ObservedJob::Foreign => false,
+    };
     let may_end = submission.status.as_ref().is_some_and(|status| {
         let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
         status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)

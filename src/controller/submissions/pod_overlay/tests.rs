@@ -314,6 +314,10 @@ fn what_a_container_may_not_say() {
             ),
         ],
     );
+}
+
+#[test]
+fn what_an_init_container_may_not_say() {
     refused_in(
         "initContainers",
         &[

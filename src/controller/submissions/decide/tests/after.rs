@@ -1,5 +1,7 @@
 //! After the end: EvalAI, the table, the Job's time to live.
 
+use std::time::Duration;
+
 use jiff::SignedDuration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
@@ -33,19 +35,20 @@ fn evalai_first_then_the_table_then_rest() {
         (finished(), Finished, EvalaiUpdate::Finished),
         (failed(), Failed, EvalaiUpdate::Failed),
     ] {
-        world.job().has_ttl = true;
         let mut plan = world.pass();
         plan.actions.retain(|a| !matches!(a, Action::KeepLog { .. }));
         assert_eq!(plan.actions, [Action::UpdateEvalai(wish)]);
         assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::WAITING.into()));
+        let before = world.status();
         world.published();
         let plan = world.pass();
-        assert_eq!(condition(&plan, PUBLISHED).0, "True");
-        assert_eq!(events(&plan), ["Published"]);
+        assert_eq!(plan.status, before, "both answers are one write");
         assert_eq!(plan.actions, [Action::Record { end: true }]);
         world.recorded();
         let plan = world.pass();
+        assert_eq!(condition(&plan, PUBLISHED).0, "True");
         assert_eq!(condition(&plan, RECORDED).0, "True");
+        assert!(plan.events.is_empty(), "the status shows it");
         assert_eq!(
             (plan.actions.as_slice(), plan.requeue),
             ([Action::Forget].as_slice(), None)
@@ -59,6 +62,53 @@ fn evalai_first_then_the_table_then_rest() {
             (Some(state), [Action::Forget].as_slice())
         );
     }
+}
+
+#[test]
+fn evalais_answer_is_shown_after_ten_seconds_without_the_tables() {
+    let mut world = finished();
+    world.published();
+    let plan = world.pass();
+    assert_eq!(condition(&plan, PUBLISHED).0, "False");
+    assert!(plan.requeue.is_some_and(|wait| wait <= Duration::from_secs(11)));
+    world.wait(9);
+    assert_eq!(condition(&world.pass(), PUBLISHED).0, "False");
+    world.wait(1);
+    let plan = world.pass();
+    assert_eq!(condition(&plan, PUBLISHED).0, "True");
+    assert_eq!(condition(&plan, RECORDED).0, "False");
+    assert!(plan.status.times.published.is_some());
+}
+
+#[test]
+fn a_job_goes_early_only_by_the_hosts_choice_and_when_all_have_its_end() {
+    let deletes = |plan: &Plan| has(plan, |a| matches!(a, Action::DeleteJob { .. }));
+    let mut world = World::local().running();
+    world.leaderboard().ttl_seconds_after_finished = 600;
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    world.wait(600);
+    assert!(!deletes(&world.pass()), "the table has no end yet");
+    let mut late = world.clone();
+    late.recorded();
+    assert!(deletes(&late.pass()));
+    late.job().deleting = true;
+    assert!(!deletes(&late.pass()));
+    late.job_gone();
+    assert_eq!(late.pass().requeue, None);
+
+    world.wait(-1);
+    world.recorded();
+    let plan = world.pass();
+    assert!(!deletes(&plan));
+    assert!(plan.requeue.is_some_and(|wait| wait <= Duration::from_secs(2)));
+
+    world.leaderboard().ttl_seconds_after_finished = 7 * 86_400;
+    world.wait(30 * 86_400);
+    let plan = world.pass();
+    assert!(!deletes(&plan), "Kubernetes does it");
+    assert_eq!(plan.requeue, None);
 }
 
 #[test]
@@ -108,6 +158,7 @@ fn a_cancel_that_our_own_write_may_have_undone_is_told_again() {
     world.in_evalai().overtaken = false;
     assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Cancelled]);
     world.published();
+    world.recorded();
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
     assert_eq!(
         (evalai_updates(&plan), condition(&plan, PUBLISHED).0),
@@ -138,6 +189,7 @@ fn evalais_end_wins_until_ours_is_answered_and_not_after() {
     }
     let mut world = finished();
     world.published();
+    world.recorded();
     world.pass();
     world.in_evalai().end = Some(EvalaiEnd::Ended {
         status: "cancelled".into(),
@@ -280,7 +332,6 @@ fn says(world: &mut World, status: &str) {
 #[test]
 fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
     for (mut world, state) in [(finished(), Finished), (failed(), Failed)] {
-        world.job().has_ttl = true;
         world.published();
         world.recorded();
         world.pass();
@@ -332,7 +383,6 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
 #[test]
 fn a_row_that_was_read_before_the_rerun_is_asked_for_anew() {
     let mut world = finished();
-    world.job().has_ttl = true;
     world.published();
     world.recorded();
     world.pass();
@@ -405,25 +455,19 @@ fn an_end_says_until_when_it_waits_for_the_controller_before() {
 }
 
 #[test]
-fn a_finished_job_gets_its_time_to_live_once() {
-    let mut world = finished();
-    assert!(has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
-    world.job().has_ttl = true;
-    assert!(!has(&world.pass(), |a| matches!(a, Action::SetJobTtl { .. })));
-}
-
-#[test]
 fn a_row_that_has_gone_to_another_team_is_said_with_its_end() {
     let mut world = finished();
     world.in_evalai().team_id = Some("42".into());
     let mut same = world.clone();
     same.published();
-    assert_eq!(events(&same.pass()), ["Published"]);
+    same.recorded();
+    assert!(same.pass().events.is_empty());
 
     world.in_evalai().team_id = Some("43".into());
     world.published();
+    world.recorded();
     let plan = world.pass();
-    assert_eq!(events(&plan), ["Published", reasons::TEAM_DIFFERS]);
+    assert_eq!(events(&plan), [reasons::TEAM_DIFFERS]);
     let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
     assert!(
         shown.message.contains("team 43") && shown.message.contains("team 42"),

@@ -7,9 +7,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::json;
 
 use super::rules;
-use crate::controller::submissions::archive::digest::ReportDigest;
 use crate::controller::submissions::decide::blame::is_crash;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob,
     ObservedLog, ObservedNode, ObservedReport, ObservedTexts, PodView, RecordView, Stage, Standing, Texts, Turn, View,
@@ -112,6 +112,8 @@ impl World {
                 fence: ObservedFence::Held,
                 log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
+                // Long enough that silence is shown.
+                evalai_waited: std::time::Duration::from_secs(5),
                 record: Some(RecordView::default()),
                 partial_sent: None,
                 rerun_as: None,
@@ -162,7 +164,6 @@ impl World {
             created: Some(self.view.now),
             end: None,
             deleting: false,
-            has_ttl: false,
             failed_create: None,
         });
     }

@@ -35,7 +35,6 @@ fn complete_results_that_count_finish() {
     assert_eq!(condition(&plan, FINISHED), ("True".into(), reasons::FINISHED.into()));
     assert_eq!(condition(&plan, ARCHIVED), ("True".into(), reasons::STORED.into()));
     assert_eq!(condition(&plan, RUNNING).0, "False");
-    assert!(has(&plan, |a| matches!(a, Action::SetJobTtl { seconds: 86_400, .. })));
 }
 
 /// The Pod's agents and simulators have ended well at this second; its Job knows nothing of it yet.
@@ -52,7 +51,6 @@ fn a_complete_run_waits_neither_for_logcopys_farewell_nor_for_its_job() {
     let plan = world.pass_to(Finished, reasons::FINISHED);
     assert_eq!(plan.status.times.finished.clone().unwrap().0, at(500));
     assert_eq!(condition(&plan, ARCHIVED), ("True".into(), reasons::STORED.into()));
-    assert!(has(&plan, |a| matches!(a, Action::SetJobTtl { .. })));
     assert!(
         !has(&plan, |a| matches!(a, Action::DeleteJob { .. })),
         "it ends by itself"

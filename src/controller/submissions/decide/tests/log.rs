@@ -1,8 +1,8 @@
 //! Which log is kept of which failure, from where, and when.
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, LogAt, LogPlace, Plan};
-use crate::controller::submissions::view::{JobEnd, ObservedReport};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan};
+use crate::controller::submissions::view::{JobEnd, LogAt, LogPlace, ObservedReport};
 use crate::pod::report::Report;
 use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
 use leaderboard_api::reasons;

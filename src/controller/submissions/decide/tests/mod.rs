@@ -7,6 +7,7 @@ mod builders;
 mod crashes;
 mod end;
 mod failure;
+mod finalizer;
 mod isolation;
 mod line;
 mod log;

@@ -49,6 +49,7 @@ enum Change {
 #[derive(Clone, Debug)]
 enum Sight {
     Absent,
+    Created,
     Foreign,
     Present {
         end: Option<JobEnd>,
@@ -75,6 +76,7 @@ fn job() -> impl Strategy<Value = Sight> {
     let present = (select(ends), any::<bool>(), any::<bool>());
     prop_oneof![
         2 => Just(Sight::Absent),
+        1 => Just(Sight::Created),
         1 => Just(Sight::Foreign),
         1 => Just(Sight::Earlier),
         8 => present.prop_map(|(end, deleting, refused)| Sight::Present { end, deleting: deleting && refused, refused }),
@@ -326,12 +328,12 @@ fn see_job(world: &mut World, sight: Sight) {
             created: Some(at(0)),
             end,
             deleting,
-            has_ttl: deleting,
             failed_create: refused.then(|| "exceeded quota".into()),
         })
     };
     world.view.job = match sight {
         Sight::Absent => ObservedJob::Absent,
+        Sight::Created => ObservedJob::Created,
         Sight::Foreign => ObservedJob::Foreign,
         Sight::Earlier => ours(None, false, false),
         Sight::Present { end, deleting, refused } => ours(end, deleting, refused),
@@ -419,7 +421,7 @@ proptest! {
             if has(&plan, |a| matches!(a, crate::controller::submissions::decide::Action::DeleteJob { .. })) || is_going(&world) {
                 world.job_gone();
             }
-            if matches!(world.view.job, ObservedJob::Foreign) || is_earlier(&world) {
+            if matches!(world.view.job, ObservedJob::Created | ObservedJob::Foreign) || is_earlier(&world) {
                 world.job_gone();
             }
             world.wait(300);

@@ -23,7 +23,17 @@ pub fn check(view: &View, plan: &Plan) {
     conditions_are_conventional(plan);
     live_ones_are_looked_at_again(plan);
     a_wait_hears_evalai(view, plan);
+    the_state_is_for_people(view, plan);
     comes_to_rest(view, plan);
+}
+
+/// No decision depends on the state that is stored.
+fn the_state_is_for_people(view: &View, plan: &Plan) {
+    let mut view = view.clone();
+    if let Some(status) = &mut std::sync::Arc::make_mut(&mut view.submission).status {
+        status.state = None;
+    }
+    assert_eq!(decide(&view), *plan);
 }
 
 fn is_finished(status: &SubmissionStatus) -> bool {
@@ -62,8 +72,8 @@ fn one_job(view: &View, plan: &Plan) {
     assert!(created.len() <= 1, "two Jobs in one pass");
     if let Some((attempt, retry)) = created.first() {
         assert!(
-            !matches!(view.job, ObservedJob::Ours(_)),
-            "a second Job beside the present one"
+            !matches!(view.job, ObservedJob::Ours(_) | ObservedJob::Created),
+            "a second Job next to the present one"
         );
         assert!(!is_finished(&plan.status));
         assert_eq!((plan.status.attempt, plan.status.retry), (Some(*attempt), *retry));
@@ -148,9 +158,9 @@ fn tells_fit(view: &View, plan: &Plan) {
 
 fn status_is_whole(plan: &Plan) {
     let status = &plan.status;
-    let joins = |action: &Action| matches!(action, Action::JoinLine(_));
-    if *status == SubmissionStatus::default() && plan.actions.iter().any(joins) {
-        // Nothing was written of it yet, and its place comes first.
+    let waits = |action: &Action| matches!(action, Action::JoinLine(_) | Action::AskEvalai);
+    if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
+        // Nothing was written of it yet, and its place or EvalAI's answer comes first.
         return;
     }
     let state = status.state.expect("a state");

@@ -2,7 +2,7 @@
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::view::{ObservedJob, ObservedReport, PodView};
+use crate::controller::submissions::view::{ObservedJob, ObservedReport, PodView, Stage};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
@@ -341,12 +341,71 @@ fn a_job_deleted_by_hand_is_made_again_three_times() {
 }
 
 #[test]
-fn a_job_deleted_before_it_had_a_node_counts_too() {
+fn a_job_deleted_before_it_had_a_node_is_made_again_and_not_counted() {
     let mut world = World::local().with_job();
     world.job().failed_create = Some("exceeded quota: q".into());
     world.pass_to(Pending, reasons::QUOTA_EXCEEDED);
     world.job_gone();
-    assert_eq!(world.pass_to(Pending, reasons::PREPARING).status.recreated, 1);
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert_eq!((creates(&plan), plan.status.recreated), (true, 0));
+}
+
+#[test]
+fn a_job_that_was_just_created_is_waited_for() {
+    let mut world = World::local();
+    world.pass();
+    world.view.job = ObservedJob::Created;
+    let before = world.status();
+    let plan = world.pass();
+    assert_eq!((plan.status, plan.actions, plan.report), (before, Vec::new(), None));
+    // It cannot be deleted without its UID.
+    world.submission().spec.cancel = true;
+    assert_eq!(world.pass_to(Pending, reasons::PREPARING).actions, []);
+    world.see_job();
+    assert!(has(&world.pass(), |a| matches!(a, Action::DeleteJob { .. })));
+}
+
+#[test]
+fn a_run_that_began_and_ended_between_two_controllers_is_not_driven_again() {
+    let mut world = World::local();
+    assert_eq!(world.pass().report, None, "what is stored is no word of a new Job");
+    world.view.report_stage = None;
+    let plan = world.pass();
+    assert!(!creates(&plan));
+    assert_eq!(plan.report.unwrap().stage, Stage::JobEnded);
+    world.view.report_stage = Some(Stage::JobEnded);
+    let mut never = world.clone();
+    never.view.report = ObservedReport::Absent;
+    let plan = never.pass_to(Pending, reasons::PREPARING);
+    assert_eq!((creates(&plan), plan.status.recreated), (true, 0));
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+}
+
+#[test]
+fn a_job_that_is_gone_after_its_time_is_not_made_again() {
+    const WEEK: i64 = 7 * 86_400;
+    let gone_at = |second: i64| {
+        let mut world = World::local().running();
+        world.go_to(second);
+        world.job_gone();
+        world
+    };
+    let plan = gone_at(WEEK).pass_to(Failed, reasons::JOB_EXPIRED);
+    let failure = plan.status.failure.unwrap();
+    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    assert!(creates(&gone_at(WEEK - 1).pass_to(Running, reasons::REPLACING)));
+
+    let mut longer = gone_at(WEEK);
+    longer.leaderboard().ttl_seconds_after_finished = 2 * 7 * 86_400;
+    assert!(creates(&longer.pass_to(Running, reasons::REPLACING)));
+    let mut shorter = gone_at(WEEK - 1);
+    shorter.leaderboard().ttl_seconds_after_finished = 0;
+    assert!(creates(&shorter.pass_to(Running, reasons::REPLACING)));
+
+    let mut told = gone_at(WEEK);
+    told.report(final_report());
+    told.pass_to(Finished, reasons::FINISHED);
 }
 
 #[test]

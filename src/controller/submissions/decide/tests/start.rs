@@ -33,7 +33,7 @@ fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
     world.go_to(50);
     world.see_agents();
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!(events(&plan), [reasons::RUNNING]);
+    assert!(events(&plan).is_empty(), "the status shows it");
     assert_eq!(condition(&plan, RUNNING).0, "True");
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Running]);
 }

@@ -6,6 +6,7 @@ use sha2::{Digest, Sha256};
 
 use crate::pod::report::{Report, ReportError, ReportPair};
 use crate::pod::run::Stop;
+use leaderboard_api::text::one_line;
 
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
@@ -87,7 +88,7 @@ fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
 }
 
 fn cut(text: &str) -> String {
-    text.chars().take(LONGEST).collect()
+    one_line(text, LONGEST)
 }
 
 #[cfg(test)]
@@ -144,7 +145,7 @@ mod tests {
         let (digest, _) = ReportDigest::read(&report(true), "u").unwrap().unwrap();
         let metrics = digest.metrics.unwrap();
         assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
-        assert_eq!(digest.why.unwrap().len(), LONGEST);
+        assert_eq!(digest.why.unwrap().chars().count(), LONGEST);
     }
 
     #[test]

@@ -1,0 +1,202 @@
+"""Owns what the chart renders for given values: the objects, the text after an installation, and one file to install without Helm.
+
+Called by `charttest` and by `lab install-yaml`. Rendering asks no cluster; kubectl only turns YAML into JSON.
+"""
+
+import json
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from . import chartdocs, chartmetrics, chartshows
+from .chartcases import NOTES, RELEASE, SYSTEM
+from .chartshows import ABSENT, Case, Shown
+from .errors import LabError
+from .kube import Kube
+
+SOURCE = re.compile(r"^# Source: leaderboard-operator/(templates/\S+)$", re.MULTILINE)
+MONITORING_KINDS = ("PodMonitor", "ServiceMonitor", "PrometheusRule")
+
+
+def folder(repository: Path) -> Path:
+    return repository / "charts" / RELEASE
+
+
+def template(kube: Kube, chart: Path, values: Mapping[str, Any], kinds: Sequence[str] = ()) -> str:
+    """The objects of some values, as YAML. `kinds` are those that the cluster is to have, as group/version/kind."""
+    argv = ["template", RELEASE, str(chart), f"--namespace={SYSTEM}", "--values=-"]
+    return kube.run("helm", *argv, *(f"--api-versions={kind}" for kind in kinds), given=json.dumps(nested(values)))
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """`{"a.b": 1}` as `{"a": {"b": 1}}`; keys of the values themselves stay as they are."""
+    result: dict[str, Any] = {}
+    for path, value in values.items():
+        *groups, name = path.split(".")
+        place = result
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[name] = value
+    return result
+
+
+def objects(kube: Kube, manifests: str) -> dict[str, dict[str, Any]]:
+    """The objects of a YAML text by kind/name. An empty patch that kubectl makes here gives them back as JSON."""
+    text = kube.run(
+        "kubectl", "patch", "--local", "--filename=-", "--type=merge", "--patch={}", "--output=json", given=manifests
+    )
+    found: dict[str, dict[str, Any]] = {}
+    for item in documents(text):
+        name = f"{item['kind']}/{item['metadata']['name']}"
+        if name in found:
+            raise LabError(f"{name} is rendered twice")
+        found[name] = item
+    return found
+
+
+def documents(text: str) -> list[dict[str, Any]]:
+    """JSON objects one after the other, or one List of them."""
+    found, decoder, place = [], json.JSONDecoder(), 0
+    text = text.strip()
+    while place < len(text):
+        value, place = decoder.raw_decode(text, place)
+        found += value["items"] if value.get("kind") == "List" else [value]
+        while place < len(text) and text[place].isspace():
+            place += 1
+    return found
+
+
+def at(value: Any, path: str) -> Any:
+    """What is at a path, whose parts are keys or places in a list; ABSENT where there is nothing."""
+    for part in filter(None, path.split(".")):
+        if isinstance(value, list) and part.isdecimal() and int(part) < len(value):
+            value = value[int(part)]
+        elif isinstance(value, dict) and part in value:
+            value = value[part]
+        else:
+            return ABSENT
+    return value
+
+
+def holds(found: Any, wanted: Any) -> bool:
+    """True if all that is wanted is there: maps may have more keys and lists more members."""
+    if isinstance(wanted, dict) and isinstance(found, dict):
+        return all(key in found and holds(found[key], value) for key, value in wanted.items())
+    if isinstance(wanted, list) and isinstance(found, list):
+        return all(any(holds(one, value) for one in found) for value in wanted)
+    return bool(found == wanted) and type(found) is type(wanted)
+
+
+def fault(rendered: Mapping[str, Any], shown: Shown) -> str | None:
+    value = rendered.get(shown.object, ABSENT)
+    found = at(value, shown.path) if value != ABSENT else ABSENT
+    if value == ABSENT and shown.path:
+        return f"there is no {shown.object}"
+    if holds(found, shown.holds):
+        return None
+    return f"{shown.object}: {shown.path or 'the object'} is {json.dumps(found)[:300]}, not {json.dumps(shown.holds)}"
+
+
+def every_value(kube: Kube, chart: Path) -> str:
+    """Renders each case; then no value and no template may be without one."""
+    sources: set[str] = set()
+    for case in chartshows.CASES:
+        manifests = template(kube, chart, case.values, case.kinds)
+        sources |= set(SOURCE.findall(manifests))
+        rendered = objects(kube, manifests)
+        faults = [text for shown in case.shown if (text := fault(rendered, shown))]
+        if faults:
+            raise LabError(f"with {json.dumps(case.values)}: {'; '.join(faults)}")
+    untested = without_case(chart, chartshows.CASES)
+    idle = sorted({f"templates/{file.name}" for file in (chart / "templates").glob("*.yaml")} - sources)
+    if untested or idle:
+        raise LabError(f"chartshows.py has no case for the values {untested} and none that renders {idle}: add them")
+    return f"{len(chartshows.CASES)} cases, {sum(len(case.shown) for case in chartshows.CASES)} assertions"
+
+
+def without_case(chart: Path, cases: Sequence[Case]) -> list[str]:
+    """Values that no case sets."""
+    given = {path for case in cases for path in paths(case.values)}
+    return [path for path in chartdocs.leaves((chart / "values.yaml").read_text()) if path not in given]
+
+
+def paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """The paths of values, those of groups among them."""
+    for name, value in values.items():
+        yield prefix + name
+        if isinstance(value, dict):
+            yield from paths(value, f"{prefix}{name}.")
+
+
+def notes(kube: Kube, chart: Path) -> str:
+    """What people read after an installation."""
+    for values, present, missing in NOTES:
+        argv = ["install", RELEASE, str(chart), f"--namespace={SYSTEM}", "--dry-run=client", "--values=-"]
+        text = kube.run("helm", *argv, given=json.dumps(nested(values))).partition("\nNOTES:\n")[2]
+        wrong = [f"lacks {one!r}" for one in present if one not in text]
+        wrong += [f"has {one!r}" for one in missing if one in text]
+        if wrong:
+            raise LabError(f"with {json.dumps(values)} NOTES.txt {', '.join(wrong)}: {text}")
+    return f"{len(NOTES)} cases"
+
+
+def queries(kube: Kube, chart: Path, repository: Path) -> str:
+    """Every metric, label and value that an alert or the dashboard asks for must be one that the operator exports."""
+    values = {"prometheusRule.enabled": True, "dashboard.enabled": True}
+    kinds = [f"{chartshows.MONITORING}/{kind}" for kind in MONITORING_KINDS]
+    rendered = objects(kube, template(kube, chart, values, kinds))
+    asked = [
+        *of_alerts(rendered[f"PrometheusRule/{RELEASE}"]["spec"]["groups"]),
+        *of_dashboard(json.loads(rendered[f"ConfigMap/{RELEASE}-dashboard"]["data"]["leaderboard-operator.json"])),
+    ]
+    metrics, literals = chartmetrics.of_repository(repository)
+    wrong = [f"{name}: {one}" for name, query in asked for one in chartmetrics.faults(query, metrics, literals)]
+    if wrong:
+        raise LabError("; ".join(wrong))
+    return f"{len(asked)} queries, {len(metrics)} metrics"
+
+
+def of_alerts(groups: Sequence[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+    """The name and the query of each alert, which must have what people need to act."""
+    for rule in (rule for group in groups for rule in group["rules"]):
+        missing = {"summary", "description"} - rule["annotations"].keys()
+        if missing or rule["labels"].get("severity") not in ("critical", "warning"):
+            raise LabError(f"{rule['alert']} has no {', '.join(missing) or 'severity of critical or warning'}")
+        yield rule["alert"], rule["expr"]
+
+
+def of_dashboard(dashboard: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for panel in dashboard["panels"]:
+        for target in panel.get("targets", []):
+            yield panel["title"], target["expr"]
+    for variable in dashboard["templating"]["list"]:
+        if variable["type"] == "query":
+            yield variable["name"], variable["query"]["query"]
+
+
+def one_file(kube: Kube, chart: Path, more: Sequence[str] = ()) -> str:
+    """All that is to be applied where there is no Helm: the namespace, the definitions and the operator. `more` is for `helm template`."""
+    namespace = f"apiVersion: v1\nkind: Namespace\nmetadata:\n  name: {SYSTEM}\n"
+    argv = ["template", RELEASE, str(chart), f"--namespace={SYSTEM}", "--no-hooks", *more]
+    return f"# kubectl apply --server-side --filename=FILE\n{namespace}{kube.run('helm', *argv)}"
+
+
+def applied(kube: Kube, chart: Path) -> str:
+    """The one file goes in, and out again."""
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", prefix="leaderboard-") as file:
+        file.write(one_file(kube, chart, ['--set-json=leaderboards=[{"namespace":"other","secrets":["evalai"]}]']))
+        file.flush()
+        argv = [f"--filename={file.name}", "--output=name"]
+        made = kube.run("kubectl", "apply", "--server-side", "--validate=strict", *argv).splitlines()
+        # Nothing here would empty a namespace that is deleted.
+        selector = f"--selector=app.kubernetes.io/part-of={RELEASE}"
+        kinds = "deployments,services,poddisruptionbudgets,serviceaccounts,roles,rolebindings,clusterroles,clusterrolebindings"
+        gone = kube.run("kubectl", "delete", kinds, selector, "--all-namespaces", "--output=name").splitlines()
+        kube.run("kubectl", "delete", "crd", "--all", "--wait=true", "--timeout=30s")
+    if len(made) != len(gone) + len(("namespace", "leaderboards", "submissions")):
+        raise LabError(
+            f"{len(made)} objects were applied, and {len(gone)} could be deleted by their label: {made} {gone}"
+        )
+    return f"{len(made)} objects"
