@@ -19,6 +19,7 @@ mod api {
     mod evalai;
     mod examples;
     mod failures;
+    mod intake;
     mod isolation;
     mod leader;
     mod objects;
@@ -26,11 +27,14 @@ mod api {
     mod plugin;
     mod pod;
     mod queue;
+    mod retention;
     mod rule_cases;
     mod rules;
     mod scale;
     mod slots;
     mod table;
     mod token;
+    mod two_operators;
     mod watches;
+    mod world;
 }

@@ -117,7 +117,7 @@ def work(controller: str, namespace: str) -> list[Access]:
     """What the controller can't work without, in one namespace."""
     return [
         *may(controller, "get list watch patch", f"{OWN}/leaderboards", namespace),
-        *may(controller, "get list watch create patch", f"{OWN}/submissions", namespace),
+        *may(controller, "get list watch create patch delete", f"{OWN}/submissions", namespace),
         *may(controller, "patch", f"{OWN}/submissions:status", namespace),
         *may(controller, "patch", f"{OWN}/leaderboards:status", namespace),
         *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
@@ -127,6 +127,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "get list", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
         *may(controller, "get list watch create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may(controller, "get", "coordination.k8s.io/leases", namespace, "another"),
         *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
     ]
 
@@ -144,7 +145,7 @@ def never(controller: str, bridge: str) -> list[Access]:
     """What neither may do, whatever the values."""
     return [
         *may_not(controller, "create update delete", f"{OWN}/leaderboards"),
-        *may_not(controller, "update delete deletecollection", f"{OWN}/submissions"),
+        *may_not(controller, "update deletecollection", f"{OWN}/submissions"),
         *may_not(controller, "create update", "pods"),
         *may_not(controller, "create", "pods:exec"),
         *may_not(controller, "deletecollection", "batch/jobs"),
@@ -153,10 +154,10 @@ def never(controller: str, bridge: str) -> list[Access]:
         *may_not(controller, "get", "secrets", name="another"),
         *may_not(controller, "get", "secrets", "other", "evalai"),
         *may_not(controller, "get", "secrets", SYSTEM, "aws"),
-        *may_not(controller, "get update", "coordination.k8s.io/leases", SYSTEM, "another"),
+        *may_not(controller, "update", "coordination.k8s.io/leases", SYSTEM, "another"),
         *may_not(controller, "create", "coordination.k8s.io/leases", "leaderboard"),
         *may_not(controller, "create", "serviceaccounts:token", SYSTEM),
-        *may_not(controller, "list watch patch delete", "nodes", ""),
+        *may_not(controller, "patch delete", "nodes", ""),
         *may_not(bridge, "get", "pods:log"),
         *may_not(bridge, "get", "nodes", ""),
         *may_not(bridge, "list watch update delete", f"{OWN}/submissions"),
@@ -173,6 +174,7 @@ def lease(controller: str) -> list[Access]:
     return [
         *may(controller, "create", "coordination.k8s.io/leases", SYSTEM),
         *may(controller, "get update", "coordination.k8s.io/leases", SYSTEM, RELEASE),
+        *may(controller, "get", "coordination.k8s.io/leases", SYSTEM, "another"),
     ]
 
 
@@ -184,7 +186,7 @@ CLUSTER_WIDE = (
     *never(CONTROLLER, BRIDGE),
     *lease(CONTROLLER),
     *may(CONTROLLER, "get", "secrets", name="evalai"),
-    *may(CONTROLLER, "get", "nodes", ""),
+    *may(CONTROLLER, "get list watch", "nodes", ""),
 )
 # ci/roles.yaml: another account, secrets in two namespaces.
 WITH_ROLES = (
@@ -208,6 +210,6 @@ NAMESPACED = (
     *may_not(CONTROLLER, "get list create", "batch/jobs", "other"),
     *may_not(CONTROLLER, "list", "pods", ""),
     *may_not(CONTROLLER, "get", "pods:log", "other"),
-    *may_not(CONTROLLER, "get", "nodes", ""),
+    *may_not(CONTROLLER, "get list watch", "nodes", ""),
     *may_not(BRIDGE, "get list", f"{OWN}/leaderboards", "other"),
 )

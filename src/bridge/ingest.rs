@@ -144,7 +144,7 @@ pub enum IngestError {
 /// Decides what an incoming submission means for the object of its name, read uncached.
 pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &Incoming) -> Ingest {
     let Some(existing) = existing else {
-        if incoming.source == Source::Sweep(Swept::Edited) {
+        if was_run_before(&incoming.source) {
             return Ingest::NotNew;
         }
         return Ingest::Create(Box::new(new_submission(leaderboard, incoming)));
@@ -184,6 +184,12 @@ pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming:
             resource_version,
         },
     }
+}
+
+/// True if it is a row alone that shows an earlier run. Its participant can edit it, so it makes no object anew: not of a Submission
+/// that was deleted, by a person or after its retention.
+fn was_run_before(source: &Source) -> bool {
+    matches!(source, Source::Sweep(Swept::Edited | Swept::Resuming))
 }
 
 /// True if the present attempt has ended in a way that a resume can follow.
@@ -281,9 +287,10 @@ fn annotation(record: &Ingested) -> (String, String) {
 pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming) -> Result<Outcome, IngestError> {
     let name = names::submission(incoming.submission);
     // Most are new, so the first try creates; the answer AlreadyExists makes the read necessary.
-    let mut existing = match incoming.source {
-        Source::Sweep(Swept::Edited) => call(&name, "the read", api.get_opt(&name)).await?,
-        _ => None,
+    let mut existing = if was_run_before(&incoming.source) {
+        call(&name, "the read", api.get_opt(&name)).await?
+    } else {
+        None
     };
     for _ in 0..ROUNDS {
         let done = match decide_ingest(leaderboard, existing.as_ref(), incoming) {

@@ -34,7 +34,7 @@ impl Leaderboards {
             .list(&ListParams::default())
             .await?;
         let count = list.items.len();
-        let readable = list.items.into_iter().filter_map(|object| object.0.ok());
+        let readable = list.items.into_iter().filter_map(|item| item.object.ok());
         let all: Vec<_> = readable.map(Arc::new).collect();
         Ok(Self {
             is_complete: all.len() == count,

@@ -21,7 +21,7 @@ use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 use tokio::time::Instant;
 
-use crate::kubernetes::{Clients, Watch, guarded, spawn_watch};
+use crate::kubernetes::{Clients, Shape, Watch, guarded, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::aws::Aws;
@@ -51,13 +51,16 @@ impl Shared {
     fn new(clients: Clients, aws: Aws, namespace: Option<String>, telemetry: Observability) -> Self {
         let guarded = guarded(clients.watch, namespace.as_deref());
         // The status changes often and means nothing here.
-        let trim = |leaderboard: &mut Leaderboard| leaderboard.status = None;
+        let shape = Shape {
+            trim: |leaderboard: &mut Leaderboard| leaderboard.status = None,
+            ..Shape::default()
+        };
         let reporter = Reporter {
             controller: "leaderboard.carla.org/bridge".to_owned(),
             instance: std::env::var("POD_NAME").ok(),
         };
         Self {
-            leaderboards: spawn_watch(guarded, Config::default(), trim, &telemetry),
+            leaderboards: spawn_watch(guarded, Config::default(), shape, &telemetry),
             recorder: Recorder::new(clients.api.clone(), reporter),
             client: clients.api,
             namespace,

@@ -51,7 +51,7 @@ fn one_board() -> Response<Body> {
 }
 
 fn is_list(request: &Request<Body>) -> bool {
-    request.uri().query().is_some_and(|query| query.contains("limit=500"))
+    request.uri().query().is_some_and(|query| query.contains("limit=100"))
 }
 
 async fn shared() -> (Shared, Server, watch::Sender<bool>) {

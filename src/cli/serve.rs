@@ -119,6 +119,7 @@ async fn lead(options: Controller) -> Result<(), String> {
         image: options.image,
         image_pull_policy: options.image_pull_policy,
         region: aws.region(),
+        operator: lease.installation(),
         namespace: namespace(&options.server.namespace),
         concurrency: options.concurrency,
     };

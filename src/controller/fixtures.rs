@@ -8,15 +8,11 @@ use aws_config::{BehaviorVersion, Region};
 use aws_credential_types::Credentials;
 use http::{Method, Request, Response};
 use jiff::Timestamp;
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::client::Body;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
-use kube::runtime::reflector::store::Writer;
-use kube::runtime::reflector::{Lookup, ObjectRef, Store};
-use kube::runtime::watcher::Event;
+use kube::runtime::reflector::ObjectRef;
 use kube::{Client, Resource, ResourceExt};
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, watch};
@@ -27,13 +23,15 @@ use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
 use crate::controller::settings::Settings;
-use crate::controller::stores::Stores;
+use crate::controller::stores::{Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::observe::team;
 use crate::controller::submissions::reruns::Reruns;
-use crate::kubernetes::Synced;
+use crate::kubernetes::objects::{Job, Owner, Pod};
+use crate::kubernetes::{Store, Synced};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
@@ -44,6 +42,8 @@ use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, Times, e
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";
+/// The installation that drives every Leaderboard here.
+const OPERATOR: &str = "system/operator";
 
 /// What the caches show.
 #[derive(Default)]
@@ -132,11 +132,13 @@ fn noting<K: Resource<DynamicType = ()> + 'static>(names: &mpsc::UnboundedSender
     })
 }
 
-fn settings() -> Settings {
+/// As the operator is started.
+pub fn settings() -> Settings {
     Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        operator: OPERATOR.into(),
         namespace: None,
         concurrency: 16,
     }
@@ -146,12 +148,13 @@ fn stores(cluster: Cluster) -> Stores {
     let policies_synced = Synced::default();
     policies_synced.set(true);
     Stores {
-        leaderboards: store(cluster.leaderboards),
-        submissions: store(cluster.submissions),
-        jobs: store(cluster.jobs),
-        pods: store(cluster.pods),
-        policies: store(cluster.policies),
+        leaderboards: Store::of(cluster.leaderboards, |_| None),
+        submissions: Store::of(cluster.submissions, team::index),
+        jobs: Store::of(cluster.jobs, |_| None),
+        pods: Store::of(cluster.pods, owner_uid),
+        policies: Store::of(cluster.policies, |_| None),
         policies_synced,
+        nodes: None,
     }
 }
 
@@ -169,20 +172,6 @@ fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
     });
     let rows = mpsc::unbounded_channel().0;
     ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, rows, tasks.clone()))
-}
-
-fn store<K>(objects: Vec<K>) -> Store<K>
-where
-    K: Lookup + Clone + 'static,
-    K::DynamicType: Default + Clone + Eq + std::hash::Hash,
-{
-    let mut writer = Writer::new(K::DynamicType::default());
-    writer.apply_watcher_event(&Event::Init);
-    for object in objects {
-        writer.apply_watcher_event(&Event::InitApply(object));
-    }
-    writer.apply_watcher_event(&Event::InitDone);
-    writer.as_reader()
 }
 
 async fn serve(
@@ -233,6 +222,7 @@ pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
     let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some(NAMESPACE.into());
     object.metadata.uid = Some(format!("uid-of-{name}"));
+    object.status.get_or_insert_default().operator = Some(OPERATOR.into());
     object
 }
 
@@ -266,13 +256,10 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
         ..SubmissionStatus::default()
     });
     let mut job = Job::default();
-    job.metadata.name = Some(job_name.clone());
+    job.metadata.name = job_name.as_str().into();
     job.metadata.namespace = Some(NAMESPACE.into());
-    job.metadata.uid = Some(format!("uid-of-{job_name}"));
+    job.metadata.uid = format!("uid-of-{job_name}").into();
     job.metadata.creation_timestamp = Some(now);
-    job.metadata.owner_references = Some(vec![OwnerReference {
-        uid,
-        ..OwnerReference::default()
-    }]);
+    job.metadata.owner_references = [Owner { uid: uid.into() }].into();
     (submission, job)
 }

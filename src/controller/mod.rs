@@ -4,6 +4,8 @@
 //! Leaderboards by `leaderboards` and Submissions by `submissions` (observe, decide, act); both ask `slots` whose turn it is.
 
 #[cfg(test)]
+mod cache_tests;
+#[cfg(test)]
 pub(crate) mod fixtures;
 pub mod leaderboards;
 pub mod network_policy;

@@ -1,11 +1,11 @@
 //! What is read off any object: its key, its owner, and what marks it as ours. Pure.
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 
+use crate::kubernetes::objects::{Job, Pod};
 use crate::services::ObjectKey;
 use leaderboard_api::names;
 
@@ -26,6 +26,49 @@ pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
     }
 }
 
+/// An object that the operator makes for Submissions.
+pub trait Child {
+    fn namespace(&self) -> Option<&str>;
+    /// The name of its Submission, if it has one.
+    fn submission(&self) -> Option<&str>;
+    /// The name of its Leaderboard.
+    fn leaderboard(&self) -> Option<&str>;
+}
+
+macro_rules! child {
+    ($kind:ty) => {
+        impl Child for $kind {
+            fn namespace(&self) -> Option<&str> {
+                self.metadata.namespace.as_deref()
+            }
+
+            fn submission(&self) -> Option<&str> {
+                self.metadata.labels.submission.as_deref()
+            }
+
+            fn leaderboard(&self) -> Option<&str> {
+                self.metadata.labels.leaderboard.as_deref()
+            }
+        }
+    };
+}
+child!(Job);
+child!(Pod);
+
+impl Child for NetworkPolicy {
+    fn namespace(&self) -> Option<&str> {
+        self.metadata.namespace.as_deref()
+    }
+
+    fn submission(&self) -> Option<&str> {
+        None
+    }
+
+    fn leaderboard(&self) -> Option<&str> {
+        self.labels().get(names::LABEL_LEADERBOARD).map(String::as_str)
+    }
+}
+
 /// The reference by which a child goes with its owner.
 pub fn owner_reference<K: Resource<DynamicType = ()>>(owner: &K) -> OwnerReference {
     OwnerReference {
@@ -36,12 +79,6 @@ pub fn owner_reference<K: Resource<DynamicType = ()>>(owner: &K) -> OwnerReferen
         controller: Some(true),
         block_owner_deletion: Some(true),
     }
-}
-
-/// Whether a Pod belongs to a Job.
-pub fn is_pod_of(pod: &Pod, job: &Job) -> bool {
-    let uid = job.uid();
-    pod.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
 }
 
 /// The label selector of everything the operator makes for submissions.

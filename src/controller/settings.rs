@@ -9,6 +9,8 @@ pub struct Settings {
     pub image_pull_policy: Option<String>,
     /// AWS region of the operator, handed on to Pods.
     pub region: Option<String>,
+    /// Name of this installation, `<namespace>/<name>` of its Lease.
+    pub operator: String,
     /// Only this namespace, or all.
     pub namespace: Option<String>,
     /// Reconciles at once.

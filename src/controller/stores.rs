@@ -2,34 +2,53 @@
 
 use std::sync::Arc;
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::ResourceExt;
-use kube::runtime::reflector::{ObjectRef, Store};
+use kube::runtime::reflector::ObjectRef;
 
 use super::network_policy;
-use super::objects::is_pod_of;
+use super::objects::Child;
 use super::slots::SlotAllocator;
-use crate::kubernetes::Synced;
-use leaderboard_api::{Leaderboard, Submission, names};
+use crate::kubernetes::objects::{Job, Node, Pod};
+use crate::kubernetes::{Store, Synced};
+use leaderboard_api::{Leaderboard, Submission};
 
 /// Caches of the API server, filled by one task each.
 pub struct Stores {
     pub leaderboards: Store<Leaderboard>,
+    /// Those that their simulators ended by their team too.
     pub submissions: Store<Submission>,
     pub jobs: Store<Job>,
+    /// By the UID of their Job too.
     pub pods: Store<Pod>,
     pub policies: Store<NetworkPolicy>,
     /// Whether what `policies` shows can be relied on.
     pub policies_synced: Synced,
+    /// None: an operator of one namespace has no right to nodes.
+    pub nodes: Option<Nodes>,
+}
+
+/// The nodes of the cluster.
+pub struct Nodes {
+    pub store: Store<Node>,
+    /// Whether what `store` shows can be relied on.
+    pub synced: Synced,
 }
 
 impl Stores {
     /// The youngest Pod of a Job.
     pub fn newest_pod(&self, job: &Job) -> Option<Arc<Pod>> {
-        let pods = self.pods.state().into_iter().filter(|pod| is_pod_of(pod, job));
-        pods.max_by_key(|pod| (pod.metadata.creation_timestamp.clone().map(|t| t.0), pod.name_any()))
+        let created = |pod: &Arc<Pod>| pod.metadata.creation_timestamp.as_ref().map(|t| t.0);
+        let age = |one: &Arc<Pod>, other: &Arc<Pod>| {
+            let by_name = one.metadata.name.cmp(&other.metadata.name);
+            created(one).cmp(&created(other)).then(by_name)
+        };
+        self.pods_of(job).into_iter().max_by(age)
+    }
+
+    /// All Pods of a Job.
+    pub fn pods_of(&self, job: &Job) -> Vec<Arc<Pod>> {
+        self.pods.indexed(&job.metadata.uid)
     }
 
     /// Takes all that is there into the lines for slots.
@@ -53,14 +72,18 @@ impl Stores {
     }
 
     /// The Submission that a child belongs to.
-    pub fn owner_of(child: &impl ResourceExt) -> Option<ObjectRef<Submission>> {
-        let name = child.labels().get(names::LABEL_SUBMISSION)?;
-        Some(ObjectRef::new(name).within(&child.namespace()?))
+    pub fn owner_of(child: &impl Child) -> Option<ObjectRef<Submission>> {
+        Some(ObjectRef::new(child.submission()?).within(child.namespace()?))
     }
 
     /// The Leaderboard that a Pod or a policy belongs to.
-    pub fn leaderboard_of(child: &impl ResourceExt) -> Option<ObjectRef<Leaderboard>> {
-        let name = child.labels().get(names::LABEL_LEADERBOARD)?;
-        Some(ObjectRef::new(name).within(&child.namespace()?))
+    pub fn leaderboard_of(child: &impl Child) -> Option<ObjectRef<Leaderboard>> {
+        Some(ObjectRef::new(child.leaderboard()?).within(child.namespace()?))
     }
+}
+
+/// The UID of what a Pod belongs to, by which it is found.
+pub fn owner_uid(pod: &Pod) -> Option<String> {
+    let owner = pod.metadata.owner_references.first()?;
+    Some(owner.uid.to_string())
 }

@@ -1,19 +1,18 @@
 //! The writes that Submissions and Leaderboards share: the finalizer and the status. Both are safe to repeat.
 
 use kube::api::{Patch, PatchParams};
-use kube::core::NamespaceResourceScope;
-use kube::{Api, Client, Resource, ResourceExt};
+use kube::{Client, Resource, ResourceExt};
 use serde::Serialize;
 use serde_json::json;
 
 use super::objects::uid_of;
-use crate::kubernetes::{CallError, Watchable, call};
+use crate::kubernetes::{CallError, Watchable, Writes, call};
 use leaderboard_api::names;
 
 /// Puts our finalizer on an object, or takes it off.
 pub async fn set_finalizer<K>(client: &Client, object: &K, finalizer: &str, wanted: bool) -> Result<(), CallError>
 where
-    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+    K: Watchable + Resource<DynamicType = ()>,
 {
     let mut finalizers = object.finalizers().to_vec();
     finalizers.retain(|known| known != finalizer);
@@ -32,30 +31,31 @@ where
     }
 }
 
-/// Applies a status. Returns the object as the API server has it then.
-pub async fn apply_status<K>(client: &Client, object: &K, status: &impl Serialize) -> Result<K, CallError>
+/// Applies a status. Returns the version of the object that has it.
+pub async fn apply_status<K>(client: &Client, object: &K, status: &impl Serialize) -> Result<Box<str>, CallError>
 where
-    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+    K: Watchable + Resource<DynamicType = ()>,
 {
     let (api, name) = (api(client, object), object.name_any());
     let patch = Patch::Apply(json!({
-        "apiVersion": K::api_version(&()),
-        "kind": K::kind(&()),
+        "apiVersion": <K as Resource>::api_version(&()),
+        "kind": <K as Resource>::kind(&()),
         "metadata": { "name": name, "uid": uid_of(object) },
         "status": status,
     }));
     let params = PatchParams::apply(names::MANAGER_STATUS).force();
     let applied = api.patch_status(&name, &params, &patch);
-    call("the status", &described(object), applied).await
+    let written = call("the status", &described(object), applied).await?;
+    Ok(written.metadata.resource_version)
 }
 
-fn described<K: Watchable>(object: &K) -> String {
+fn described<K: Resource<DynamicType = ()>>(object: &K) -> String {
     format!("{} {}", K::kind(&()), object.name_any())
 }
 
-fn api<K>(client: &Client, object: &K) -> Api<K>
+fn api<K>(client: &Client, object: &K) -> Writes<K>
 where
-    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+    K: Watchable + Resource<DynamicType = ()>,
 {
-    Api::namespaced(client.clone(), &object.namespace().unwrap_or_default())
+    Writes::new(client.clone(), &ResourceExt::namespace(object).unwrap_or_default())
 }

@@ -10,7 +10,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::task::{Context, Poll, Waker};
 
 use futures::Stream;
-use kube::ResourceExt;
+use kube::runtime::reflector::Lookup;
+
+use super::store::key_of;
 
 /// An object that was added, changed or deleted.
 #[derive(Debug)]
@@ -39,8 +41,8 @@ struct Lanes<K> {
 }
 
 struct Lane<K> {
-    order: VecDeque<String>,
-    latest: HashMap<String, WatchEvent<K>>,
+    order: VecDeque<Box<str>>,
+    latest: HashMap<Box<str>, WatchEvent<K>>,
     waker: Option<Waker>,
     is_closed: bool,
 }
@@ -55,7 +57,7 @@ impl<K> Clone for Feed<K> {
     }
 }
 
-impl<K: ResourceExt> Feed<K> {
+impl<K: Lookup> Feed<K> {
     pub(super) fn new() -> Self {
         Self(Arc::new(Mutex::new(Lanes {
             lanes: Vec::new(),
@@ -109,15 +111,23 @@ impl<K: ResourceExt> Feed<K> {
     }
 }
 
-impl<K: ResourceExt> Lane<K> {
+impl<K: Lookup> Lane<K> {
     fn push(&mut self, event: WatchEvent<K>) {
-        let object = &event.object;
-        let key = object
-            .uid()
-            .unwrap_or_else(|| format!("{}/{}", object.namespace().unwrap_or_default(), object.name_any()));
+        let object = event.object.as_ref();
+        let key = object.uid().map_or_else(|| key_of(object), Into::into);
         if self.latest.insert(key.clone(), event).is_none() {
             self.order.push_back(key);
         }
+    }
+}
+
+#[cfg(test)]
+impl<K: Lookup> WatchEvents<K> {
+    /// Events that a test makes.
+    pub(crate) fn by_hand() -> (impl Fn(K, bool), Self) {
+        let feed = Feed::new();
+        let events = feed.subscribe(Vec::new);
+        (move |object, is_gone| feed.push(&Arc::new(object), is_gone), events)
     }
 }
 
@@ -147,6 +157,7 @@ mod tests {
     use super::*;
     use futures::{FutureExt, StreamExt};
     use k8s_openapi::api::core::v1::ConfigMap;
+    use kube::ResourceExt;
 
     fn object(name: &str, uid: &str, version: &str) -> Arc<ConfigMap> {
         let mut object = ConfigMap::default();
@@ -158,7 +169,13 @@ mod tests {
 
     fn read(events: &mut WatchEvents<ConfigMap>) -> Vec<(String, String, bool)> {
         std::iter::from_fn(|| events.next().now_or_never().flatten())
-            .map(|t| (t.object.name_any(), t.object.resource_version().unwrap(), t.is_gone))
+            .map(|t| {
+                (
+                    t.object.name_any(),
+                    t.object.metadata.resource_version.clone().unwrap(),
+                    t.is_gone,
+                )
+            })
             .collect()
     }
 

@@ -4,36 +4,30 @@
 
 mod call;
 mod feed;
+mod item;
+pub mod objects;
 pub mod preflight;
+mod store;
 mod watch;
+mod write;
 
 #[cfg(test)]
 mod tests;
 
-use std::fmt;
 use std::time::Duration;
 
-use kube::core::{DeserializeGuard, NamespaceResourceScope};
-use kube::{Api, Client, Resource};
-use serde::de::DeserializeOwned;
+use kube::core::NamespaceResourceScope;
+use kube::{Api, Client};
 
 pub use call::{CALL_TIMEOUT, CallError, call, call_within};
 pub use feed::{WatchEvent, WatchEvents};
-pub use watch::{Synced, Unreadable, Watch, spawn_watch};
+pub use item::{Item, Malformed, Watchable};
+pub use store::{Index, Store};
+pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
+pub use write::{Writes, Written};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.
 const READ_TIMEOUT: Duration = Duration::from_mins(5);
-
-/// What can be watched.
-pub trait Watchable:
-    Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
-{
-}
-
-impl<K> Watchable for K where
-    K: Resource<DynamicType = ()> + Clone + fmt::Debug + DeserializeOwned + Send + Sync + 'static
-{
-}
 
 /// One client for calls, one whose dead connections end for watches.
 #[derive(Clone)]
@@ -69,9 +63,9 @@ fn client_with(mut config: kube::Config, read_timeout: Duration) -> Result<Clien
 }
 
 /// The API of a kind, in one namespace or in all. A malformed object is an item of its own kind, and fails no list.
-pub fn guarded<K>(client: Client, namespace: Option<&str>) -> Api<DeserializeGuard<K>>
+pub fn guarded<K>(client: Client, namespace: Option<&str>) -> Api<Item<K>>
 where
-    K: Watchable + Resource<Scope = NamespaceResourceScope>,
+    K: Watchable<Scope = NamespaceResourceScope>,
 {
     match namespace {
         Some(namespace) => Api::namespaced(client, namespace),

@@ -1,5 +1,7 @@
 //! Watches and the preflight on a mock of the API server's client.
 
+mod lists;
+
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -26,7 +28,7 @@ const LIMIT: Duration = Duration::from_mins(20);
 enum Answer {
     Json(u16, Value),
     /// The lines of a watch, which then ends.
-    Watch(Vec<Value>),
+    Watch(Vec<String>),
 }
 
 type Script = mpsc::UnboundedSender<Answer>;
@@ -51,7 +53,7 @@ async fn serve(mut handle: Handle<Request<Body>, Response<Body>>, mut answers: m
         let Some(answer) = answers.recv().await else { return };
         let (code, body) = match answer {
             Answer::Json(code, body) => (code, body.to_string()),
-            Answer::Watch(lines) => (200, lines.iter().map(|line| line.to_string() + "\n").collect()),
+            Answer::Watch(lines) => (200, lines.concat()),
         };
         let response = Response::builder().status(code).body(Body::from(body.into_bytes()));
         send.send_response(response.unwrap());
@@ -78,11 +80,12 @@ fn list(items: &[Value]) -> Answer {
     )
 }
 
-fn line(kind: &str, object: &Value) -> Value {
-    json!({"type": kind, "object": object})
+/// As the API server writes it: the type comes first.
+fn line(kind: &str, object: &Value) -> String {
+    format!("{{\"type\":\"{kind}\",\"object\":{object}}}\n")
 }
 
-fn gone() -> Value {
+fn gone() -> String {
     line(
         "ERROR",
         &json!({"kind": "Status", "status": "Failure", "reason": "Expired", "code": 410, "message": "too old"}),
@@ -102,8 +105,11 @@ fn rig(answers: Vec<Answer>) -> Rig {
     let (stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
     telemetry.readiness.registered();
-    let trim = |board: &mut Leaderboard| board.metadata.annotations = None;
-    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), trim, &telemetry);
+    let shape = Shape {
+        trim: |board: &mut Leaderboard| board.metadata.annotations = None,
+        ..Shape::default()
+    };
+    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), shape, &telemetry);
     let events = watch.subscribe();
     Rig {
         watch,
@@ -296,7 +302,12 @@ async fn a_watch_on_a_half_open_connection_ends_by_the_read_timeout_and_begins_a
     let client = client_with(config, Duration::from_millis(200)).unwrap();
     let (_stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
-    let watch = spawn_watch::<Leaderboard>(guarded(client, Some("ns")), Config::default(), |_| {}, &telemetry);
+    let watch = spawn_watch::<Leaderboard>(
+        guarded(client, Some("ns")),
+        Config::default(),
+        Shape::default(),
+        &telemetry,
+    );
     for _ in 0..2 {
         timeout(LIMIT, watches.recv()).await.unwrap().unwrap();
     }

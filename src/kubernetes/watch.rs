@@ -3,21 +3,21 @@
 //! One task each, because a shared backoff would let one broken watch hold up all others. Errors are logged, counted and
 //! retried here; readers only ever get objects.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashSet};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use futures::{Stream, StreamExt};
-use kube::core::DeserializeGuard;
-use kube::runtime::reflector::{ObjectRef, Store, store::Writer};
+use kube::Api;
 use kube::runtime::watcher::{Config, Error, Event};
 use kube::runtime::{WatchStreamExt, watcher};
-use kube::{Api, ResourceExt};
 
-use super::Watchable;
 use super::feed::{Feed, WatchEvents};
+use super::item::{Item, Watchable};
+use super::objects::Texts;
+use super::store::{Index, Store, Writer, key_of};
 use crate::observability::Observability;
 use crate::observability::liveness::WatchProbe;
 use crate::observability::metrics::WatchMetrics;
@@ -27,6 +27,8 @@ use leaderboard_api::client_errors;
 
 /// A watch that the API server has refused begins again with a list after this long.
 const REFUSED_AGAIN: Duration = Duration::from_secs(10);
+/// Objects of one page of a list, each of up to 50 KB: a page is in memory as a whole while it is decoded.
+const PAGE: u32 = 100;
 
 /// A running watch. Clones are the same one.
 pub struct Watch<K: Watchable> {
@@ -57,23 +59,33 @@ impl Synced {
 
 /// The objects that this program can't read now, by namespace and name. Clones are the same.
 #[derive(Clone, Debug, Default)]
-pub struct Unreadable(Arc<Mutex<BTreeSet<ObjectName>>>);
-
-type ObjectName = (Option<String>, String);
+pub struct Unreadable(Arc<Mutex<BTreeSet<Box<str>>>>);
 
 impl Unreadable {
     /// There is none.
     pub fn is_empty(&self) -> bool {
-        self.names().is_empty()
+        self.keys().is_empty()
     }
 
-    fn names(&self) -> MutexGuard<'_, BTreeSet<ObjectName>> {
+    fn keys(&self) -> MutexGuard<'_, BTreeSet<Box<str>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn name_of(object: &impl ResourceExt) -> ObjectName {
-    (object.namespace(), object.name_any())
+/// What is kept of a kind, and how it is found.
+pub struct Shape<K> {
+    /// Drops what is never read, before an object is cached.
+    pub trim: fn(&mut K),
+    pub index: Index<K>,
+}
+
+impl<K> Default for Shape<K> {
+    fn default() -> Self {
+        Self {
+            trim: |_| {},
+            index: |_| None,
+        }
+    }
 }
 
 impl<K: Watchable> Clone for Watch<K> {
@@ -95,21 +107,27 @@ impl<K: Watchable> Watch<K> {
 
     /// All objects that exist now, then each that is added, changed or deleted. The store is at least as new as each event.
     pub fn subscribe(&self) -> WatchEvents<K> {
-        self.feed.subscribe(|| self.store.state())
+        self.feed.subscribe(|| {
+            // What a first list has brought so far comes once it is complete.
+            if self.store.is_ready() {
+                self.store.state()
+            } else {
+                Vec::new()
+            }
+        })
     }
 }
 
-/// Starts to watch a kind until the process stops. `trim` drops what is never read, before it is cached; managed fields go
-/// anyway. Until the first list is complete, the process is not ready.
+/// Starts to watch a kind until the process stops. Until the first list is complete, the process is not ready.
 pub fn spawn_watch<K: Watchable>(
-    api: Api<DeserializeGuard<K>>,
+    api: Api<Item<K>>,
     config: Config,
-    trim: fn(&mut K),
+    Shape { trim, index }: Shape<K>,
     telemetry: &Observability,
 ) -> Watch<K> {
-    let writer = Writer::<K>::new(());
+    let writer = Writer::<K>::new(index);
     let watch = Watch {
-        store: writer.as_reader(),
+        store: writer.store().clone(),
         synced: Synced::default(),
         unreadable: Unreadable::default(),
         feed: Feed::new(),
@@ -122,15 +140,16 @@ pub fn spawn_watch<K: Watchable>(
         readiness: telemetry.readiness.clone(),
         kind,
         trim,
-        store: watch.store.clone(),
+        texts: Texts::default(),
         writer,
         feed: watch.feed.clone(),
         synced: watch.synced.clone(),
         unreadable: watch.unreadable.clone(),
-        listing: BTreeSet::new(),
+        list: Listing::default(),
     };
     task.missing("the first list has not come yet");
     let name = format!("watch of {}", K::plural(&()));
+    let config = config.page_size(PAGE);
     telemetry
         .tasks
         .stay(name, task.run(api, config, telemetry.stop.clone()));
@@ -145,19 +164,42 @@ struct Task<K: Watchable> {
     metrics: WatchMetrics,
     readiness: Readiness,
     trim: fn(&mut K),
-    store: Store<K>,
+    texts: Texts,
     writer: Writer<K>,
     feed: Feed<K>,
     synced: Synced,
     unreadable: Unreadable,
-    /// The unreadable objects of the list under way.
-    listing: BTreeSet<ObjectName>,
+    list: Listing<K>,
 }
 
-type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<DeserializeGuard<K>>, Error>> + Send>>;
+/// A list under way. What it brings is cached at once, so that no second cache is needed, and is an event once the list is
+/// complete.
+struct Listing<K> {
+    /// What this list has shown.
+    shown: HashSet<Box<str>>,
+    /// What it has shown and cannot be read.
+    unreadable: BTreeSet<Box<str>>,
+    /// What has changed since the last list that was complete.
+    changed: HashSet<Box<str>>,
+    /// What was replaced by another object of its name meanwhile.
+    replaced: Vec<Arc<K>>,
+}
+
+impl<K> Default for Listing<K> {
+    fn default() -> Self {
+        Self {
+            shown: HashSet::new(),
+            unreadable: BTreeSet::new(),
+            changed: HashSet::new(),
+            replaced: Vec::new(),
+        }
+    }
+}
+
+type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<Item<K>>, Error>> + Send>>;
 
 /// A list, then what changes.
-fn begin<K: Watchable>(api: &Api<DeserializeGuard<K>>, config: &Config) -> Events<K> {
+fn begin<K: Watchable>(api: &Api<Item<K>>, config: &Config) -> Events<K> {
     Box::pin(watcher(api.clone(), config.clone()).default_backoff())
 }
 
@@ -172,7 +214,7 @@ fn is_refusal(error: &Error) -> bool {
 }
 
 impl<K: Watchable> Task<K> {
-    async fn run(mut self, api: Api<DeserializeGuard<K>>, config: Config, stop: Stop) {
+    async fn run(mut self, api: Api<Item<K>>, config: Config, stop: Stop) {
         let mut events = begin(&api, &config);
         loop {
             let event = tokio::select! {
@@ -196,137 +238,128 @@ impl<K: Watchable> Task<K> {
         self.feed.close();
     }
 
-    fn event(&mut self, event: Event<DeserializeGuard<K>>) {
+    fn event(&mut self, event: Event<Item<K>>) {
         if matches!(event, Event::Init) {
             // The beginning of a list is a request, not an answer.
             self.probe.listing();
-            self.listing.clear();
-            return self.writer.apply_watcher_event(&Event::Init);
+            self.list.shown.clear();
+            return self.list.unreadable.clear();
         }
         self.metrics.event();
         match event {
-            Event::Apply(object) => self.apply(object),
-            Event::Delete(object) => self.delete(object),
-            Event::InitApply(object) => self.listed(object),
+            Event::Apply(item) => self.apply(item),
+            Event::Delete(item) => self.delete(item),
+            Event::InitApply(item) => self.listed(item),
             Event::Init | Event::InitDone => self.list_done(),
         }
     }
 
-    fn apply(&mut self, object: DeserializeGuard<K>) {
+    fn apply(&mut self, item: Item<K>) {
         self.probe.running();
-        let name = name_of(&object);
-        let Some(object) = self.read(object) else {
-            self.unreadable.names().insert(name);
-            return;
+        let object = match self.read(item) {
+            Ok(object) => object,
+            Err(key) => {
+                self.unreadable.keys().insert(key);
+                return;
+            }
         };
-        self.unreadable.names().remove(&name);
-        let key = ObjectRef::from_obj(&object);
-        let before = self.store.get(&key);
-        self.writer.apply_watcher_event(&Event::Apply(object));
-        let after = self.store.get(&key);
+        self.unreadable.keys().remove(&key_of(&object));
+        let (after, before) = self.writer.put(object);
         // The end of an object that was replaced by another one of its name between two reads.
-        if let Some(before) = before.filter(|b| after.as_ref().is_some_and(|a| a.uid() != b.uid())) {
+        if let Some(before) = before.filter(|before| before.uid() != after.uid()) {
             self.feed.push(&before, true);
         }
-        if let Some(after) = after {
-            self.feed.push(&after, false);
+        self.feed.push(&after, false);
+    }
+
+    fn delete(&mut self, item: Item<K>) {
+        self.probe.running();
+        let (key, last) = match item.object {
+            Ok(object) => (key_of(&object), Some(self.trimmed(object))),
+            Err(malformed) => (malformed.key(), None),
+        };
+        self.unreadable.keys().remove(&key);
+        let known = self.writer.remove(&key);
+        // No event was sent for an object that never could be read.
+        if let Some(last) = last.map(Arc::new).or(known) {
+            self.feed.push(&last, true);
         }
     }
 
-    fn delete(&mut self, object: DeserializeGuard<K>) {
-        self.probe.running();
-        self.unreadable.names().remove(&name_of(&object));
-        let last = match object.0 {
-            Ok(mut object) => {
-                self.trim(&mut object);
-                Arc::new(object)
-            }
-            Err(invalid) => {
-                let mut key = ObjectRef::<K>::new(invalid.metadata.name.as_deref().unwrap_or_default());
-                key.namespace = invalid.metadata.namespace;
-                // No event was sent for an object that never could be read.
-                let Some(known) = self.store.get(&key) else { return };
-                known
+    fn listed(&mut self, item: Item<K>) {
+        let object = match self.read(item) {
+            Ok(object) => object,
+            Err(key) => {
+                // One that has become unreadable stays as it was last read: it has not been deleted.
+                self.list.shown.insert(key.clone());
+                self.list.unreadable.insert(key);
+                return;
             }
         };
-        self.writer.apply_watcher_event(&Event::Delete((*last).clone()));
-        self.feed.push(&last, true);
-    }
-
-    fn listed(&mut self, object: DeserializeGuard<K>) {
-        let (namespace, name) = name_of(&object);
-        let object = self.read(object).or_else(|| {
-            self.listing.insert((namespace.clone(), name.clone()));
-            // One that has become unreadable stays as it was last read: it has not been deleted.
-            let mut key = ObjectRef::<K>::new(&name);
-            key.namespace = namespace;
-            self.store.get(&key).map(|known| (*known).clone())
-        });
-        if let Some(object) = object {
-            self.writer.apply_watcher_event(&Event::InitApply(object));
+        let key = key_of(&object);
+        self.list.shown.insert(key.clone());
+        let known = self.writer.store().by_key(&key);
+        let is_known = known
+            .is_some_and(|known| known.uid() == object.uid() && known.resource_version() == object.resource_version());
+        if is_known {
+            return;
         }
+        let (after, before) = self.writer.put(object);
+        self.list.changed.insert(key);
+        self.list
+            .replaced
+            .extend(before.filter(|before| before.uid() != after.uid()));
     }
 
     fn list_done(&mut self) {
-        let mut before: HashMap<_, _> = self
-            .store
-            .state()
-            .into_iter()
-            .map(|object| (object.uid(), object))
-            .collect();
-        self.writer.apply_watcher_event(&Event::InitDone);
-        *self.unreadable.names() = std::mem::take(&mut self.listing);
+        let list = std::mem::take(&mut self.list);
+        let mut gone = list.replaced;
+        for key in self.writer.keys_without(|key| list.shown.contains(key)) {
+            gone.extend(self.writer.remove(&key));
+        }
+        *self.unreadable.keys() = list.unreadable;
         self.probe.listed();
         // Before anyone is woken by what was listed.
+        self.writer.is_complete();
         if !self.synced.is_true() {
             self.synced.set(true);
             self.readiness.set(&self.check, Ok(()));
         }
-        let mut changed = 0_usize;
-        for object in self.store.state() {
-            let known = before.remove(&object.uid());
-            if known.is_none_or(|known| known.resource_version() != object.resource_version()) {
-                self.feed.push(&object, false);
-                changed += 1;
-            }
-        }
-        for gone in before.values() {
+        for gone in &gone {
             self.feed.push(gone, true);
+        }
+        let store = self.writer.store();
+        for object in list.changed.iter().filter_map(|key| store.by_key(key)) {
+            self.feed.push(&object, false);
         }
         tracing::info!(
             kind = self.kind,
-            objects = self.store.len(),
-            changed,
-            gone = before.len(),
+            objects = store.len(),
+            changed = list.changed.len(),
+            gone = gone.len(),
             "listed"
         );
     }
 
-    /// The object, trimmed; None if it can't be read, which is logged with its name.
-    fn read(&self, object: DeserializeGuard<K>) -> Option<K> {
-        match object.0 {
-            Ok(mut object) => {
-                self.trim(&mut object);
-                Some(object)
-            }
-            Err(invalid) => {
-                self.metrics.malformed();
-                let (namespace, name) = (invalid.metadata.namespace.as_deref(), invalid.metadata.name.as_deref());
-                tracing::error!(
-                    kind = self.kind,
-                    namespace,
-                    name,
-                    error = invalid.error,
-                    "skipped an object that can't be read"
-                );
-                None
-            }
-        }
+    /// The object, trimmed; if it can't be read, its key, and its name is logged.
+    fn read(&mut self, item: Item<K>) -> Result<K, Box<str>> {
+        item.object.map(|object| self.trimmed(object)).map_err(|malformed| {
+            self.metrics.malformed();
+            tracing::error!(
+                kind = self.kind,
+                namespace = malformed.namespace,
+                name = malformed.name,
+                error = malformed.error,
+                "skipped an object that can't be read"
+            );
+            malformed.key()
+        })
     }
 
-    fn trim(&self, object: &mut K) {
-        object.meta_mut().managed_fields = None;
-        (self.trim)(object);
+    fn trimmed(&mut self, mut object: K) -> K {
+        (self.trim)(&mut object);
+        object.share(&mut self.texts);
+        object
     }
 
     fn error(&self, error: &Error) {

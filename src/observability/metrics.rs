@@ -33,6 +33,12 @@ struct KindOutcome {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct KindClass {
+    kind: &'static str,
+    class: &'static str,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct KindReason {
     kind: &'static str,
     reason: &'static str,
@@ -93,6 +99,8 @@ pub struct Metrics {
 struct Reconciles {
     total: Family<KindOutcome, Counter>,
     seconds: Timings<Kind>,
+    waiting: Family<KindClass, Gauge>,
+    wait_seconds: Timings<KindClass>,
     errors: Family<KindReason, Counter>,
 }
 
@@ -156,6 +164,17 @@ impl Reconciles {
         Self {
             total: zero(r, "reconciles", "Reconciliations by kind and outcome"),
             seconds: add(r, "reconcile_seconds", "Duration of a reconciliation", timings()),
+            waiting: zero(
+                r,
+                "reconciles_waiting",
+                "Objects that are ready to be reconciled, by class",
+            ),
+            wait_seconds: add(
+                r,
+                "reconcile_wait_seconds",
+                "Time from an event to its reconciliation, by class",
+                timings(),
+            ),
             errors: zero(r, "reconcile_errors", "Failed reconciliations by kind and reason"),
         }
     }
@@ -257,6 +276,16 @@ impl Metrics {
         self.reconciles.errors.get_or_create(&KindReason { kind, reason }).inc();
     }
 
+    /// The queue of a kind, with its classes; they appear at once, at zero.
+    pub fn queue<const N: usize>(&self, kind: &'static str, classes: [&'static str; N]) -> QueueMetrics<N> {
+        let of_class = |class| {
+            let label = KindClass { kind, class };
+            let waited = self.reconciles.wait_seconds.get_or_create_owned(&label);
+            (self.reconciles.waiting.get_or_create_owned(&label), waited)
+        };
+        QueueMetrics(classes.map(of_class))
+    }
+
     /// The counters of one kind's watch; they appear at once, at zero.
     pub fn watch(&self, kind: &str) -> WatchMetrics {
         let label = Kind { kind: kind.to_owned() };
@@ -320,6 +349,26 @@ fn whole(count: usize) -> i64 {
     i64::try_from(count).unwrap_or(i64::MAX)
 }
 
+/// Of one kind's queue, by class.
+#[derive(Clone, Debug)]
+pub struct QueueMetrics<const N: usize>([(Gauge, Histogram); N]);
+
+impl<const N: usize> QueueMetrics<N> {
+    /// So many are ready.
+    pub fn waiting(&self, depth: [usize; N]) {
+        for ((gauge, _), count) in self.0.iter().zip(depth) {
+            gauge.set(whole(count));
+        }
+    }
+
+    /// The reconciliation of one begins, so long after its event.
+    pub fn began(&self, class: usize, waited: Duration) {
+        if let Some((_, histogram)) = self.0.get(class) {
+            histogram.observe(waited.as_secs_f64());
+        }
+    }
+}
+
 /// Of one kind's watch.
 #[derive(Clone, Debug)]
 pub struct WatchMetrics {
@@ -355,6 +404,9 @@ mod tests {
         let metrics = Metrics::new();
         metrics.reconciled("Submission", "ok", Duration::from_millis(20));
         metrics.reconcile_failed("Submission", "conflict");
+        let queue = metrics.queue("Submission", ["urgent", "new"]);
+        queue.waiting([0, 3]);
+        queue.began(1, Duration::from_millis(20));
         let watch = metrics.watch("Job");
         watch.failed();
         watch.event();
@@ -371,6 +423,9 @@ mod tests {
             "leaderboard_reconciles_total{kind=\"Submission\",outcome=\"ok\"} 1",
             "leaderboard_reconcile_seconds_bucket{le=\"0.025\",kind=\"Submission\"} 1",
             "leaderboard_reconcile_errors_total{kind=\"Submission\",reason=\"conflict\"} 1",
+            "leaderboard_reconciles_waiting{kind=\"Submission\",class=\"new\"} 3",
+            "leaderboard_reconcile_wait_seconds_bucket{le=\"0.025\",kind=\"Submission\",class=\"new\"} 1",
+            "leaderboard_reconcile_wait_seconds_count{kind=\"Submission\",class=\"urgent\"} 0",
             "leaderboard_watch_errors_total{kind=\"Job\"} 1",
             "leaderboard_watch_malformed_objects_total{kind=\"Job\"} 0",
             "leaderboard_is_leader 1",

@@ -168,7 +168,7 @@ async fn watched<T>(mut guard: Guard, stays: bool, work: impl Future<Output = T>
             Some(value)
         }
         Err(panic) => {
-            let why = format!("has panicked: {}", message(panic.as_ref()));
+            let why = format!("has panicked: {}", panic_message(panic.as_ref()));
             tracing::error!(task = guard.name, why, "a task has failed");
             guard.may_end = true;
             if !guard.tasks.stop.is_set() {
@@ -179,7 +179,8 @@ async fn watched<T>(mut guard: Guard, stays: bool, work: impl Future<Output = T>
     }
 }
 
-fn message(panic: &(dyn Any + Send)) -> &str {
+/// What a panic was about.
+pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str))
         .unwrap_or("without a message")

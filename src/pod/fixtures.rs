@@ -36,6 +36,7 @@ pub(crate) fn run() -> Run {
             contents_image: "contents".to_owned(),
             simulator_image: "simulator".to_owned(),
             resume: false,
+            earlier_attempts: 0,
         },
         verify: Verify::Off,
         period_seconds: 1,

@@ -152,7 +152,7 @@ pub enum TableError {
     #[error("table {table} has no sort key; it needs a partition key for the team and a sort key for the submission")]
     NoSortKey { table: String },
     /// The keys that are set are not the table's.
-    #[error("table {table} has the keys {found} but table.partitionKey and table.sortKey say {set}; leave both out")]
+    #[error("table {table} has the keys {found} but table.partitionKey and table.sortKey are {set}; leave both out")]
     OtherKeys { table: String, found: String, set: String },
     /// A key's value is not of the type that the table wants.
     #[error("table {table}: key {key} {problem}")]
@@ -434,7 +434,7 @@ mod tests {
         let other = keys("t", Some(&table), Some(("team-id".into(), "submission-id".into()))).unwrap_err();
         assert_eq!(
             other.to_string(),
-            "table t has the keys team_id and submission_id but table.partitionKey and table.sortKey say team-id and submission-id; leave both out"
+            "table t has the keys team_id and submission_id but table.partitionKey and table.sortKey are team-id and submission-id; leave both out"
         );
     }
 

@@ -1,6 +1,8 @@
 //! The bridge against a real API server and the AWS stand-in.
 #![cfg(test)]
 
+mod rest;
+
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;

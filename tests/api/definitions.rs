@@ -92,6 +92,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "verify": "Warn",
         "syncPeriodSeconds": 10,
         "ttlSecondsAfterFinished": 604_800,
+        "retention": {"finishedSeconds": 0},
                 })
     );
 }

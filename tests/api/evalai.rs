@@ -257,6 +257,7 @@ fn run(pk: i64, attempt: i64) -> Run {
         job: format!("submission-{pk}-{attempt}"),
         by_hand: true,
         has_job: false,
+        ended: None,
     }
 }
 

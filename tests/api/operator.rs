@@ -90,6 +90,7 @@ pub fn run(
         image: "operator:1".into(),
         image_pull_policy: None,
         region: Some("us-east-1".into()),
+        operator: lease.installation(),
         namespace: Some(namespace.to_owned()),
         concurrency: 16,
     };

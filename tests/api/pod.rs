@@ -256,6 +256,7 @@ fn run(bucket: &str) -> Run {
             contents_image: "contents".to_owned(),
             simulator_image: "simulator".to_owned(),
             resume: false,
+            earlier_attempts: 0,
         },
         verify: Verify::Off,
         period_seconds: 1,

@@ -248,6 +248,12 @@ fn times() -> Vec<Case> {
         ),
         create(
             Leaderboard,
+            "retention.finishedSeconds must be 0 or at least",
+            &json!({"ttlSecondsAfterFinished": 3600, "retention": {"finishedSeconds": 3600}}),
+            &json!({"retention": {"finishedSeconds": 3599}}),
+        ),
+        create(
+            Leaderboard,
             "concurrency.perTeam is larger than concurrency.total",
             &json!({"concurrency": {"total": 2, "perTeam": 2}}),
             &json!({"concurrency": {"total": 1}}),

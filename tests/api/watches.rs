@@ -8,7 +8,7 @@ use kube::runtime::watcher::Config;
 use kube::{Api, ResourceExt};
 use leaderboard_api::Submission;
 use leaderboard_operator::kubernetes::preflight::{Need, access_missing, await_kinds};
-use leaderboard_operator::kubernetes::{WatchEvents, guarded, spawn_watch};
+use leaderboard_operator::kubernetes::{Shape, WatchEvents, guarded, spawn_watch};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use serde_json::json;
@@ -41,7 +41,7 @@ async fn creations_changes_and_deletions_are_events() {
     let watch = spawn_watch::<Submission>(
         guarded(client.clone(), Some(&namespace)),
         Config::default(),
-        |_| {},
+        Shape::default(),
         &telemetry,
     );
     let mut events = watch.subscribe();

@@ -227,6 +227,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
             contents_image: "contents".to_owned(),
             simulator_image: "simulator".to_owned(),
             resume: false,
+            earlier_attempts: 0,
         },
         verify: Verify::Refuse,
         // The smallest pause between two rounds is what is left.

@@ -4,7 +4,7 @@
 //! What depends on another field has no schema default: `api::effective` computes it.
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use kube::CustomResource;
 use kube::KubeSchema;
 use kube::ResourceExt;
@@ -15,6 +15,7 @@ use super::leaderboard_parts::{
     SimulatorContainer, Storage, Table, Track,
 };
 use super::leaderboard_parts::{LeaderboardVersion, Verify};
+use super::retention::Retention;
 
 /// One leaderboard version: its tracks, the images that run it, and the services its results go to.
 #[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
@@ -57,6 +58,7 @@ use super::leaderboard_parts::{LeaderboardVersion, Verify};
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || t.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.routes) ? t.routes : self.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
     validation = Rule::new("self.leaderboardVersion == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
     validation = Rule::new("self.tracks.all(t, !has(t.deadlines) || !has(t.deadlines.runSeconds) || t.deadlines.runSeconds == 0 || (self.deadlines.idleSeconds < t.deadlines.runSeconds && self.deadlines.readySeconds < t.deadlines.runSeconds))").message("a track's deadlines.runSeconds must be longer than deadlines.idleSeconds and deadlines.readySeconds: the run would end before they could be reached"),
+    validation = Rule::new("self.retention.finishedSeconds == 0 || self.retention.finishedSeconds >= self.ttlSecondsAfterFinished").message("retention.finishedSeconds must be 0 or at least ttlSecondsAfterFinished: the Job would be removed with its Submission before its own time; raise one or lower the other"),
     validation = Rule::new("self.deadlines.idleSeconds > self.syncPeriodSeconds").message("deadlines.idleSeconds must be longer than syncPeriodSeconds: an agent would be stopped before its first report")
 )]
 pub struct LeaderboardSpec {
@@ -136,6 +138,9 @@ pub struct LeaderboardSpec {
     #[serde(default = "defaults::ttl_seconds_after_finished")]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub ttl_seconds_after_finished: i32,
+    /// How long ended Submissions are kept.
+    #[serde(default)]
+    pub retention: Retention,
 }
 
 /// Kubernetes keeps a finished Job at least so long: within it a controller that was away, or a bucket that could not be read, is
@@ -170,6 +175,10 @@ pub struct LeaderboardStatus {
     /// Generation of the spec that this status speaks of.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub observed_generation: Option<i64>,
+    /// The installation of the operator that drives it, by its Lease: `<namespace>/<name>`. Every other one leaves it alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 512))]
+    pub operator: Option<String>,
     /// Submissions by state.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub counts: Option<Counts>,
@@ -188,13 +197,26 @@ pub struct LeaderboardStatus {
 }
 
 /// Requests to EvalAI with this Leaderboard's token.
-#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct EvalaiUse {
     /// Sent in the last minute.
     pub requests_last_minute: i32,
     /// The limit, `spec.evalai.requestsPerMinute`.
     pub requests_per_minute: i32,
+    /// Results that EvalAI does not have yet; absent if it has all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub backlog: Option<EvalaiBacklog>,
+}
+
+/// Ends of submissions that wait for a request to EvalAI, of all Leaderboards with the same token.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct EvalaiBacklog {
+    /// How many.
+    pub waiting: i32,
+    /// When the last of them is expected to be in EvalAI, to the minute.
+    pub last_expected_time: Time,
 }
 
 /// What a track effectively runs.

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
 pub use super::leaderboard_services::*;
-use super::submission_status::{NotASlice, RouteSlice};
+use super::route_slice::{NotASlice, RouteSlice};
 
 /// A version of CARLA Leaderboard: it chooses the format of the checkpoints, the flags of the programs and some defaults.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! The Kubernetes API of the operator: the kinds, their rules, and every name that more than one room uses.
+//! The Kubernetes API of the operator: the kinds, their rules, and every name that more than one module uses.
 //!
 //! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
 
@@ -13,18 +13,32 @@ pub mod leaderboard;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
 pub mod names;
+mod pair_status;
+mod progress;
 pub mod ranges;
 pub mod reasons;
+mod retention;
+mod route_slice;
 pub mod submission;
 pub mod submission_status;
+mod team;
 pub mod text;
+mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
 pub use ingested::{Ingested, RefusedAttempt};
-pub use leaderboard::{EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus};
+pub use leaderboard::{
+    EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,
+};
 pub use leaderboard_parts::*;
-pub use submission::{EvalaiRef, Submission, SubmissionSpec, Team};
+pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};
+pub use progress::{Progress, Score};
+pub use retention::Retention;
+pub use route_slice::{NotASlice, RouteSlice};
+pub use submission::{EvalaiRef, Submission, SubmissionSpec};
 pub use submission_status::*;
+pub use team::{Team, TeamStatus};
+pub use waiting::{Eta, Waiting};
 
 /// API group of both kinds.
 pub const GROUP: &str = "leaderboard.carla.org";

@@ -347,6 +347,11 @@ reasons! {
             "Submissions can run. The message may have a note: metrics of a phase's leaderboard that stay empty, a token that \
              expires soon, or until when nothing is written to EvalAI after a change of operators.",
             "Nothing, or what the note asks for.";
+        OTHER_OPERATOR = "OtherOperator",
+            "Only in the log and the metrics of an operator: another installation drives this Leaderboard, which `status.operator` \
+             names by its Lease. This one leaves the Leaderboard and its submissions alone, and takes over when that Lease is gone \
+             or has not been renewed for 30 s.",
+            "Uninstall one of the two, or let them serve different namespaces (`watchNamespace`).";
         TOKEN_MISSING = "TokenMissing",
             "EvalAI's token is not where `evalai.token` points.",
             "Create the Secret, or correct the reference.";

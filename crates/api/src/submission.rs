@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::submission_status::SubmissionStatus;
+use super::team::Team;
 
 /// One participant's image on one track of a Leaderboard.
 #[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
@@ -108,20 +109,6 @@ pub struct EvalaiRef {
     /// Id of the submission.
     #[schemars(range(min = 1))]
     pub submission: i64,
-}
-
-/// Who submitted.
-#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq, Eq)]
-#[x_kube(validation = Rule::new("has(self.id) || has(self.name)").message("team needs an id or a name"))]
-pub struct Team {
-    /// Id in EvalAI, in decimal; any text for a local submission.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(min = 1, max = 128))]
-    pub id: Option<String>,
-    /// Name for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(min = 1, max = 256))]
-    pub name: Option<String>,
 }
 
 fn first_attempt() -> i64 {

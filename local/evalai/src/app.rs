@@ -47,7 +47,7 @@ impl Config {
 /// Everything the requests share.
 pub(crate) struct App {
     pub(crate) queues: Arc<dyn Queues>,
-    /// Held by the PUT whose turn it is: the server looks at one after the other.
+    /// Held by the PUT whose turn it is: the server works on one after the other.
     pub(crate) turn: tokio::sync::Mutex<()>,
     state: Mutex<State>,
     knobs: Mutex<Knobs>,

@@ -20,12 +20,12 @@ pub(crate) enum Failure {
         /// Why.
         source: reqwest::Error,
     },
-    /// The server said no.
+    /// The server refused.
     #[error("the server answered {status}: {reason}")]
     Refused {
         /// HTTP status code.
         status: u16,
-        /// Its words.
+        /// Its message.
         reason: String,
     },
 }
@@ -196,7 +196,7 @@ impl Client {
         }
         let json: Value = serde_json::from_str(&text).unwrap_or_default();
         let known = ["error", "detail"].into_iter().find_map(|name| json[name].as_str());
-        let page = || "a page for an exception; the log of `evalai-stand-in serve` may say more".to_owned();
+        let page = || "a page for an exception; see the log of `evalai-stand-in serve`".to_owned();
         let reason = known.map_or_else(page, str::to_owned);
         Err(Failure::Refused {
             status: status.as_u16(),

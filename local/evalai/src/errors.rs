@@ -1,6 +1,6 @@
-//! Every error EvalAI was seen to answer, word for word: status code, shape and text.
+//! Every error that EvalAI was observed to answer, to the letter: status code, shape and text.
 //!
-//! The handlers answer from this table and the operator's client tests read it, so that both speak of the same server.
+//! The handlers answer from this table and the operator's client tests read it, so that both are about the same server.
 //! `{}` in a text stands for a value and is filled in order. Misspelt and run-together words are EvalAI's own.
 
 use serde_json::{Map, Value, json};
@@ -23,7 +23,7 @@ pub enum Shape {
 /// One error of the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ErrorText {
-    /// The constant's name, to say in a test which line of the table failed.
+    /// The constant's name, for the message of a test that fails.
     pub name: &'static str,
     /// HTTP status code.
     pub status: u16,
@@ -107,7 +107,7 @@ error_texts! {
     THROTTLED = 429 Shape::Detail, "Request was throttled. Expected available in {} {}.";
     /// The body is not JSON.
     JSON_PARSE = 400 Shape::Detail, "JSON parse error - {}";
-    /// The body is not the form its content type says.
+    /// The body is not in the form of its content type.
     MULTIPART_PARSE = 400 Shape::Detail, "Multipart form parse error - {}";
     /// The path exists, with other methods.
     METHOD_NOT_ALLOWED = 405 Shape::Detail, r#"Method "{}" not allowed."#;

@@ -57,7 +57,7 @@ pub enum When {
     /// Nothing is done.
     #[default]
     Before,
-    /// Everything is done, and the client does not learn of it.
+    /// Everything is done, and the client gets no answer.
     After,
 }
 
@@ -95,7 +95,7 @@ impl Fault {
     }
 }
 
-/// All knobs. Unless a test says otherwise, the times are those of the real server.
+/// All knobs. Unless a test sets others, the times are those of the real server.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Knobs {
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn faults_hit_what_they_name_as_often_as_they_say() {
+    fn faults_hit_what_they_name_as_often_as_they_should() {
         let faults = json!({"fail_next": [
             {"method": "PUT", "path_prefix": "/api/jobs/", "answer": 503, "times": 2},
             {"answer": "close", "when": "after"},

@@ -1,7 +1,7 @@
 //! A stand-in for EvalAI's API: the demo's participants push into it, the operator reports to it, the tests read it.
 //!
 //! Started by the binary `evalai-stand-in` and, inside tests, by [`serve`]. It knows nothing of the operator: what it
-//! does is what EvalAI's own server was seen to do, including what is wrong with it (no state machine, duplicate
+//! does is what EvalAI's own server was observed to do, including what is wrong with it (no state machine, duplicate
 //! leaderboard rows after concurrent results, whole rows saved late).
 //!
 //! The pure part ([`state`], [`update`], [`submissions`], [`edit`], [`views`], [`python`], [`throttle`], [`routes`])

@@ -56,7 +56,7 @@ struct Serve {
     /// The SQS endpoint messages go to, over plain HTTP (absent: queues in memory, read over REST only).
     #[arg(long, env = "EVALAI_STAND_IN_SQS_ENDPOINT", value_name = "URL")]
     sqs_endpoint: Option<String>,
-    /// The queue of all challenges, by name or URL (absent: as the seed says).
+    /// The queue of all challenges, by name or URL (absent: as in the seed).
     #[arg(long, env = "EVALAI_STAND_IN_QUEUE_URL", value_name = "NAME|URL")]
     queue_url: Option<String>,
     /// Requests per user and minute; 0 is no limit.

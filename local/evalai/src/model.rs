@@ -45,7 +45,7 @@ impl Status {
         Self::PartiallyEvaluated,
     ];
 
-    /// The server's word for it.
+    /// Its name on the server.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Submitted => "submitted",
@@ -61,7 +61,7 @@ impl Status {
         }
     }
 
-    /// Reads the server's word, exactly.
+    /// Reads its name on the server, exactly.
     pub fn parse(text: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|status| status.as_str() == text)
     }
@@ -261,7 +261,7 @@ pub struct Submission {
     pub input_file: Option<String>,
     /// Of two-stage challenges.
     pub submission_input_file: Option<String>,
-    /// What the evaluation said.
+    /// What the evaluation printed.
     pub stdout_file: Option<String>,
     /// What it complained of.
     pub stderr_file: Option<String>,
@@ -281,13 +281,13 @@ pub struct Submission {
     pub rerun_resumed_at: Option<Timestamp>,
     /// When it was made public.
     pub when_made_public: Option<Timestamp>,
-    /// The participant's words.
+    /// A text of the participant.
     pub method_name: String,
-    /// The participant's words.
+    /// A text of the participant.
     pub method_description: String,
-    /// The participant's words.
+    /// A text of the participant.
     pub project_url: String,
-    /// The participant's words.
+    /// A text of the participant.
     pub publication_url: String,
     /// On the public leaderboard.
     pub is_public: bool,

@@ -6,7 +6,7 @@ use std::fmt::{self, Write as _};
 use serde::de::{Deserialize, DeserializeOwned, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value;
 
-/// Stands for a number JSON has no word for (NaN, an infinity), which Python's `json.loads` reads and the server
+/// Stands for a number that JSON cannot express (NaN, an infinity), which Python's `json.loads` reads and the server
 /// refuses only later. The control characters keep it apart from any text a client can mean.
 const NOT_FINITE: &str = "\u{1}\u{2}not finite\u{2}\u{1}";
 
@@ -33,7 +33,7 @@ pub fn json_error(text: &str, error: &serde_json::Error) -> String {
     format!("{what}: line {line} column {column} (char {char})")
 }
 
-/// What Python says when it is given something else than a string.
+/// Python's message when it gets something else than a string.
 pub fn loads_type_error(value: &Value) -> String {
     format!(
         "the JSON object must be str, bytes or bytearray, not {}",

@@ -38,7 +38,7 @@ pub enum QueueError {
         queue: String,
         /// What was asked of it.
         action: &'static str,
-        /// What it said.
+        /// Its message.
         reason: String,
     },
     /// The receipt handle is none of this queue's.

@@ -87,7 +87,7 @@ pub enum Found {
     Nothing,
 }
 
-/// Looks a path up.
+/// Finds the endpoint of a path.
 pub fn find(path: &str) -> Found {
     let Some(rest) = path.strip_prefix("/api/") else {
         return Found::Nothing;
@@ -136,8 +136,8 @@ fn key(text: &str) -> Option<u64> {
 }
 
 fn name(text: &str) -> Option<String> {
-    let word = |char: char| char.is_alphanumeric() || matches!(char, '_' | '.' | '-');
-    (!text.is_empty() && text.chars().all(word)).then(|| text.to_owned())
+    let is_allowed = |char: char| char.is_alphanumeric() || matches!(char, '_' | '.' | '-');
+    (!text.is_empty() && text.chars().all(is_allowed)).then(|| text.to_owned())
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Puts HTTP around the state: listeners, the order in which the server looks at a request, the log, faults on purpose.
+//! Puts HTTP around the state: listeners, the order in which the server checks a request, the log, faults on purpose.
 //! Started by the binary and by tests; what a request means is in `handlers` and [`crate::control`].
 //!
 //! A request runs in a task of its own: as behind the real server's proxy, the work goes on when its client is gone.

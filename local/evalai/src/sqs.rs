@@ -104,7 +104,7 @@ where
     }
 }
 
-/// The error and what is behind it, in words.
+/// The error and what is behind it, as text.
 fn chain(error: &dyn std::error::Error) -> String {
     let causes = std::iter::successors(error.source(), |cause| cause.source());
     causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"))

@@ -14,7 +14,7 @@ use crate::model::{Challenge, LeaderboardRow, Phase, Split, Status, Submission, 
 use crate::reply::Reply;
 use crate::seed::Seed;
 
-/// A message that went out, for tests to look at.
+/// A message that was sent, for tests.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Published {
     /// When.
@@ -77,8 +77,8 @@ impl State {
 
     /// The user behind the value of an `Authorization` header, or none without one.
     pub fn authenticate(&self, header: Option<&str>) -> Result<Option<&User>, Reply> {
-        let words: Vec<_> = header.unwrap_or_default().split_whitespace().collect();
-        let error = match words.as_slice() {
+        let parts: Vec<_> = header.unwrap_or_default().split_whitespace().collect();
+        let error = match parts.as_slice() {
             ["Bearer", token] => return self.bearer(token).map(Some),
             ["Bearer", ..] => &errors::BAD_AUTHORIZATION_HEADER,
             [scheme, rest @ ..] if scheme.eq_ignore_ascii_case("Token") => match rest {
@@ -248,7 +248,7 @@ impl State {
         rows
     }
 
-    /// Saves a submission as a new row: a new key, status submitted whatever it says, the next number of its team in
+    /// Saves a submission as a new row: a new key, status submitted whatever it holds, the next number of its team in
     /// the phase. Hands the key back.
     pub fn insert(&mut self, mut submission: Submission) -> u64 {
         let of_team = |s: &&Submission| {

@@ -26,7 +26,7 @@ pub enum Upload {
     NoFile,
 }
 
-/// What a new submission says about itself.
+/// What a new submission holds.
 #[derive(Debug, Clone)]
 pub struct NewSubmission {
     /// The team's primary key.
@@ -41,7 +41,7 @@ pub struct NewSubmission {
     pub fields: Map<String, Value>,
 }
 
-/// The checks of a submission by a user: the phase's and challenge's rows when they pass.
+/// The checks of a submission by a user: the phase's and challenge's rows when they succeed.
 pub fn check_new<'a>(
     state: &'a State,
     user: &User,

@@ -14,7 +14,7 @@ pub struct Throttle {
 }
 
 impl Throttle {
-    /// Lets a request of `key` at the time `now` (since any fixed moment) through, or says how many whole seconds it
+    /// Lets a request of `key` at the time `now` (since any fixed moment) through, or hands back how many whole seconds it
     /// has to wait. A refused request does not count. `limit` 0 lets everything through.
     pub fn check(&mut self, key: &str, limit: usize, now: Duration) -> Result<(), u64> {
         if limit == 0 {

@@ -97,7 +97,7 @@ pub fn prepare_patch(state: &State, door: Door, form: &Form, now: Timestamp) -> 
             form.text("job_name")?.to_lowercase(),
         ))
     };
-    // The two endpoints look the submission up and read the body in different orders.
+    // The two endpoints find the submission and read the body in different orders.
     let (mut submission, (status, job_name)) = match door {
         Door::Update => (named(state, form)?, read()?),
         Door::Partial => {

@@ -21,9 +21,9 @@ pub fn time(at: Timestamp) -> String {
 /// Why a text is no time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BadTime {
-    /// It does not look like one.
+    /// It has not the form of one.
     Shape,
-    /// It looks like one, and there is no such day or hour.
+    /// It has the form of one, and there is no such day or hour.
     Value,
 }
 

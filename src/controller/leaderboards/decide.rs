@@ -12,10 +12,11 @@ use super::reach::Unreachable;
 use super::state::Policy;
 use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
+use crate::services::evalai::Usage;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
+    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
 };
 
 /// What one reconcile has read of a Leaderboard.
@@ -41,8 +42,8 @@ pub struct LeaderboardView {
     pub evalai: EvalaiStanding,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
-    /// Requests of the last minute and the limit.
-    pub budget: Option<(u32, u32)>,
+    /// How the requests of its token are used.
+    pub usage: Option<Usage>,
 }
 
 /// What a reconcile has to do.
@@ -60,10 +61,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let generation = leaderboard.metadata.generation;
     status.observed_generation = generation;
     status.counts = Some(view.counts);
-    status.evalai = view.budget.map(|(used, limit)| EvalaiUse {
-        requests_last_minute: i32::try_from(used).unwrap_or(i32::MAX),
-        requests_per_minute: i32::try_from(limit).unwrap_or(i32::MAX),
-    });
+    status.evalai = view.usage.map(evalai_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
@@ -95,6 +93,18 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
         _ => None,
     };
     LeaderboardPlan { status, finalizer }
+}
+
+fn evalai_use(usage: Usage) -> EvalaiUse {
+    let waiting = i32::try_from(usage.waiting).unwrap_or(i32::MAX);
+    EvalaiUse {
+        requests_last_minute: i32::try_from(usage.used).unwrap_or(i32::MAX),
+        requests_per_minute: i32::try_from(usage.limit).unwrap_or(i32::MAX),
+        backlog: usage.last_expected.map(|at| EvalaiBacklog {
+            waiting,
+            last_expected_time: Time(at),
+        }),
+    }
 }
 
 /// What keeps a Leaderboard that is being deleted. With it goes its NetworkPolicy, which has to outlive the last Pod.
@@ -272,252 +282,5 @@ fn without_limit(leaderboard: &Leaderboard) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) -> Arc<Leaderboard> {
-        let spec = json!({
-            "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
-            "storage": {"bucket": "bucket", "prefix": prefix}, "deadlines": {"runSeconds": 86400},
-        });
-        let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
-        object.metadata.namespace = Some("ns".into());
-        object.metadata.uid = Some(name.into());
-        object.metadata.creation_timestamp = Some(Time(Timestamp::from_second(second).unwrap()));
-        Arc::new(object)
-    }
-
-    fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
-        LeaderboardView {
-            now: Timestamp::from_second(1000).unwrap(),
-            leaderboard: Arc::clone(mine),
-            all: all.to_vec(),
-            counts: Counts::default(),
-            in_use: 0,
-            pods: 0,
-            policy: Policy::InPlace,
-            measured: None,
-            invalid_pod: None,
-            unreachable: None,
-            evalai: EvalaiStanding::Fits { note: None },
-            evalai_writes_from: None,
-            budget: Some((3, 54)),
-        }
-    }
-
-    fn reason(plan: &LeaderboardPlan) -> (String, String) {
-        let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
-        (condition.status.clone(), condition.reason.clone())
-    }
-
-    #[test]
-    fn of_two_with_the_same_phase_the_older_serves() {
-        let old = leaderboard("old", 1, 7, "https://e", "a/");
-        let new = leaderboard("new", 2, 7, "https://e/", "b/");
-        let all = [Arc::clone(&old), Arc::clone(&new)];
-        assert_eq!(
-            reason(&decide(&view(&old, &all))),
-            ("True".into(), reasons::READY.into())
-        );
-        assert_eq!(
-            reason(&decide(&view(&new, &all))),
-            ("False".into(), reasons::PHASE_CONFLICT.into())
-        );
-    }
-
-    #[test]
-    fn two_servers_may_not_share_a_prefix() {
-        let old = leaderboard("old", 1, 7, "https://one", "a/");
-        let new = leaderboard("new", 2, 8, "https://two", "a/");
-        let all = [Arc::clone(&old), Arc::clone(&new)];
-        assert_eq!(
-            reason(&decide(&view(&new, &all))),
-            ("False".into(), reasons::PREFIX_CONFLICT.into())
-        );
-    }
-
-    #[test]
-    fn it_stays_while_submissions_need_it() {
-        let mut one = leaderboard("one", 1, 7, "https://e", "a/").as_ref().clone();
-        one.metadata.finalizers = Some(vec![names::FINALIZER_LEADERBOARD.into()]);
-        one.metadata.deletion_timestamp = Some(Time(Timestamp::from_second(900).unwrap()));
-        let one = Arc::new(one);
-        let mut seen = view(&one, &[]);
-        seen.in_use = 2;
-        let plan = decide(&seen);
-        assert_eq!(plan.finalizer, None);
-        assert!(conditions::is_true(&plan.status.conditions, conditions::TERMINATING));
-        (seen.in_use, seen.pods) = (0, 1);
-        let plan = decide(&seen);
-        assert_eq!(plan.finalizer, None, "its policy goes with it");
-        let shown = conditions::get(&plan.status.conditions, conditions::TERMINATING).unwrap();
-        assert!(shown.message.starts_with("1 Pods still run"), "{}", shown.message);
-        seen.pods = 0;
-        assert_eq!(decide(&seen).finalizer, Some(false));
-    }
-
-    #[test]
-    fn what_is_surely_wrong_comes_before_what_nobody_knows() {
-        let one = leaderboard("one", 1, 7, "https://e", "a/");
-        let unreachable = |truth| {
-            Some(Unreachable {
-                truth,
-                reason: reasons::TABLE_UNREACHABLE,
-                message: "It is not there.".into(),
-            })
-        };
-        let fits = || EvalaiStanding::Fits { note: None };
-        let missing = || EvalaiStanding::NoToken("x".into());
-        let cases = [
-            (unreachable(Truth::False), fits(), "False", reasons::TABLE_UNREACHABLE),
-            (
-                unreachable(Truth::False),
-                missing(),
-                "False",
-                reasons::TABLE_UNREACHABLE,
-            ),
-            (
-                unreachable(Truth::Unknown),
-                fits(),
-                "Unknown",
-                reasons::TABLE_UNREACHABLE,
-            ),
-            (unreachable(Truth::Unknown), missing(), "False", reasons::TOKEN_MISSING),
-            (
-                unreachable(Truth::Unknown),
-                EvalaiStanding::Unchecked(None),
-                "Unknown",
-                reasons::TABLE_UNREACHABLE,
-            ),
-            (None, fits(), "True", reasons::READY),
-        ];
-        for (unreachable, evalai, status, expected) in cases {
-            let seen = LeaderboardView {
-                unreachable,
-                evalai,
-                ..view(&one, &[])
-            };
-            assert_eq!(
-                reason(&decide(&seen)),
-                (status.to_owned(), expected.to_owned()),
-                "{seen:?}"
-            );
-            let broken = LeaderboardView {
-                invalid_pod: Some("no".into()),
-                ..seen
-            };
-            assert_eq!(
-                reason(&decide(&broken)),
-                ("False".to_owned(), reasons::INVALID_POD.to_owned())
-            );
-        }
-    }
-
-    #[test]
-    fn a_leaderboard_says_until_when_nothing_is_written_to_evalai() {
-        let one = leaderboard("one", 1, 7, "https://e", "a/");
-        let note = || Some("EvalAI's token ends on 2026-12-01.".to_owned());
-        for (evalai, ready, message) in [
-            (
-                EvalaiStanding::Fits { note: None },
-                "True",
-                "Nothing is written to EvalAI before 00:17:55 UTC: the previous controller did not confirm its last requests, and \
-                 they may still be running. Nothing to do.",
-            ),
-            (
-                EvalaiStanding::Fits { note: note() },
-                "True",
-                "EvalAI's token ends on 2026-12-01. Nothing is written to EvalAI before 00:17:55 UTC: the previous controller did \
-                 not confirm its last requests, and they may still be running. Nothing to do.",
-            ),
-            (EvalaiStanding::NoToken("x".into()), "False", "x"),
-        ] {
-            let seen = LeaderboardView {
-                evalai,
-                evalai_writes_from: Timestamp::from_second(1075).ok(),
-                ..view(&one, &[])
-            };
-            let plan = decide(&seen);
-            let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
-            assert_eq!(
-                (condition.status.as_str(), condition.message.as_str()),
-                (ready, message)
-            );
-        }
-    }
-
-    #[test]
-    fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
-        let mut one = leaderboard("one", 1, 7, "https://e", "a/");
-        let spec = &mut Arc::make_mut(&mut one).spec;
-        spec.deadlines.run_seconds = 0;
-        let plan = decide(&view(&one, &[]));
-        let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
-        assert_eq!(
-            ready.message,
-            "Runs of the track sensors have no time limit: an agent that does not end keeps its nodes until it is cancelled; \
-             set deadlines.runSeconds."
-        );
-        Arc::make_mut(&mut one).spec.tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
-            run_seconds: Some(7200),
-            start_seconds: None,
-        });
-        let plan = decide(&view(&one, &[]));
-        assert_eq!(
-            conditions::get(&plan.status.conditions, conditions::READY)
-                .unwrap()
-                .message,
-            ""
-        );
-    }
-
-    #[test]
-    fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
-        let one = leaderboard("one", 1, 7, "https://e", "a/");
-        for (policy, ready, isolated) in [
-            (Policy::InPlace, reasons::READY, reasons::NOT_MEASURED),
-            (Policy::External, reasons::READY, reasons::EXTERNAL),
-            (Policy::Refused("No.".into()), reasons::NOT_ISOLATED, reasons::FORBIDDEN),
-            (
-                Policy::NotApplied("No.".into()),
-                reasons::NOT_ISOLATED,
-                reasons::NOT_APPLIED,
-            ),
-        ] {
-            let seen = LeaderboardView {
-                policy,
-                ..view(&one, &[])
-            };
-            let plan = decide(&seen);
-            assert_eq!(reason(&plan).1, ready);
-            let shown = conditions::get(&plan.status.conditions, conditions::ISOLATED).unwrap();
-            assert_eq!(shown.reason, isolated);
-        }
-    }
-
-    #[test]
-    fn what_is_wrong_with_evalai_is_said() {
-        let one = leaderboard("one", 1, 7, "https://e", "a/");
-        let cases = [
-            (EvalaiStanding::NoToken("x".into()), "False", reasons::TOKEN_MISSING),
-            (
-                EvalaiStanding::TokenRefused("x".into()),
-                "False",
-                reasons::TOKEN_REFUSED,
-            ),
-            (EvalaiStanding::Misfit("x".into()), "False", reasons::LABELS_DIFFER),
-            (EvalaiStanding::Unchecked(None), "Unknown", reasons::ASKING_EVALAI),
-            (EvalaiStanding::NotRequired, "True", reasons::READY),
-        ];
-        for (evalai, status, expected) in cases {
-            let seen = LeaderboardView {
-                evalai,
-                ..view(&one, &[])
-            };
-            assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.to_owned()));
-        }
-    }
-}
+#[path = "decide_tests.rs"]
+mod tests;

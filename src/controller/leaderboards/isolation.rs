@@ -8,7 +8,6 @@ use std::time::Duration;
 use futures::StreamExt;
 use futures::stream::select;
 use jiff::Timestamp;
-use k8s_openapi::api::core::v1::{ContainerStateTerminated, ContainerStatus, Pod};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::reflector::ObjectRef;
@@ -19,6 +18,7 @@ use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::objects::{Wake, key_of, uid_of};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
+use crate::kubernetes::objects::Pod;
 use crate::kubernetes::{WatchEvents, call};
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::conditions::{self, Truth};
@@ -225,12 +225,10 @@ pub(super) fn measured(
 
 /// What the Pod that ended its `workspace` last has found, of those that this generation's Jobs made.
 fn by_pods(stores: &Stores, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
-    let (name, namespace) = (leaderboard.name_any(), leaderboard.namespace());
     let generation = leaderboard.metadata.generation.unwrap_or_default().to_string();
     let is_ours = |pod: &Arc<Pod>| {
-        pod.namespace() == namespace
-            && pod.labels().get(names::LABEL_LEADERBOARD) == Some(&name)
-            && pod.annotations().get(names::ANNOTATION_GENERATION) == Some(&generation)
+        is_pod_of(pod, leaderboard)
+            && pod.metadata.annotations.leaderboard_generation.as_deref() == Some(generation.as_str())
     };
     let pods = stores.pods.state();
     let found = pods.iter().filter(|pod| is_ours(pod)).filter_map(|pod| finding(pod));
@@ -242,21 +240,22 @@ pub(super) fn pods_left(stores: &Stores, leaderboard: &Leaderboard) -> usize {
     if leaderboard.metadata.deletion_timestamp.is_none() {
         return 0;
     }
-    let (name, namespace) = (leaderboard.name_any(), leaderboard.namespace());
     let is_left = |pod: &Arc<Pod>| {
-        let phase = pod.status.as_ref().and_then(|status| status.phase.as_deref());
-        pod.namespace() == namespace
-            && pod.labels().get(names::LABEL_LEADERBOARD) == Some(&name)
-            && !matches!(phase, Some("Succeeded" | "Failed"))
+        is_pod_of(pod, leaderboard) && !matches!(pod.status.phase.as_deref(), Some("Succeeded" | "Failed"))
     };
     stores.pods.state().iter().filter(|pod| is_left(pod)).count()
 }
 
+fn is_pod_of(pod: &Pod, leaderboard: &Leaderboard) -> bool {
+    let meta = &pod.metadata;
+    meta.labels.leaderboard.as_deref() == leaderboard.metadata.name.as_deref()
+        && meta.namespace.as_deref() == leaderboard.metadata.namespace.as_deref()
+}
+
 /// What a Pod has found of its isolation, and when.
 pub fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
-    let status = pod.status.as_ref()?;
-    let mut containers = status.init_container_statuses.iter().flatten();
-    let end = last_end(containers.find(|c| c.name == names::CONTAINER_WORKSPACE)?)?;
+    let mut containers = pod.status.init_container_statuses.iter();
+    let end = containers.find(|c| &*c.name == names::CONTAINER_WORKSPACE)?.ended()?;
     let verdict = WorkspaceVerdict::parse(end.message.as_deref()?)?;
     let is_finding = matches!(
         verdict.reason,
@@ -267,11 +266,6 @@ pub fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
             | WorkspaceReason::NotKnownIsolated
     );
     is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
-}
-
-fn last_end(status: &ContainerStatus) -> Option<&ContainerStateTerminated> {
-    let states = [status.state.as_ref(), status.last_state.as_ref()];
-    states.into_iter().flatten().find_map(|state| state.terminated.as_ref())
 }
 
 /// What `Isolated` says.

@@ -1,11 +1,12 @@
 //! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
-//! Applies the policy before it waits for anything else, since no Job is made without it. Reads the token (every five minutes,
-//! or when EvalAI refuses it), checks whether bucket, table and queues answer, and gives the way to EvalAI to `external`. `decide`
-//! and `reach` are pure.
+//! Does nothing for a Leaderboard that another installation drives. Applies the policy before it waits for anything else, since no
+//! Job is made without it. Reads the token (every five minutes, or when EvalAI refuses it), checks whether bucket, table and queues
+//! answer, and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
 
 pub mod decide;
 pub mod isolation;
+pub mod operator;
 mod places;
 pub mod probe;
 mod reach;
@@ -40,8 +41,30 @@ pub struct Uses<'a> {
     pub aws: &'a Aws,
 }
 
+/// What a reconcile came to.
+pub enum Reconciled {
+    /// When to look again.
+    Done(Duration),
+    /// Another installation of the operator drives it; when to look again.
+    LeftAlone(Duration),
+}
+
 /// One reconcile.
-pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
+pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Reconciled, CallError> {
+    let Policies { client, state, .. } = uses.policies;
+    let key = key_of(leaderboard.as_ref());
+    match operator::ours(client, state, Arc::clone(&leaderboard), &uses.settings.operator).await? {
+        Ok(ours) => drive(ours, uses).await.map(Reconciled::Done),
+        Err(wait) => {
+            uses.external.set_target(&leaderboard, None);
+            uses.external.hub.retire(&key);
+            Ok(Reconciled::LeftAlone(wait))
+        }
+    }
+}
+
+/// One reconcile of a Leaderboard that this installation drives.
+async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
     let uid = uid_of(leaderboard.as_ref());
     let now = Timestamp::now();
     let Policies {
@@ -94,7 +117,7 @@ fn observe(
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(hub, leaderboard, &key, now),
         evalai_writes_from: hub.writes_from(),
-        budget: hub.budget_used(&key),
+        usage: hub.usage(&key),
     }
 }
 
@@ -112,7 +135,7 @@ async fn write_status(
     }
     let only_numbers = leaderboard_api::LeaderboardStatus {
         counts: old.counts,
-        evalai: old.evalai,
+        evalai: old.evalai.clone(),
         ..plan.status.clone()
     } == old;
     let uid = uid_of(leaderboard);

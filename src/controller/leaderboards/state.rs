@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use super::operator::Foreign;
 use super::probe::Probe;
 use crate::pod::workspace::WorkspaceVerdict;
 
@@ -61,6 +62,8 @@ struct Entry {
     written: Option<Timestamp>,
     applied: Option<Applied>,
     measured: Option<Measured>,
+    /// The Lease of the installation that drives it, where that is another one.
+    foreign: Option<Foreign>,
 }
 
 impl LeaderboardState {
@@ -107,6 +110,14 @@ impl LeaderboardState {
 
     pub(super) fn note_measured(&self, uid: &str, found: Measured) {
         self.change(uid, |entry| entry.measured = Some(found));
+    }
+
+    pub(super) fn foreign(&self, uid: &str) -> Option<Foreign> {
+        self.lock().get(uid)?.foreign.clone()
+    }
+
+    pub(super) fn note_foreign(&self, uid: &str, found: Foreign) {
+        self.change(uid, |entry| entry.foreign = Some(found));
     }
 
     /// Whether its status was not written for so long.

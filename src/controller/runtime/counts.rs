@@ -4,8 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use kube::runtime::reflector::Store;
-
+use crate::kubernetes::Store;
 use crate::observability::Observability;
 use crate::services::evalai::Hub;
 use leaderboard_api::{State, Submission};

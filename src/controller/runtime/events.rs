@@ -1,26 +1,28 @@
-//! Which objects an event concerns: the streams of the watches and services, mapped straight into the two work queues.
+//! Which objects an event concerns, and how urgent it is: the streams of the watches and services, mapped for the two queues.
 //!
 //! Each mapping takes the event in where something is remembered of it, and leaves out the echo of our own writes.
 
+use std::collections::hash_map::DefaultHasher;
 use std::collections::{HashMap, HashSet};
+use std::hash::Hasher;
 use std::sync::Arc;
 
 use futures::stream::{self, BoxStream, StreamExt, select_all};
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 use tokio::sync::mpsc;
 
+use super::queue::{Class, Key, Queue, urgency};
 use super::{Shared, Watches};
 use crate::controller::leaderboards::isolation;
-use crate::controller::objects::key_of;
+use crate::controller::objects::{Wake, key_of};
 use crate::controller::stores::Stores;
-use crate::kubernetes::WatchEvent;
+use crate::kubernetes::objects::{Job, Pod};
+use crate::kubernetes::{Store, WatchEvent};
 use crate::services::ObjectKey;
 use crate::services::evalai::Changed;
-use leaderboard_api::{Leaderboard, Submission, conditions};
+use leaderboard_api::{Leaderboard, Submission, conditions, names};
 
 /// What the services report.
 pub(super) struct Reports {
@@ -28,91 +30,112 @@ pub(super) struct Reports {
     pub(super) rows: mpsc::UnboundedReceiver<ObjectKey>,
     /// What EvalAI has news of.
     pub(super) evalai: mpsc::UnboundedReceiver<Changed>,
-    /// Submissions that have an answer from S3, or of the API server.
-    pub(super) answers: mpsc::UnboundedReceiver<ObjectRef<Submission>>,
 }
 
-/// Wakes a Leaderboard.
-pub(super) type Boards = mpsc::UnboundedSender<ObjectRef<Leaderboard>>;
+/// Objects that something has happened to, and how urgent that is.
+pub(super) type Events<K> = BoxStream<'static, (ObjectRef<K>, Class)>;
 
-/// Every Submission that something has happened to. What concerns its Leaderboard goes to `boards`, after it was counted.
-pub(super) fn of_submissions(
-    watches: &Watches,
-    reports: Reports,
-    boards: &Boards,
-    shared: &Arc<Shared>,
-) -> BoxStream<'static, ObjectRef<Submission>> {
-    let own = of_submission(Arc::clone(shared), boards.clone());
-    let slots = Arc::clone(&shared.context.slots);
-    let of_job = move |event: WatchEvent<Job>| {
-        slots.job(&event.object, event.is_gone);
-        Stores::owner_of(event.object.as_ref())
+/// Every Submission that something has happened to. What concerns its Leaderboard is added to that one's queue, after it was
+/// counted.
+pub(super) fn of_submissions(watches: &Watches, reports: Reports, shared: &Arc<Shared>) -> Events<Submission> {
+    let boards = Arc::clone(&shared.queues.leaderboards);
+    let store = shared.context.stores.submissions.clone();
+    let by_store = move |urgency: fn(&Submission) -> Class| {
+        let store = store.clone();
+        move |object| Some(ranked(&store, object, urgency))
     };
-    let (to_boards, evalai) = (boards.clone(), received(reports.evalai));
+    let (of_row, of_turn) = (by_store(urgency::of_answer), by_store(urgency::of_submission));
+    let of_evalai = by_store(urgency::of_evalai);
     let of_evalai = move |change| match change {
-        Changed::Submission(key) => Some(reference(&key)),
+        Changed::Submission(key) => of_evalai(reference(&key)),
         Changed::Leaderboard(key) => {
-            // Without a receiver the process is ending.
-            let _ = to_boards.send(reference(&key));
+            boards.add(&reference::<Leaderboard>(&key), Class::Refresh);
             None
         }
     };
     select_all([
-        mapped(watches.submissions.subscribe(), own),
-        mapped(watches.jobs.subscribe(), of_job),
-        mapped(watches.pods.subscribe(), of_pod(Arc::clone(shared), boards.clone())),
-        mapped(received(reports.rows), |key| Some(reference(&key))),
-        mapped(evalai, of_evalai),
-        received(reports.answers).boxed(),
-        shared.context.slots.woken().boxed(),
+        mapped(watches.submissions.subscribe(), of_submission(Arc::clone(shared))),
+        mapped(watches.jobs.subscribe(), of_job(Arc::clone(shared))),
+        mapped(watches.pods.subscribe(), of_pod(Arc::clone(shared))),
+        mapped(received(reports.rows), move |key| of_row(reference(&key))),
+        mapped(received(reports.evalai), of_evalai),
+        mapped(shared.context.slots.woken(), of_turn),
     ])
     .boxed()
 }
 
+/// Puts a Submission into the queue that has an answer from S3, or of the API server.
+pub(super) fn waking(queue: &Arc<Queue>, submissions: &Store<Submission>) -> Wake<Submission> {
+    let (queue, submissions) = (Arc::clone(queue), submissions.clone());
+    Box::new(move |object| {
+        let (object, class) = ranked(&submissions, object, urgency::of_answer);
+        queue.add(&object, class);
+    })
+}
+
+fn ranked(
+    submissions: &Store<Submission>,
+    object: ObjectRef<Submission>,
+    urgency: fn(&Submission) -> Class,
+) -> (ObjectRef<Submission>, Class) {
+    let class = submissions.get(&object).map_or(Class::Refresh, |found| urgency(&found));
+    (object, class)
+}
+
 /// Every Leaderboard that something has happened to; those that wait for it are woken.
-pub(super) fn of_leaderboards(
-    watches: &Watches,
-    woken: mpsc::UnboundedReceiver<ObjectRef<Leaderboard>>,
-    shared: &Arc<Shared>,
-) -> BoxStream<'static, ObjectRef<Leaderboard>> {
+pub(super) fn of_leaderboards(watches: &Watches, shared: &Arc<Shared>) -> Events<Leaderboard> {
     let slots = Arc::clone(&shared.context.slots);
     let of_policy = move |event: WatchEvent<NetworkPolicy>| {
         let board = Stores::leaderboard_of(event.object.as_ref())?;
         slots.wake_pending(&board);
-        Some(board)
+        Some((board, Class::Urgent))
     };
     select_all([
         mapped(watches.leaderboards.subscribe(), of_leaderboard(Arc::clone(shared))),
         mapped(watches.policies.subscribe(), of_policy),
-        received(woken).boxed(),
     ])
     .boxed()
 }
 
 fn of_submission(
     shared: Arc<Shared>,
-    boards: Boards,
-) -> impl FnMut(WatchEvent<Submission>) -> Vec<ObjectRef<Submission>> + Send {
+) -> impl FnMut(WatchEvent<Submission>) -> Vec<(ObjectRef<Submission>, Class)> + Send {
     let mut marks = Marks::default();
     move |event| {
-        let object = event.object.as_ref();
+        let (object, queues) = (event.object.as_ref(), &shared.queues);
         if shared.context.slots.submission(object, event.is_gone) {
             let namespace = object.namespace().unwrap_or_default();
-            let _ = boards.send(ObjectRef::new(&object.spec.leaderboard_name).within(&namespace));
+            let board = ObjectRef::<Leaderboard>::new(&object.spec.leaderboard_name).within(&namespace);
+            queues.leaderboards.add(&board, Class::Refresh);
         }
         let original = shared.context.reruns.moved(object, event.is_gone);
         if event.is_gone {
             marks.forget(object);
+            queues.submissions.forget(&Key::from(&ObjectRef::from_obj(object)));
             shared.forget(&key_of(object));
             return Vec::new();
         }
-        let is_news = marks.moved(object, "");
-        let own = is_news.then(|| ObjectRef::from_obj(object));
+        shared.context.memory.is_shown(object);
+        let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_SUBMISSION));
+        let own = is_news.then(|| (ObjectRef::from_obj(object), urgency::of_submission(object)));
+        let original = original.into_iter().map(|original| (original, Class::Refresh));
         own.into_iter().chain(original).collect()
     }
 }
 
-fn of_leaderboard(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Leaderboard>) -> Option<ObjectRef<Leaderboard>> + Send {
+fn of_job(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Job>) -> Option<(ObjectRef<Submission>, Class)> + Send {
+    let mut marks = Marks::default();
+    move |event| {
+        let job = event.object.as_ref();
+        shared.context.slots.job(job, event.is_gone);
+        let owner = Stores::owner_of(job).filter(|_| marks.job_has_news(job, event.is_gone));
+        owner.map(|owner| (owner, urgency::of_job(job, event.is_gone)))
+    }
+}
+
+fn of_leaderboard(
+    shared: Arc<Shared>,
+) -> impl FnMut(WatchEvent<Leaderboard>) -> Option<(ObjectRef<Leaderboard>, Class)> + Send {
     let (mut marks, mut standings) = (Marks::default(), Marks::default());
     move |event| {
         let (object, slots) = (event.object.as_ref(), &shared.context.slots);
@@ -121,6 +144,7 @@ fn of_leaderboard(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Leaderboard>) ->
         if event.is_gone {
             marks.forget(object);
             standings.forget(object);
+            shared.queues.leaderboards.forget(&Key::from(&reference));
             shared.forget(&key_of(object));
             slots.wake_pending(&reference);
             return None;
@@ -128,7 +152,8 @@ fn of_leaderboard(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Leaderboard>) ->
         if standings.moved(object, &standing(object)) {
             slots.wake_pending(&reference);
         }
-        marks.moved(object, "").then_some(reference)
+        let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_LEADERBOARD));
+        is_news.then_some((reference, Class::Urgent))
     }
 }
 
@@ -138,18 +163,19 @@ fn standing(leaderboard: &Leaderboard) -> String {
     let conditions = status.map(|status| status.conditions.as_slice()).unwrap_or_default();
     let condition = |type_: &str| conditions::get(conditions, type_).map(|c| (&c.status, &c.reason, &c.message));
     format!(
-        "{:?} {:?}",
+        "{:?} {:?} {:?}",
+        status.and_then(|status| status.operator.as_deref()),
         condition(conditions::READY),
         condition(conditions::ISOLATED)
     )
 }
 
 /// A Pod concerns its Submission, and its Leaderboard once it has measured its isolation.
-fn of_pod(shared: Arc<Shared>, boards: Boards) -> impl FnMut(WatchEvent<Pod>) -> Option<ObjectRef<Submission>> + Send {
+fn of_pod(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Pod>) -> Option<(ObjectRef<Submission>, Class)> + Send {
     let mut measured = HashSet::new();
     move |event| {
         let pod = event.object.as_ref();
-        let uid = pod.uid().unwrap_or_default();
+        let uid = pod.metadata.uid.clone();
         let board = Stores::leaderboard_of(pod);
         // A Leaderboard that is being deleted waits for the end of its last Pod.
         let known = board
@@ -163,25 +189,54 @@ fn of_pod(shared: Arc<Shared>, boards: Boards) -> impl FnMut(WatchEvent<Pod>) ->
             isolation::finding(pod).is_some() && measured.insert(uid)
         };
         if let Some(board) = board.filter(|_| is_awaited || is_measured) {
-            let _ = boards.send(board);
+            shared.queues.leaderboards.add(&board, Class::Refresh);
         }
-        Stores::owner_of(pod)
+        Stores::owner_of(pod).map(|owner| (owner, urgency::of_pod(pod, event.is_gone)))
     }
 }
 
-/// What was last seen of each object, to tell our own status writes from what others did.
+/// What of an object is news to us: neither its status nor our own finalizer, which both are our own writes.
+fn own_fields(object: &impl ResourceExt, own_finalizer: &str) -> String {
+    let meta = object.meta();
+    let finalizers = meta
+        .finalizers
+        .iter()
+        .flatten()
+        .filter(|finalizer| *finalizer != own_finalizer);
+    let finalizers: Vec<&String> = finalizers.collect();
+    let (generation, annotations) = (meta.generation, &meta.annotations);
+    format!(
+        "{generation:?} {:?} {finalizers:?} {annotations:?}",
+        meta.deletion_timestamp
+    )
+}
+
+/// What was last observed of each object, as a hash: what has not changed is no news.
 #[derive(Default)]
-struct Marks(HashMap<String, String>);
+struct Marks(HashMap<String, u64>);
 
 impl Marks {
-    fn moved(&mut self, object: &impl ResourceExt, standing: &str) -> bool {
-        let meta = object.meta();
-        let mark = format!(
-            "{:?} {:?} {:?} {:?} {standing}",
-            meta.generation, meta.deletion_timestamp, meta.finalizers, meta.annotations
-        );
-        let old = self.0.insert(object.uid().unwrap_or_default(), mark.clone());
-        old != Some(mark)
+    fn moved(&mut self, object: &impl ResourceExt, mark: &str) -> bool {
+        self.moved_uid(object.uid().unwrap_or_default(), mark)
+    }
+
+    fn moved_uid(&mut self, uid: String, mark: &str) -> bool {
+        let mut hasher = DefaultHasher::new();
+        hasher.write(mark.as_bytes());
+        let mark = hasher.finish();
+        self.0.insert(uid, mark) != Some(mark)
+    }
+
+    /// Of a Job only its end and its deletion are news: it was made by us, and what else happens shows in its Pod.
+    fn job_has_news(&mut self, job: &Job, is_gone: bool) -> bool {
+        let (uid, deleted) = (&*job.metadata.uid, &job.metadata.deletion_timestamp);
+        if is_gone {
+            self.0.remove(uid);
+            return true;
+        }
+        let conditions = &job.status.conditions;
+        let has_moved = self.moved_uid(uid.to_owned(), &format!("{deleted:?} {conditions:?}"));
+        has_moved && (!conditions.is_empty() || deleted.is_some())
     }
 
     fn forget(&mut self, object: &impl ResourceExt) {
@@ -210,4 +265,85 @@ fn received<T: Send + 'static>(
     mut queue: mpsc::UnboundedReceiver<T>,
 ) -> impl futures::Stream<Item = T> + Send + 'static {
     stream::poll_fn(move |cx| queue.poll_recv(cx))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn changed(change: &Value) -> Submission {
+        let mut object = json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+            "metadata": {"name": "s", "namespace": "one", "uid": "u", "generation": 1},
+            "spec": {"leaderboardName": "l", "track": "t", "image": "i"},
+        });
+        for (part, fields) in change.as_object().unwrap() {
+            let part = object.as_object_mut().unwrap().entry(part).or_insert_with(|| json!({}));
+            part.as_object_mut()
+                .unwrap()
+                .extend(fields.as_object().unwrap().clone());
+        }
+        serde_json::from_value(object).unwrap()
+    }
+
+    #[test]
+    fn our_own_writes_of_a_submission_are_no_news() {
+        let (ours, other) = (names::FINALIZER_SUBMISSION, "example.org/other");
+        let both = [ours, other];
+        let mut marks = Marks::default();
+        let mut is_news = |change: Value| {
+            let object = changed(&change);
+            marks.moved(&object, &own_fields(&object, ours))
+        };
+        for (what, change, expected) in [
+            ("it is new", json!({}), true),
+            ("a status", json!({"status": {"jobName": "j"}}), false),
+            ("our finalizer", json!({"metadata": {"finalizers": [ours]}}), false),
+            ("another finalizer", json!({"metadata": {"finalizers": both}}), true),
+            (
+                "a spec",
+                json!({"metadata": {"finalizers": both, "generation": 2}}),
+                true,
+            ),
+            (
+                "an annotation",
+                json!({"metadata": {"finalizers": both, "generation": 2, "annotations": {"a": "b"}}}),
+                true,
+            ),
+        ] {
+            assert_eq!(is_news(change), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn of_a_job_only_its_end_and_its_deletion_are_news() {
+        let mut marks = Marks::default();
+        let time = "2026-01-01T00:00:00Z";
+        let ended = json!({"conditions": [{"type": "Complete", "status": "True"}]});
+        let ttl = json!({"ttlSecondsAfterFinished": 1, "template": {}});
+        for (what, change, is_gone, expected) in [
+            ("made by us", json!({}), false, false),
+            (
+                "its Pod was made",
+                json!({"status": {"active": 1, "startTime": time}}),
+                false,
+                false,
+            ),
+            ("its end", json!({"status": ended}), false, true),
+            ("its time to live", json!({"spec": ttl, "status": ended}), false, false),
+            (
+                "its deletion",
+                json!({"metadata": {"deletionTimestamp": time}, "status": ended}),
+                false,
+                true,
+            ),
+            ("it is gone", json!({}), true, true),
+        ] {
+            let mut job: Job = serde_json::from_value(change).unwrap();
+            job.metadata.uid = "u".into();
+            assert_eq!(marks.job_has_news(&job, is_gone), expected, "{what}");
+        }
+    }
 }

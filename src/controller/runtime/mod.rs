@@ -9,35 +9,35 @@ mod counts;
 mod events;
 pub mod leader;
 mod needs;
+mod queue;
 mod reconciles;
 mod sweep;
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Container, Pod, PodTemplateSpec};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
-use kube::runtime::reflector::{ObjectRef, Store};
 use kube::runtime::watcher::Config;
-use kube::{Client, Resource};
+use kube::{Api, Client};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use super::leaderboards::isolation;
 use super::leaderboards::state::LeaderboardState;
-use super::objects::{Wake, children_selector};
+use super::leaderboards::{isolation, operator};
+use super::objects::children_selector;
 use super::settings::Settings;
-use super::stores::Stores;
+use super::stores::{Nodes, Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::observe::{node, team};
 use crate::controller::submissions::reruns::Reruns;
+use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
-use crate::kubernetes::{Watch, guarded, spawn_watch};
+use crate::kubernetes::{Shape, Store, Watch, guarded, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::ObjectKey;
@@ -49,6 +49,8 @@ use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
 use leaderboard_api::{Leaderboard, Submission};
+use queue::Class;
+use reconciles::Queues;
 
 /// Reconciles under way may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -68,6 +70,7 @@ pub enum RunError {
 /// What all reconciles share.
 pub(super) struct Shared {
     context: Arc<Context>,
+    queues: Queues,
     backoff: BackoffMap,
     telemetry: Observability,
 }
@@ -153,17 +156,50 @@ struct Watches {
     jobs: Watch<Job>,
     pods: Watch<Pod>,
     policies: Watch<NetworkPolicy>,
+    /// None: an operator of one namespace has no right to them.
+    nodes: Option<Watch<Node>>,
 }
 
 impl Watches {
     fn start(client: &Client, namespace: Option<&str>, telemetry: &Observability) -> Self {
         let children = || Config::default().labels(&children_selector());
+        let submissions = Shape {
+            index: team::index,
+            ..Shape::default()
+        };
+        let pods = Shape {
+            index: owner_uid,
+            ..Shape::default()
+        };
         Self {
-            leaderboards: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, telemetry),
-            submissions: spawn_watch(guarded(client.clone(), namespace), Config::default(), |_| {}, telemetry),
-            jobs: spawn_watch(guarded(client.clone(), namespace), children(), trim_job, telemetry),
-            pods: spawn_watch(guarded(client.clone(), namespace), children(), trim_pod, telemetry),
-            policies: spawn_watch(guarded(client.clone(), namespace), children(), |_| {}, telemetry),
+            leaderboards: spawn_watch(
+                guarded(client.clone(), namespace),
+                Config::default(),
+                Shape::default(),
+                telemetry,
+            ),
+            submissions: spawn_watch(
+                guarded(client.clone(), namespace),
+                Config::default(),
+                submissions,
+                telemetry,
+            ),
+            jobs: spawn_watch(
+                guarded(client.clone(), namespace),
+                children(),
+                Shape::default(),
+                telemetry,
+            ),
+            pods: spawn_watch(guarded(client.clone(), namespace), children(), pods, telemetry),
+            policies: spawn_watch(
+                guarded(client.clone(), namespace),
+                children(),
+                Shape::default(),
+                telemetry,
+            ),
+            nodes: namespace
+                .is_none()
+                .then(|| spawn_watch(Api::all(client.clone()), Config::default(), Shape::default(), telemetry)),
         }
     }
 
@@ -175,6 +211,10 @@ impl Watches {
             pods: self.pods.store.clone(),
             policies: self.policies.store.clone(),
             policies_synced: self.policies.synced.clone(),
+            nodes: self.nodes.as_ref().map(|nodes| Nodes {
+                store: nodes.store.clone(),
+                synced: nodes.synced.clone(),
+            }),
         }
     }
 
@@ -185,27 +225,6 @@ impl Watches {
         let _ = self.jobs.store.wait_until_ready().await;
         let _ = self.pods.store.wait_until_ready().await;
         let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
-    }
-}
-
-/// Of a Job, decisions read metadata and status.
-fn trim_job(job: &mut Job) {
-    if let Some(spec) = &mut job.spec {
-        spec.template = PodTemplateSpec::default();
-    }
-}
-
-/// Of a Pod, decisions read metadata, its node, the names of its containers and status.
-pub(super) fn trim_pod(pod: &mut Pod) {
-    if let Some(spec) = &mut pod.spec {
-        for container in &mut spec.containers {
-            *container = Container {
-                name: std::mem::take(&mut container.name),
-                ..Container::default()
-            };
-        }
-        spec.init_containers = None;
-        spec.volumes = None;
     }
 }
 
@@ -224,14 +243,14 @@ impl Parts {
             return Ok(());
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
-        let (boards, woken_boards) = mpsc::unbounded_channel();
+        let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (rows, changed_rows) = mpsc::unbounded_channel();
         let (evalai, changed) = mpsc::unbounded_channel();
-        let (answers, answered) = mpsc::unbounded_channel();
         let external = self.external(&leader.fence(), evalai, rows);
         let hub = external.hub.clone();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(external, &answers, &boards)),
+            context: Arc::new(self.context(external, &queues)),
+            queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
@@ -239,10 +258,9 @@ impl Parts {
         let reports = events::Reports {
             rows: changed_rows,
             evalai: changed,
-            answers: answered,
         };
-        let of_submissions = events::of_submissions(&self.watches, reports, &boards, &shared);
-        let of_leaderboards = events::of_leaderboards(&self.watches, woken_boards, &shared);
+        let of_submissions = events::of_submissions(&self.watches, reports, &shared);
+        let of_leaderboards = events::of_leaderboards(&self.watches, &shared);
         let mut leadership = leader.leadership();
         let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
         let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
@@ -281,30 +299,31 @@ impl Parts {
         ExternalSystems::new(hub, recorder)
     }
 
-    /// What all reconciles share. `answers` and `boards` wake Submissions and Leaderboards.
-    fn context(
-        &self,
-        external: ExternalSystems,
-        answers: &mpsc::UnboundedSender<ObjectRef<Submission>>,
-        boards: &mpsc::UnboundedSender<ObjectRef<Leaderboard>>,
-    ) -> Context {
+    /// What all reconciles share.
+    fn context(&self, external: ExternalSystems, queues: &Queues) -> Context {
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
+        let answered = || events::waking(&queues.submissions, &self.watches.submissions.store);
+        let boards = Arc::clone(&queues.leaderboards);
         let context = Context {
             client: client.clone(),
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), waking(answers)),
-            lookups: Lookups::start(client.clone(), tasks, waking(answers)),
+            archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered()),
+            lookups: Lookups::start(client.clone(), tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),
             external,
             aws: aws.clone(),
             recorder: events(client),
-            wake: waking(boards),
+            wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
         };
         context.stores.fill(&context.slots);
+        if let Some(nodes) = &self.watches.nodes {
+            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), answered());
+            tasks.stay("nodes", woken);
+        }
         context
     }
 
@@ -313,21 +332,17 @@ impl Parts {
         let context = Arc::clone(context);
         let keep = move |board| {
             let context = Arc::clone(&context);
-            async move { isolation::keep_missing(context.policies(), &board).await }
+            async move {
+                let known = context.stores.leaderboards.get(&board);
+                if known.is_some_and(|known| operator::is_ours(&known, &context.settings.operator)) {
+                    isolation::keep_missing(context.policies(), &board).await;
+                }
+            }
         };
         let watches = &self.watches;
         let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
         self.telemetry.tasks.stay("policies", restored);
     }
-}
-
-/// Puts an object into its queue.
-fn waking<K: Resource<DynamicType = ()> + 'static>(queue: &mpsc::UnboundedSender<ObjectRef<K>>) -> Wake<K> {
-    let queue = queue.clone();
-    Box::new(move |object| {
-        // Without a receiver the process is ending.
-        let _ = queue.send(object);
-    })
 }
 
 /// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.

@@ -11,9 +11,13 @@ use leaderboard_api::GROUP;
 type Right = (&'static str, &'static str, &'static [&'static str]);
 
 /// In the namespaces of the Leaderboards.
-const OF_RUNS: [Right; 13] = [
+const OF_RUNS: [Right; 14] = [
     (GROUP, "leaderboards", &["get", "list", "watch", "patch"]),
-    (GROUP, "submissions", &["get", "list", "watch", "create", "patch"]),
+    (
+        GROUP,
+        "submissions",
+        &["get", "list", "watch", "create", "patch", "delete"],
+    ),
     (GROUP, "leaderboards/status", &["get", "patch"]),
     (GROUP, "submissions/status", &["get", "patch"]),
     (GROUP, "leaderboards/finalizers", &["update"]),
@@ -28,7 +32,8 @@ const OF_RUNS: [Right; 13] = [
         "networkpolicies",
         &["get", "list", "watch", "create", "patch"],
     ),
-    ("", "nodes", &["get"]),
+    (LEASES.0, LEASES.1, &["get"]),
+    ("", "nodes", &["get", "list", "watch"]),
 ];
 /// Kinds without a namespace: an operator of one namespace has no right to them and does without.
 const OF_THE_CLUSTER: [&str; 1] = ["nodes"];
@@ -50,7 +55,7 @@ pub(super) fn needs<'a>(namespace: Option<&'a str>, lease: &'a leader::Settings)
         })
     });
     // Of a request that creates, the name is not known when it is allowed.
-    let of_lease = [("create", false), ("get", true), ("update", true)].map(|(verb, is_named)| Need {
+    let of_lease = [("create", false), ("get", false), ("update", true)].map(|(verb, is_named)| Need {
         group: LEASES.0,
         resource: LEASES.1,
         verb,

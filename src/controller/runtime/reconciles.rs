@@ -1,33 +1,66 @@
 //! The reconciles: one queue for Submissions, one for Leaderboards; each object by one reconcile at a time, a bounded number
-//! at once.
+//! at once, each as a task of its own.
 
-use std::convert::Infallible;
+use std::future::Future;
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use futures::stream::{BoxStream, StreamExt};
-use kube::Resource;
-use kube::runtime::controller::{Action, Config, applier};
+use futures::stream::StreamExt;
+use futures::{FutureExt, Stream};
 use kube::runtime::reflector::ObjectRef;
+use kube::{Resource, ResourceExt};
 
 use super::Shared;
+use super::events::Events;
+use super::queue::{After, Class, Limits, Queue, Turn, urgency};
 use crate::backoff::jittered;
-use crate::controller::leaderboards;
-use crate::controller::objects::{key_of, uid_of};
+use crate::controller::leaderboards::{self, Reconciled, operator};
+use crate::controller::objects::uid_of;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
 use crate::controller::submissions::decide::{self, Plan, decide};
 use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
+use crate::observability::metrics::Metrics;
+use crate::observability::tasks::panic_message;
 use leaderboard_api::conditions::{self, FINISHED};
+use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 
 /// A reconcile takes at most this long.
 const TIME_LIMIT: Duration = Duration::from_secs(90);
-/// Events of one object that come together are one reconcile.
-const DEBOUNCE: Duration = Duration::from_millis(50);
 /// An object without any other cause is reconciled this often.
 const RESYNC: Duration = Duration::from_mins(10);
+/// Jobs that are created at once, and in one namespace: an admission webhook may take ten seconds for each.
+const CREATES: usize = 8;
+const CREATES_PER_NAMESPACE: usize = 4;
+/// Leaderboards that are reconciled at once.
+const LEADERBOARDS: usize = 4;
+
+/// One for each kind.
+pub(super) struct Queues {
+    pub(super) submissions: Arc<Queue>,
+    pub(super) leaderboards: Arc<Queue>,
+}
+
+impl Queues {
+    /// Empty ones; `concurrency` is of Submissions.
+    pub(super) fn new(concurrency: u16, metrics: &Metrics) -> Self {
+        let queue = |kind, reconciles: usize| {
+            let limits = Limits {
+                reconciles: reconciles.max(1),
+                creates: CREATES,
+                creates_per_namespace: CREATES_PER_NAMESPACE,
+            };
+            Queue::new(limits, metrics.queue(kind, Class::ALL.map(Class::as_str)))
+        };
+        Self {
+            submissions: queue("submission", concurrency.into()),
+            leaderboards: queue("leaderboard", LEADERBOARDS),
+        }
+    }
+}
 
 /// Why a reconcile ended early.
 #[derive(thiserror::Error, Debug)]
@@ -38,6 +71,8 @@ enum ReconcileError {
     Leaderboard(#[from] CallError),
     #[error("the reconcile took longer than {} s", TIME_LIMIT.as_secs())]
     TooLong,
+    #[error("the reconcile has panicked: {0}")]
+    Panicked(String),
 }
 
 impl ReconcileError {
@@ -46,72 +81,98 @@ impl ReconcileError {
             Self::Act(error) => error.label(),
             Self::Leaderboard(_) => "leaderboard",
             Self::TooLong => "timeout",
+            Self::Panicked(_) => "panic",
         }
     }
 }
 
 /// Runs reconciles until the stop; then finishes those that have begun.
-pub(super) async fn run(
-    submissions: BoxStream<'static, ObjectRef<Submission>>,
-    leaderboards: BoxStream<'static, ObjectRef<Leaderboard>>,
-    shared: Arc<Shared>,
-) {
-    let (stop, stores) = (&shared.telemetry.stop, &shared.context.stores);
-    let config = Config::default()
-        .concurrency(shared.context.settings.concurrency)
-        .debounce(DEBOUNCE);
-    let of_submissions = applier(
-        |object, shared: Arc<Shared>| Box::pin(reconcile_submission(object, shared)),
-        |object: Arc<Submission>, _: &ReconcileError, shared| after_error(object.as_ref(), &shared),
-        Arc::clone(&shared),
-        stores.submissions.clone(),
-        submissions.take_until(Box::pin(stop.wait())).map(Ok::<_, Infallible>),
-        config.clone(),
-    );
-    let of_leaderboards = applier(
-        |object, shared: Arc<Shared>| Box::pin(reconcile_leaderboard(object, shared)),
-        |object: Arc<Leaderboard>, _: &ReconcileError, shared| after_error(object.as_ref(), &shared),
-        Arc::clone(&shared),
-        stores.leaderboards.clone(),
-        leaderboards.take_until(Box::pin(stop.wait())).map(Ok::<_, Infallible>),
-        config.concurrency(4),
-    );
-    // What a reconcile returns was counted and logged by it.
+pub(super) async fn run(submissions: Events<Submission>, leaderboards: Events<Leaderboard>, shared: Arc<Shared>) {
+    let (stop, queues) = (&shared.telemetry.stop, &shared.queues);
+    let events = async {
+        tokio::join!(
+            add(&queues.submissions, submissions),
+            add(&queues.leaderboards, leaderboards)
+        )
+    };
+    let events = async {
+        tokio::select! { _ = events => {}, () = stop.wait() => {} }
+    };
+    let of_submission = |turn| reconcile_submission(turn, Arc::clone(&shared));
+    let of_leaderboard = |turn| reconcile_leaderboard(turn, Arc::clone(&shared));
     tokio::join!(
-        of_submissions.for_each(|_| async {}),
-        of_leaderboards.for_each(|_| async {})
+        events,
+        queues.submissions.run(stop, of_submission),
+        queues.leaderboards.run(stop, of_leaderboard),
     );
 }
 
-async fn reconcile_submission(submission: Arc<Submission>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
+async fn add<K>(queue: &Queue, events: impl Stream<Item = (ObjectRef<K>, Class)>)
+where
+    K: Resource<DynamicType = ()>,
+{
+    events
+        .for_each(|(object, class)| {
+            queue.add(&object, class);
+            std::future::ready(())
+        })
+        .await;
+}
+
+async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
+    let Some(submission) = shared.context.stores.submissions.get(&(&turn.key).into()) else {
+        return After::Gone;
+    };
     let started = Instant::now();
-    let name = key_of(submission.as_ref()).to_string();
-    let slots = &shared.context.slots;
+    let context = &shared.context;
+    let slots = &context.slots;
+    let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&submission.namespace().unwrap_or_default());
+    let board = context.stores.leaderboards.get(&board);
+    if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
+        let metrics = &shared.telemetry.metrics;
+        metrics.reconciled("submission", OTHER_OPERATOR, started.elapsed());
+        return After::In(jittered(wait, 0.2), Class::Refresh);
+    }
     let work = async {
         let policies = shared.context.policies();
         let view = observe(shared.context.for_observe(), Arc::clone(&submission), |board| {
             policies.is_in_place(board)
         });
         let plan = decide(&view);
-        let requeue = plan.requeue;
+        let creates_job = plan
+            .actions
+            .iter()
+            .any(|a| matches!(a, decide::Action::CreateJob { .. }));
+        if !turn.may_continue(creates_job) {
+            return Ok(None);
+        }
+        let (requeue, class) = (plan.requeue, urgency::after(&submission, &plan));
         settle(slots, &submission, &plan);
         let held_back = act(shared.context.for_act(), &view, plan).await?;
-        Ok([requeue, held_back].into_iter().flatten().min())
+        let requeue = [requeue, held_back].into_iter().flatten().min();
+        Ok(Some((requeue, class)))
     };
-    let result = tokio::time::timeout(TIME_LIMIT, work)
-        .await
-        .unwrap_or(Err(ReconcileError::TooLong));
+    let result = Box::pin(limited(work)).await;
     if result.is_err() {
         slots.did_not_start(&submission);
     }
-    finish(
-        "submission",
-        &name,
-        &uid_of(submission.as_ref()),
-        started,
-        &shared,
-        result,
-    )
+    let Some(result) = result.transpose() else {
+        return After::WithPermit;
+    };
+    let result = result.map_err(|error| (error, urgency::of_submission(&submission)));
+    finish("submission", &turn, submission.as_ref(), started, &shared, result)
+}
+
+/// A reconcile within its limit of time; a panic of it is its own error.
+async fn limited<T>(work: impl Future<Output = Result<T, ReconcileError>>) -> Result<T, ReconcileError> {
+    match AssertUnwindSafe(tokio::time::timeout(TIME_LIMIT, work))
+        .catch_unwind()
+        .await
+    {
+        Ok(Ok(result)) => result,
+        Ok(Err(_)) => Err(ReconcileError::TooLong),
+        Err(panic) => Err(ReconcileError::Panicked(panic_message(panic.as_ref()).to_owned())),
+    }
 }
 
 /// Gives the slot back of a submission that does not start after all, or has come to its end: a later attempt stands in line
@@ -125,36 +186,45 @@ fn settle(slots: &SlotAllocator, submission: &Submission, plan: &Plan) {
     }
 }
 
-async fn reconcile_leaderboard(leaderboard: Arc<Leaderboard>, shared: Arc<Shared>) -> Result<Action, ReconcileError> {
-    let started = Instant::now();
-    let (name, uid) = (key_of(leaderboard.as_ref()).to_string(), uid_of(leaderboard.as_ref()));
-    let work = leaderboards::reconcile(leaderboard, shared.context.for_leaderboards());
-    let result = match tokio::time::timeout(TIME_LIMIT, work).await {
-        Ok(result) => result.map(Some).map_err(ReconcileError::from),
-        Err(_) => Err(ReconcileError::TooLong),
+async fn reconcile_leaderboard(turn: Turn, shared: Arc<Shared>) -> After {
+    let context = &shared.context;
+    let Some(leaderboard) = context.stores.leaderboards.get(&(&turn.key).into()) else {
+        return After::Gone;
     };
-    finish("leaderboard", &name, &uid, started, &shared, result)
+    let started = Instant::now();
+    let work = leaderboards::reconcile(Arc::clone(&leaderboard), context.for_leaderboards());
+    let result = match limited(work.map(|result| result.map_err(ReconcileError::from))).await {
+        Ok(Reconciled::LeftAlone(wait)) => {
+            let metrics = &shared.telemetry.metrics;
+            metrics.reconciled("leaderboard", OTHER_OPERATOR, started.elapsed());
+            return After::In(wait, Class::Refresh);
+        }
+        Ok(Reconciled::Done(wait)) => Ok((Some(wait), Class::Refresh)),
+        Err(error) => Err((error, Class::Refresh)),
+    };
+    finish("leaderboard", &turn, leaderboard.as_ref(), started, &shared, result)
 }
 
 fn finish(
     kind: &'static str,
-    name: &str,
-    uid: &str,
+    turn: &Turn,
+    object: &impl Resource,
     started: Instant,
     shared: &Shared,
-    result: Result<Option<Duration>, ReconcileError>,
-) -> Result<Action, ReconcileError> {
+    result: Result<(Option<Duration>, Class), (ReconcileError, Class)>,
+) -> After {
+    let (uid, metrics) = (uid_of(object), &shared.telemetry.metrics);
     match result {
-        Ok(requeue) => {
-            shared.backoff.succeeded(uid);
-            shared.telemetry.metrics.reconciled(kind, "ok", started.elapsed());
-            Ok(Action::requeue(requeue.unwrap_or_else(jittered_resync)))
+        Ok((requeue, class)) => {
+            shared.backoff.succeeded(&uid);
+            metrics.reconciled(kind, "ok", started.elapsed());
+            After::In(requeue.unwrap_or_else(jittered_resync), class)
         }
-        Err(error) => {
-            shared.telemetry.metrics.reconciled(kind, "error", started.elapsed());
-            shared.telemetry.metrics.reconcile_failed(kind, error.label());
-            tracing::warn!(kind, object = name, "{error}");
-            Err(error)
+        Err((error, class)) => {
+            metrics.reconciled(kind, "error", started.elapsed());
+            metrics.reconcile_failed(kind, error.label());
+            tracing::warn!(kind, object = %turn.key, "{error}");
+            After::In(shared.backoff.failed(&uid), class)
         }
     }
 }
@@ -162,10 +232,6 @@ fn finish(
 /// Spreads the resync of many objects.
 fn jittered_resync() -> Duration {
     jittered(RESYNC, 0.2)
-}
-
-fn after_error(object: &impl Resource, shared: &Shared) -> Action {
-    Action::requeue(shared.backoff.failed(&uid_of(object)))
 }
 
 #[cfg(test)]

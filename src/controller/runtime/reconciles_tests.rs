@@ -14,7 +14,7 @@ use crate::observability::shutdown::Stop;
 
 /// Submissions that wait for a bucket which takes connections and never answers.
 const BEHIND: usize = 300;
-/// Cancels of others. The queue takes who waits in no order, so that one of them may be lucky.
+/// Cancels of others.
 const CANCELS: usize = 6;
 
 #[tokio::test(start_paused = true)]
@@ -39,23 +39,29 @@ async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
     cluster.leaderboards = vec![hanging, other];
 
     let (queue, mut queued) = mpsc::unbounded_channel();
-    let touch = |submission: &ObjectRef<Submission>| queue.send(submission.clone()).unwrap();
+    let event = |submission: &ObjectRef<Submission>, class| queue.send((submission.clone(), class)).unwrap();
     let mut all: Vec<_> = cluster.submissions.iter().map(ObjectRef::from_obj).collect();
     let cancelled = all.split_off(BEHIND);
     let mut around = surroundings(cluster, &endpoint).await;
     let (_stop, signal) = Stop::new();
+    let telemetry = Observability::new(signal);
     let shared = Arc::new(Shared {
         context: Arc::new(around.context),
+        queues: Queues::new(16, &telemetry.metrics),
         backoff: BackoffMap::default(),
-        telemetry: Observability::new(signal),
+        telemetry,
     });
     let of_submissions = stream::poll_fn(move |cx| queued.poll_recv(cx)).boxed();
     let reconciles = tokio::spawn(run(of_submissions, stream::pending().boxed(), shared));
-    all.iter().for_each(touch);
+    for submission in &all {
+        event(submission, Class::Refresh);
+    }
     // As many reconciles as there may be at once have begun, and the others wait.
     tokio::time::sleep(Duration::from_secs(1)).await;
     let began = tokio::time::Instant::now();
-    cancelled.iter().for_each(touch);
+    for submission in &cancelled {
+        event(submission, Class::Urgent);
+    }
     let mut stopped = Vec::new();
     while stopped.len() < CANCELS {
         let request = around.requests.recv().await.unwrap();
@@ -68,4 +74,15 @@ async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
         stopped.iter().all(|took| *took <= Duration::from_secs(1)),
         "their Jobs were deleted after {stopped:?}"
     );
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_reconcile_that_panics_or_hangs_is_an_error_of_its_own() {
+    let panics = limited::<()>(async { panic!("no row {}", 7) }).await.unwrap_err();
+    assert_eq!(
+        (panics.label(), panics.to_string().as_str()),
+        ("panic", "the reconcile has panicked: no row 7")
+    );
+    let hangs = limited(std::future::pending::<Result<(), _>>()).await.unwrap_err();
+    assert_eq!(hangs.label(), "timeout");
 }

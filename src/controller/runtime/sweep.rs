@@ -4,11 +4,11 @@
 
 use std::sync::Arc;
 
-use kube::runtime::reflector::Store;
 use kube::{Api, Client, ResourceExt};
 use tokio::sync::mpsc;
 
 use crate::bridge::ingest::{self, Incoming, Outcome, Source};
+use crate::kubernetes::Store;
 use crate::services::evalai::SweepRow;
 use leaderboard_api::{Evalai, Leaderboard, Submission, names};
 
@@ -67,8 +67,6 @@ mod tests {
     use jiff::Timestamp;
     use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
     use kube::client::Body;
-    use kube::runtime::reflector::store::Writer;
-    use kube::runtime::watcher::Event;
     use serde_json::{Value, json};
 
     use super::*;
@@ -137,19 +135,14 @@ mod tests {
 
     #[tokio::test]
     async fn two_servers_with_the_same_ids_are_kept_apart() {
-        let mut writer = Writer::<Leaderboard>::default();
-        writer.apply_watcher_event(&Event::Init);
-        for board in [board("stand-in", 1, "http://one"), board("real", 2, "http://two")] {
-            writer.apply_watcher_event(&Event::InitApply(board));
-        }
-        writer.apply_watcher_event(&Event::InitDone);
+        let boards = [board("stand-in", 1, "http://one"), board("real", 2, "http://two")];
         let (client, mut asked) = cluster();
         let (sender, rows) = mpsc::unbounded_channel();
         for server in ["http://two", "http://one"] {
             sender.send(row(server, 2)).unwrap();
         }
         drop(sender);
-        into_cluster(client, writer.as_reader(), rows).await;
+        into_cluster(client, Store::of(boards, |_| None), rows).await;
         for name in ["real", "stand-in"] {
             let (line, object) = asked.recv().await.unwrap();
             let path = "/apis/leaderboard.carla.org/v1alpha1/namespaces";

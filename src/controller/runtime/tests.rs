@@ -13,10 +13,11 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 12] = [
+const TASKS: [&str; 14] = [
     "gauges",
     "lease",
     "lookups",
+    "nodes",
     "permissions",
     "policies",
     "reconciles",
@@ -24,6 +25,7 @@ const TASKS: [&str; 12] = [
     "watch of jobs",
     "watch of leaderboards",
     "watch of networkpolicies",
+    "watch of nodes",
     "watch of pods",
     "watch of submissions",
 ];
@@ -81,6 +83,7 @@ async fn leader() -> Process {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        operator: lease.installation(),
         namespace: None,
         concurrency: 4,
     };

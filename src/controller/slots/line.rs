@@ -51,7 +51,6 @@ struct Reserved {
 
 #[derive(Clone)]
 struct Waiting {
-    name: String,
     attempt: i64,
     place: InLine,
     /// None until it was worked out.
@@ -129,7 +128,7 @@ impl Line {
         waiting.unwrap_or(Turn::NotInLine)
     }
 
-    pub(super) fn join(&mut self, name: String, attempt: i64, place: InLine) {
+    pub(super) fn join(&mut self, attempt: i64, place: InLine) {
         // One that is gone has left nothing behind; one that the watch has not shown yet joins when it does.
         let is_known = self.members.contains_key(&place.uid);
         if !is_known
@@ -150,7 +149,6 @@ impl Line {
             return;
         }
         let waiting = Waiting {
-            name,
             attempt,
             place,
             turn: None,
@@ -217,7 +215,7 @@ impl Line {
             };
             if waiting.is_news(&turn) {
                 waiting.shown = turn.position();
-                woken.push(waiting.name.clone());
+                woken.push(waiting.place.name.clone());
             }
             let is_granted = turn == Turn::Go;
             waiting.turn = Some(turn);
@@ -254,7 +252,7 @@ impl Line {
         let running = &self.running;
         let holds = |uid: &String, waiting: &Waiting| running.get(uid).is_some_and(|r| r.attempt == waiting.attempt);
         let through = self.waiting.extract_if(|uid, waiting| holds(uid, waiting));
-        through.map(|(_, waiting)| waiting.name).collect()
+        through.map(|(_, waiting)| waiting.place.name).collect()
     }
 
     fn has_slot(&self, uid: &str, attempt: i64) -> bool {

@@ -14,15 +14,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use futures::{Stream, StreamExt, stream};
-use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use crate::controller::slots::turns::{InLine, Limits, Turn};
+use crate::kubernetes::objects::Job;
 use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{Leaderboard, Submission, names};
+use leaderboard_api::{Leaderboard, Submission};
 use line::Line;
 use member::Member;
 
@@ -70,14 +70,14 @@ impl SlotAllocator {
 
     /// The watch shows a Job. It has a slot although its Submission's status may not name it.
     pub fn job(&self, object: &Job, is_gone: bool) {
-        let Some(board) = object.labels().get(names::LABEL_LEADERBOARD) else {
+        let meta = &object.metadata;
+        let Some(board) = &meta.labels.leaderboard else {
             return;
         };
-        let key = (object.namespace().unwrap_or_default(), board.clone());
-        let name = object.name_any();
+        let key = (meta.namespace().to_owned(), board.to_string());
         self.change(&key, |line| {
-            for owner in object.owner_references() {
-                line.job(&owner.uid, &name, is_gone);
+            for owner in &meta.owner_references {
+                line.job(&owner.uid, &meta.name, is_gone);
             }
         });
     }
@@ -106,8 +106,8 @@ impl SlotAllocator {
 
     /// A submission waits for nothing but a slot. It is woken by the answer, and by each change of it.
     pub fn join(&self, submission: &Submission, place: InLine) {
-        let (name, attempt) = (submission.name_any(), submission.spec.attempt);
-        self.change(&board_of(submission), |line| line.join(name, attempt, place));
+        let attempt = submission.spec.attempt;
+        self.change(&board_of(submission), |line| line.join(attempt, place));
     }
 
     /// The Job is about to be created, or exists.

@@ -1,8 +1,9 @@
 use futures::FutureExt;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::{Value, json};
 
 use super::*;
+use crate::kubernetes::objects::Owner;
 use leaderboard_api::Eta;
 use leaderboard_api::LeaderboardSpec;
 
@@ -77,6 +78,7 @@ impl World {
         let created = submission.metadata.creation_timestamp.as_ref().unwrap();
         let place = InLine {
             uid: uid_of(submission),
+            name: submission.name_any(),
             team: submission.spec.team.as_ref().unwrap().id.clone().unwrap(),
             track: "sensors".into(),
             priority: submission.spec.priority,
@@ -203,14 +205,10 @@ fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
     let (a, b) = (submission("a", "x", 1, json!({})), submission("b", "y", 2, json!({})));
     let slots = Arc::new(SlotAllocator::default());
     let mut job = Job::default();
-    job.metadata.name = Some("a-1".into());
+    job.metadata.name = "a-1".into();
     job.metadata.namespace = Some("ns".into());
-    job.metadata.labels = Some([(names::LABEL_LEADERBOARD.to_owned(), "lb".to_owned())].into());
-    let owner = OwnerReference {
-        uid: "a".into(),
-        ..OwnerReference::default()
-    };
-    job.metadata.owner_references = Some(vec![owner]);
+    job.metadata.labels.leaderboard = Some("lb".into());
+    job.metadata.owner_references = [Owner { uid: "a".into() }].into();
     let job = Arc::new(job);
     let all = [Arc::new(a.clone()), Arc::new(b.clone())];
     slots.start(&[Arc::new(one())], &[Arc::clone(&job)], &all);
@@ -225,8 +223,8 @@ fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
     let mut resumed = submission("c", "x", 3, ended(1));
     resumed.spec.attempt = 2;
     let mut job = Job::clone(&job);
-    job.metadata.name = Some("c-1".into());
-    job.metadata.owner_references.as_mut().unwrap()[0].uid = "c".into();
+    job.metadata.name = "c-1".into();
+    job.metadata.owner_references[0].uid = "c".into();
     world.slots.job(&job, false);
     world.shows(&resumed);
     world.becomes(leaderboard(&json!({"total": 2}), false));

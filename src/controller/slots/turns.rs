@@ -3,7 +3,7 @@
 //! Pure; called by `slots`. Fair between teams: each pick goes to the team that has the least running
 //! and picked so far, and among these to the one whose last run began longest ago. So a team with a hundred submissions
 //! does not hold up another's first, even where only one runs at a time. Within a team the higher priority goes first,
-//! then the older.
+//! then the older; those of one second stand in the order of their names.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
@@ -45,6 +45,7 @@ impl Turn {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InLine {
     pub uid: String,
+    pub name: String,
     pub team: String,
     pub track: String,
     pub priority: i32,
@@ -123,7 +124,7 @@ impl<'a> Teams<'a> {
             b.priority
                 .cmp(&a.priority)
                 .then(a.submitted.cmp(&b.submitted))
-                .then(a.uid.cmp(&b.uid))
+                .then_with(|| a.name.cmp(&b.name))
         });
         let mut load: HashMap<&str, usize> = HashMap::new();
         for team in &past.occupied {
@@ -220,6 +221,7 @@ mod tests {
         let submitted = Timestamp::from_second(second).unwrap();
         InLine {
             uid: uid.into(),
+            name: uid.into(),
             team: team.into(),
             track: "sensors".into(),
             priority: 0,
@@ -278,6 +280,20 @@ mod tests {
         assert_eq!(all["late"], Turn::Go);
         assert_eq!(all["other"], Turn::Go);
         assert_eq!(all["early"], wait(1));
+    }
+
+    #[test]
+    fn those_of_one_second_stand_in_the_order_of_their_names() {
+        let named = |name: &str, uid| InLine {
+            name: name.into(),
+            ..waiting(uid, "x", 1)
+        };
+        let all = turns(
+            &[named("second", "b"), named("third", "a")],
+            &occupied(&["x"]),
+            limits(1),
+        );
+        assert_eq!((&all["b"], &all["a"]), (&wait(1), &wait(2)));
     }
 
     #[test]

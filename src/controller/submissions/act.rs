@@ -4,13 +4,10 @@
 
 use std::time::Duration;
 
-use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
-use kube::api::{ApiResource, DeleteParams, DynamicObject, Patch, PatchParams, PostParams, Preconditions};
-use kube::core::NamespaceResourceScope;
+use kube::api::{DeleteParams, Patch, PatchParams, PostParams, Preconditions};
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
 use kube::runtime::reflector::ObjectRef;
-use kube::{Api, Client, Resource, ResourceExt};
+use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 
 use super::archive::ArchiveWorkers;
@@ -21,12 +18,13 @@ use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::significance::{Change, change, patience};
 use super::view::{LogPlace, View};
-use crate::controller::objects::{is_pod_of, uid_of};
+use crate::controller::objects::uid_of;
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, set_finalizer};
-use crate::kubernetes::{CallError, Watchable, call};
+use crate::kubernetes::objects::{Job, Meta, Pod};
+use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use leaderboard_api::text::one_line;
 use leaderboard_api::{State, Submission, SubmissionStatus, names};
 
@@ -45,6 +43,9 @@ pub struct Uses<'a> {
     pub archive: &'a ArchiveWorkers,
     pub external: &'a ExternalSystems,
 }
+
+/// A create that an admission webhook holds up keeps a permit that others wait for.
+const CREATE_LIMIT: Duration = Duration::from_secs(10);
 
 /// What a reconcile could not carry out.
 #[derive(thiserror::Error, Debug)]
@@ -103,11 +104,8 @@ impl Actor<'_> {
         self.submission().name_any()
     }
 
-    fn api<K>(&self) -> Api<K>
-    where
-        K: Watchable + Resource<Scope = NamespaceResourceScope>,
-    {
-        Api::namespaced(self.uses.client.clone(), &self.namespace)
+    fn writes<K: Watchable>(&self) -> Writes<K> {
+        Writes::new(self.uses.client.clone(), &self.namespace)
     }
 
     async fn carry_out(&self, action: &Action, status: &SubmissionStatus) -> Result<(), ActError> {
@@ -124,6 +122,7 @@ impl Actor<'_> {
                 let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
                 self.patch::<Pod>("the stop annotation", pod, &patch).await
             }
+            Action::DeleteSubmission { uid, resource_version } => self.delete_submission(uid, resource_version).await,
             other => {
                 self.request(other, status);
                 Ok(())
@@ -160,6 +159,7 @@ impl Actor<'_> {
             | Action::CreateJob { .. }
             | Action::DeleteJob { .. }
             | Action::ForceDeletePod { .. }
+            | Action::DeleteSubmission { .. }
             | Action::AnnotateStop { .. } => {}
         }
     }
@@ -190,8 +190,8 @@ impl Actor<'_> {
             }
             Change::Real => {}
         }
-        let answer = apply_status(self.uses.client, self.submission(), status).await?;
-        self.uses.memory.wrote(&answer);
+        let version = apply_status(self.uses.client, self.submission(), status).await?;
+        self.uses.memory.wrote(self.submission(), status, &version);
         self.log_transition(status);
         Ok(None)
     }
@@ -229,13 +229,13 @@ impl Actor<'_> {
             now: self.view.now,
         });
         let name = names::job(&self.name(), attempt, retry);
-        let resource = ApiResource::erase::<Job>(&());
-        let api: Api<DynamicObject> = Api::namespaced_with(self.uses.client.clone(), &self.namespace, &resource);
+        let api = self.writes::<Job>();
         let params = PostParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PostParams::default()
         };
-        match call("creating the Job", &name, api.create(&params, &object)).await {
+        let create = api.create(&params, &object);
+        match call_within(CREATE_LIMIT, "creating the Job", &name, create).await {
             // Its name is ours alone; whose it is, the next reconcile sees.
             Err(error) if error.is_conflict() => Ok(()),
             other => {
@@ -259,11 +259,32 @@ impl Actor<'_> {
         let Some(job) = self.uses.stores.jobs.get(&reference) else {
             return Ok(());
         };
-        let pods = self.uses.stores.pods.state();
-        for pod in pods.iter().filter(|pod| is_pod_of(pod, &job)) {
-            self.delete_pod(&pod.name_any(), &uid_of(pod.as_ref()), grace_seconds)
-                .await?;
+        for pod in self.uses.stores.pods_of(&job) {
+            let Meta { name, uid, .. } = &pod.metadata;
+            self.delete_pod(name, uid, grace_seconds).await?;
         }
+        Ok(())
+    }
+
+    /// The Job goes with it. A change since the decision, a resume for example, makes this fail, and the next reconcile decides anew.
+    async fn delete_submission(&self, uid: &str, resource_version: &str) -> Result<(), ActError> {
+        let name = self.name();
+        let params = DeleteParams::background().preconditions(Preconditions {
+            uid: Some(uid.into()),
+            resource_version: Some(resource_version.into()),
+        });
+        match call(
+            "the deletion",
+            &name,
+            self.writes::<Submission>().delete(&name, &params),
+        )
+        .await
+        {
+            Err(error) if error.is_gone() || error.is_conflict() => return Ok(()),
+            other => other.map(|_| ())?,
+        }
+        let submission = format_args!("{}/{name}", self.namespace);
+        tracing::info!(%submission, "the Submission is deleted: retention.finishedSeconds have passed since its end");
         Ok(())
     }
 
@@ -276,29 +297,40 @@ impl Actor<'_> {
     }
 
     /// Deletes the object of this UID. Nothing is left to do where it is gone, or another one has its name.
-    async fn delete<K>(&self, what: &'static str, name: &str, uid: &str, params: DeleteParams) -> Result<(), ActError>
-    where
-        K: Watchable + Resource<Scope = NamespaceResourceScope>,
-    {
+    async fn delete<K: Watchable>(
+        &self,
+        what: &'static str,
+        name: &str,
+        uid: &str,
+        params: DeleteParams,
+    ) -> Result<(), ActError> {
         let params = params.preconditions(Preconditions {
             uid: Some(uid.into()),
             resource_version: None,
         });
-        match call(what, name, self.api::<K>().delete(name, &params)).await {
+        match call(what, name, self.writes::<K>().delete(name, &params)).await {
             Err(error) if !error.is_gone() && !error.is_conflict() => Err(error.into()),
             _ => Ok(()),
         }
     }
 
-    async fn patch<K>(&self, what: &'static str, name: &str, patch: &serde_json::Value) -> Result<(), ActError>
-    where
-        K: Watchable + Resource<Scope = NamespaceResourceScope>,
-    {
+    async fn patch<K: Watchable>(
+        &self,
+        what: &'static str,
+        name: &str,
+        patch: &serde_json::Value,
+    ) -> Result<(), ActError> {
         let params = PatchParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
             ..PatchParams::default()
         };
-        match call(what, name, self.api::<K>().patch(name, &params, &Patch::Merge(patch))).await {
+        match call(
+            what,
+            name,
+            self.writes::<K>().patch(name, &params, &Patch::Merge(patch)),
+        )
+        .await
+        {
             Err(error) if error.is_gone() => Ok(()),
             other => Ok(other.map(|_| ())?),
         }

@@ -81,7 +81,7 @@ impl ExternalSystems {
     /// What is known of a submission's row. None without a table.
     pub fn record_view(&self, leaderboard: &Leaderboard, submission: &Submission) -> Option<RecordView> {
         leaderboard.spec.table.as_ref()?;
-        let attempt = submission.status.as_ref().and_then(|s| s.attempt);
+        let attempt = submission.status.as_ref().map(result_texts::attempt_of_run);
         let seen = self
             .recorder
             .view(&key_of(submission))
@@ -191,6 +191,7 @@ fn run_of(submission: &Submission) -> Run {
         job: names::job(&submission.name_any(), attempt, 0),
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
         has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
+        ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
     }
 }
 
@@ -240,6 +241,7 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
                 team_name: row.team_name.clone(),
                 submitted_at: row.submitted_at,
                 rerun_of,
+                last_attempt: reruns::last_attempt(row),
                 image,
                 image_problem,
             }),

@@ -25,7 +25,7 @@ pub struct Memory {
     next_place: Mutex<Option<Instant>>,
 }
 
-#[derive(Clone, Default)]
+#[derive(Default)]
 struct Entry {
     written: Option<Written>,
     partial: Option<(i64, u32)>,
@@ -40,40 +40,50 @@ struct Entry {
 /// How long a Job that the API server has created is waited for in the cache. One that was deleted at once never shows there.
 const JOB_SHOWS: Duration = Duration::from_secs(15);
 
-#[derive(Clone)]
 struct Written {
     version: u64,
     at: Instant,
-    status: SubmissionStatus,
+    /// Until the cache is as new.
+    status: Option<Box<SubmissionStatus>>,
 }
 
 impl Memory {
     /// The object with the status that we wrote last, where the cache does not have it yet.
     pub fn with_own_status(&self, submission: Arc<Submission>) -> Arc<Submission> {
-        let seen = version(&submission);
-        let written = self
-            .lock()
+        self.is_shown(&submission);
+        let entries = self.lock();
+        let written = entries
             .get(&uid_of(submission.as_ref()))
-            .and_then(|e| e.written.clone());
+            .and_then(|e| e.written.as_ref()?.status.as_deref());
         match written {
-            Some(written) if seen < written.version => {
+            Some(status) => {
                 let mut newer = submission.as_ref().clone();
-                newer.status = Some(written.status);
+                newer.status = Some(status.clone());
                 Arc::new(newer)
             }
-            _ => submission,
+            None => submission,
         }
     }
 
-    /// Remembers what the API server answered to a write of status.
-    pub fn wrote(&self, answer: &Submission) {
-        let Some(status) = answer.status.clone() else { return };
+    /// Remembers a status that we wrote, and the version that the API server has made of it.
+    pub fn wrote(&self, submission: &Submission, status: &SubmissionStatus, version: &str) {
         let written = Written {
-            version: version(answer),
+            version: version.parse().unwrap_or(0),
             at: Instant::now(),
-            status,
+            status: Some(Box::new(status.clone())),
         };
-        self.lock().entry(uid_of(answer)).or_default().written = Some(written);
+        self.lock().entry(uid_of(submission)).or_default().written = Some(written);
+    }
+
+    /// The cache shows an object: our own status goes once that is as new.
+    pub fn is_shown(&self, submission: &Submission) {
+        let mut entries = self.lock();
+        let entry = entries.get_mut(&uid_of(submission));
+        if let Some(written) = entry.and_then(|e| e.written.as_mut())
+            && version(submission) >= written.version
+        {
+            written.status = None;
+        }
     }
 
     /// Time since our last write of its status; None if this process has not written it.
@@ -243,10 +253,26 @@ mod tests {
     #[test]
     fn an_older_cache_does_not_hide_our_own_write() {
         let memory = Memory::default();
-        memory.wrote(&object("12", "new"));
-        let seen = memory.with_own_status(Arc::new(object("9", "old")));
-        assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("new"));
-        let seen = memory.with_own_status(Arc::new(object("13", "newer")));
-        assert_eq!(seen.status.as_ref().unwrap().reason.as_deref(), Some("newer"));
+        let (old, new) = (object("9", "old"), object("", "new").status.unwrap());
+        memory.wrote(&old, &new, "12");
+        let reason = |shown: &Submission| {
+            let shown = memory.with_own_status(Arc::new(shown.clone()));
+            shown.status.as_ref().unwrap().reason.clone().unwrap()
+        };
+        assert_eq!(reason(&old), "new");
+        memory.is_shown(&object("11", "between"));
+        assert_eq!(reason(&old), "new");
+        assert_eq!(reason(&object("13", "newer")), "newer");
+    }
+
+    #[test]
+    fn our_own_status_is_kept_no_longer_than_the_cache_lags() {
+        let memory = Memory::default();
+        let old = object("9", "old");
+        memory.wrote(&old, old.status.as_ref().unwrap(), "12");
+        let keeps = || memory.lock()["u"].written.as_ref().unwrap().status.is_some();
+        assert!(keeps());
+        memory.is_shown(&object("12", "new"));
+        assert!(!keeps() && memory.since_write(&old).is_some());
     }
 }

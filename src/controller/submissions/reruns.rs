@@ -12,7 +12,10 @@ use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
 use crate::services::evalai::row::Row;
-use leaderboard_api::{Rerun, Submission};
+use leaderboard_api::{Rerun, Submission, names};
+
+/// The highest number that `spec.attempt` may have.
+const MOST_ATTEMPTS: i64 = 9999;
 
 /// The newest Submission that a row is a re-run of; `known` looks a Submission of the same namespace up by its name. A
 /// participant can edit the row, so only a Submission of the same Leaderboard, phase and team is taken.
@@ -39,11 +42,24 @@ pub(super) fn original(
     })
 }
 
-/// The Submission of the first Job of an attempt, `<name>-<attempt>`.
+/// The highest attempt whose first Job a row names as its own; 0 for none. A participant can edit the row, so a number that no
+/// Submission can have counts for nothing.
+pub(super) fn last_attempt(row: &Row) -> i64 {
+    let own = names::submission(row.id);
+    let jobs = row.jobs.iter().filter_map(|job| split(job));
+    let attempts = jobs.filter(|(name, attempt)| *name == own && (1..MOST_ATTEMPTS).contains(attempt));
+    attempts.map(|(_, attempt)| attempt).max().unwrap_or(0)
+}
+
+/// The Submission of the first Job of an attempt.
 fn submission_of(job: &str) -> Option<&str> {
+    split(job).map(|(name, _)| name)
+}
+
+/// Submission and attempt of a first Job, `<name>-<attempt>`.
+fn split(job: &str) -> Option<(&str, i64)> {
     let (name, attempt) = job.rsplit_once('-')?;
-    attempt.parse::<i64>().ok()?;
-    Some(name)
+    Some((name, attempt.parse().ok()?))
 }
 
 /// Which submissions were re-run, by namespace and name of the original: the re-run's name and when.

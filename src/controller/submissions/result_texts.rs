@@ -100,7 +100,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
     Some(Row {
         team_id: team.id.clone()?,
         run_id: plan.run_id.clone(),
-        attempt: status.attempt.unwrap_or(1),
+        attempt: attempt_of_run(status),
         team_name: team.name.clone().unwrap_or_default(),
         submission_status: table_status(status.state).to_owned(),
         track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
@@ -118,6 +118,12 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
             .unwrap_or_default(),
         metrics: columns(report.filter(|_| is_finished(status)), plan.leaderboard_version),
     })
+}
+
+/// The attempt as the row counts it: also those of an earlier Submission of the same run, which is gone.
+pub(super) fn attempt_of_run(status: &SubmissionStatus) -> i64 {
+    let earlier = status.plan.as_ref().map_or(0, |plan| plan.earlier_attempts);
+    status.attempt.unwrap_or(1).saturating_add(earlier)
 }
 
 /// Whether its results count.

@@ -333,6 +333,8 @@ pub struct EvalaiInfo {
     pub submitted_at: Option<Timestamp>,
     /// The submission that this one re-runs.
     pub rerun_of: Option<Rerun>,
+    /// The highest attempt whose Job its row names; 0 for none.
+    pub last_attempt: i64,
     pub image: Option<String>,
     /// Why the uploaded file names no image, which no later read changes; none while it has not been read.
     pub image_problem: Option<String>,

@@ -15,7 +15,7 @@ use super::client::{Client, ClientError, Timeouts};
 use super::labels::Labels;
 use super::queue::{Now, Queue, Timing};
 use super::task::{Outlets, Shared, Task, now, run};
-use super::types::{Changed, DesiredUpdate, Key, Subject, SubmissionState, SweepRow, Target, WriteGuard};
+use super::types::{Changed, DesiredUpdate, Key, Subject, SubmissionState, SweepRow, Target, Usage, WriteGuard};
 use crate::observability::tasks::Tasks;
 use crate::services::meter::Meter;
 
@@ -182,11 +182,11 @@ impl Hub {
         labels.is_some_and(|labels| labels.partial.contains(&phase))
     }
 
-    /// Requests that a Leaderboard's token has made in the last minute, and its limit.
-    pub fn budget_used(&self, leaderboard: &Key) -> Option<(u32, u32)> {
+    /// How the requests of a Leaderboard's token are used.
+    pub fn usage(&self, leaderboard: &Key) -> Option<Usage> {
         let shared = self.place(leaderboard)?;
-        let used = shared.queue().budget_used(shared.now());
-        Some(used)
+        let usage = shared.queue().usage(shared.now());
+        Some(usage)
     }
 
     /// Requests of the last minute, and updates that wait for one, over all tokens.
@@ -194,7 +194,7 @@ impl Hub {
         let queues: Vec<_> = self.state().tokens.values().map(|entry| entry.shared.clone()).collect();
         queues.iter().fold((0, 0), |(used, waiting), shared| {
             let queue = shared.queue();
-            let (sent, _) = queue.budget_used(shared.now());
+            let sent = queue.requests_of_last_minute(shared.now());
             (used + sent as usize, waiting + queue.waiting())
         })
     }
@@ -351,6 +351,7 @@ fn wall(at: Instant) -> Timestamp {
 mod tests {
     use super::*;
     use crate::observability::shutdown::Stop;
+    use crate::services::evalai::types::Run;
     use crate::services::token::Token;
     use futures::FutureExt;
     use std::time::Duration;
@@ -405,6 +406,37 @@ mod tests {
             "{failed}"
         );
         assert!(!hub.drain().await, "a write of it may have no answer");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn nothing_is_remembered_of_a_thousand_submissions_that_are_forgotten() {
+        let (_stop, signal) = Stop::new();
+        let hub = hub(&Tasks::new(signal), || true);
+        let target = Arc::new(target("x"));
+        let subject = |pk: i64| Subject {
+            target: target.clone(),
+            key: key(&pk.to_string()),
+            pk,
+            run: Run {
+                attempt: 1,
+                job: format!("submission-{pk}-1"),
+                by_hand: false,
+                has_job: true,
+                ended: None,
+            },
+        };
+        for pk in 0..1000 {
+            hub.live(&subject(pk), Timestamp::UNIX_EPOCH).unwrap();
+        }
+        assert_eq!(hub.state().places.len(), 1000);
+        for pk in 0..1000 {
+            hub.forget(&subject(pk).key);
+        }
+        tokio::time::sleep(Duration::from_mins(2)).await;
+        let state = hub.state();
+        assert_eq!((state.places.len(), state.tokens.len()), (0, 0));
+        drop(state);
+        assert!(hub.view(&key("1")).is_none());
     }
 
     #[tokio::test(start_paused = true)]

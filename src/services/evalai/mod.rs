@@ -27,5 +27,5 @@ pub use row::Row;
 pub use status::{Outcome, Progress, Status};
 pub use types::{
     Changed, DesiredUpdate, Ended, ImageAnswer, Key, Payload, Run, Subject, SubmissionState, SweepRow, Swept, Target,
-    WriteGuard,
+    Usage, WriteGuard,
 };

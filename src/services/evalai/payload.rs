@@ -45,7 +45,7 @@ pub fn check(payload: &Payload, split: &str, labels: &[String]) -> Result<(), St
     Ok(())
 }
 
-/// Tells texts apart without keeping them.
+/// Distinguishes texts without keeping them.
 pub fn digest(payload: &Payload) -> u64 {
     let mut hasher = DefaultHasher::new();
     payload.hash(&mut hasher);

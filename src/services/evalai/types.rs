@@ -37,7 +37,7 @@ pub struct Target {
     pub since: Timestamp,
 }
 
-/// Tells, right before each write, whether this process still leads.
+/// Answers, right before each write, whether this process still leads.
 pub trait WriteGuard: Send + Sync + 'static {
     /// True while the lease was renewed less than 10 s ago, by a clock that counts pauses of the machine.
     fn may_write(&self) -> bool;
@@ -72,6 +72,8 @@ pub struct Run {
     pub by_hand: bool,
     /// The Job was created.
     pub has_job: bool,
+    /// When it ended: the oldest end is published first, also by a process that has just begun to lead.
+    pub ended: Option<Timestamp>,
 }
 
 /// What EvalAI is to show.
@@ -157,6 +159,19 @@ pub enum Ended {
     /// EvalAI refuses it, or would file it wrongly. It is retried from time to time, and at once with other texts; a cancel
     /// that such a try finds makes it `Otherwise`.
     Refused(String),
+}
+
+/// How a token's requests are used, and what waits for one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Usage {
+    /// Requests of the last minute.
+    pub used: u32,
+    /// Requests that may be made in a minute.
+    pub limit: u32,
+    /// Ends that EvalAI does not have yet, but for those that it refuses.
+    pub waiting: usize,
+    /// When the last of them is expected there; none if none waits.
+    pub last_expected: Option<Timestamp>,
 }
 
 /// What has changed, to wake its object.

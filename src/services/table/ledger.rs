@@ -158,6 +158,11 @@ impl Ledger {
         })
     }
 
+    #[cfg(test)]
+    pub fn len(&self) -> usize {
+        self.entries.len()
+    }
+
     /// Forgets an object; what was not written stays unwritten.
     pub fn forget(&mut self, key: &ObjectKey) {
         self.entries.remove(key);

@@ -171,3 +171,31 @@ async fn a_worker_that_panics_is_a_failed_task_of_the_process() {
         ("table t", "has panicked: no such row")
     );
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_running_submission_costs_a_write_for_each_step_of_its_progress_and_none_at_rest() {
+    let bench = bench(vec![]);
+    // A reconcile of a live run each 10 s: three new routes in ten minutes.
+    for step in 0..60 {
+        let progress = format!("{}/20", step / 20);
+        bench.recorder.record(&table("t"), &key("a"), row(&progress), false);
+        tokio::time::sleep(Duration::from_secs(10)).await;
+    }
+    assert_eq!(bench.written().len(), 3);
+}
+
+#[tokio::test(start_paused = true)]
+async fn nothing_is_remembered_of_a_thousand_rows_that_are_written_and_forgotten() {
+    let mut bench = bench(vec![]);
+    let keys: Vec<ObjectKey> = (0..1000).map(|number| key(&format!("submission-{number}"))).collect();
+    for key in &keys {
+        bench.recorder.record(&table("t"), key, row("20/20"), true);
+    }
+    for _ in &keys {
+        let key = bench.wake.recv().await.unwrap();
+        assert!(bench.recorder.view(&key).unwrap().end_written);
+        bench.recorder.forget(&key);
+    }
+    assert_eq!(lock(&bench.recorder.shared.ledger).len(), 0);
+    assert_eq!(lock(&bench.recorder.shared.tables).len(), 1, "the task of the table");
+}

@@ -1,5 +1,7 @@
 //! Tokens that are refused, and uploaded files that name no image.
 
+use leaderboard_operator::services::evalai::Usage;
+
 use super::*;
 
 #[tokio::test]
@@ -45,7 +47,7 @@ async fn a_refused_token_is_reported_and_a_new_one_used() {
     world.ask(pk, false);
     world.until(pk, |view| view.answered == 1).await;
     assert_eq!(world.hub.token_refused(&leaderboard()), None);
-    let (used, limit) = world.hub.budget_used(&leaderboard()).unwrap();
+    let Usage { used, limit, .. } = world.hub.usage(&leaderboard()).unwrap();
     assert!(used > 0 && limit == 6000);
 }
 

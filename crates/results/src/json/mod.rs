@@ -4,10 +4,11 @@
 //! `serde_json` can't stand in: the files may hold NaN, Infinity, `1e999`, whole numbers of any size, lone surrogates and
 //! repeated keys, and all of these have to come out again as Python would write them.
 
+mod limits;
 mod read;
 mod write;
 
-pub use read::{FileLimits, Limit};
+pub use limits::{FileLimits, Limit};
 pub(crate) use read::{ReadError, read};
 pub(crate) use write::{KeyOrder, Node, write};
 

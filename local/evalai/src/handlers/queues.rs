@@ -41,7 +41,7 @@ pub(super) async fn receive(call: &Call, queue: &str) -> Answer {
     ))
 }
 
-/// Deletes a message. The body is looked at before the user is.
+/// Deletes a message. The body is checked before the user is.
 pub(super) async fn delete(call: &Call, queue: &str) -> Answer {
     let user = call.user()?;
     if call.app.state().challenge_of_queue(queue, user).is_none() {

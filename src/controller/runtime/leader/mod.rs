@@ -89,6 +89,11 @@ impl Settings {
             clock: Clock::boot(),
         }
     }
+
+    /// Name of the installation that stands for leader: all its replicas share the Lease.
+    pub fn installation(&self) -> String {
+        format!("{}/{}", self.namespace, self.name)
+    }
 }
 
 /// Where this process stands.

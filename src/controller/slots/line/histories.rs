@@ -225,13 +225,13 @@ impl World {
         if self.line.turn(uid(&object), object.spec.attempt) != Turn::Go {
             let place = InLine {
                 uid: uid(&object).to_owned(),
+                name: object.metadata.name.clone().unwrap(),
                 team: object.spec.team.as_ref().unwrap().id.clone().unwrap(),
                 track: "sensors".into(),
                 priority: object.spec.priority,
                 submitted: object.metadata.creation_timestamp.as_ref().unwrap().0,
             };
-            let name = object.metadata.name.clone().unwrap();
-            return self.line.join(name, object.spec.attempt, place);
+            return self.line.join(object.spec.attempt, place);
         }
         self.line.starts(uid(&object));
         if fails {

@@ -316,7 +316,11 @@ fn pin(
         Some(pinned) => pinned,
         None => {
             let resume = resumed || draft.spec().attempt > 1;
-            effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume)
+            let plan = effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume);
+            leaderboard_api::RunPlan {
+                earlier_attempts: earlier_attempts(draft, info),
+                ..plan
+            }
         }
     };
     draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
@@ -324,6 +328,13 @@ fn pin(
     if draft.status.times.accepted.is_none() {
         draft.status.times.accepted = Some(draft.time());
     }
+}
+
+/// How many attempts the table's row of a resumed run counts before ours: those of a Submission that was deleted after its end.
+/// The row takes no attempt that is not above its own.
+fn earlier_attempts(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
+    let resumed = info.filter(|info| info.standing == Standing::Resumed);
+    resumed.map_or(0, |info| (info.last_attempt + 1 - draft.spec().attempt).max(0))
 }
 
 fn refuse(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) -> bool {

@@ -1,4 +1,4 @@
-//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer.
+//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer or the object's own time.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
-use super::{accept, log, state, stop};
+use super::{accept, log, retention, state, stop};
 use crate::controller::submissions::view::{EvalaiEnd, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -47,6 +47,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let complete = is_published && recorded && log_left.is_none();
     if complete && !follow_rerun(draft) {
         draft.act(Action::Forget);
+        retention::decide(draft);
     } else {
         draft.requeue_in(AGAIN);
     }

@@ -1,5 +1,7 @@
 //! In line for a slot: joins it, and shows the place. Who is next is decided by `slots`.
 
+use kube::ResourceExt;
+
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
 use crate::controller::slots::turns::{InLine, Turn};
@@ -52,6 +54,7 @@ fn join(draft: &mut PlanBuilder<'_>) {
     let team = team.and_then(|team| team.id.clone().or_else(|| team.name.clone()));
     let place = InLine {
         uid: draft.submission().metadata.uid.clone().unwrap_or_default(),
+        name: draft.submission().name_any(),
         team: team.unwrap_or_default(),
         track: status.track.clone().unwrap_or_default(),
         priority: draft.spec().priority,

@@ -2,8 +2,8 @@
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `blame`
-//! decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `failure` names the
-//! causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
+//! decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `retention` deletes what
+//! has ended long ago, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
 mod after;
@@ -20,6 +20,7 @@ mod next_steps;
 mod plan;
 mod plan_builder;
 mod reading;
+mod retention;
 mod start;
 mod state;
 mod stop;

@@ -59,6 +59,8 @@ pub enum Action {
     Forget,
     /// Write the row.
     Record { end: bool },
+    /// Delete the object, if it is still the one that was decided on.
+    DeleteSubmission { uid: String, resource_version: String },
 }
 
 /// What is sent to EvalAI.

@@ -64,6 +64,7 @@ impl Case {
                 image: OPERATOR_IMAGE.into(),
                 image_pull_policy: None,
                 region: None,
+                operator: "system/operator".into(),
                 namespace: None,
                 concurrency: 16,
             },

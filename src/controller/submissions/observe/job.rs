@@ -1,17 +1,14 @@
 //! A Job reduced to what decisions depend on. Pure.
 
-use k8s_openapi::api::batch::v1::{Job, JobCondition};
-use k8s_openapi::api::core::v1::Pod;
-use kube::ResourceExt;
-
 use crate::controller::submissions::view::{JobEnd, JobView};
+use crate::kubernetes::objects::{Job, Pod};
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 
 /// Reduces a Job. `pod` is its newest.
 pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
     JobView {
-        name: job.name_any(),
-        uid: job.uid().unwrap_or_default(),
+        name: job.metadata.name.to_string(),
+        uid: job.metadata.uid.to_string(),
         created: job.metadata.creation_timestamp.as_ref().map(|t| t.0),
         end: end(job).or_else(|| pod.and_then(completion)),
         deleting: job.metadata.deletion_timestamp.is_some(),
@@ -21,25 +18,21 @@ pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
 
 /// A Pod that has succeeded completes its Job, which has one completion. The Job controller says so some seconds later.
 fn completion(pod: &Pod) -> Option<JobEnd> {
-    let status = pod
-        .status
-        .as_ref()
-        .filter(|status| status.phase.as_deref() == Some("Succeeded"))?;
-    let all = [&status.init_container_statuses, &status.container_statuses];
-    let containers = all.into_iter().flatten().flatten();
-    let ends = containers.filter_map(|container| container.state.as_ref()?.terminated.as_ref()?.finished_at.as_ref());
+    let status = &pod.status;
+    if status.phase.as_deref() != Some("Succeeded") {
+        return None;
+    }
+    let ends = status
+        .all_containers()
+        .filter_map(|container| container.state.terminated.as_ref()?.finished_at.as_ref());
     Some(JobEnd::Complete {
         at: ends.map(|time| time.0).max(),
     })
 }
 
 fn end(job: &Job) -> Option<JobEnd> {
-    let conditions = job.status.as_ref()?.conditions.as_deref()?;
-    let find = |type_: &str| {
-        conditions
-            .iter()
-            .find(|c: &&JobCondition| c.type_ == type_ && c.status == "True")
-    };
+    let conditions = &job.status.conditions;
+    let find = |type_: &str| conditions.iter().find(|c| &*c.type_ == type_ && &*c.status == "True");
     if let Some(condition) = find("Complete") {
         return Some(JobEnd::Complete {
             at: condition.last_transition_time.as_ref().map(|t| t.0),
@@ -48,7 +41,7 @@ fn end(job: &Job) -> Option<JobEnd> {
     let condition = find("Failed")?;
     Some(JobEnd::Failed {
         at: condition.last_transition_time.as_ref().map(|t| t.0),
-        reason: condition.reason.clone().unwrap_or_default(),
+        reason: condition.reason.as_deref().unwrap_or_default().to_owned(),
         message: one_line(condition.message.as_deref().unwrap_or_default(), LONGEST_MESSAGE),
     })
 }

@@ -1,5 +1,6 @@
-//! What no watch shows and is asked of the API server now and then: whether a node reports, and why a Job has no Pod. Asked by
-//! a task of its own, once for all who want to know; an answer that differs wakes them. No reconcile waits for it.
+//! What no watch shows and is asked of the API server now and then: why a Job has no Pod, and, where nodes are not watched, whether
+//! one reports. Asked by a task of its own, once for all who want to know; an answer that differs wakes them. No reconcile waits
+//! for it.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -26,6 +27,8 @@ use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 const AT_ONCE: usize = 4;
 /// Who has not asked again for so long does not want to know any more: a live run is reconciled more often.
 const FORGOTTEN: Duration = Duration::from_mins(6);
+/// How long an answer is passed on.
+const FRESH: Duration = Duration::from_mins(1);
 /// How often it is checked which questions are due.
 const TICK: Duration = Duration::from_secs(1);
 
@@ -38,16 +41,6 @@ enum Question {
         namespace: String,
         job: String,
     },
-}
-
-impl Question {
-    /// How long an answer is passed on.
-    fn fresh(&self) -> Duration {
-        match self {
-            Self::Node(_) => Duration::from_secs(15),
-            Self::Refusal { .. } => Duration::from_mins(1),
-        }
-    }
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -132,13 +125,11 @@ impl Shared {
                 .retain(|_, at| now.saturating_duration_since(*at) < FORGOTTEN);
             entry.is_under_way || !entry.wanted_by.is_empty()
         });
-        let is_due = |question: &Question, entry: &Entry| {
-            let is_fresh = entry
-                .asked
-                .is_some_and(|at| now.saturating_duration_since(at) < question.fresh());
+        let is_due = |entry: &Entry| {
+            let is_fresh = entry.asked.is_some_and(|at| now.saturating_duration_since(at) < FRESH);
             !entry.is_under_way && !is_fresh
         };
-        let (question, entry) = entries.iter_mut().find(|(question, entry)| is_due(question, entry))?;
+        let (question, entry) = entries.iter_mut().find(|(_, entry)| is_due(entry))?;
         entry.is_under_way = true;
         entry.asked = Some(now);
         Some(question.clone())
@@ -235,7 +226,7 @@ mod tests {
             shared.done(&node, Answer::Node(ObservedNode::Reports)).is_empty(),
             "nothing to decide on"
         );
-        tokio::time::advance(Duration::from_secs(14)).await;
+        tokio::time::advance(Duration::from_secs(59)).await;
         assert_eq!(shared.next(Instant::now()), None);
         tokio::time::advance(Duration::from_secs(1)).await;
         assert_eq!(shared.next(Instant::now()), Some(node.clone()));

@@ -9,7 +9,6 @@ pub mod team;
 use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
-use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
@@ -21,6 +20,7 @@ use super::reruns::Reruns;
 use super::view::{ObservedJob, ObservedNode, PodView, View};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
+use crate::kubernetes::objects::Job;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus, conditions};
 use lookups::Lookups;
 
@@ -57,7 +57,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         now,
         is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
-        node: node(uses.lookups, &submission, pod.as_ref()),
+        node: node(uses, &submission, pod.as_ref()),
         report: archive.report.report,
         report_stage: archive.report.stage,
         report_waited: archive.report.waited,
@@ -111,11 +111,11 @@ fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (Observe
 }
 
 /// The node of a Pod that runs or is being deleted.
-fn node(lookups: &Lookups, submission: &Submission, pod: Option<&PodView>) -> ObservedNode {
+fn node(uses: Uses<'_>, submission: &Submission, pod: Option<&PodView>) -> ObservedNode {
     let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
     let name = pod.filter(matters).and_then(|pod| pod.node.as_ref());
     name.map_or(ObservedNode::Unknown, |name| {
-        lookups.node(name, ObjectRef::from_obj(submission))
+        node::watched(uses.stores, name).unwrap_or_else(|| uses.lookups.node(name, ObjectRef::from_obj(submission)))
     })
 }
 
@@ -133,11 +133,10 @@ fn simulator_failures(stores: &Stores, submission: &Submission, job: &ObservedJo
     if !may_end {
         return 0;
     }
-    let all = stores.submissions.state();
-    team::simulator_failures(all.iter().map(AsRef::as_ref), submission, now)
+    team::simulator_failures(&stores.submissions, submission, now)
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {
-    let uid = submission.uid();
-    job.owner_references().iter().any(|o| Some(&o.uid) == uid.as_ref())
+    job.metadata
+        .is_owned_by(submission.metadata.uid.as_deref().unwrap_or_default())
 }

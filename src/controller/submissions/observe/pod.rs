@@ -1,13 +1,10 @@
 //! A Pod reduced to what decisions depend on. Pure; reads the runner's verdicts as hostile text.
 
-use k8s_openapi::api::core::v1::{
-    ContainerState, ContainerStateTerminated, ContainerStatus, Pod, PodCondition, PodStatus,
-};
-use kube::ResourceExt;
 use leaderboard_runner::protocol::Member;
 use leaderboard_runner::verdict::Verdict;
 
 use crate::controller::submissions::view::{ContainerView, EndView, PodView};
+use crate::kubernetes::objects::{Condition, ContainerStatus, Ended, Pod, PodStatus};
 use crate::pod::run::Stop;
 use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
@@ -15,25 +12,22 @@ use leaderboard_api::{names, reasons};
 
 /// Reduces a Pod.
 pub fn view(pod: &Pod) -> PodView {
-    let status = pod.status.clone().unwrap_or_default();
-    let containers: Vec<ContainerView> = statuses(&status).map(container).collect();
+    let (meta, status) = (&pod.metadata, &pod.status);
+    let containers: Vec<ContainerView> = status.all_containers().map(container).collect();
     let running = |name: &str| containers.iter().any(|c| c.name == name && c.running);
     PodView {
-        name: pod.name_any(),
-        uid: pod.uid().unwrap_or_default(),
-        node: pod.spec.as_ref().and_then(|s| s.node_name.clone()),
-        scheduled: scheduled(&status),
-        unschedulable: unschedulable(&status),
-        delete_by: pod.metadata.deletion_timestamp.as_ref().map(|t| t.0),
+        name: meta.name.to_string(),
+        uid: meta.uid.to_string(),
+        node: pod.spec.node_name.as_deref().map(str::to_owned),
+        scheduled: scheduled(status),
+        unschedulable: unschedulable(status),
+        delete_by: meta.deletion_timestamp.as_ref().map(|t| t.0),
         deleted: deleted(pod),
-        agent_started: agent_started(&status),
+        agent_started: agent_started(status),
         logcopy_running: running(names::CONTAINER_LOGCOPY),
-        run_ended: run_ended(pod, &status),
-        ended_by_node: ended_by_node(&status),
-        stop: pod
-            .annotations()
-            .get(names::ANNOTATION_STOP)
-            .and_then(|text| Stop::parse(text)),
+        run_ended: run_ended(pod),
+        ended_by_node: ended_by_node(status),
+        stop: meta.annotations.stop.as_deref().and_then(Stop::parse),
         containers,
     }
 }
@@ -45,25 +39,17 @@ fn deleted(pod: &Pod) -> Option<jiff::Timestamp> {
     by.checked_sub(jiff::SignedDuration::from_secs(grace)).ok()
 }
 
-fn statuses(status: &PodStatus) -> impl Iterator<Item = &ContainerStatus> {
-    let init = status.init_container_statuses.iter().flatten();
-    init.chain(status.container_statuses.iter().flatten())
-}
-
-fn condition<'a>(status: &'a PodStatus, type_: &str) -> Option<&'a PodCondition> {
-    status.conditions.iter().flatten().find(|c| c.type_ == type_)
+/// Whether it has a node, if the scheduler says this of it.
+fn scheduling<'a>(status: &'a PodStatus, truth: &str) -> Option<&'a Condition> {
+    status.scheduled.as_deref().filter(|c| &*c.status == truth)
 }
 
 fn scheduled(status: &PodStatus) -> Option<jiff::Timestamp> {
-    condition(status, "PodScheduled")
-        .filter(|c| c.status == "True")?
-        .last_transition_time
-        .as_ref()
-        .map(|t| t.0)
+    scheduling(status, "True")?.last_transition_time.as_ref().map(|t| t.0)
 }
 
 fn unschedulable(status: &PodStatus) -> Option<String> {
-    let found = condition(status, "PodScheduled").filter(|c| c.status == "False")?;
+    let found = scheduling(status, "False")?;
     Some(short(found.message.as_deref().unwrap_or("no node takes the Pod")))
 }
 
@@ -71,24 +57,18 @@ fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
     let agents = status
         .container_statuses
         .iter()
-        .flatten()
         .filter(|c| c.name.starts_with("agent-"));
     agents.flat_map(started_times).min()
 }
 
 /// The simulators leave once the final report is stored; logcopy's farewell and the kubelet's last word come seconds later.
-fn run_ended(pod: &Pod, status: &PodStatus) -> Option<jiff::Timestamp> {
-    let containers = pod.spec.iter().flat_map(|spec| &spec.containers);
+fn run_ended(pod: &Pod) -> Option<jiff::Timestamp> {
+    let containers = pod.spec.containers.iter();
     let of_pairs = containers.filter(|c| ["agent-", "simulator-"].iter().any(|start| c.name.starts_with(start)));
     let ends: Option<Vec<jiff::Timestamp>> = of_pairs
         .map(|wanted| {
-            let mut statuses = status.container_statuses.iter().flatten();
-            let end = statuses
-                .find(|s| s.name == wanted.name)?
-                .state
-                .as_ref()?
-                .terminated
-                .as_ref()?;
+            let mut statuses = pod.status.container_statuses.iter();
+            let end = statuses.find(|s| s.name == wanted.name)?.state.terminated.as_ref()?;
             end.finished_at.as_ref().filter(|_| end.exit_code == 0).map(|at| at.0)
         })
         .collect();
@@ -96,48 +76,44 @@ fn run_ended(pod: &Pod, status: &PodStatus) -> Option<jiff::Timestamp> {
 }
 
 fn started_times(status: &ContainerStatus) -> impl Iterator<Item = jiff::Timestamp> {
-    let states = [status.state.as_ref(), status.last_state.as_ref()];
-    states.into_iter().flatten().filter_map(|state| {
-        let running = state.running.as_ref().and_then(|r| r.started_at.as_ref());
-        // A container that could not be started has no start of its own.
-        let ended = state
-            .terminated
-            .as_ref()
-            .filter(|t| t.reason.as_deref() != Some("StartError"));
-        running.or(ended.and_then(|t| t.started_at.as_ref())).map(|t| t.0)
-    })
+    let running = status
+        .state
+        .running
+        .as_ref()
+        .and_then(|running| running.started_at.as_ref());
+    let ends = [&status.state.terminated, &status.last_ended].into_iter().flatten();
+    // A container that could not be started has no start of its own.
+    let ended = ends.filter(|end| end.reason.as_deref() != Some("StartError"));
+    running
+        .into_iter()
+        .chain(ended.filter_map(|end| end.started_at.as_ref()))
+        .map(|time| time.0)
 }
 
 fn ended_by_node(status: &PodStatus) -> Option<(String, String)> {
-    let reason = status.reason.clone()?;
+    let reason = status.reason.as_deref()?.to_owned();
     Some((reason, short(status.message.as_deref().unwrap_or_default())))
 }
 
 fn container(status: &ContainerStatus) -> ContainerView {
-    let state = status.state.clone().unwrap_or_default();
+    let state = &status.state;
     ContainerView {
-        name: status.name.clone(),
+        name: status.name.to_string(),
         restarts: status.restart_count,
         running: state.running.is_some(),
         waiting: state.waiting.as_ref().map(|w| {
             (
-                w.reason.clone().unwrap_or_default(),
+                w.reason.as_deref().unwrap_or_default().to_owned(),
                 short(w.message.as_deref().unwrap_or_default()),
             )
         }),
-        last: last_end(status, &state),
+        last: status.ended().map(|ended| end(&status.name, ended)),
     }
-}
-
-fn last_end(status: &ContainerStatus, state: &ContainerState) -> Option<EndView> {
-    let before = status.last_state.as_ref().and_then(|s| s.terminated.as_ref());
-    let ended = state.terminated.as_ref().or(before)?;
-    Some(end(&status.name, ended))
 }
 
 /// Whose words are passed on to people. A stranger's program can write whatever it likes where the runner leaves its
 /// verdict, for example a private route; of that only a verdict's closed words and numbers are used.
-fn may_speak(container: &str, ended: &ContainerStateTerminated) -> bool {
+fn may_speak(container: &str, ended: &Ended) -> bool {
     let is_hosts = [
         names::CONTAINER_CONTENTS,
         names::CONTAINER_WORKSPACE,
@@ -148,7 +124,7 @@ fn may_speak(container: &str, ended: &ContainerStateTerminated) -> bool {
     is_hosts || matches!(ended.reason.as_deref(), Some("StartError" | "ContainerCannotRun"))
 }
 
-fn end(container: &str, terminated: &ContainerStateTerminated) -> EndView {
+fn end(container: &str, terminated: &Ended) -> EndView {
     let message = terminated.message.as_deref().unwrap_or_default();
     let is_behind_runner = Member::parse(container).is_some();
     let verdict = Verdict::parse(message).ok().filter(|_| is_behind_runner);
@@ -158,7 +134,7 @@ fn end(container: &str, terminated: &ContainerStateTerminated) -> EndView {
     });
     let foreign = Some(message).filter(|_| may_speak(container, terminated));
     let out_of_memory = verdict.as_ref().is_some_and(|v| v.out_of_memory);
-    let reason = terminated.reason.clone().unwrap_or_default();
+    let reason = terminated.reason.as_deref().unwrap_or_default().to_owned();
     EndView {
         reason: if out_of_memory { "OOMKilled".into() } else { reason },
         exit_code: terminated.exit_code,
@@ -263,10 +239,9 @@ mod tests {
             let pod = json!({"metadata": {"name": "p"},
                 "spec": {"containers": [{"name": "simulator-1"}, {"name": "agent-1"}, {"name": "extra"}]},
                 "status": {"containerStatuses": statuses}});
-            let mut pod = serde_json::from_value(pod).unwrap();
-            // As the cache keeps it.
-            crate::controller::runtime::trim_pod(&mut pod);
-            view(&pod).run_ended.map(|at| at.to_string())
+            view(&serde_json::from_value(pod).unwrap())
+                .run_ended
+                .map(|at| at.to_string())
         };
         let agent = ended("agent-1", 0, "2026-01-01T00:00:07Z");
         let simulator = ended("simulator-1", 0, "2026-01-01T00:00:09Z");

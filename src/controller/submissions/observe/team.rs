@@ -1,37 +1,42 @@
 //! How often the simulators of a team have failed. Pure.
 
-use jiff::{SignedDuration, Timestamp};
-use kube::ResourceExt;
+use std::sync::Arc;
 
+use jiff::{SignedDuration, Timestamp};
+
+use crate::kubernetes::Store;
 use leaderboard_api::{Submission, conditions, reasons};
 
 /// How long an ended submission counts.
 const COUNTED: SignedDuration = SignedDuration::from_hours(24);
 
 /// Other submissions of the same team and Leaderboard that ended because of their simulators, within a day.
-pub fn simulator_failures<'a>(
-    all: impl IntoIterator<Item = &'a Submission>,
-    submission: &Submission,
-    now: Timestamp,
-) -> usize {
-    let Some(team) = submission.team() else { return 0 };
-    let is_counted = |other: &&Submission| {
-        other.namespace() == submission.namespace()
-            && other.spec.leaderboard_name == submission.spec.leaderboard_name
-            && other.uid() != submission.uid()
-            && other.team() == Some(team)
-            && ended_by_its_simulator(other, now)
+pub fn simulator_failures(all: &Store<Submission>, submission: &Submission, now: Timestamp) -> usize {
+    let Some(key) = key(submission) else { return 0 };
+    let is_counted = |other: &&Arc<Submission>| {
+        let finished = other.status.as_ref().and_then(|status| status.times.finished.as_ref());
+        let is_recent = finished.is_some_and(|at| now.duration_since(at.0) < COUNTED);
+        is_recent && other.metadata.uid != submission.metadata.uid
     };
-    all.into_iter().filter(is_counted).count()
+    all.indexed(&key).iter().filter(is_counted).count()
 }
 
-fn ended_by_its_simulator(submission: &Submission, now: Timestamp) -> bool {
-    let Some(status) = &submission.status else { return false };
+/// By what the cache finds those that ended because of their simulators.
+pub fn index(submission: &Submission) -> Option<String> {
+    let status = submission.status.as_ref()?;
+    let failure = status.failure.as_ref()?;
     let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
-    let is_recent = |at: Timestamp| now.duration_since(at) < COUNTED;
-    let failure = status.failure.as_ref().filter(|_| is_finished);
-    failure.is_some_and(|failure| failure.reason == reasons::SIMULATION_CRASHED)
-        && status.times.finished.as_ref().is_some_and(|at| is_recent(at.0))
+    let is_counted = is_finished && failure.reason == reasons::SIMULATION_CRASHED;
+    is_counted.then(|| key(submission)).flatten()
+}
+
+/// Its namespace, Leaderboard and team, if it has one.
+fn key(submission: &Submission) -> Option<String> {
+    let namespace = submission.metadata.namespace.as_deref().unwrap_or_default();
+    let leaderboard = &submission.spec.leaderboard_name;
+    submission
+        .team()
+        .map(|team| format!("{namespace}/{leaderboard}/{team}"))
 }
 
 #[cfg(test)]
@@ -70,9 +75,11 @@ mod tests {
             submission("e", "t1", "lb", crashed, "2025-12-31T23:00:00Z"),
             under_way,
         ];
-        assert_eq!(simulator_failures(&all, &all[0], now), 1);
-        let mut nobodys = all[0].clone();
+        let own = all[0].clone();
+        let cache = Store::of(all, index);
+        assert_eq!(simulator_failures(&cache, &own, now), 1);
+        let mut nobodys = own;
         nobodys.spec.team = None;
-        assert_eq!(simulator_failures(&all, &nobodys, now), 0);
+        assert_eq!(simulator_failures(&cache, &nobodys, now), 0);
     }
 }

@@ -38,6 +38,9 @@ impl Queue {
             (request, Reply::Written(answer)) => self.wrote(request, answer, &now),
             (request, reply) => self.took_of_challenge(request, ticket.requested, reply, &now),
         }
+        if let Some(subject) = ticket.request.submission() {
+            self.drop_lane(subject.pk, &now);
+        }
     }
 
     /// A request was not sent after all; it is chosen again.

@@ -22,6 +22,8 @@ const READ_ONE_BY_ONE: usize = 5;
 const ACCEPT_REACH: SignedDuration = SignedDuration::from_hours(5 * 24);
 /// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
 const SWEEP_REACH: SignedDuration = SignedDuration::from_hours(180 * 24);
+/// After so long a question whether a submission may run comes before ends.
+const OVERDUE: Duration = Duration::from_mins(1);
 /// While writes are not allowed they are checked again so often: no event reports that they are.
 const RECHECK: Duration = Duration::from_secs(1);
 
@@ -32,6 +34,8 @@ pub(super) enum Priority {
     Free,
     /// A write whose read has just been answered: it would be worth nothing a moment later.
     Write,
+    /// A question that ends have kept waiting: nothing can start before its answer.
+    Overdue,
     End,
     CancelList,
     Acceptance,
@@ -43,9 +47,9 @@ pub(super) enum Priority {
     Rest,
 }
 
-#[derive(Clone, Debug)]
-enum What {
-    Sub(Key, Step),
+#[derive(Clone, Copy, Debug)]
+enum What<'a> {
+    Sub(&'a Key, Step),
     List(i64, Purpose),
     Check(i64),
 }
@@ -60,12 +64,21 @@ enum Step {
 }
 
 /// A request that is due at `ready`.
-#[derive(Clone, Debug)]
-struct Offer {
+#[derive(Clone, Copy, Debug)]
+struct Offer<'a> {
     priority: Priority,
+    /// Of an end: when it came to be.
+    ended: Option<Timestamp>,
     since: Duration,
     ready: Duration,
-    what: What,
+    what: What<'a>,
+}
+
+impl Offer<'_> {
+    /// Less comes first.
+    fn rank(&self) -> (Priority, Option<Timestamp>, Duration) {
+        (self.priority, self.ended, self.since)
+    }
 }
 
 impl Queue {
@@ -76,13 +89,12 @@ impl Queue {
             .offers(&now, may_write)
             .into_iter()
             .partition(|offer| offer.ready <= now.at);
-        let first = |one: &&Offer, other: &&Offer| (one.priority, one.since).cmp(&(other.priority, other.since));
-        let best = due.iter().min_by(first);
+        let best = due.iter().min_by_key(|offer| offer.rank());
         // Writes wait until the budget has two requests left; the list of the runs that are to stop goes in between.
         let list = due
             .iter()
             .filter(|offer| offer.priority == Priority::CancelList)
-            .min_by(first);
+            .min_by_key(|offer| offer.rank());
         let chosen = [best, list].into_iter().flatten();
         let (now_affordable, not_yet): (Vec<_>, Vec<_>) = chosen
             .map(|offer| (self.affordable_at(&now, offer), offer))
@@ -95,7 +107,15 @@ impl Queue {
             let opens = (!self.open).then_some(self.not_before);
             return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).chain(opens).min());
         };
-        match self.start(&best.what, &now) {
+        let started = match best.what {
+            What::Sub(key, step) => {
+                let key = key.clone();
+                self.start_sub(&key, step)
+            }
+            What::List(id, purpose) => self.start_list(id, purpose, &now),
+            What::Check(id) => self.start_check(id),
+        };
+        match started {
             Some(request) => {
                 if request.counts() {
                     self.budget.take(now.at);
@@ -110,7 +130,7 @@ impl Queue {
     }
 
     /// When the budget allows it: every read for a write keeps one request back for the write that follows it.
-    fn affordable_at(&self, now: &Now, offer: &Offer) -> Duration {
+    fn affordable_at(&self, now: &Now, offer: &Offer<'_>) -> Duration {
         let reserved = self
             .lanes
             .values()
@@ -130,7 +150,7 @@ impl Queue {
         self.budget.ready_keeping(now.at, count, keep).max(token)
     }
 
-    fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer> {
+    fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer<'_>> {
         let (asked, live) = (self.asked_by_list(), self.live_by_list());
         let in_flight = self.lanes.values().filter(|lane| lane.busy.is_some()).count();
         let mut offers = Vec::new();
@@ -147,7 +167,7 @@ impl Queue {
             offers.extend(subs);
         }
         for (id, challenge) in &self.challenges {
-            offers.extend(self.offers_of(*id, challenge, asked.contains_key(id)));
+            offers.extend(self.offers_of(*id, challenge, asked.get(id).copied(), now));
         }
         let lists = live.keys().filter_map(|(id, purpose)| {
             let challenge = self.challenges.get(id)?;
@@ -164,18 +184,17 @@ impl Queue {
             && self.challenges.get(&sub.challenge).is_some_and(|c| c.sweep.is_some())
     }
 
-    /// Challenges with so many waiting submissions that one list is asked for all.
-    fn asked_by_list(&self) -> BTreeMap<i64, usize> {
+    /// Challenges with so many waiting submissions that one list is asked for all, and since when the first of them waits.
+    fn asked_by_list(&self) -> BTreeMap<i64, Duration> {
         let mut counts = BTreeMap::new();
-        for sub in self
-            .subs
-            .values()
-            .filter(|sub| sub.asked.as_ref().is_some_and(|asked| !asked.listed))
-        {
-            *counts.entry(sub.challenge).or_insert(0) += 1;
+        for sub in self.subs.values() {
+            if let Some(asked) = sub.asked.as_ref().filter(|asked| !asked.listed) {
+                let (count, since) = counts.entry(sub.challenge).or_insert((0, asked.since));
+                (*count, *since) = (*count + 1, asked.since.min(*since));
+            }
         }
-        counts.retain(|_, count| *count > ASKED_ONE_BY_ONE);
-        counts
+        counts.retain(|_, (count, _)| *count > ASKED_ONE_BY_ONE);
+        counts.into_iter().map(|(id, (_, since))| (id, since)).collect()
     }
 
     /// Lists of live submissions that hold so many that one request is made for all.
@@ -190,7 +209,7 @@ impl Queue {
         counts
     }
 
-    fn offer_of(&self, key: &Key, sub: &Sub, now: &Now, terms: Terms) -> Option<Offer> {
+    fn offer_of<'a>(&self, key: &'a Key, sub: &Sub, now: &Now, terms: Terms) -> Option<Offer<'a>> {
         let idle = Lane::default();
         let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
         if lane.busy.is_some() {
@@ -203,11 +222,13 @@ impl Queue {
             sub.retry_at
         };
         let pause = again.max(lane.hold_until);
+        let is_end = matches!(priority, Priority::End | Priority::Cancelled);
         Some(Offer {
             priority,
+            ended: sub.end_since().filter(|_| is_end),
             since,
             ready: if write { pause.max(self.not_before) } else { pause },
-            what: What::Sub(key.clone(), step),
+            what: What::Sub(key, step),
         })
     }
 
@@ -223,7 +244,7 @@ impl Queue {
         }
         if let Some(asked) = &sub.asked {
             let alone = asked.listed || !terms.asked_by_list;
-            return alone.then_some((Priority::Acceptance, asked.since, false, Step::Get));
+            return alone.then(|| (acceptance(asked.since, now), asked.since, false, Step::Get));
         }
         let refresh = self.refresh_of(sub, now, terms);
         // A file that is not there must not keep its submission from being read.
@@ -262,14 +283,14 @@ impl Queue {
         Some((priority, since, true, Step::GetForWrite))
     }
 
-    fn offers_of(&self, id: i64, challenge: &Challenge, by_list: bool) -> Vec<Offer> {
+    fn offers_of(&self, id: i64, challenge: &Challenge, asked: Option<Duration>, now: &Now) -> Vec<Offer<'static>> {
         let list = |priority, purpose| offer_of_list(priority, challenge, id, purpose);
         let mut offers = Vec::new();
         if self.subs.values().any(|sub| sub.challenge == id && sub.live.is_some()) {
             offers.extend(list(Priority::CancelList, Purpose::Cancel));
         }
-        if by_list {
-            offers.extend(list(Priority::Acceptance, Purpose::Accept));
+        if let Some(since) = asked {
+            offers.extend(list(acceptance(since, now), Purpose::Accept));
         }
         if challenge.sweep.is_some() {
             offers.extend(list(Priority::Sweep, Purpose::SweepSubmitted));
@@ -277,6 +298,7 @@ impl Queue {
             if !challenge.check.poll.busy {
                 offers.push(Offer {
                     priority: Priority::Sweep,
+                    ended: None,
                     since: challenge.check.poll.due,
                     ready: challenge.check.poll.due,
                     what: What::Check(id),
@@ -286,26 +308,21 @@ impl Queue {
         offers
     }
 
-    /// Marks a request as sent.
-    fn start(&mut self, what: &What, now: &Now) -> Option<Request> {
-        match what {
-            What::Sub(key, step) => self.start_sub(key, *step),
-            What::List(id, purpose) => {
-                let after = self.list_after(*id, *purpose, now.wall)?;
-                self.challenges.get_mut(id)?.poll(*purpose).busy = true;
-                Some(Request::List {
-                    challenge: *id,
-                    purpose: *purpose,
-                    after,
-                })
-            }
-            What::Check(id) => {
-                let check = &mut self.challenges.get_mut(id)?.check;
-                let request = check.request(*id)?;
-                check.poll.busy = true;
-                Some(request)
-            }
-        }
+    fn start_list(&mut self, challenge: i64, purpose: Purpose, now: &Now) -> Option<Request> {
+        let after = self.list_after(challenge, purpose, now.wall)?;
+        self.challenges.get_mut(&challenge)?.poll(purpose).busy = true;
+        Some(Request::List {
+            challenge,
+            purpose,
+            after,
+        })
+    }
+
+    fn start_check(&mut self, challenge: i64) -> Option<Request> {
+        let check = &mut self.challenges.get_mut(&challenge)?.check;
+        let request = check.request(challenge)?;
+        check.poll.busy = true;
+        Some(request)
     }
 
     fn start_sub(&mut self, key: &Key, step: Step) -> Option<Request> {
@@ -373,16 +390,26 @@ struct Terms {
     live_by_list: bool,
 }
 
+/// The priority of a question that waits since then.
+fn acceptance(since: Duration, now: &Now) -> Priority {
+    if now.at.saturating_sub(since) < OVERDUE {
+        Priority::Acceptance
+    } else {
+        Priority::Overdue
+    }
+}
+
 /// The list that holds a live submission, going by its last row.
 fn list_of_live(sub: &Sub) -> Option<Purpose> {
     let row = sub.view.row.as_ref().filter(|_| sub.live.is_some())?;
     Purpose::of_live(row.status)
 }
 
-fn offer_of_list(priority: Priority, challenge: &Challenge, id: i64, purpose: Purpose) -> Option<Offer> {
+fn offer_of_list(priority: Priority, challenge: &Challenge, id: i64, purpose: Purpose) -> Option<Offer<'static>> {
     let poll = challenge.lists.get(&purpose).copied().unwrap_or_default();
     (!poll.busy).then_some(Offer {
         priority,
+        ended: None,
         since: poll.due,
         ready: poll.due,
         what: What::List(id, purpose),

@@ -12,6 +12,7 @@
 mod answers;
 mod choose;
 mod lists;
+mod outlook;
 mod poll;
 mod sub;
 
@@ -283,6 +284,14 @@ impl Queue {
         self.drop_unused(sub.challenge);
     }
 
+    /// A lane that nothing uses needs no memory.
+    fn drop_lane(&mut self, pk: i64, now: &Now) {
+        let is_idle = |lane: &Lane| lane.busy.is_none() && lane.hold_until <= now.at;
+        if !self.pks.contains_key(&pk) && self.lanes.get(&pk).is_some_and(is_idle) {
+            self.lanes.remove(&pk);
+        }
+    }
+
     /// A challenge that no Leaderboard serves and no submission is of needs no memory.
     fn drop_unused(&mut self, challenge: i64) {
         let is_served = self.served.values().any(|target| target.challenge == challenge);
@@ -308,9 +317,9 @@ impl Queue {
         (labels, challenge.check.error.clone())
     }
 
-    /// Requests of the last minute, and the limit.
-    pub fn budget_used(&self, now: Now) -> (u32, u32) {
-        (self.budget.used(now.at), self.budget.limit())
+    /// Requests of the last minute.
+    pub fn requests_of_last_minute(&self, now: Now) -> u32 {
+        self.budget.used(now.at)
     }
 
     /// Updates and questions that wait for a request.
@@ -361,6 +370,7 @@ impl Queue {
         }
         if run.attempt == sub.run.attempt {
             sub.run.has_job |= run.has_job;
+            sub.run.ended = sub.run.ended.or(run.ended);
         }
         // An object's submission is immutable.
         (run.attempt == sub.run.attempt && *pk == sub.pk).then_some(sub)
@@ -423,6 +433,7 @@ fn request_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Pa
     };
     let since = now.at;
     sub.end = Some(Pending { what: want, since });
+    sub.run.ended.get_or_insert(now.wall);
     (sub.progress, sub.partial, sub.view.end) = (None, None, None);
     sub.retry_at = sub.retry_at.min(now.at);
     true

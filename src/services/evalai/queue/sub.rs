@@ -137,6 +137,16 @@ impl Sub {
         self.end.is_some() || self.view.end.is_some() || self.is_over()
     }
 
+    /// When the end that waits came to be.
+    pub fn end_since(&self) -> Option<Timestamp> {
+        self.end.as_ref().and(self.run.ended)
+    }
+
+    /// Whether an end waits that EvalAI has not refused.
+    pub fn has_end_to_publish(&self) -> bool {
+        self.end.is_some() && self.view.end.is_none()
+    }
+
     /// Whether this attempt needs no further update.
     pub fn is_over(&self) -> bool {
         self.view.ended.is_some()

@@ -3,100 +3,61 @@
 use super::builders::*;
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
 use crate::pod::run::Stop;
+use leaderboard_api::Failure;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
 use leaderboard_api::reasons;
 
-/// How often each side of pair 1 ends how, and what comes of it.
-#[test]
-fn a_pair_that_always_fails_ends_the_run_by_its_cause() {
-    let cases = [
-        (
-            "agent crashes",
-            Some("exited"),
-            Some("peerCrashed"),
-            reasons::AGENT_CRASHED,
-            Participant,
-        ),
-        (
-            "agent is killed",
-            Some("silentDeath"),
-            None,
-            reasons::AGENT_CRASHED,
-            Participant,
-        ),
-        (
-            "agent ends without results",
-            Some("incomplete"),
-            Some("peerCrashed"),
-            reasons::INVALID_RESULTS,
-            Participant,
-        ),
-        (
-            "agent is idle",
-            Some("idle"),
-            Some("peerCrashed"),
-            reasons::IDLE,
-            Participant,
-        ),
-        (
-            "agent cannot start",
-            Some("cannotStart"),
-            Some("peerCrashed"),
-            reasons::CANNOT_START,
-            Participant,
-        ),
-        (
-            "simulator crashes",
-            Some("peerCrashed"),
-            Some("exited"),
-            reasons::SIMULATION_CRASHED,
-            Infrastructure,
-        ),
-        (
-            "and the agent with it",
-            Some("exited"),
-            Some("killed"),
-            reasons::SIMULATION_CRASHED,
-            Infrastructure,
-        ),
-        (
-            "agent says that it crashed, and runs on",
-            Some("peerCrashed"),
-            Some("peerCrashed"),
-            reasons::AGENT_CRASHED,
-            Participant,
-        ),
-        (
-            "simulator cannot start",
-            None,
-            Some("cannotStart"),
-            reasons::SIMULATION_CRASHED,
-            Infrastructure,
-        ),
-        (
-            "simulator is late",
-            Some("notReady"),
-            Some("notReady"),
-            reasons::SIMULATION_CRASHED,
-            Infrastructure,
-        ),
-    ];
-    for (what, agent, simulator, reason, class) in cases {
-        let mut world = World::local().running();
-        for (name, word) in [("agent-1", agent), ("simulator-1", simulator)] {
-            if let Some(word) = word {
-                world.see_alone(ended(name, 3, word, 1, 100));
-            }
+/// Each side of pair 1 ends like this until its retries are used up: what comes of it.
+fn used_up(agent: &str, simulator: &str) -> Failure {
+    let mut world = World::local().running();
+    for (name, verdict) in [("agent-1", agent), ("simulator-1", simulator)] {
+        if !verdict.is_empty() {
+            world.see_alone(ended(name, 3, verdict, 1, 100));
         }
-        world.go_to(221);
-        let plan = world.pass_to(Running, reasons::STOPPING);
-        let failure = plan.status.failure.clone().unwrap();
-        assert_eq!((failure.reason.as_str(), failure.class), (reason, class), "{what}");
-        assert_eq!(annotated(&plan), Some(Stop::Retries), "{what}");
+    }
+    world.go_to(221);
+    let plan = world.pass_to(Running, reasons::STOPPING);
+    assert_eq!(annotated(&plan), Some(Stop::Retries), "{agent} {simulator}");
+    assert_eq!(
+        plan.status.pairs[0].crashes, 4,
+        "{agent} {simulator}: the end that is not restarted yet counts"
+    );
+    plan.status.failure.unwrap()
+}
+
+#[test]
+fn a_pair_whose_agent_always_fails_ends_the_run_at_the_participants_cost() {
+    for (agent, simulator, reason) in [
+        ("exited", "peerCrashed", reasons::AGENT_CRASHED),
+        ("silentDeath", "", reasons::AGENT_CRASHED),
+        ("incomplete", "peerCrashed", reasons::INVALID_RESULTS),
+        ("idle", "peerCrashed", reasons::IDLE),
+        ("cannotStart", "peerCrashed", reasons::CANNOT_START),
+        // It claims that its peer crashed, and runs on.
+        ("peerCrashed", "peerCrashed", reasons::AGENT_CRASHED),
+    ] {
+        let failure = used_up(agent, simulator);
+        let found = (failure.reason.as_str(), failure.class);
+        assert_eq!(found, (reason, Participant), "{agent} {simulator}");
+    }
+}
+
+#[test]
+fn a_pair_whose_simulator_always_fails_ends_the_run_at_nobodys_cost() {
+    for (agent, simulator) in [
+        ("peerCrashed", "exited"),
+        // The agent crashes with it.
+        ("exited", "killed"),
+        ("", "cannotStart"),
+        ("notReady", "notReady"),
+    ] {
+        let failure = used_up(agent, simulator);
+        let found = (failure.reason.as_str(), failure.class);
         assert_eq!(
-            plan.status.pairs[0].crashes, 4,
-            "{what}: the end that is not restarted yet counts"
+            found,
+            (reasons::SIMULATION_CRASHED, Infrastructure),
+            "{agent} {simulator}"
         );
     }
 }

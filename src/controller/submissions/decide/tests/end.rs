@@ -6,6 +6,7 @@ use super::builders::*;
 use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
 use crate::pod::report::Report;
+use leaderboard_api::Failure;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
@@ -118,72 +119,48 @@ fn results_that_are_complete_win_over_a_cancel_that_comes_with_them() {
     world.pass_to(Finished, reasons::FINISHED);
 }
 
+/// The Job is complete with this report, and no retry is left.
+fn completes_with(report: Option<Report>, reason: &str) -> Failure {
+    let mut world = World::local().running();
+    world.leaderboard().retries.infrastructure = 0;
+    world.complete();
+    if let Some(report) = report {
+        world.report(report);
+    }
+    let plan = world.pass_to(Failed, reason);
+    assert!(plan.events.last().unwrap().warning, "{reason}");
+    plan.status.failure.unwrap()
+}
+
 #[test]
 fn each_end_without_that_has_its_class_and_reason() {
-    let is_final = true;
     let ineligible = |status: &str| Report {
         eligible: false,
         entry_status: status.into(),
         ..final_report()
     };
-    let refused = Report {
+    let refused = |is_final| Report {
         is_final,
         why: Some("a score of NaN.".into()),
         ..report(3)
     };
-    let unsettled = Report {
-        is_final: false,
-        ..refused.clone()
-    };
-    let cases = [
-        (
-            "rejected",
-            Some(ineligible("Rejected")),
-            reasons::NOT_ELIGIBLE,
-            Participant,
-        ),
-        (
-            "invalid",
-            Some(ineligible("Invalid")),
-            reasons::NOT_ELIGIBLE,
-            Participant,
-        ),
-        (
-            "crashed",
-            Some(ineligible("Crashed")),
-            reasons::SIMULATION_CRASHED,
-            Infrastructure,
-        ),
-        ("refused", Some(refused), reasons::INVALID_RESULTS, Participant),
-        (
-            "refused, not for good",
-            Some(unsettled),
-            reasons::RESULTS_NOT_STORED,
-            Infrastructure,
-        ),
-        (
-            "routes missing",
-            Some(report(3)),
-            reasons::RESULTS_NOT_STORED,
-            Infrastructure,
-        ),
-        ("nothing", None, reasons::RESULTS_NOT_STORED, Infrastructure),
-    ];
-    for (what, told, reason, class) in cases {
-        let mut world = World::local().running();
-        world.leaderboard().retries.infrastructure = 0;
-        world.complete();
-        if let Some(told) = told {
-            world.report(told);
-        }
-        let plan = world.pass_to(Failed, reason);
-        let failure = plan.status.failure.unwrap();
-        assert_eq!(
-            (failure.class, failure.charged),
-            (class, class == Participant),
-            "{what}"
-        );
-        assert!(plan.events.last().unwrap().warning, "{what}");
+    for (report, reason) in [
+        (ineligible("Rejected"), reasons::NOT_ELIGIBLE),
+        (ineligible("Invalid"), reasons::NOT_ELIGIBLE),
+        (refused(true), reasons::INVALID_RESULTS),
+    ] {
+        let failure = completes_with(Some(report), reason);
+        assert_eq!((failure.class, failure.charged), (Participant, true), "{reason}");
+    }
+    for (report, reason) in [
+        (Some(ineligible("Crashed")), reasons::SIMULATION_CRASHED),
+        (Some(refused(false)), reasons::RESULTS_NOT_STORED),
+        // Routes are missing.
+        (Some(report(3)), reasons::RESULTS_NOT_STORED),
+        (None, reasons::RESULTS_NOT_STORED),
+    ] {
+        let failure = completes_with(report, reason);
+        assert_eq!((failure.class, failure.charged), (Infrastructure, false), "{reason}");
     }
 }
 

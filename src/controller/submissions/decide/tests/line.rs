@@ -56,6 +56,7 @@ fn joining_the_line_shows_nothing_and_starts_nothing() {
         assert!(plan.events.is_empty() && !creates(&plan) && evalai_updates(&plan).is_empty());
         let place = InLine {
             uid: UID.into(),
+            name: world.view.submission.metadata.name.clone().unwrap(),
             team: if is_evalais { "42" } else { "t1" }.into(),
             track: "sensors".into(),
             priority: 0,

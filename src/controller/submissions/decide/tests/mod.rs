@@ -15,6 +15,7 @@ mod nodes;
 mod properties;
 mod reading;
 mod resume;
+mod retention;
 mod rules;
 mod run;
 mod start;

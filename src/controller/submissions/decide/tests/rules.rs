@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
 use crate::controller::submissions::view::{ObservedJob, ObservedNode, Standing, View};
-use leaderboard_api::conditions::{self, FINISHED, PUBLISHED};
+use leaderboard_api::conditions::{self, FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::reasons::{self, Class};
 use leaderboard_api::{FailureClass, PolicySource, State, SubmissionStatus};
 
@@ -17,6 +17,7 @@ pub fn check(view: &View, plan: &Plan) {
     one_job(view, plan);
     tells_fit(view, plan);
     logs_come_first(plan);
+    only_what_every_system_has_is_deleted(view, plan);
     a_reporting_node_has_its_grace(view, plan);
     status_is_whole(plan);
     reasons_are_of_the_table(plan);
@@ -114,6 +115,24 @@ fn logs_come_first(plan: &Plan) {
         .iter()
         .position(|a| matches!(a, Action::UpdateEvalai(_) | Action::Forget));
     assert!(told.is_none_or(|told| place < told), "{:?}", plan.actions);
+}
+
+/// A Submission is deleted only as it is stored: ended, known to every system that has to know it, and without a Job that runs.
+fn only_what_every_system_has_is_deleted(view: &View, plan: &Plan) {
+    let is_deletion = |action: &Action| matches!(action, Action::DeleteSubmission { .. });
+    if !plan.actions.iter().any(is_deletion) {
+        return;
+    }
+    let stored = view.submission.status.as_ref().expect("a status");
+    assert_eq!(*stored, plan.status, "something is still to be stored");
+    assert!(is_finished(stored));
+    for system in [PUBLISHED, RECORDED] {
+        let condition = conditions::get(&stored.conditions, system).expect("a condition");
+        let has_it = condition.status == "True" || condition.reason == reasons::NOT_REQUIRED;
+        assert!(has_it, "{condition:?}");
+    }
+    let runs = matches!(&view.job, ObservedJob::Ours(job) if job.end.is_none());
+    assert!(!runs, "its Job runs");
 }
 
 /// As long as its kubelet reports, a Pod that nobody here stops has the whole of its grace.

@@ -1,5 +1,6 @@
 //! The queue, one rule a test: updates in, requests out, answers in.
 
+mod bursts;
 mod cancels;
 mod faults;
 mod life;
@@ -14,7 +15,7 @@ use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
 use crate::services::evalai::status::Status;
-use crate::services::evalai::types::{ImageAnswer, Run};
+use crate::services::evalai::types::{ImageAnswer, Run, Usage};
 use crate::services::token::Token;
 
 /// A queue whose time is ours.
@@ -56,6 +57,7 @@ fn run(pk: i64, attempt: i64) -> Run {
         job: format!("submission-{pk}-{attempt}"),
         by_hand: true,
         has_job: false,
+        ended: None,
     }
 }
 
@@ -165,6 +167,11 @@ impl Bench {
 
     /// The next request as text, and its ticket.
     fn next(&mut self) -> Option<(String, Ticket)> {
+        self.next_or_wait().ok()
+    }
+
+    /// The same, or until when there is nothing to send.
+    fn next_or_wait(&mut self) -> Result<(String, Ticket), Option<Duration>> {
         let now = self.now();
         match self.queue.next(now, true) {
             Next::Send(ticket) => {
@@ -173,9 +180,9 @@ impl Bench {
                     .submission()
                     .map(|subject| format!(" {}", subject.pk))
                     .unwrap_or_default();
-                Some((format!("{}{pk}", ticket.request.name()), ticket))
+                Ok((format!("{}{pk}", ticket.request.name()), ticket))
             }
-            Next::Wait(_) => None,
+            Next::Wait(until) => Err(until),
         }
     }
 

@@ -358,6 +358,7 @@ impl World {
                 job: format!("submission-{pk}-{}", actor.attempt),
                 by_hand: true,
                 has_job: actor.began.is_some(),
+                ended: None,
             },
         };
         self.queue.ask(&subject, false, now);

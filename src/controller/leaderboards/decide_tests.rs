@@ -1,0 +1,272 @@
+//! What a Leaderboard's status says, as tables.
+
+use super::*;
+use serde_json::json;
+
+fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) -> Arc<Leaderboard> {
+    let spec = json!({
+        "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+        "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+        "storage": {"bucket": "bucket", "prefix": prefix}, "deadlines": {"runSeconds": 86400},
+    });
+    let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
+    object.metadata.namespace = Some("ns".into());
+    object.metadata.uid = Some(name.into());
+    object.metadata.creation_timestamp = Some(Time(Timestamp::from_second(second).unwrap()));
+    Arc::new(object)
+}
+
+const USAGE: Usage = Usage {
+    used: 3,
+    limit: 54,
+    waiting: 0,
+    last_expected: None,
+};
+
+#[test]
+fn the_status_shows_how_many_results_wait_for_evalai_and_when_the_last_is_expected() {
+    let at = Timestamp::from_second(3600).unwrap();
+    let waiting = Usage {
+        waiting: 812,
+        last_expected: Some(at),
+        ..USAGE
+    };
+    let backlog = EvalaiBacklog {
+        waiting: 812,
+        last_expected_time: Time(at),
+    };
+    assert_eq!(evalai_use(waiting).backlog, Some(backlog));
+    assert_eq!(evalai_use(USAGE).backlog, None);
+}
+
+fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
+    LeaderboardView {
+        now: Timestamp::from_second(1000).unwrap(),
+        leaderboard: Arc::clone(mine),
+        all: all.to_vec(),
+        counts: Counts::default(),
+        in_use: 0,
+        pods: 0,
+        policy: Policy::InPlace,
+        measured: None,
+        invalid_pod: None,
+        unreachable: None,
+        evalai: EvalaiStanding::Fits { note: None },
+        evalai_writes_from: None,
+        usage: Some(USAGE),
+    }
+}
+
+fn reason(plan: &LeaderboardPlan) -> (String, String) {
+    let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+    (condition.status.clone(), condition.reason.clone())
+}
+
+#[test]
+fn of_two_with_the_same_phase_the_older_serves() {
+    let old = leaderboard("old", 1, 7, "https://e", "a/");
+    let new = leaderboard("new", 2, 7, "https://e/", "b/");
+    let all = [Arc::clone(&old), Arc::clone(&new)];
+    assert_eq!(
+        reason(&decide(&view(&old, &all))),
+        ("True".into(), reasons::READY.into())
+    );
+    assert_eq!(
+        reason(&decide(&view(&new, &all))),
+        ("False".into(), reasons::PHASE_CONFLICT.into())
+    );
+}
+
+#[test]
+fn two_servers_may_not_share_a_prefix() {
+    let old = leaderboard("old", 1, 7, "https://one", "a/");
+    let new = leaderboard("new", 2, 8, "https://two", "a/");
+    let all = [Arc::clone(&old), Arc::clone(&new)];
+    assert_eq!(
+        reason(&decide(&view(&new, &all))),
+        ("False".into(), reasons::PREFIX_CONFLICT.into())
+    );
+}
+
+#[test]
+fn it_stays_while_submissions_need_it() {
+    let mut one = leaderboard("one", 1, 7, "https://e", "a/").as_ref().clone();
+    one.metadata.finalizers = Some(vec![names::FINALIZER_LEADERBOARD.into()]);
+    one.metadata.deletion_timestamp = Some(Time(Timestamp::from_second(900).unwrap()));
+    let one = Arc::new(one);
+    let mut seen = view(&one, &[]);
+    seen.in_use = 2;
+    let plan = decide(&seen);
+    assert_eq!(plan.finalizer, None);
+    assert!(conditions::is_true(&plan.status.conditions, conditions::TERMINATING));
+    (seen.in_use, seen.pods) = (0, 1);
+    let plan = decide(&seen);
+    assert_eq!(plan.finalizer, None, "its policy goes with it");
+    let shown = conditions::get(&plan.status.conditions, conditions::TERMINATING).unwrap();
+    assert!(shown.message.starts_with("1 Pods still run"), "{}", shown.message);
+    seen.pods = 0;
+    assert_eq!(decide(&seen).finalizer, Some(false));
+}
+
+#[test]
+fn what_is_surely_wrong_comes_before_what_nobody_knows() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let unreachable = |truth| {
+        Some(Unreachable {
+            truth,
+            reason: reasons::TABLE_UNREACHABLE,
+            message: "It is not there.".into(),
+        })
+    };
+    let fits = || EvalaiStanding::Fits { note: None };
+    let missing = || EvalaiStanding::NoToken("x".into());
+    let cases = [
+        (unreachable(Truth::False), fits(), "False", reasons::TABLE_UNREACHABLE),
+        (
+            unreachable(Truth::False),
+            missing(),
+            "False",
+            reasons::TABLE_UNREACHABLE,
+        ),
+        (
+            unreachable(Truth::Unknown),
+            fits(),
+            "Unknown",
+            reasons::TABLE_UNREACHABLE,
+        ),
+        (unreachable(Truth::Unknown), missing(), "False", reasons::TOKEN_MISSING),
+        (
+            unreachable(Truth::Unknown),
+            EvalaiStanding::Unchecked(None),
+            "Unknown",
+            reasons::TABLE_UNREACHABLE,
+        ),
+        (None, fits(), "True", reasons::READY),
+    ];
+    for (unreachable, evalai, status, expected) in cases {
+        let seen = LeaderboardView {
+            unreachable,
+            evalai,
+            ..view(&one, &[])
+        };
+        assert_eq!(
+            reason(&decide(&seen)),
+            (status.to_owned(), expected.to_owned()),
+            "{seen:?}"
+        );
+        let broken = LeaderboardView {
+            invalid_pod: Some("no".into()),
+            ..seen
+        };
+        assert_eq!(
+            reason(&decide(&broken)),
+            ("False".to_owned(), reasons::INVALID_POD.to_owned())
+        );
+    }
+}
+
+#[test]
+fn a_leaderboard_says_until_when_nothing_is_written_to_evalai() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let note = || Some("EvalAI's token ends on 2026-12-01.".to_owned());
+    for (evalai, ready, message) in [
+        (
+            EvalaiStanding::Fits { note: None },
+            "True",
+            "Nothing is written to EvalAI before 00:17:55 UTC: the previous controller did not confirm its last requests, and \
+             they may still be running. Nothing to do.",
+        ),
+        (
+            EvalaiStanding::Fits { note: note() },
+            "True",
+            "EvalAI's token ends on 2026-12-01. Nothing is written to EvalAI before 00:17:55 UTC: the previous controller did \
+             not confirm its last requests, and they may still be running. Nothing to do.",
+        ),
+        (EvalaiStanding::NoToken("x".into()), "False", "x"),
+    ] {
+        let seen = LeaderboardView {
+            evalai,
+            evalai_writes_from: Timestamp::from_second(1075).ok(),
+            ..view(&one, &[])
+        };
+        let plan = decide(&seen);
+        let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+        assert_eq!(
+            (condition.status.as_str(), condition.message.as_str()),
+            (ready, message)
+        );
+    }
+}
+
+#[test]
+fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
+    let mut one = leaderboard("one", 1, 7, "https://e", "a/");
+    let spec = &mut Arc::make_mut(&mut one).spec;
+    spec.deadlines.run_seconds = 0;
+    let plan = decide(&view(&one, &[]));
+    let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+    assert_eq!(
+        ready.message,
+        "Runs of the track sensors have no time limit: an agent that does not end keeps its nodes until it is cancelled; \
+         set deadlines.runSeconds."
+    );
+    Arc::make_mut(&mut one).spec.tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
+        run_seconds: Some(7200),
+        start_seconds: None,
+    });
+    let plan = decide(&view(&one, &[]));
+    assert_eq!(
+        conditions::get(&plan.status.conditions, conditions::READY)
+            .unwrap()
+            .message,
+        ""
+    );
+}
+
+#[test]
+fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    for (policy, ready, isolated) in [
+        (Policy::InPlace, reasons::READY, reasons::NOT_MEASURED),
+        (Policy::External, reasons::READY, reasons::EXTERNAL),
+        (Policy::Refused("No.".into()), reasons::NOT_ISOLATED, reasons::FORBIDDEN),
+        (
+            Policy::NotApplied("No.".into()),
+            reasons::NOT_ISOLATED,
+            reasons::NOT_APPLIED,
+        ),
+    ] {
+        let seen = LeaderboardView {
+            policy,
+            ..view(&one, &[])
+        };
+        let plan = decide(&seen);
+        assert_eq!(reason(&plan).1, ready);
+        let shown = conditions::get(&plan.status.conditions, conditions::ISOLATED).unwrap();
+        assert_eq!(shown.reason, isolated);
+    }
+}
+
+#[test]
+fn what_is_wrong_with_evalai_is_said() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let cases = [
+        (EvalaiStanding::NoToken("x".into()), "False", reasons::TOKEN_MISSING),
+        (
+            EvalaiStanding::TokenRefused("x".into()),
+            "False",
+            reasons::TOKEN_REFUSED,
+        ),
+        (EvalaiStanding::Misfit("x".into()), "False", reasons::LABELS_DIFFER),
+        (EvalaiStanding::Unchecked(None), "Unknown", reasons::ASKING_EVALAI),
+        (EvalaiStanding::NotRequired, "True", reasons::READY),
+    ];
+    for (evalai, status, expected) in cases {
+        let seen = LeaderboardView {
+            evalai,
+            ..view(&one, &[])
+        };
+        assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.to_owned()));
+    }
+}

@@ -1,0 +1,57 @@
+//! When a Submission that has ended is deleted: `retention.finishedSeconds` after its end, once every system has that end.
+//!
+//! Called by `after`. Pure. An end is deleted only as it is stored: the deletion names the version of the object that was decided
+//! on, and a reconcile that still has something to store deletes nothing.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::plan::Action;
+use super::plan_builder::{PlanBuilder, after};
+use crate::controller::submissions::view::ObservedJob;
+use leaderboard_api::{SubmissionStatus, conditions, reasons};
+
+/// A deletion that has not succeeded is tried again after this long.
+const AGAIN: Duration = Duration::from_secs(30);
+/// A far end is decided on again after this long, since the Leaderboard may have been edited.
+const AT_MOST: Duration = Duration::from_hours(1);
+
+/// Deletes the Submission if its time is over, else comes back at that time.
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
+    let Some(until) = until(draft) else { return };
+    if draft.now() < until {
+        draft.requeue_in(AT_MOST);
+        return draft.requeue_at(until);
+    }
+    let object = draft.submission();
+    if object.status.as_ref() == Some(&draft.status)
+        && let (Some(uid), Some(resource_version)) =
+            (object.metadata.uid.clone(), object.metadata.resource_version.clone())
+    {
+        draft.act(Action::DeleteSubmission { uid, resource_version });
+    }
+    draft.requeue_in(AGAIN);
+}
+
+/// When it is to be deleted. None: not at all, or not as it stands.
+fn until(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
+    let kept = draft.leaderboard()?.retention.finished_seconds;
+    let status = &draft.status;
+    let end = conditions::get(&status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
+    let is_present = status.attempt == Some(draft.spec().attempt);
+    let has_all = is_delivered(status, conditions::PUBLISHED) && is_delivered(status, conditions::RECORDED);
+    let may_go = kept > 0 && !draft.is_deleting() && is_present && has_all && !has_job(draft);
+    may_go.then(|| after(end.last_transition_time.0, kept))
+}
+
+/// Whether a system has the end, or is to have none.
+fn is_delivered(status: &SubmissionStatus, type_: &str) -> bool {
+    let condition = conditions::get(&status.conditions, type_);
+    condition.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+}
+
+/// Whether its Job has not ended: with the Submission its Pod would go.
+fn has_job(draft: &PlanBuilder<'_>) -> bool {
+    matches!(&draft.view.job, ObservedJob::Ours(job) if job.end.is_none())
+}

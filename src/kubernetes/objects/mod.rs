@@ -1,0 +1,75 @@
+//! The kinds that the API server types, reduced to what is read of them.
+//!
+//! A cache holds thousands, so that each takes as little as it can: fields that nobody reads are skipped while they are decoded,
+//! and texts that many objects share are stored once (`Texts`). Every field is optional and every enum a text: whatever a newer
+//! API server sends can be read.
+
+mod job;
+mod meta;
+mod node;
+mod pod;
+mod texts;
+
+pub use job::{Job, JobCondition, JobStatus};
+pub use meta::{Annotations, Labels, Meta, Owner};
+pub use node::{Node, NodeCondition, NodeStatus};
+pub use pod::{
+    Condition, ContainerName, ContainerState, ContainerStatus, Ended, Pod, PodSpec, PodStatus, Running, Waiting,
+};
+pub use texts::{Text, Texts};
+
+/// Makes a kind known to caches, feeds and watches.
+macro_rules! watchable {
+    ($type:ty, $scope:ty, $kind:literal, $group:literal, $version:literal, $plural:literal) => {
+        impl kube::runtime::reflector::Lookup for $type {
+            type DynamicType = ();
+
+            fn kind((): &()) -> std::borrow::Cow<'_, str> {
+                $kind.into()
+            }
+
+            fn group((): &()) -> std::borrow::Cow<'_, str> {
+                $group.into()
+            }
+
+            fn version((): &()) -> std::borrow::Cow<'_, str> {
+                $version.into()
+            }
+
+            fn plural((): &()) -> std::borrow::Cow<'_, str> {
+                $plural.into()
+            }
+
+            fn name(&self) -> Option<std::borrow::Cow<'_, str>> {
+                Some(self.metadata.name.as_ref().into())
+            }
+
+            fn namespace(&self) -> Option<std::borrow::Cow<'_, str>> {
+                self.metadata.namespace.as_deref().map(Into::into)
+            }
+
+            fn resource_version(&self) -> Option<std::borrow::Cow<'_, str>> {
+                Some(self.metadata.resource_version.as_ref().into())
+            }
+
+            fn uid(&self) -> Option<std::borrow::Cow<'_, str>> {
+                Some(self.metadata.uid.as_ref().into())
+            }
+        }
+
+        impl $crate::kubernetes::Watchable for $type {
+            type Scope = $scope;
+
+            fn read<'de, D: serde::Deserializer<'de>>(
+                deserializer: D,
+            ) -> Result<Result<Self, $crate::kubernetes::Malformed>, D::Error> {
+                serde::Deserialize::deserialize(deserializer).map(Ok)
+            }
+
+            fn share(&mut self, texts: &mut $crate::kubernetes::objects::Texts) {
+                self.share_texts(texts);
+            }
+        }
+    };
+}
+use watchable;

@@ -1,0 +1,50 @@
+//! A node as it is cached: its name, and whether its kubelet reports.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::core::ClusterResourceScope;
+use serde::Deserialize;
+
+use super::meta::Meta;
+use super::pod::of_type;
+use super::texts::{Text, Texts};
+use super::watchable;
+
+/// What is read of a node.
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct Node {
+    pub metadata: Meta,
+    pub status: NodeStatus,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct NodeStatus {
+    /// The condition `Ready`.
+    #[serde(rename = "conditions", deserialize_with = "ready")]
+    pub ready: Option<NodeCondition>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct NodeCondition {
+    #[serde(rename = "type")]
+    type_: Text,
+    pub status: Text,
+    pub last_transition_time: Option<Time>,
+}
+
+fn ready<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<NodeCondition>, D::Error> {
+    of_type(deserializer, |condition: &NodeCondition| &*condition.type_ == "Ready")
+}
+
+impl Node {
+    fn share_texts(&mut self, texts: &mut Texts) {
+        if let Some(ready) = &mut self.status.ready {
+            texts.share(&mut ready.type_);
+            texts.share(&mut ready.status);
+        }
+    }
+}
+
+watchable!(Node, ClusterResourceScope, "Node", "", "v1", "nodes");

@@ -1,0 +1,168 @@
+//! A Pod as it is cached: its names, its node, and how its containers fare.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::core::NamespaceResourceScope;
+use serde::{Deserialize, Deserializer};
+
+use super::meta::Meta;
+use super::texts::{Text, Texts, cut};
+use super::watchable;
+
+/// What is read of a Pod.
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct Pod {
+    pub metadata: Meta,
+    pub spec: PodSpec,
+    pub status: PodStatus,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct PodSpec {
+    pub node_name: Option<Text>,
+    pub containers: Box<[ContainerName]>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct ContainerName {
+    pub name: Text,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct PodStatus {
+    pub phase: Option<Text>,
+    pub reason: Option<Text>,
+    #[serde(deserialize_with = "cut")]
+    pub message: Option<Box<str>>,
+    /// The condition `PodScheduled`.
+    #[serde(rename = "conditions", deserialize_with = "scheduled")]
+    pub scheduled: Option<Box<Condition>>,
+    pub init_container_statuses: Box<[ContainerStatus]>,
+    pub container_statuses: Box<[ContainerStatus]>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct Condition {
+    #[serde(rename = "type")]
+    type_: Text,
+    pub status: Text,
+    pub last_transition_time: Option<Time>,
+    #[serde(deserialize_with = "cut")]
+    pub message: Option<Box<str>>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct ContainerStatus {
+    pub name: Text,
+    pub restart_count: i32,
+    pub state: ContainerState,
+    /// How the life before the present one ended.
+    #[serde(rename = "lastState", deserialize_with = "ended")]
+    pub last_ended: Option<Box<Ended>>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct ContainerState {
+    pub running: Option<Running>,
+    pub waiting: Option<Box<Waiting>>,
+    pub terminated: Option<Box<Ended>>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct Running {
+    pub started_at: Option<Time>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct Waiting {
+    pub reason: Option<Text>,
+    #[serde(deserialize_with = "cut")]
+    pub message: Option<Box<str>>,
+}
+
+/// How a container ended.
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
+pub struct Ended {
+    pub exit_code: i32,
+    pub reason: Option<Text>,
+    #[serde(deserialize_with = "cut")]
+    pub message: Option<Box<str>>,
+    pub started_at: Option<Time>,
+    pub finished_at: Option<Time>,
+}
+
+fn scheduled<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<Condition>>, D::Error> {
+    let found = of_type(deserializer, |condition: &Condition| {
+        &*condition.type_ == "PodScheduled"
+    })?;
+    Ok(found.map(Box::new))
+}
+
+/// Of all conditions the one that is read.
+pub(super) fn of_type<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
+    deserializer: D,
+    is_it: impl FnMut(&T) -> bool,
+) -> Result<Option<T>, D::Error> {
+    let all = Option::<Vec<T>>::deserialize(deserializer)?;
+    Ok(all.into_iter().flatten().find(is_it))
+}
+
+fn ended<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<Ended>>, D::Error> {
+    ContainerState::deserialize(deserializer).map(|state| state.terminated)
+}
+
+impl PodStatus {
+    /// The status of every container, those first that run first.
+    pub fn all_containers(&self) -> impl Iterator<Item = &ContainerStatus> {
+        self.init_container_statuses.iter().chain(&self.container_statuses)
+    }
+}
+
+impl ContainerStatus {
+    /// How it ended last.
+    pub fn ended(&self) -> Option<&Ended> {
+        self.state.terminated.as_deref().or(self.last_ended.as_deref())
+    }
+}
+
+impl Pod {
+    fn share_texts(&mut self, texts: &mut Texts) {
+        self.metadata.share_texts(texts);
+        let Self { spec, status, .. } = self;
+        let mut shared: Vec<&mut Text> = Vec::new();
+        shared.extend(&mut spec.node_name);
+        shared.extend(spec.containers.iter_mut().map(|container| &mut container.name));
+        shared.extend(&mut status.phase);
+        shared.extend(&mut status.reason);
+        if let Some(scheduled) = &mut status.scheduled {
+            shared.extend([&mut scheduled.type_, &mut scheduled.status]);
+        }
+        let all = [&mut status.init_container_statuses, &mut status.container_statuses];
+        for container in all.into_iter().flat_map(|containers| containers.iter_mut()) {
+            shared.push(&mut container.name);
+            shared.extend(
+                container
+                    .state
+                    .waiting
+                    .iter_mut()
+                    .filter_map(|waiting| waiting.reason.as_mut()),
+            );
+            let ends = [&mut container.state.terminated, &mut container.last_ended];
+            shared.extend(ends.into_iter().flatten().filter_map(|ended| ended.reason.as_mut()));
+        }
+        for text in shared {
+            texts.share(text);
+        }
+    }
+}
+
+watchable!(Pod, NamespaceResourceScope, "Pod", "", "v1", "pods");

@@ -1,0 +1,152 @@
+//! Texts that many objects have in common, such as the names of namespaces, nodes and containers.
+
+use std::collections::HashSet;
+use std::fmt;
+use std::ops::Deref;
+use std::sync::Arc;
+
+use serde::de::{Deserialize, Deserializer, Error, Visitor};
+
+/// Texts that are kept at least, whether or not an object still has them.
+const KEPT: usize = 256;
+/// Bytes that are kept of a free text: more than any verdict of ours has, and than anybody is shown.
+const LONGEST_TEXT: usize = 1024;
+
+/// A text that may be shared.
+#[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Text(Arc<str>);
+
+impl Deref for Text {
+    type Target = str;
+
+    fn deref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Default for Text {
+    fn default() -> Self {
+        Self::from("")
+    }
+}
+
+impl From<&str> for Text {
+    fn from(text: &str) -> Self {
+        Self(text.into())
+    }
+}
+
+impl fmt::Debug for Text {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(&*self.0, f)
+    }
+}
+
+impl<'de> Deserialize<'de> for Text {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct OfText;
+        impl Visitor<'_> for OfText {
+            type Value = Text;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a text")
+            }
+
+            fn visit_str<E: Error>(self, text: &str) -> Result<Text, E> {
+                Ok(text.into())
+            }
+        }
+        deserializer.deserialize_str(OfText)
+    }
+}
+
+/// The texts of one cache, each once.
+#[derive(Debug)]
+pub struct Texts {
+    known: HashSet<Text>,
+    /// More than this, and those that no object has any more are dropped.
+    limit: usize,
+}
+
+impl Default for Texts {
+    fn default() -> Self {
+        Self {
+            known: HashSet::new(),
+            limit: KEPT,
+        }
+    }
+}
+
+impl Texts {
+    /// Replaces a text by the one that is known already.
+    pub fn share(&mut self, text: &mut Text) {
+        if let Some(known) = self.known.get(text) {
+            *text = known.clone();
+            return;
+        }
+        if self.known.len() >= self.limit {
+            self.known.retain(|known| Arc::strong_count(&known.0) > 1);
+            self.limit = KEPT.max(self.known.len().saturating_mul(2));
+        }
+        self.known.insert(text.clone());
+    }
+}
+
+/// Reads a text that may be long, as far as it is of use.
+pub(super) fn cut<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<str>>, D::Error> {
+    struct Cut;
+    impl<'de> Visitor<'de> for Cut {
+        type Value = Option<Box<str>>;
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("a text or nothing")
+        }
+
+        fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
+            Ok(Some(text[..text.floor_char_boundary(LONGEST_TEXT)].into()))
+        }
+
+        fn visit_unit<E: Error>(self) -> Result<Self::Value, E> {
+            Ok(None)
+        }
+
+        fn visit_none<E: Error>(self) -> Result<Self::Value, E> {
+            Ok(None)
+        }
+
+        fn visit_some<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+            deserializer.deserialize_str(self)
+        }
+    }
+    deserializer.deserialize_option(Cut)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_is_stored_once_while_an_object_has_it() {
+        let mut texts = Texts::default();
+        let (mut one, mut two) = (Text::from("node-1"), Text::from("node-1"));
+        texts.share(&mut one);
+        texts.share(&mut two);
+        assert!(Arc::ptr_eq(&one.0, &two.0));
+        for number in 0..10_000 {
+            texts.share(&mut Text::from(format!("node-{number}").as_str()));
+        }
+        assert!(texts.known.len() <= KEPT, "{}", texts.known.len());
+        let mut again = Text::from("node-1");
+        texts.share(&mut again);
+        assert!(Arc::ptr_eq(&one.0, &again.0), "still in use");
+    }
+
+    #[test]
+    fn a_long_text_is_cut_between_two_characters() {
+        let read = |text: &str| cut(&mut serde_json::Deserializer::from_str(text)).unwrap();
+        let long = format!("\"{}ä\"", "x".repeat(LONGEST_TEXT - 1));
+        assert_eq!(read(&long).unwrap().len(), LONGEST_TEXT - 1);
+        assert_eq!(read("\"ä\\n\"").as_deref(), Some("ä\n"));
+        assert_eq!(read("null"), None);
+    }
+}

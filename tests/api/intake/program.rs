@@ -1,0 +1,121 @@
+//! One of the operator's programs as a child process that can be killed and started again.
+
+use std::fs::{self, File, OpenOptions};
+use std::path::PathBuf;
+use std::process::Stdio;
+
+use tokio::process::{Child, Command};
+
+use crate::support::apiserver::server;
+
+/// What the controller writes last when it ends because its Lease could not be renewed: on a busy machine that may be.
+const LOST_LEASE: &str = "this process no longer leads";
+
+/// A running program, in a Pod of its own that keeps its name. It is killed when this is dropped.
+pub struct Program {
+    command: &'static str,
+    name: &'static str,
+    namespace: String,
+    kubeconfig: PathBuf,
+    folder: tempfile::TempDir,
+    child: Child,
+}
+
+impl Program {
+    pub async fn start(program: &'static str, name: &'static str, namespace: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let kubeconfig = server().await.kubeconfig();
+        let child = command(program, name, namespace, &kubeconfig, &folder).spawn().unwrap();
+        Self {
+            command: program,
+            name,
+            namespace: namespace.to_owned(),
+            kubeconfig,
+            folder,
+            child,
+        }
+    }
+
+    /// Kills it, as a lost node would, and waits for its end.
+    pub async fn kill(&mut self) {
+        self.keep();
+        self.child.kill().await.unwrap();
+    }
+
+    /// As the kubelet would.
+    pub fn start_again(&mut self) {
+        let mut command = command(self.command, self.name, &self.namespace, &self.kubeconfig, &self.folder);
+        self.child = command.spawn().unwrap();
+    }
+
+    /// Starts it again if it has lost its Lease. No other end by itself is allowed.
+    pub fn keep(&mut self) {
+        let Some(status) = self.child.try_wait().unwrap() else {
+            return;
+        };
+        let log = self.log();
+        let last = log.lines().last().unwrap_or("nothing");
+        assert!(
+            last.contains(LOST_LEASE),
+            "{} has ended by itself, {status}: {last}",
+            self.name
+        );
+        self.start_again();
+    }
+
+    /// Its resident memory in KiB.
+    pub fn memory(&self) -> u64 {
+        let id = self.child.id().expect("it runs");
+        let status = fs::read_to_string(format!("/proc/{id}/status")).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+        line.trim().trim_end_matches(" kB").parse().unwrap()
+    }
+
+    /// All that it has logged.
+    pub fn log(&self) -> String {
+        fs::read_to_string(log(&self.folder)).unwrap_or_default()
+    }
+}
+
+fn log(folder: &tempfile::TempDir) -> PathBuf {
+    folder.path().join("log")
+}
+
+fn command(program: &str, name: &str, namespace: &str, kubeconfig: &PathBuf, folder: &tempfile::TempDir) -> Command {
+    let log: File = OpenOptions::new().create(true).append(true).open(log(folder)).unwrap();
+    // A killed test drops nothing; the kernel ends its children all the same.
+    let mut command = Command::new("setpriv");
+    command
+        .args([
+            "--pdeathsig",
+            "KILL",
+            env!("CARGO_BIN_EXE_leaderboard-operator"),
+            program,
+        ])
+        .args(["--namespace", namespace, "--http", "127.0.0.1:0"]);
+    if program == "controller" {
+        command.args([
+            "--image",
+            "operator:1",
+            "--lease",
+            "operator",
+            "--lease-namespace",
+            namespace,
+        ]);
+    }
+    command
+        .env("KUBECONFIG", kubeconfig)
+        .env("POD_NAME", name)
+        .env("POD_UID", name)
+        .env("RUST_LOG", "warn")
+        .env("AWS_ACCESS_KEY_ID", "test")
+        .env("AWS_SECRET_ACCESS_KEY", "test")
+        .env("AWS_REGION", "us-east-1")
+        .env("AWS_EC2_METADATA_DISABLED", "true")
+        .env_remove("AWS_ENDPOINT_URL")
+        .stdin(Stdio::null())
+        .stdout(log.try_clone().unwrap())
+        .stderr(log)
+        .kill_on_drop(true);
+    command
+}

@@ -1,0 +1,314 @@
+//! A world for the whole controller: a real API server, both stand-ins, and a test that plays the Job controller, the kubelet and
+//! logcopy.
+#![cfg(test)]
+
+use evalai_stand_in::model::{FileState, User};
+use evalai_stand_in::submissions::{NewSubmission, create, rerun};
+use evalai_stand_in::{Config, Handle};
+use jiff::{SignedDuration, Timestamp};
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Pod, Secret};
+use k8s_openapi::api::events::v1::Event;
+use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
+use kube::runtime::wait::await_condition;
+use kube::{Api, Client, ResourceExt};
+use leaderboard_api::{Leaderboard, Storage, Submission, SubmissionStatus, names};
+use leaderboard_operator::controller::runtime::leader::{self, Identity};
+use leaderboard_operator::controller::runtime::{self as run, Clients};
+use leaderboard_operator::controller::settings::Settings;
+use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::services::archive::Archive;
+use leaderboard_runner::verdict::{Verdict, What};
+use serde_json::{Map, Value, json};
+use tokio::net::TcpListener;
+use tokio::time::timeout;
+
+use super::bridge::{LIMIT, StandIn};
+use super::objects::merge;
+use crate::support::apiserver;
+
+/// A line of the routes file.
+pub(super) const ROUTE: &str = r#"<waypoint x="4711.25" y="-815.5" z="1.0"/>"#;
+/// Where all Pods are.
+pub(super) const NODE: &str = "node-of-failures";
+pub(super) const HOST: &str = "local-host-token";
+pub(super) const PARTICIPANT: &str = "local-team-a-token";
+
+/// The whole controller between a real API server and both stand-ins.
+pub(super) struct World {
+    pub(super) client: Client,
+    pub(super) namespace: String,
+    pub(super) aws: StandIn,
+    pub(super) bucket: String,
+    pub(super) evalai: Handle,
+    pub(super) http: reqwest::Client,
+}
+
+impl World {
+    pub(super) async fn new() -> Self {
+        // Somebody else may have installed it.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let server = apiserver::server().await;
+        let aws = StandIn::start().await;
+        let bucket = aws.name("failure-log");
+        let s3 = aws.aws.s3(None, Some(&aws.endpoint));
+        s3.create_bucket().bucket(&bucket).send().await.unwrap();
+        let (config, _) = Config::in_memory().unwrap();
+        let config = Config { throttle: 0, ..config };
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let world = Self {
+            client: server.client(),
+            namespace: server.namespace("failure-log").await,
+            aws,
+            bucket,
+            evalai: evalai_stand_in::serve(config, vec![listener]),
+            http: reqwest::Client::builder().no_proxy().build().unwrap(),
+        };
+        let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": HOST}});
+        let secret: Secret = serde_json::from_value(secret).unwrap();
+        world.api().create(&PostParams::default(), &secret).await.unwrap();
+        world
+    }
+
+    pub(super) fn api<K>(&self) -> Api<K>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
+        K::DynamicType: Default,
+    {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    /// Starts a controller that stops when the sender goes.
+    pub(super) fn controller(&self) -> tokio::sync::watch::Sender<bool> {
+        self.installation("operator", "operator:1")
+    }
+
+    /// The same with this Lease and this image.
+    pub(super) fn installation(&self, lease: &str, image: &str) -> tokio::sync::watch::Sender<bool> {
+        let (sender, stop) = Stop::new();
+        let clients = Clients {
+            api: self.client.clone(),
+            watch: self.client.clone(),
+            lease: self.client.clone(),
+        };
+        let lease = leader::Settings::new(&self.namespace, lease, Identity::random("test"));
+        let settings = Settings {
+            image: image.into(),
+            image_pull_policy: None,
+            region: None,
+            operator: lease.installation(),
+            namespace: Some(self.namespace.clone()),
+            concurrency: 4,
+        };
+        let aws = self.aws.aws.clone();
+        tokio::spawn(run::run(clients, lease, settings, aws, Observability::new(stop)));
+        sender
+    }
+
+    /// A Leaderboard of one phase, made as a person writes it.
+    pub(super) async fn leaderboard(&self, name: &str, phase: i64, log_tail: &str) {
+        self.leaderboard_with(name, phase, log_tail, &json!({})).await;
+    }
+
+    /// The same with more of its spec.
+    pub(super) async fn leaderboard_with(&self, name: &str, phase: i64, log_tail: &str, more: &Value) {
+        let mut leaderboard = json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard", "metadata": {"name": name},
+            "spec": {
+                "evalai": {
+                    "apiServer": self.evalai.url(), "challenge": 1, "requestsPerMinute": 6000, "logTail": log_tail,
+                    "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
+                },
+                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+                "leaderboardVersion": "V2",
+                "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                "pairs": 1, "routes": 1, "retries": {"perPair": 0}, "syncPeriodSeconds": 1,
+                "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
+            },
+        });
+        merge(&mut leaderboard, &json!({ "spec": more }));
+        let kind = ApiResource::erase::<Leaderboard>(&());
+        let api: Api<DynamicObject> = Api::namespaced_with(self.client.clone(), &self.namespace, &kind);
+        let object = serde_json::from_value(leaderboard).unwrap();
+        api.create(&PostParams::default(), &object).await.unwrap();
+    }
+
+    /// Team a pushes to a phase; hands back EvalAI's key and the object's name.
+    pub(super) async fn submit(&self, leaderboard: &str, phase: u64) -> (u64, String) {
+        let image = json!("r/team-a:1");
+        self.submit_image(leaderboard, phase, &image, &image).await
+    }
+
+    /// The same with these images in the uploaded file and in the object.
+    pub(super) async fn submit_image(
+        &self,
+        leaderboard: &str,
+        phase: u64,
+        uploaded: &Value,
+        image: &Value,
+    ) -> (u64, String) {
+        let new = NewSubmission {
+            team: 1,
+            phase,
+            user: 11,
+            input: json!({ "submitted_image_uri": uploaded }).to_string().into_bytes(),
+            fields: Map::new(),
+        };
+        let pk = self
+            .evalai
+            .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
+        let name = self.object(leaderboard, phase, pk, image).await;
+        (pk, name)
+    }
+
+    /// A host re-runs a submission; hands back the new key and the new object's name.
+    pub(super) async fn rerun(&self, leaderboard: &str, phase: u64, pk: u64) -> (u64, String) {
+        let again = self.evalai.with_state(|state| {
+            let host = User {
+                staff: true,
+                ..state.user(11).unwrap().clone()
+            };
+            rerun(state, &host, pk, Timestamp::now())
+        });
+        let new = again.unwrap_or_else(|_| panic!("EvalAI re-runs {pk}"));
+        let image = json!("r/team-a:1");
+        (new, self.object(leaderboard, phase, new, &image).await)
+    }
+
+    /// The object of a submission, as the bridge makes it.
+    pub(super) async fn object(&self, leaderboard: &str, phase: u64, pk: u64, image: &Value) -> String {
+        let name = names::submission(i64::try_from(pk).unwrap());
+        let spec = json!({"leaderboardName": leaderboard, "image": image,
+                          "evalai": {"challenge": 1, "phase": phase, "submission": pk}});
+        let submission = Submission::new(&name, serde_json::from_value(spec).unwrap());
+        self.api().create(&PostParams::default(), &submission).await.unwrap();
+        name
+    }
+
+    pub(super) fn archive(&self, run: u64) -> Archive {
+        let storage = json!({"bucket": self.bucket, "endpoint": self.aws.endpoint});
+        let storage: Storage = serde_json::from_value(storage).unwrap();
+        Archive::of_run(&self.aws.aws, &storage, &run.to_string())
+    }
+
+    /// The Job runs, its agent prints the routes and crashes, logcopy stores the log, and the Job ends as requested.
+    pub(super) async fn run_that_crashes(&self, pk: u64, name: &str) {
+        let job = self.job(name, 0).await;
+        let log = format!("\u{1b}[32mloading routes\u{1b}[0m\n{ROUTE}\nTraceback: boom\n");
+        let archive = self.archive(pk);
+        let stored = archive.put("agent/agent1/leaderboard.log", log.into_bytes());
+        stored.await.unwrap();
+        let pod = self.pod(&job, &crashed()).await;
+        let is_told = |pod: Option<&Pod>| pod.is_some_and(|p| p.annotations().contains_key(names::ANNOTATION_STOP));
+        let told = timeout(LIMIT, await_condition(self.api(), &pod, is_told)).await;
+        told.expect("the Pod is asked to stop").unwrap();
+        let jobs = self.api::<Job>();
+        jobs.delete(&job.name_any(), &DeleteParams::background()).await.unwrap();
+    }
+
+    /// Waits for the Job of the first attempt that follows so many failures of the infrastructure.
+    pub(super) async fn job(&self, name: &str, retry: i32) -> Job {
+        let is_there = |job: Option<&Job>| job.is_some();
+        let job_name = names::job(name, 1, retry);
+        let job = timeout(LIMIT, await_condition(self.api(), &job_name, is_there)).await;
+        job.expect("a Job is made").unwrap().unwrap()
+    }
+
+    /// Makes the Pod of a Job, with this status; hands back its name.
+    pub(super) async fn pod(&self, job: &Job, status: &Value) -> String {
+        let template = job.spec.as_ref().unwrap().template.metadata.as_ref().unwrap();
+        let pod = json!({
+            "metadata": {
+                "name": format!("{}-x", job.name_any()), "namespace": self.namespace, "labels": template.labels,
+                "ownerReferences": [{"apiVersion": "batch/v1", "kind": "Job", "name": job.name_any(),
+                                     "uid": job.metadata.uid, "controller": true}],
+            },
+            "spec": {
+                "nodeName": NODE, "terminationGracePeriodSeconds": 600, "restartPolicy": "OnFailure",
+                "automountServiceAccountToken": false,
+                "initContainers": [{"name": "logcopy", "image": "i", "restartPolicy": "Always"}],
+                "containers": [{"name": "simulator-1", "image": "i"}, {"name": "agent-1", "image": "i"}],
+            },
+        });
+        let pod: Pod = serde_json::from_value(pod).unwrap();
+        let (pods, name) = (self.api::<Pod>(), pod.name_any());
+        pods.create(&PostParams::default(), &pod).await.unwrap();
+        let status = Patch::Merge(json!({"status": status}));
+        let patched = pods.patch_status(&name, &PatchParams::default(), &status).await;
+        patched.unwrap();
+        name
+    }
+
+    pub(super) async fn until(&self, name: &str, what: &str, holds: impl Fn(&SubmissionStatus) -> bool) {
+        let holds = |found: Option<&Submission>| found.and_then(|s| s.status.as_ref()).is_some_and(&holds);
+        let seen = timeout(LIMIT, await_condition(self.api::<Submission>(), name, holds)).await;
+        seen.expect(what).unwrap();
+    }
+
+    /// All that EvalAI hands this user of a submission: the row, and the text behind each of its links.
+    pub(super) async fn fetched(&self, pk: u64, token: &str) -> (Value, String) {
+        let get = async |url: String| {
+            let answer = self.http.get(&url).bearer_auth(token).send().await.unwrap();
+            assert!(answer.status().is_success(), "{url}: {}", answer.status());
+            answer.text().await.unwrap()
+        };
+        let row = get(format!("{}/api/jobs/submission/{pk}", self.evalai.url())).await;
+        let row: Value = serde_json::from_str(&row).unwrap();
+        let mut all = row.to_string();
+        for (field, value) in row.as_object().unwrap() {
+            if let Some(url) = value.as_str().filter(|_| field.ends_with("_file")) {
+                all += &get(url.to_owned()).await;
+            }
+        }
+        (row, all)
+    }
+
+    /// Everything that Kubernetes shows of a submission.
+    pub(super) async fn shown(&self, name: &str) -> String {
+        let object = self.api::<Submission>().get(name).await.unwrap();
+        let events = self.api::<Event>().list(&ListParams::default()).await.unwrap();
+        let events: Vec<_> = events
+            .items
+            .iter()
+            .map(|e| e.note.clone().unwrap_or_default())
+            .collect();
+        assert!(!events.is_empty());
+        format!("{} {events:?}", serde_json::to_string(&object).unwrap())
+    }
+}
+
+/// Some seconds ago, as Kubernetes writes it.
+pub(super) fn ago(seconds: i64) -> String {
+    let at = Timestamp::now() - SignedDuration::from_secs(seconds);
+    at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
+}
+
+/// The Pod's status after the crash. What the agent leaves as its last message is no verdict of a runner; its simulator's runner
+/// has followed it.
+pub(super) fn crashed() -> Value {
+    let now = ago(0);
+    let mut status = running();
+    let forged = json!({"reason": ROUTE, "message": ROUTE}).to_string();
+    let followed = Verdict::new(What::PeerCrashed, 0, "the agent crashed, so the server was stopped").to_json();
+    for (container, message) in [(0, followed), (1, forged)] {
+        let container = &mut status["containerStatuses"][container];
+        container["ready"] = json!(false);
+        container["state"] = json!({"terminated": {
+            "exitCode": 1, "reason": "Error", "message": message, "startedAt": now, "finishedAt": now,
+        }});
+    }
+    status
+}
+
+/// The status of a Pod all of whose containers run.
+pub(super) fn running() -> Value {
+    let now = ago(0);
+    let running = |name: &str| json!({"name": name, "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": {"running": {"startedAt": now}}});
+    json!({
+        "phase": "Running",
+        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
+        "initContainerStatuses": [running("logcopy")],
+        "containerStatuses": [running("simulator-1"), running("agent-1")],
+    })
+}
