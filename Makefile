@@ -12,7 +12,7 @@ BENCH_LINES ?= target/bench/lines.jsonl
 BENCH_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale measure-intake cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test install-yaml chart-docs
+.PHONY: help demo test test-core measure-scale measure-intake cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
