@@ -216,13 +216,13 @@ async fn prepare(client: &Client, setup: &Setup, storage: &str) -> Outcome<()> {
 async fn established(client: &Client, path: &str) -> Outcome<()> {
     #[derive(serde::Deserialize, Clone)]
     struct Status {
-        #[serde(default)]
-        conditions: Vec<Condition>,
+        // The API server writes null for none.
+        conditions: Option<Vec<Condition>>,
     }
     let served = async {
         loop {
             let found: Slim<Status> = api::get(client, path).await?;
-            let conditions = found.status.map(|status| status.conditions).unwrap_or_default();
+            let conditions = found.status.and_then(|status| status.conditions).unwrap_or_default();
             if conditions.iter().any(|c| c.kind == "Established" && c.status == "True") {
                 return Outcome::Ok(());
             }
