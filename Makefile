@@ -5,9 +5,14 @@ TARGET := target/x86_64-unknown-linux-gnu
 STATIC := RUSTFLAGS="-C target-feature=+crt-static"
 LAB := ./local/lab
 FUZZ_SECONDS ?= 600
+BENCH_PROFILE ?= release
+BENCH_TARGET := target/$(BENCH_PROFILE:dev=debug)
+BENCH := $(BENCH_TARGET)/leaderboard-bench
+BENCH_LINES ?= target/bench/lines.jsonl
+BENCH_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale measure-intake cluster down status build static image images crds docs fmt lint deny bench fuzz chart-test lab-test
+.PHONY: help demo test test-core measure-scale measure-intake cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -82,7 +87,18 @@ chart-docs: ## Write the table of values in the chart's README
 install-yaml: ## Print one file that installs the operator without Helm; ARGS are for helm template
 	@$(LAB) install-yaml -- $(ARGS)
 
-bench: ## Measure the merge of results
+bench: ## Measure the operator next to the limit of its API server (30 min after the build; BENCH_FLAGS, BENCH_PROFILE)
+	cargo build --locked --profile $(BENCH_PROFILE) -p leaderboard-operator -p leaderboard-bench --bins
+	$(BENCH) run --tools "$$($(LAB) tools etcd kube-apiserver kube-controller-manager)" \
+	    --operator $(BENCH_TARGET)/leaderboard-operator --profile $(BENCH_PROFILE) --out $(BENCH_LINES) $(BENCH_FLAGS)
+
+bench-quick: ## The same with smaller numbers (5 min after the build)
+	$(MAKE) bench BENCH_FLAGS="--quick $(BENCH_FLAGS)"
+
+bench-report: ## Write tables and plots of docs/performance.md and docs/scale.md from what bench has measured
+	$(BENCH) report $(BENCH_LINES)
+
+bench-results: ## Measure the merge of results
 	cargo bench -p leaderboard-results
 
 fuzz: ## Fuzz the results code, FUZZ_SECONDS (600) for each target; needs cargo-fuzz and a C++ compiler

@@ -1,7 +1,7 @@
 //! One round of a run: read four workers' files, merge, render. Measured against the floor: the same bytes read into
 //! `serde_json` values and written again, the least any merge of them has to do.
 //!
-//! `make bench`. Read the ratio: it does not depend on the machine as the times do. 1.0 would be a merge for free; the aim is
+//! `make bench-results`. Read the ratio: it does not depend on the machine as the times do. 1.0 would be a merge for free; the aim is
 //! at most 3.
 #![allow(clippy::unwrap_used, reason = "a bench that can't run has nothing to say")]
 

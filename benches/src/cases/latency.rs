@@ -1,0 +1,137 @@
+//! Two submissions a second, each with a whole life, next to a client that writes status and Job in series at the same pace.
+
+use std::time::{Duration, Instant};
+
+use super::costs;
+use super::lifecycles::POD;
+use crate::observed::Moments;
+use crate::player::Pods;
+use crate::raw::{Bodies, WARM_NAME, create_submission, name};
+use crate::record::Figures;
+use crate::stats::percentile;
+use crate::world::{Setup, World};
+use crate::{Bench, Outcome, audit};
+
+const COUNT: usize = 120;
+const QUICK_COUNT: usize = 40;
+const PAUSE: Duration = Duration::from_millis(500);
+const CAP: Duration = Duration::from_mins(2);
+
+pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
+    let count = bench.count(if bench.quick { QUICK_COUNT } else { COUNT });
+    let mut figures = Figures::default();
+    for is_operator in [false, true] {
+        one(bench, bodies, &mut figures, count, is_operator).await?;
+    }
+    for part in ["p50", "p99"] {
+        let side = |side: &str| format!("{side}, created to Job, {part} ms");
+        figures.ratio(
+            &format!("created to Job, operator / limit, {part}"),
+            &side("operator"),
+            &side("limit"),
+        );
+    }
+    Ok(figures)
+}
+
+async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize, is_operator: bool) -> Outcome<()> {
+    let setup = Setup {
+        has_operator: is_operator,
+        has_controllers: true,
+        pods: Some(Pods::Last(POD)),
+        ..Setup::default()
+    };
+    let mut world = World::start(bench, &setup).await?;
+    world.warm(bodies).await?;
+    let (before, s3) = (world.used()?, world.storage.requests());
+    let known = if is_operator { reconciles(&world).await? } else { 0.0 };
+    let mut clock = tokio::time::interval(PAUSE);
+    for number in 0..count {
+        clock.tick().await;
+        let name = name(number);
+        let uid = create_submission(&world.client, &name).await?.uid;
+        world
+            .observed
+            .note(|moments| moments.created.insert(name.clone(), Instant::now()));
+        if !is_operator {
+            bodies.accept(&world.client, &name, &uid).await?;
+        }
+    }
+    let ends = |moments: &Moments| {
+        if is_operator {
+            moments.finished.len()
+        } else {
+            moments.complete.len()
+        }
+    };
+    if !world.observed.until(CAP, |moments| ends(moments) > count).await {
+        figures.note(format!(
+            "{} of {count} have not come to their end",
+            count + 1 - ends(&world.observed.get())
+        ));
+    }
+    world.check()?;
+    let after = world.used()?;
+    let side = if is_operator { "operator" } else { "limit" };
+    costs(figures, bench, side, &before, &after, count);
+    add_percentiles(
+        figures,
+        &format!("{side}, created to Job"),
+        &to_job(&world.observed.get()),
+    );
+    if is_operator {
+        add_percentiles(figures, "end to Finished", &to_finished(&world.observed.get()));
+        figures.add(
+            "reconciles a lifecycle",
+            (reconciles(&world).await? - known) / count as f64,
+        );
+        figures.add(
+            "S3 requests a lifecycle",
+            (world.storage.requests() - s3) as f64 / count as f64,
+        );
+        let all = audit::read(&world.servers.audit_log())?;
+        let each = |requests: usize| requests as f64 / (count + 1) as f64;
+        let writes = audit::writes(&all);
+        figures.add("operator writes a lifecycle", each(writes.values().sum()));
+        figures.counts = writes
+            .into_iter()
+            .map(|(name, writes)| (format!("{name}, a lifecycle"), each(writes)))
+            .collect();
+    }
+    Ok(())
+}
+
+async fn reconciles(world: &World) -> Outcome<f64> {
+    match &world.operator {
+        Some(operator) => operator.reconciles().await,
+        None => Ok(0.0),
+    }
+}
+
+/// Milliseconds from the answer to the create until the Job was observed.
+fn to_job(moments: &Moments) -> Vec<f64> {
+    let job = |name: &String, created: &Instant| Some(millis(*created, *moments.jobs.get(name)?));
+    moments
+        .created
+        .iter()
+        .filter_map(|(name, created)| job(name, created))
+        .collect()
+}
+
+/// Milliseconds from the commit of the last container's end until `Finished` was observed.
+pub fn to_finished(moments: &Moments) -> Vec<f64> {
+    let measured = moments.ended.iter().filter(|(name, _)| *name != WARM_NAME);
+    measured
+        .filter_map(|(name, (ended, _))| Some(millis(*ended, *moments.finished.get(name)?)))
+        .collect()
+}
+
+fn millis(from: Instant, to: Instant) -> f64 {
+    to.saturating_duration_since(from).as_secs_f64() * 1e3
+}
+
+pub fn add_percentiles(figures: &mut Figures, what: &str, millis: &[f64]) {
+    for (name, percent) in [("p50", 50.0), ("p99", 99.0)] {
+        figures.add(&format!("{what}, {name} ms"), percentile(millis, percent));
+    }
+}

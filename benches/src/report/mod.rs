@@ -1,0 +1,155 @@
+//! Makes the tables and plots of the documentation from the lines of a run. What is between two marks of a document is replaced.
+
+mod aims;
+mod plots;
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use crate::record::{Line, read};
+use crate::stats::Summary;
+use crate::{Outcome, scale};
+
+/// Writes everything that the lines are enough for.
+pub fn write(file: &Path, docs: &Path) -> Outcome<()> {
+    let lines = read(file)?;
+    if lines.is_empty() {
+        return Err(format!("{} has no line", file.display()).into());
+    }
+    let document = docs.join("performance.md");
+    let text = std::fs::read_to_string(&document)?;
+    let text = replaced(&text, "machine", &machine(&lines))?;
+    let text = replaced(&text, "aims", &aims::table(&lines))?;
+    let text = replaced(&text, "figures", &figures(&lines))?;
+    let plots = plots::write(&lines, &docs.join("performance"))?;
+    let text = replaced(&text, "plots", &plots)?;
+    std::fs::write(&document, text)?;
+    let document = docs.join("scale.md");
+    let text = std::fs::read_to_string(&document)?;
+    std::fs::write(&document, replaced(&text, "simulation", &scale::table(&lines)?)?)?;
+    Ok(())
+}
+
+/// The text with another content between two marks.
+fn replaced(text: &str, mark: &str, content: &str) -> Outcome<String> {
+    let (begin, end) = (format!("<!-- begin {mark} -->\n"), format!("<!-- end {mark} -->"));
+    let parts = text
+        .split_once(&begin)
+        .and_then(|(before, rest)| Some((before, rest.split_once(&end)?.1)));
+    let (before, after) = parts.ok_or_else(|| format!("the marks of \"{mark}\" are missing"))?;
+    Ok(format!("{before}{begin}{}\n{end}{after}", content.trim_end()))
+}
+
+/// What the lines were measured on.
+fn machine(lines: &[Line]) -> String {
+    let mut text = String::new();
+    let Some(first) = lines.first() else { return text };
+    let machine = &first.machine;
+    let day = first.time.get(..10).unwrap_or_default();
+    let kind = if first.quick {
+        "`make bench-quick`"
+    } else {
+        "`make bench`"
+    };
+    let _ = writeln!(
+        text,
+        "{kind} of {day}: {} cores ({}), {} GiB, Linux {}; operator built with `--profile {}`.",
+        machine.cores, machine.processor, machine.memory_gib, machine.kernel, first.profile
+    );
+    let foreign: Vec<f64> = lines
+        .iter()
+        .filter_map(|line| line.foreign.as_ref())
+        .map(|share| share.median)
+        .collect();
+    if let Some(share) = Summary::of(&foreign) {
+        let _ = writeln!(
+            text,
+            "Share of all cores that other processes took: median {:.0} % of the cases, {:.0} to {:.0} %.",
+            100.0 * share.median,
+            100.0 * share.low,
+            100.0 * share.high
+        );
+    }
+    if let Some(line) = lines.iter().find(|line| line.scale < 1.0) {
+        let _ = writeln!(
+            text,
+            "**Numbers of submissions at {} of the full size: these figures show nothing.**",
+            line.scale
+        );
+    }
+    text
+}
+
+/// Every figure of every case.
+fn figures(lines: &[Line]) -> String {
+    let mut text = String::new();
+    for line in lines {
+        let _ = writeln!(
+            text,
+            "### {}\n\n| figure | median | range | runs |\n|---|---:|---:|---:|",
+            line.case
+        );
+        for (name, summary) in &line.figures {
+            let range = format!("{} to {}", number(summary.low), number(summary.high));
+            let range = if summary.runs.len() > 1 { range } else { String::new() };
+            let _ = writeln!(
+                text,
+                "| {name} | {} | {range} | {} |",
+                number(summary.median),
+                summary.runs.len()
+            );
+        }
+        for (name, count) in &line.counts {
+            let _ = writeln!(text, "| {name} | {} | | 1 |", number(*count));
+        }
+        for note in &line.notes {
+            let _ = writeln!(text, "\nNote: {note}.");
+        }
+        let _ = writeln!(text);
+    }
+    text
+}
+
+/// Three digits are more than the noise leaves.
+pub fn number(value: f64) -> String {
+    match value.abs() {
+        size if size >= 100.0 => format!("{value:.0}"),
+        size if size >= 10.0 => format!("{value:.1}"),
+        _ => format!("{value:.2}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_is_between_the_marks_changes() {
+        let text = "a\n<!-- begin x -->\nold\n<!-- end x -->\nb\n";
+        let new = replaced(text, "x", "new\n\n").unwrap();
+        assert_eq!(new, "a\n<!-- begin x -->\nnew\n<!-- end x -->\nb\n");
+        assert_eq!(replaced(&new, "x", "new").unwrap(), new);
+        assert!(replaced(text, "y", "new").is_err());
+    }
+
+    #[test]
+    fn numbers_have_three_digits() {
+        for (value, text) in [(1234.5, "1234"), (12.34, "12.3"), (0.126, "0.13"), (0.0, "0.00")] {
+            assert_eq!(number(value), text);
+        }
+    }
+
+    #[test]
+    fn the_documents_have_their_marks() {
+        let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs");
+        for (file, marks) in [
+            ("performance.md", vec!["machine", "aims", "figures", "plots"]),
+            ("scale.md", vec!["simulation"]),
+        ] {
+            let text = std::fs::read_to_string(docs.join(file)).unwrap();
+            for mark in marks {
+                replaced(&text, mark, "").unwrap();
+            }
+        }
+    }
+}
