@@ -5,6 +5,7 @@
 //! answer, and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
 
 pub mod decide;
+mod foreign;
 pub mod isolation;
 pub mod operator;
 mod places;

@@ -14,6 +14,7 @@ use kube::{Api, Client, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
+use super::foreign::Foreign;
 use super::state::{LeaderboardState, SOONEST};
 use crate::controller::objects::{key_of, uid_of};
 use crate::kubernetes::{CallError, call};
@@ -21,8 +22,6 @@ use leaderboard_api::{Leaderboard, names, reasons};
 
 /// The Lease of another installation is read this often.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
-/// A Lease that has not changed for so long, and for twice its own duration, is held by nobody.
-const UNCHANGED: Duration = Duration::from_secs(30);
 /// A Submission waits so long for the claim of its Leaderboard, which also wakes those that are pending.
 const UNCLAIMED: Duration = Duration::from_secs(2);
 /// A Submission of another installation's Leaderboard is decided on again after this long.
@@ -60,41 +59,6 @@ pub fn left_alone(leaderboard: Option<&Leaderboard>, us: &str) -> Option<Duratio
         Driver::Us => None,
         Driver::Nobody => Some(UNCLAIMED),
         Driver::Other(_) => Some(OF_ANOTHER),
-    }
-}
-
-/// The Lease of another installation, as it was last read.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Foreign {
-    operator: String,
-    version: Option<String>,
-    duration: Duration,
-    /// Since when it has not changed.
-    since: Instant,
-}
-
-impl Foreign {
-    fn of(operator: &str, lease: &Lease, now: Instant) -> Self {
-        let seconds = lease.spec.as_ref().and_then(|spec| spec.lease_duration_seconds);
-        Self {
-            operator: operator.to_owned(),
-            version: lease.metadata.resource_version.clone(),
-            duration: Duration::from_secs(seconds.and_then(|s| u64::try_from(s).ok()).unwrap_or(0)),
-            since: now,
-        }
-    }
-
-    /// The same, unchanged since what was known.
-    fn after(self, known: Option<&Self>) -> Self {
-        let same = known.filter(|known| known.operator == self.operator && known.version == self.version);
-        Self {
-            since: same.map_or(self.since, |known| known.since),
-            ..self
-        }
-    }
-
-    fn is_given_up(&self, now: Instant) -> bool {
-        now.duration_since(self.since) >= UNCHANGED.max(self.duration * 2)
     }
 }
 

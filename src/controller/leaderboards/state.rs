@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::operator::Foreign;
+use super::foreign::Foreign;
 use super::probe::Probe;
 use crate::pod::workspace::WorkspaceVerdict;
 
