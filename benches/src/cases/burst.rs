@@ -7,15 +7,14 @@ use jiff::Timestamp;
 
 use super::costs;
 use super::latency::{add_percentiles, to_finished};
-use super::lifecycles::POD;
+use super::lifecycles;
 use crate::machine::{cpu, memory};
 use crate::observed::Moments;
 use crate::operator::Operator;
-use crate::player::Pods;
 use crate::raw::{Bodies, WARM_NAME};
 use crate::record::Figures;
 use crate::stats::percentile;
-use crate::world::{Setup, World};
+use crate::world::World;
 use crate::{Bench, Outcome, audit};
 
 const COUNT: usize = 1_000;
@@ -26,14 +25,7 @@ const SAMPLE: Duration = Duration::from_secs(1);
 pub async fn measure(bench: &Bench, bodies: &Bodies, has_restart: bool) -> Outcome<Figures> {
     let count = bench.count(if bench.quick { QUICK_COUNT } else { COUNT });
     let mut figures = Figures::default();
-    let setup = Setup {
-        has_operator: true,
-        has_controllers: true,
-        pods: Some(Pods::Last(POD)),
-        ..Setup::default()
-    };
-    let mut world = World::start(bench, &setup).await?;
-    world.warm(bodies).await?;
+    let mut world = lifecycles::start(bench, bodies, true).await?;
     let before = world.used()?;
     let began = world.burst(0..count).await?;
     let mut killed = None;

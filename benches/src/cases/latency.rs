@@ -3,13 +3,12 @@
 use std::time::{Duration, Instant};
 
 use super::costs;
-use super::lifecycles::POD;
+use super::lifecycles;
 use crate::observed::Moments;
-use crate::player::Pods;
 use crate::raw::{Bodies, WARM_NAME, create_submission, name};
 use crate::record::Figures;
 use crate::stats::percentile;
-use crate::world::{Setup, World};
+use crate::world::World;
 use crate::{Bench, Outcome, audit};
 
 const COUNT: usize = 120;
@@ -35,14 +34,7 @@ pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
 }
 
 async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize, is_operator: bool) -> Outcome<()> {
-    let setup = Setup {
-        has_operator: is_operator,
-        has_controllers: true,
-        pods: Some(Pods::Last(POD)),
-        ..Setup::default()
-    };
-    let mut world = World::start(bench, &setup).await?;
-    world.warm(bodies).await?;
+    let mut world = lifecycles::start(bench, bodies, is_operator).await?;
     let (before, s3) = (world.used()?, world.storage.requests());
     let known = if is_operator { reconciles(&world).await? } else { 0.0 };
     let mut clock = tokio::time::interval(PAUSE);

@@ -16,6 +16,19 @@ const PAIRS: usize = 5;
 pub const POD: Duration = Duration::from_secs(5);
 const CAP: Duration = Duration::from_mins(4);
 
+/// A cluster in which submissions live their whole lives, warm.
+pub async fn start(bench: &Bench, bodies: &Bodies, is_operator: bool) -> Outcome<World> {
+    let setup = Setup {
+        has_operator: is_operator,
+        has_controllers: true,
+        pods: Some(Pods::Last(POD)),
+        ..Setup::default()
+    };
+    let world = World::start(bench, &setup).await?;
+    world.warm(bodies).await?;
+    Ok(world)
+}
+
 pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
     let count = bench.count(COUNT);
     let mut figures = Figures::default();
@@ -29,14 +42,7 @@ pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
 }
 
 async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize, is_operator: bool) -> Outcome<()> {
-    let setup = Setup {
-        has_operator: is_operator,
-        has_controllers: true,
-        pods: Some(Pods::Last(POD)),
-        ..Setup::default()
-    };
-    let mut world = World::start(bench, &setup).await?;
-    world.warm(bodies).await?;
+    let mut world = start(bench, bodies, is_operator).await?;
     let (before, s3) = (world.used()?, world.storage.requests());
     let began = Instant::now();
     if is_operator {
