@@ -39,7 +39,7 @@ pub enum Action {
     },
     /// Remove a Pod that does not end.
     ForceDeletePod { name: String, uid: String },
-    /// Write our own mark into `logcopy/owner`, so that a Pod we lost sight of stops itself.
+    /// Write our own mark into `logcopy/owner`, so that a Pod that can no longer be reached stops itself.
     TakeOwnership,
     /// Ask the Pod to stop.
     AnnotateStop { pod: String, stop: Stop },

@@ -125,7 +125,7 @@ mod tests {
             since: since.parse().unwrap(),
         };
         let ready = |status: &str| json!([{"type": "Ready", "status": status, "lastTransitionTime": since}]);
-        for (conditions, sight) in [
+        for (conditions, expected) in [
             (ready("True"), ObservedNode::Reports),
             (ready("False"), ObservedNode::Reports),
             (ready("Unknown"), silent),
@@ -137,7 +137,7 @@ mod tests {
             (json!([]), ObservedNode::Unknown),
         ] {
             let node = json!({"metadata": {"name": "n"}, "status": {"conditions": conditions}});
-            assert_eq!(of(&serde_json::from_value(node.clone()).unwrap()), sight, "{node}");
+            assert_eq!(of(&serde_json::from_value(node.clone()).unwrap()), expected, "{node}");
         }
         assert_eq!(of(&Node::default()), ObservedNode::Unknown);
     }

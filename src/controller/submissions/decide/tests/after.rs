@@ -31,13 +31,13 @@ fn failed() -> World {
 
 #[test]
 fn evalai_first_then_the_table_then_rest() {
-    for (mut world, state, wish) in [
+    for (mut world, state, update) in [
         (finished(), Finished, EvalaiUpdate::Finished),
         (failed(), Failed, EvalaiUpdate::Failed),
     ] {
         let mut plan = world.pass();
         plan.actions.retain(|a| !matches!(a, Action::KeepLog { .. }));
-        assert_eq!(plan.actions, [Action::UpdateEvalai(wish)]);
+        assert_eq!(plan.actions, [Action::UpdateEvalai(update)]);
         assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::WAITING.into()));
         let before = world.status();
         world.published();

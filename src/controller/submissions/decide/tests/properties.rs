@@ -20,7 +20,7 @@ use crate::pod::run::Stop;
 #[derive(Clone, Debug)]
 enum Change {
     Time(i64),
-    Job(Sight),
+    Job(JobCase),
     Pod(Option<Box<PodView>>),
     Node(ObservedNode),
     Report(ObservedReport),
@@ -47,7 +47,7 @@ enum Change {
 
 /// What is seen where the Job of the present attempt should be.
 #[derive(Clone, Debug)]
-enum Sight {
+enum JobCase {
     Absent,
     Created,
     Foreign,
@@ -59,7 +59,7 @@ enum Sight {
     Earlier,
 }
 
-fn job() -> impl Strategy<Value = Sight> {
+fn job() -> impl Strategy<Value = JobCase> {
     let words = |reason: &str| JobEnd::Failed {
         at: Some(at(50)),
         reason: reason.into(),
@@ -75,11 +75,11 @@ fn job() -> impl Strategy<Value = Sight> {
     ];
     let present = (select(ends), any::<bool>(), any::<bool>());
     prop_oneof![
-        2 => Just(Sight::Absent),
-        1 => Just(Sight::Created),
-        1 => Just(Sight::Foreign),
-        1 => Just(Sight::Earlier),
-        8 => present.prop_map(|(end, deleting, refused)| Sight::Present { end, deleting: deleting && refused, refused }),
+        2 => Just(JobCase::Absent),
+        1 => Just(JobCase::Created),
+        1 => Just(JobCase::Foreign),
+        1 => Just(JobCase::Earlier),
+        8 => present.prop_map(|(end, deleting, refused)| JobCase::Present { end, deleting: deleting && refused, refused }),
     ]
 }
 
@@ -316,9 +316,9 @@ fn change() -> impl Strategy<Value = Change> {
     ]
 }
 
-fn see_job(world: &mut World, sight: Sight) {
-    let name = match &sight {
-        Sight::Earlier => "sub-1-r9".to_owned(),
+fn set_job(world: &mut World, case: JobCase) {
+    let name = match &case {
+        JobCase::Earlier => "sub-1-r9".to_owned(),
         _ => job_name("sub", &world.status()),
     };
     let ours = |end, deleting, refused: bool| {
@@ -331,12 +331,12 @@ fn see_job(world: &mut World, sight: Sight) {
             failed_create: refused.then(|| "exceeded quota".into()),
         })
     };
-    world.view.job = match sight {
-        Sight::Absent => ObservedJob::Absent,
-        Sight::Created => ObservedJob::Created,
-        Sight::Foreign => ObservedJob::Foreign,
-        Sight::Earlier => ours(None, false, false),
-        Sight::Present { end, deleting, refused } => ours(end, deleting, refused),
+    world.view.job = match case {
+        JobCase::Absent => ObservedJob::Absent,
+        JobCase::Created => ObservedJob::Created,
+        JobCase::Foreign => ObservedJob::Foreign,
+        JobCase::Earlier => ours(None, false, false),
+        JobCase::Present { end, deleting, refused } => ours(end, deleting, refused),
     };
 }
 
@@ -344,7 +344,7 @@ fn apply(world: &mut World, change: Change) {
     let is_evalais = world.view.submission.spec.evalai.is_some();
     match change {
         Change::Time(seconds) => world.wait(seconds),
-        Change::Job(sight) => see_job(world, sight),
+        Change::Job(case) => set_job(world, case),
         Change::Pod(pod) => world.view.pod = pod.map(|pod| *pod),
         Change::Node(node) => world.view.node = node,
         Change::Report(report) => world.view.report = report,
