@@ -194,7 +194,7 @@ def applied(kube: Kube, chart: Path) -> str:
         selector = f"--selector=app.kubernetes.io/part-of={RELEASE}"
         kinds = "deployments,services,poddisruptionbudgets,serviceaccounts,roles,rolebindings,clusterroles,clusterrolebindings"
         gone = kube.run("kubectl", "delete", kinds, selector, "--all-namespaces", "--output=name").splitlines()
-        kube.run("kubectl", "delete", "crd", "--all", "--wait=true", "--timeout=30s")
+        kube.run("kubectl", "delete", "crd", "--all", "--wait=true", "--timeout=120s")
     if len(made) != len(gone) + len(("namespace", "leaderboards", "submissions")):
         raise LabError(
             f"{len(made)} objects were applied, and {len(gone)} could be deleted by their label: {made} {gone}"
