@@ -18,6 +18,8 @@ from .kube import Kube
 
 SOURCE = re.compile(r"^# Source: leaderboard-operator/(templates/\S+)$", re.MULTILINE)
 MONITORING_KINDS = ("PodMonitor", "ServiceMonitor", "PrometheusRule")
+# Three minutes for the removal of the definitions, which the API server is reminded of every 5 s.
+REMOVAL_LOOKS, REMOVAL_PAUSE = 36, 5
 
 
 def folder(repository: Path) -> Path:
@@ -194,9 +196,25 @@ def applied(kube: Kube, chart: Path) -> str:
         selector = f"--selector=app.kubernetes.io/part-of={RELEASE}"
         kinds = "deployments,services,poddisruptionbudgets,serviceaccounts,roles,rolebindings,clusterroles,clusterrolebindings"
         gone = kube.run("kubectl", "delete", kinds, selector, "--all-namespaces", "--output=name").splitlines()
-        kube.run("kubectl", "delete", "crd", "--all", "--wait=true", "--timeout=120s")
+        kube.run("kubectl", "delete", "crd", "--all", "--wait=false")
+        definitions_removed(kube)
     if len(made) != len(gone) + len(("namespace", "leaderboards", "submissions")):
         raise LabError(
             f"{len(made)} objects were applied, and {len(gone)} could be deleted by their label: {made} {gone}"
         )
     return f"{len(made)} objects"
+
+
+def definitions_removed(kube: Kube) -> None:
+    """Waits until every definition is gone. The API server's finalizer pauses longer after each failure, so a change of each one makes
+    it look again."""
+    left: list[str] = []
+    for number in range(REMOVAL_LOOKS):
+        left = kube.run("kubectl", "get", "crd", "--output=name").split()
+        if not left:
+            return
+        for name in left:
+            # It may be gone by now.
+            kube.attempt("kubectl", "annotate", name, f"reminder={number}", "--overwrite")
+        kube.attempt("kubectl", "wait", "--for=delete", f"--timeout={REMOVAL_PAUSE}s", *left)
+    raise LabError(f"after {REMOVAL_LOOKS * REMOVAL_PAUSE} s there still are {', '.join(left)}")

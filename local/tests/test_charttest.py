@@ -1,10 +1,14 @@
 """The pure parts of the chart's test and of the test driver."""
 
 import json
+import subprocess
 import unittest
+from typing import cast
 
-from labkit import charttest, schemas, testrun
+from labkit import chartrender, charttest, schemas, testrun
 from labkit.chartcases import Access
+from labkit.errors import LabError
+from labkit.kube import Kube
 from labkit.testrun import Result
 
 OPENAPI = {
@@ -26,6 +30,34 @@ OPENAPI = {
         },
     }
 }
+
+
+class Definitions:
+    """A server that removes its one definition when it is reminded for the n-th time."""
+
+    def __init__(self, reminders: int) -> None:
+        self.left = reminders
+        self.calls: list[tuple[str, ...]] = []
+
+    def run(self, *_argv: str) -> str:
+        return "customresourcedefinition.apiextensions.k8s.io/x\n" if self.left > 0 else ""
+
+    def attempt(self, *argv: str) -> subprocess.CompletedProcess[str]:
+        self.calls.append(argv)
+        if argv[1] == "annotate":
+            self.left -= 1
+        return subprocess.CompletedProcess(argv, 0, "", "")
+
+
+class Removal(unittest.TestCase):
+    def test_the_server_is_reminded_until_the_definitions_are_gone(self) -> None:
+        server = Definitions(3)
+        chartrender.definitions_removed(cast(Kube, server))
+        self.assertEqual([argv[1] for argv in server.calls], ["annotate", "wait"] * 3)
+
+    def test_definitions_that_stay_are_named(self) -> None:
+        with self.assertRaisesRegex(LabError, "after 180 s there still are customresourcedefinition.*/x"):
+            chartrender.definitions_removed(cast(Kube, Definitions(1000)))
 
 
 class Schemas(unittest.TestCase):
