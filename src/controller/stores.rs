@@ -51,6 +51,13 @@ impl Stores {
         self.pods.indexed(&job.metadata.uid)
     }
 
+    /// All Submissions of a namespace.
+    pub fn submissions_of(&self, namespace: &str) -> Vec<Arc<Submission>> {
+        let mut all = self.submissions.state();
+        all.retain(|submission| submission.metadata.namespace.as_deref() == Some(namespace));
+        all
+    }
+
     /// Takes all that is there into the lines for slots.
     pub fn fill(&self, slots: &SlotAllocator) {
         slots.start(

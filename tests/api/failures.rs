@@ -74,19 +74,43 @@ async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() 
     let world = World::new().await;
     world.leaderboard("lb", 1, "Hosts").await;
     let _controller = world.controller();
-    let (old, name) = world.submit("lb", 1).await;
-    world.run_that_crashes(old, &name).await;
+    let (old, name) = failed(&world).await;
+    is_named_by_its_rerun(&world, old, &name).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_rerun_is_named_although_its_original_ended_before_evalai_knew_its_job() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let _controller = world.controller();
+    let (old, name) = failed(&world).await;
+    world.evalai.with_state(|state| {
+        let mut row = state.submissions[&old].clone();
+        row.job_name.clear();
+        state.save(row);
+    });
+    is_named_by_its_rerun(&world, old, &name).await;
+}
+
+/// A submission whose failure EvalAI has.
+async fn failed(world: &World) -> (u64, String) {
+    let (pk, name) = world.submit("lb", 1).await;
+    world.run_that_crashes(pk, &name).await;
     let is_published = |s: &SubmissionStatus| s.times.published.is_some();
     world.until(&name, "EvalAI has the end", is_published).await;
+    (pk, name)
+}
 
+/// A host re-runs an ended submission, and both objects say so.
+async fn is_named_by_its_rerun(world: &World, old: u64, name: &str) {
     let (new, rerun) = world.rerun("lb", 1, old).await;
     let statuses = [old, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));
     assert_eq!(statuses, [Status::Cancelled, Status::Submitted]);
     let of = |s: &SubmissionStatus| s.rerun_of.as_ref().is_some_and(|of| of.submission_name == name);
     world.until(&rerun, "it names what it re-runs", of).await;
     let again = |s: &SubmissionStatus| s.rerun_as.as_ref().is_some_and(|again| again.submission_name == rerun);
-    world.until(&name, "it names its re-run", again).await;
-    let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
+    world.until(name, "it names its re-run", again).await;
+    let status = world.api::<Submission>().get(name).await.unwrap().status.unwrap();
     assert_eq!(status.state, Some(State::Failed), "its result stays");
     let message = status.message.unwrap();
     let told = format!(
@@ -96,7 +120,7 @@ async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() 
         message.starts_with("Agent 1 crashed") && message.ends_with(&told),
         "{message}"
     );
-    assert!(world.shown(&name).await.contains("re-ran this submission in EvalAI as"));
+    assert!(world.shown(name).await.contains("re-ran this submission in EvalAI as"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

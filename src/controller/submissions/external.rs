@@ -55,12 +55,12 @@ impl ExternalSystems {
     }
 
     /// What EvalAI is known to say of a submission.
-    /// `known` looks another Submission up by its name.
+    /// `others` are the Submissions among which the original of a re-run is looked for, until it is noted.
     pub fn evalai_view(
         &self,
         leaderboard: Option<&Leaderboard>,
         submission: &Submission,
-        known: impl Fn(&str) -> Option<Arc<Submission>>,
+        others: impl FnOnce() -> Vec<Arc<Submission>>,
     ) -> Option<EvalaiView> {
         submission.spec.evalai?;
         let Some(seen) = self.hub.view(&key_of(submission)) else {
@@ -71,10 +71,10 @@ impl ExternalSystems {
                 ..EvalaiView::default()
             });
         };
-        let rerun_of = seen
-            .row
-            .as_ref()
-            .and_then(|row| reruns::original(row, submission, known));
+        let status = submission.status.as_ref();
+        let may_note = status.is_none_or(|s| s.rerun_of.is_none() && s.job_name.is_none());
+        let row = seen.row.as_ref().filter(|_| may_note);
+        let rerun_of = row.and_then(|row| reruns::original(row, submission, others));
         Some(map_view(&seen, submission, rerun_of))
     }
 

@@ -1,5 +1,5 @@
 //! Re-runs: EvalAI cancels the row of a submission that a host re-runs, and makes a new row under a new id. The new row keeps the
-//! Job names of the old one, which lead from the new Submission to the old.
+//! Job names and the time of the old one, which lead from the new Submission to the old.
 //!
 //! `observe` finds the original of a new submission, the feed of the watches notes it from the status, and the reconcile of the
 //! original takes it from here. Pure; knows no client.
@@ -17,29 +17,51 @@ use leaderboard_api::{Rerun, Submission, names};
 /// The highest number that `spec.attempt` may have.
 const MOST_ATTEMPTS: i64 = 9999;
 
-/// The newest Submission that a row is a re-run of; `known` looks a Submission of the same namespace up by its name. A
-/// participant can edit the row, so only a Submission of the same Leaderboard, phase and team is taken.
+/// The Submission that a row is a re-run of, among `others` of the same namespace. A participant can edit the row, so only a
+/// Submission of the same Leaderboard, phase and team is taken.
+///
+/// EvalAI knows the Jobs of those alone whose `queued` or `running` was written: a run that ends before that has none there. EvalAI
+/// copies the time of the submission too, by which that one is found.
 pub(super) fn original(
     row: &Row,
     submission: &Submission,
-    known: impl Fn(&str) -> Option<Arc<Submission>>,
+    others: impl FnOnce() -> Vec<Arc<Submission>>,
 ) -> Option<Rerun> {
     let time = row.resumed_at?;
-    let is_original = |other: &Submission| {
-        let team = other.status.as_ref().and_then(|s| s.team.as_ref()?.id.clone());
-        let of_phase = |s: &Submission| s.spec.evalai.map(|e| (e.challenge, e.phase));
-        other.spec.leaderboard_name == submission.spec.leaderboard_name
-            && of_phase(other) == of_phase(submission)
-            && team.is_some()
-            && team == row.team_id.map(|id| id.to_string())
-    };
-    let names = row.jobs.iter().rev().filter_map(|job| submission_of(job));
-    let mut others = names.filter(|name| *name != submission.name_any());
-    let name = others.find(|name| known(name).is_some_and(|other| is_original(&other)))?;
+    let own = submission.name_any();
+    let of_phase = |s: &Submission| s.spec.evalai.map(|e| (e.challenge, e.phase));
+    let team = Some(row.team_id?.to_string());
+    let others: Vec<_> = others()
+        .into_iter()
+        .filter(|other| {
+            other.metadata.name.as_deref() != Some(&own)
+                && other.spec.leaderboard_name == submission.spec.leaderboard_name
+                && of_phase(other) == of_phase(submission)
+                && other.status.as_ref().and_then(|s| s.team.as_ref()?.id.as_ref()) == team.as_ref()
+        })
+        .collect();
+    let mut names = row.jobs.iter().rev().filter_map(|job| submission_of(job));
+    let named = names.find(|name| others.iter().any(|other| other.metadata.name.as_deref() == Some(name)));
+    let name = named.map(str::to_owned).or_else(|| copied(row, submission, &others))?;
     Some(Rerun {
-        submission_name: name.to_owned(),
+        submission_name: name,
         time: Some(Time(time)),
     })
+}
+
+/// The newest submission that is older than a row, and was submitted in the second that the row names. A resumed submission names its
+/// own time too, and is no copy.
+fn copied(row: &Row, submission: &Submission, others: &[Arc<Submission>]) -> Option<String> {
+    if submission.spec.attempt != 1 || last_attempt(row) > 0 {
+        return None;
+    }
+    let second = row.submitted_at?.as_second();
+    let submitted = |s: &Submission| Some(s.status.as_ref()?.times.submitted.as_ref()?.0.as_second());
+    let id = |s: &Submission| s.spec.evalai.map(|evalai| evalai.submission);
+    let older = others
+        .iter()
+        .filter(|other| submitted(other) == Some(second) && id(other) < Some(row.id));
+    older.max_by_key(|other| id(other)).map(|other| other.name_any())
 }
 
 /// The highest attempt whose first Job a row names as its own; 0 for none. A participant can edit the row, so a number that no
@@ -119,6 +141,14 @@ mod tests {
         serde_json::from_value(row).unwrap()
     }
 
+    const SUBMITTED: &str = "2026-11-19T08:30:00Z";
+
+    /// The one that a row of this submission is found to be a re-run of.
+    fn found(row: &Row, new: &Submission, all: &[Submission]) -> Option<String> {
+        let others = || all.iter().cloned().map(Arc::new).collect();
+        original(row, new, others).map(|rerun| rerun.submission_name)
+    }
+
     #[test]
     fn the_job_names_of_a_row_lead_to_its_original() {
         let all = [
@@ -128,9 +158,7 @@ mod tests {
             submission(5, "lb", 1, "3"),
             submission(6, "lb", 2, "66"),
         ];
-        let known = |name: &str| all.iter().find(|s| s.name_any() == name).cloned().map(Arc::new);
         let new = submission(9, "lb", 2, "3");
-        let found = |row: &Row| original(row, &new, known).map(|rerun| rerun.submission_name);
         for (jobs, expected) in [
             (&["submission-7-1"][..], Some("submission-7")),
             (&["submission-7-1", "submission-7-2"], Some("submission-7")),
@@ -140,9 +168,53 @@ mod tests {
             (&["submission-1-1", "nothing", "-", "submission-7-x"], None),
             (&[], None),
         ] {
-            assert_eq!(found(&row(jobs, true)).as_deref(), expected, "{jobs:?}");
+            assert_eq!(found(&row(jobs, true), &new, &all).as_deref(), expected, "{jobs:?}");
         }
-        assert_eq!(found(&row(&["submission-7-1"], false)), None, "it was not re-run");
+        assert_eq!(
+            found(&row(&["submission-7-1"], false), &new, &all),
+            None,
+            "it was not re-run"
+        );
+    }
+
+    #[test]
+    fn the_time_of_a_row_leads_to_an_original_that_ended_before_evalai_knew_its_job() {
+        let at = |id, leaderboard, team, time: &str| {
+            let mut submission = submission(id, leaderboard, 2, team);
+            submission.status.as_mut().unwrap().times.submitted = Some(Time(time.parse().unwrap()));
+            submission
+        };
+        let all = [
+            at(5, "lb", "3", "2026-11-19T08:29:59Z"),
+            at(6, "lb", "3", SUBMITTED),
+            at(7, "lb", "3", SUBMITTED),
+            at(8, "lb", "66", SUBMITTED),
+            at(10, "lb", "3", SUBMITTED),
+            at(4, "other", "3", SUBMITTED),
+        ];
+        let mut new = at(9, "lb", "3", SUBMITTED);
+        let mut copy = row(&[], true);
+        copy.submitted_at = Some("2026-11-19T08:30:00.734518Z".parse().unwrap());
+        assert_eq!(found(&copy, &new, &all).as_deref(), Some("submission-7"), "the newest");
+        let named = Row {
+            jobs: vec!["submission-5-1".into()],
+            ..copy.clone()
+        };
+        assert_eq!(
+            found(&named, &new, &all).as_deref(),
+            Some("submission-5"),
+            "a Job says more"
+        );
+        let own = Row {
+            jobs: vec!["submission-9-1".into()],
+            ..copy.clone()
+        };
+        assert_eq!(found(&own, &new, &all), None, "resumed: it has run under its own id");
+        new.spec.attempt = 2;
+        assert_eq!(found(&copy, &new, &all), None, "resumed");
+        new.spec.attempt = 1;
+        copy.submitted_at = Some("2026-11-19T08:30:01Z".parse().unwrap());
+        assert_eq!(found(&copy, &new, &all), None, "of another second");
     }
 
     #[test]

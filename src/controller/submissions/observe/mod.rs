@@ -52,7 +52,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let is_over = status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::FINISHED));
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
     let archive = uses.archive.observe(&submission, pod_uid, is_over);
-    let known = |name: &str| uses.stores.submissions.get(&ObjectRef::new(name).within(&namespace));
+    let others = || uses.stores.submissions_of(&namespace);
     View {
         now,
         is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
@@ -64,7 +64,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         texts: archive.texts,
         fence: archive.fence,
         log: archive.log,
-        evalai: uses.external.evalai_view(leaderboard.as_deref(), &submission, known),
+        evalai: uses.external.evalai_view(leaderboard.as_deref(), &submission, others),
         record: leaderboard
             .as_deref()
             .and_then(|board| uses.external.record_view(board, &submission)),
