@@ -9,7 +9,7 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 
-use crate::Outcome;
+use crate::bench::Outcome;
 
 /// The namespace of everything.
 pub const NAMESPACE: &str = "bench";

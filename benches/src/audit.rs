@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::Outcome;
+use crate::bench::Outcome;
 use crate::servers::OPERATOR;
 
 /// The process's own requests, which no submission causes.

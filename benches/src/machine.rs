@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Outcome;
+use crate::bench::Outcome;
 
 /// Clock ticks a second in /proc; Linux has no other value on the machines that this runs on.
 const TICKS: f64 = 100.0;

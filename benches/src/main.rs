@@ -4,6 +4,7 @@
 
 mod api;
 mod audit;
+mod bench;
 mod cases;
 mod machine;
 mod observed;
@@ -12,6 +13,7 @@ mod player;
 mod raw;
 mod record;
 mod report;
+mod sample;
 mod scale;
 mod servers;
 mod stats;
@@ -26,13 +28,10 @@ use clap::{Args, Parser, Subcommand};
 use jiff::Timestamp;
 use tokio::signal::unix::{SignalKind, signal};
 
+use bench::{Bench, Outcome};
 use cases::Case;
 use machine::Machine;
 use record::Line;
-
-type Fault = Box<dyn std::error::Error + Send + Sync>;
-/// Every error is for a person to read.
-pub type Outcome<T> = Result<T, Fault>;
 
 /// Measures leaderboard-operator.
 #[derive(Parser)]
@@ -79,33 +78,6 @@ struct Run {
     /// Only these cases.
     #[arg(long = "case", value_enum)]
     cases: Vec<Case>,
-}
-
-/// What all cases share.
-pub struct Bench {
-    pub tools: PathBuf,
-    pub operator: PathBuf,
-    pub quick: bool,
-    pub scale: f64,
-    pub cores: usize,
-}
-
-impl Bench {
-    /// A number of submissions at this run's scale.
-    pub fn count(&self, full: usize) -> usize {
-        #[allow(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "a count is small and positive"
-        )]
-        let scaled = (full as f64 * self.scale).round() as usize;
-        scaled.max(2)
-    }
-
-    /// How often both sides run.
-    pub fn pairs(&self, full: usize) -> usize {
-        if self.quick { 1 } else { full }
-    }
 }
 
 #[tokio::main]
@@ -155,7 +127,7 @@ async fn measure(run: &Run) -> Outcome<()> {
         "{} cores, {} GiB, {}; operator built with --profile {}",
         machine.cores, machine.memory_gib, machine.processor, run.profile
     );
-    let bodies = raw::Bodies::take(&bench).await?;
+    let bodies = sample::take(&bench).await?;
     println!(
         "a Job has {:.1} KiB as the operator sends it",
         bodies.job_bytes() as f64 / 1024.0

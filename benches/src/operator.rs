@@ -7,8 +7,9 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::{sleep, timeout};
 
+use crate::api;
+use crate::bench::Outcome;
 use crate::servers::{Program, Servers, free_ports};
-use crate::{Outcome, api};
 
 const START_LIMIT: Duration = Duration::from_mins(3);
 const POLL: Duration = Duration::from_millis(5);

@@ -13,8 +13,8 @@ use serde_json::{Value, json};
 use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 
-use crate::Outcome;
 use crate::api::{self, Meta, Slim};
+use crate::bench::Outcome;
 use crate::observed::{JobStatus, Observed, endless};
 use crate::storage::{PAIRS, Storage};
 

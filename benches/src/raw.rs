@@ -1,23 +1,20 @@
 //! A client that does nothing but write: the limit that the operator is compared with. It sends the operator's own bodies, as
 //! the API server's audit log has them, with other names in them.
 
-use std::time::Duration;
-
 use http::Method;
 use kube::Client;
 use serde_json::{Value, json};
-use tokio::time::{Instant, sleep};
 
 use crate::api::{self, APPLY, JSON, MERGE, Meta};
-use crate::servers::Audit;
-use crate::world::{Setup, World};
-use crate::{Bench, Outcome, audit};
+use crate::audit;
+use crate::bench::Outcome;
 
 /// The submission whose bodies are taken.
-const SAMPLE: &str = "run-99999";
+pub const SAMPLE: &str = "run-99999";
 /// The submission that warms everything up; it is not measured.
 pub const WARM_NAME: &str = "run-99998";
-const LIMIT: Duration = Duration::from_mins(1);
+/// Name of the Leaderboard.
+pub const LEADERBOARD: &str = "carla";
 
 /// What is written for one submission until its Job exists.
 pub struct Bodies {
@@ -45,7 +42,7 @@ pub fn submission(name: &str) -> Vec<u8> {
         "kind": "Submission",
         "metadata": {"name": name},
         "spec": {
-            "leaderboardName": crate::world::LEADERBOARD,
+            "leaderboardName": LEADERBOARD,
             "track": "sensors",
             "image": "registry.example/teams/agent:1",
             "team": {"id": name.trim_start_matches("run-"), "name": format!("Team of {name}")},
@@ -59,44 +56,21 @@ pub async fn create_submission(client: &Client, name: &str) -> Outcome<Meta> {
 }
 
 impl Bodies {
-    /// Lets the operator take one submission in.
-    pub async fn take(bench: &Bench) -> Outcome<Self> {
-        let setup = Setup {
-            audit: Audit::Bodies,
-            has_operator: true,
-            ..Setup::default()
+    /// Those of [`SAMPLE`], whose UID is this, among the entries of an audit log; none as long as one of them is missing.
+    pub fn of_sample(entries: &[audit::Entry], uid: &str) -> Option<Self> {
+        let found = |resource: &str, holds: &dyn Fn(&Value) -> bool| {
+            // The operator also asks whether the Leaderboard's Job would be accepted.
+            let mut all = entries
+                .iter()
+                .filter(|entry| entry.is_write() && entry.resource() == resource && !entry.uri.contains("dryRun"));
+            all.find(|entry| entry.body.as_ref().is_some_and(holds))
+                .and_then(Body::of)
         };
-        let world = World::start(bench, &setup).await?;
-        let uid = create_submission(&world.client, SAMPLE).await?.uid;
-        if !world
-            .observed
-            .until(LIMIT, |moments| moments.jobs.contains_key(SAMPLE))
-            .await
-        {
-            return Err("the operator makes no Job of a submission".into());
-        }
-        let end = Instant::now() + LIMIT;
-        loop {
-            // A line is written after the answer.
-            let entries = audit::read(&world.servers.audit_log())?;
-            let found = |resource: &str, holds: &dyn Fn(&Value) -> bool| {
-                // The operator also asks whether the Leaderboard's Job would be accepted.
-                let all = entries
-                    .iter()
-                    .filter(|entry| entry.is_write() && entry.resource() == resource && !entry.uri.contains("dryRun"));
-                let first = all.into_iter().find(|entry| entry.body.as_ref().is_some_and(holds));
-                first.and_then(Body::of)
-            };
-            let status = found("submissions/status", &|body| body["status"]["jobName"].is_string());
-            let job = found("jobs", &|body| body["spec"]["template"].is_object());
-            if let (Some(status), Some(job)) = (status, job) {
-                return Ok(Self { uid, status, job });
-            }
-            if Instant::now() > end {
-                return Err("the audit log has no body of a status and of a Job".into());
-            }
-            sleep(Duration::from_millis(100)).await;
-        }
+        Some(Self {
+            uid: uid.to_owned(),
+            status: found("submissions/status", &|body| body["status"]["jobName"].is_string())?,
+            job: found("jobs", &|body| body["spec"]["template"].is_object())?,
+        })
     }
 
     /// The three writes of one submission.

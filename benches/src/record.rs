@@ -7,7 +7,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Outcome;
+use crate::bench::Outcome;
 use crate::machine::Machine;
 use crate::stats::{Summary, ratios};
 

@@ -3,9 +3,9 @@
 
 use std::fmt::Write as _;
 
-use crate::Outcome;
+use crate::bench::Outcome;
 use crate::record::Line;
-use crate::report::number;
+use crate::stats::number;
 
 /// Leaderboards, the k-th with 1/k of the largest one's submissions.
 const LEADERBOARDS: usize = 16;

@@ -13,7 +13,8 @@ use tempfile::TempDir;
 use tokio::process::{Child, Command};
 use tokio::time::sleep;
 
-use crate::{Outcome, api};
+use crate::api;
+use crate::bench::Outcome;
 
 const START_LIMIT: Duration = Duration::from_mins(3);
 const POLL: Duration = Duration::from_millis(50);

@@ -58,6 +58,15 @@ fn middle(sorted: &[f64]) -> Option<f64> {
     Some(f64::midpoint(*lower, *upper))
 }
 
+/// Three digits are more than the noise leaves.
+pub fn number(value: f64) -> String {
+    match value.abs() {
+        size if size >= 100.0 => format!("{value:.0}"),
+        size if size >= 10.0 => format!("{value:.1}"),
+        _ => format!("{value:.2}"),
+    }
+}
+
 #[cfg(test)]
 #[allow(clippy::float_cmp, reason = "the expected numbers are exact")]
 mod tests {
@@ -93,5 +102,12 @@ mod tests {
     fn only_neighbors_are_compared() {
         assert_eq!(ratios(&[1.0, 6.0], &[2.0, 3.0]), [0.5, 2.0]);
         assert_eq!(ratios(&[1.0, 6.0, 9.0], &[0.0, 3.0]), [2.0]);
+    }
+
+    #[test]
+    fn numbers_have_three_digits() {
+        for (value, text) in [(1234.5, "1234"), (12.34, "12.3"), (0.126, "0.13"), (0.0, "0.00")] {
+            assert_eq!(number(value), text);
+        }
     }
 }

@@ -15,7 +15,7 @@ use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA, 
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
-use crate::Outcome;
+use crate::bench::Outcome;
 
 /// Name of the bucket.
 pub const BUCKET: &str = "bench-results";

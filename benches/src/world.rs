@@ -9,17 +9,15 @@ use serde_json::json;
 use tokio::task::JoinHandle;
 
 use crate::api::{self, Condition, Slim};
+use crate::bench::{Bench, Outcome};
 use crate::machine::Used;
 use crate::observed::Observed;
 use crate::operator::Operator;
 use crate::player::{NODE, Player, Pods};
-use crate::raw::{Bodies, WARM_NAME, create_submission, name};
+use crate::raw::{Bodies, LEADERBOARD, WARM_NAME, create_submission, name};
 use crate::servers::{Audit, Servers};
 use crate::storage::{BUCKET, PAIRS, ROUTES, Storage};
-use crate::{Bench, Outcome};
 
-/// Name of the Leaderboard.
-pub const LEADERBOARD: &str = "carla";
 /// Clients of a burst.
 const CLIENTS: usize = 16;
 const WARM_LIMIT: Duration = Duration::from_mins(2);

@@ -8,6 +8,8 @@ use jiff::Timestamp;
 use super::costs;
 use super::latency::{add_percentiles, to_finished};
 use super::lifecycles;
+use crate::audit;
+use crate::bench::{Bench, Outcome};
 use crate::machine::{cpu, memory};
 use crate::observed::Moments;
 use crate::operator::Operator;
@@ -15,7 +17,6 @@ use crate::raw::{Bodies, WARM_NAME};
 use crate::record::Figures;
 use crate::stats::percentile;
 use crate::world::World;
-use crate::{Bench, Outcome, audit};
 
 const COUNT: usize = 1_000;
 const QUICK_COUNT: usize = 200;

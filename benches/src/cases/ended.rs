@@ -9,11 +9,11 @@ use super::costs;
 use super::latency::add_percentiles;
 use super::lifecycles::POD;
 use crate::api::{self, MERGE};
+use crate::bench::{Bench, Outcome};
 use crate::player::Pods;
 use crate::raw::{Bodies, WARM_NAME, create_submission, name};
 use crate::record::Figures;
 use crate::world::{Setup, World};
-use crate::{Bench, Outcome};
 
 const SIZES: [usize; 2] = [500, 5_000];
 const QUICK_SIZES: [usize; 2] = [50, 500];

@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 use super::costs;
+use crate::bench::{Bench, Outcome};
 use crate::raw::{Bodies, WARM_NAME};
 use crate::record::Figures;
 use crate::world::{Setup, World};
-use crate::{Bench, Outcome};
 
 /// A run that has not come to its end by then is rated by what it has done.
 const CAP: Duration = Duration::from_mins(4);

@@ -4,12 +4,13 @@ use std::time::{Duration, Instant};
 
 use super::costs;
 use super::lifecycles;
+use crate::audit;
+use crate::bench::{Bench, Outcome};
 use crate::observed::Moments;
 use crate::raw::{Bodies, WARM_NAME, create_submission, name};
 use crate::record::Figures;
 use crate::stats::percentile;
 use crate::world::World;
-use crate::{Bench, Outcome, audit};
 
 const COUNT: usize = 120;
 const QUICK_COUNT: usize = 40;

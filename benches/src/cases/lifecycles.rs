@@ -3,12 +3,13 @@
 use std::time::{Duration, Instant};
 
 use super::costs;
+use crate::audit;
+use crate::bench::{Bench, Outcome};
 use crate::player::Pods;
 use crate::raw::{Bodies, WARM_NAME};
 use crate::record::Figures;
 use crate::stats::percentile;
 use crate::world::{Setup, World};
-use crate::{Bench, Outcome, audit};
 
 const COUNT: usize = 200;
 const PAIRS: usize = 5;

@@ -6,11 +6,12 @@ use futures::future::try_join_all;
 use serde::Deserialize;
 
 use crate::api;
+use crate::audit;
+use crate::bench::{Bench, Outcome};
 use crate::machine::{Used, memory};
 use crate::player::Pods;
 use crate::record::Figures;
 use crate::world::{Setup, World};
-use crate::{Bench, Outcome, audit};
 
 const SIZES: [usize; 2] = [1_000, 5_000];
 const QUICK_SIZES: [usize; 2] = [300, 1_000];

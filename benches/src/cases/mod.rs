@@ -11,10 +11,10 @@ mod storms;
 
 use clap::ValueEnum;
 
+use crate::bench::{Bench, Outcome};
 use crate::machine::Used;
 use crate::raw::Bodies;
 use crate::record::Figures;
-use crate::{Bench, Outcome};
 
 /// One case.
 #[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]

@@ -5,8 +5,8 @@ use std::time::Instant;
 
 use leaderboard_results::Format;
 
+use crate::bench::{Bench, Outcome};
 use crate::record::Figures;
-use crate::{Bench, Outcome};
 
 #[path = "../../../crates/results/tests/common/mod.rs"]
 #[allow(

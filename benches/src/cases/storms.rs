@@ -9,12 +9,13 @@ use leaderboard_api::reasons;
 use serde_json::json;
 
 use crate::api::{self, JSON, MERGE};
+use crate::audit;
+use crate::bench::{Bench, Outcome};
 use crate::machine::Used;
 use crate::player::Pods;
 use crate::raw::WARM_NAME;
 use crate::record::Figures;
 use crate::world::{Setup, World};
-use crate::{Bench, Outcome, audit};
 
 const COUNT: usize = 1_000;
 const QUICK_COUNT: usize = 200;

@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
-use super::number;
 use crate::record::Line;
+use crate::stats::number;
 
 /// Which side of the number is good.
 enum Bound {

@@ -6,9 +6,10 @@ mod plots;
 use std::fmt::Write as _;
 use std::path::Path;
 
+use crate::bench::Outcome;
 use crate::record::{Line, read};
-use crate::stats::Summary;
-use crate::{Outcome, scale};
+use crate::scale;
+use crate::stats::{Summary, number};
 
 /// Writes everything that the lines are enough for.
 pub fn write(file: &Path, docs: &Path) -> Outcome<()> {
@@ -110,15 +111,6 @@ fn figures(lines: &[Line]) -> String {
     text
 }
 
-/// Three digits are more than the noise leaves.
-pub fn number(value: f64) -> String {
-    match value.abs() {
-        size if size >= 100.0 => format!("{value:.0}"),
-        size if size >= 10.0 => format!("{value:.1}"),
-        _ => format!("{value:.2}"),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -130,13 +122,6 @@ mod tests {
         assert_eq!(new, "a\n<!-- begin x -->\nnew\n<!-- end x -->\nb\n");
         assert_eq!(replaced(&new, "x", "new").unwrap(), new);
         assert!(replaced(text, "y", "new").is_err());
-    }
-
-    #[test]
-    fn numbers_have_three_digits() {
-        for (value, text) in [(1234.5, "1234"), (12.34, "12.3"), (0.126, "0.13"), (0.0, "0.00")] {
-            assert_eq!(number(value), text);
-        }
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use crate::Outcome;
+use crate::bench::Outcome;
 use crate::record::Line;
 
 const WIDTH: f64 = 720.0;
