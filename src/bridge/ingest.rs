@@ -15,7 +15,9 @@ use thiserror::Error;
 use crate::kubernetes::{CallError, call_within};
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
-use leaderboard_api::{EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, conditions, names};
+use leaderboard_api::{
+    EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, conditions, names,
+};
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 pub const SWEEP_AGE_MS: i64 = 120_000;
@@ -196,7 +198,7 @@ fn was_run_before(source: &Source) -> bool {
 fn is_ended(existing: &Submission) -> bool {
     existing.status.as_ref().is_some_and(|status| {
         conditions::is_true(&status.conditions, conditions::FINISHED)
-            && matches!(status.state, Some(State::Failed | State::Cancelled))
+            && matches!(status.state_of_conditions(), State::Failed | State::Cancelled)
             // A raised attempt that the controller has not read yet still shows the end of the one before.
             && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
     })
@@ -205,7 +207,7 @@ fn is_ended(existing: &Submission) -> bool {
 /// True if EvalAI can have resumed it: it resumes only what has failed. The row of one that a host cancelled was edited by its
 /// participant, who takes no cancel back.
 fn is_resumable(existing: &Submission) -> bool {
-    let state = existing.status.as_ref().and_then(|status| status.state);
+    let state = existing.status.as_ref().map(SubmissionStatus::state_of_conditions);
     state == Some(State::Failed) && !existing.spec.cancel
 }
 

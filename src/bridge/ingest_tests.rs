@@ -4,7 +4,6 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use serde_json::Value;
 
 use super::*;
-use leaderboard_api::SubmissionStatus;
 
 const BOARD: &str = "leaderboard-20";
 
@@ -44,18 +43,22 @@ fn made_by(first: &Incoming) -> Submission {
 }
 
 fn with_state(mut made: Submission, state: State) -> Submission {
-    let ended = state.is_terminal();
+    let condition = |type_: &str, is_true: bool| Condition {
+        type_: type_.into(),
+        status: if is_true { "True" } else { "False" }.into(),
+        reason: state.as_str().into(),
+        message: String::new(),
+        observed_generation: None,
+        last_transition_time: Time(jiff::Timestamp::UNIX_EPOCH),
+    };
+    let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
     made.status = Some(SubmissionStatus {
-        state: Some(state),
         attempt: Some(made.spec.attempt),
-        conditions: vec![Condition {
-            type_: conditions::FINISHED.into(),
-            status: if ended { "True" } else { "False" }.into(),
-            reason: "Test".into(),
-            message: String::new(),
-            observed_generation: None,
-            last_transition_time: Time(jiff::Timestamp::UNIX_EPOCH),
-        }],
+        conditions: vec![
+            condition(conditions::FINISHED, state.is_terminal()),
+            condition(conditions::RUNNING, matches!(state, State::Running | State::Resumed)),
+        ],
+        failure: (state == State::Failed).then(|| serde_json::from_value(failure).unwrap()),
         ..SubmissionStatus::default()
     });
     made
@@ -200,6 +203,14 @@ fn the_sweep_and_the_message_that_it_stood_in_for_count_once() {
         &with_state(made_by(&first), State::Running),
         &swept_resume(300_000),
         &REPEAT,
+    );
+    let mut edited = by_message.clone();
+    edited.status.as_mut().unwrap().state = Some(State::Finished);
+    check(
+        "a row of one that failed, and whose stored state somebody has edited",
+        &edited,
+        &swept_resume(300_000),
+        &bump_to(2),
     );
 }
 

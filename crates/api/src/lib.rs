@@ -19,6 +19,7 @@ pub mod ranges;
 pub mod reasons;
 mod retention;
 mod route_slice;
+mod state;
 pub mod submission;
 pub mod submission_status;
 mod team;

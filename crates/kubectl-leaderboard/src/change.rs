@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::board::{self, Observed};
 use super::text::{Page, when};
-use super::why::{command, has_ended, is_attempt_requested};
+use super::why::{command, has_ended, is_attempt_requested, state};
 use leaderboard_api::{Deadlines, State, Submission, reasons};
 
 /// What a person asks for.
@@ -45,11 +45,11 @@ fn cancel(submission: &Submission, leaderboard: Observed<'_>, now: jiff::Timesta
     let name = submission.name_any();
     let status = submission.status.as_ref();
     if has_ended(submission) {
-        let state = status.and_then(|s| s.state).map_or("ended", State::as_str);
+        let shown = status.and_then(state).map_or("ended", State::as_str);
         let at = status.and_then(|s| s.times.finished.as_ref());
         let at = at.map(|at| format!(" since {}", when(at.0, now))).unwrap_or_default();
         return Err(format!(
-            "{name} is {state}{at}, so there is nothing to cancel. See `{}`",
+            "{name} is {shown}{at}, so there is nothing to cancel. See `{}`",
             command("why", submission)
         ));
     }
@@ -155,17 +155,17 @@ fn not_resumable(submission: &Submission) -> Option<String> {
             "attempt {wanted} of {name} is already requested and has not started yet. See `{see}`"
         ));
     }
-    let state = submission.status.as_ref().and_then(|s| s.state);
-    match state.filter(|_| has_ended(submission)) {
+    let found = submission.status.as_ref().and_then(state);
+    match found.filter(|_| has_ended(submission)) {
         Some(State::Failed | State::Cancelled) => None,
         Some(State::Finished) => Some(format!(
             "{name} has finished and cannot be resumed. Submit the image again to run it once more"
         )),
         _ => {
-            let state = state.map_or("new", State::as_str);
+            let shown = found.map_or("new", State::as_str);
             let cancel = command("cancel", submission);
             Some(format!(
-                "{name} is {state}; only Failed and Cancelled submissions can be resumed. Wait for its end (`{see}`), or \
+                "{name} is {shown}; only Failed and Cancelled submissions can be resumed. Wait for its end (`{see}`), or \
                  cancel it first (`{cancel}`)"
             ))
         }

@@ -88,13 +88,13 @@ fn row(submission: &Submission, now: Timestamp) -> Option<Row> {
     let age = since.map_or(0, |at| now.duration_since(at).as_secs());
     let place = status.waiting.as_ref().map(|w| i64::from(w.position));
     Some(Row {
-        order: match status.state {
+        order: match why::state(status) {
             Some(State::Running | State::Resumed) => (0, age),
             None | Some(State::Pending) => (1, place.unwrap_or(0)),
             Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
         },
         name: clean(&submission.name_any()),
-        state: status.state.map_or("(new)", State::as_str),
+        state: why::state(status).map_or("(new)", State::as_str),
         since: since.map(|_| span(age)).unwrap_or_default(),
         why: join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
     })
@@ -110,7 +110,7 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
             "Attempt {wanted} is requested; the operator has not processed it yet."
         ));
     }
-    match status.state {
+    match why::state(status) {
         None => Some("The operator has not processed it yet.".to_owned()),
         Some(State::Pending) => Some(match &status.waiting {
             Some(waiting) => {

@@ -51,6 +51,11 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, now: Timestam
     explanation.page.into_lines()
 }
 
+/// The state of a submission; none before the operator has processed it.
+pub(super) fn state(status: &SubmissionStatus) -> Option<State> {
+    status.attempt.map(|_| status.state_of_conditions())
+}
+
 /// Since when a submission is in its state.
 pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     let status = submission.status.as_ref()?;
@@ -60,7 +65,7 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     };
     let time = |time: &Option<Time>| time.as_ref().map(|t| t.0);
     let times = &status.times;
-    let found = match status.state? {
+    let found = match state(status)? {
         State::Finished | State::Failed | State::Cancelled => {
             time(&times.finished).or_else(|| moved(conditions::FINISHED, "True"))
         }
@@ -106,7 +111,7 @@ impl Explanation<'_> {
         let name = self.submission.name_any();
         let since = since(self.submission).map(|at| when(at, self.now));
         let made = self.submission.creation_timestamp().map(|t| when(t.0, self.now));
-        let text = match (self.status.state, since) {
+        let text = match (state(self.status), since) {
             (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
             (Some(state), None) => format!("{name} is {}.", state.as_str()),
             (None, _) => {
@@ -392,7 +397,7 @@ fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: O
             steps.push(next);
         }
     }
-    if status.state.is_none() && problems.is_empty() {
+    if state(status).is_none() && problems.is_empty() {
         steps.push("Nothing. If it lasts for a minute, check that the operator runs.".to_owned());
     }
     steps

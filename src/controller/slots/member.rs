@@ -71,7 +71,7 @@ impl Member {
             is_pending: !is_over && waits_for_leaderboard(status),
             began: began.map(|time| time.0),
             ended: ended.map(|time| time.0),
-            state: status.state.unwrap_or(State::Pending),
+            state: status.state_of_conditions(),
             needs_leaderboard: needs_leaderboard(status),
         }
     }

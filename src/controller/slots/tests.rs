@@ -404,17 +404,25 @@ fn a_change_of_the_leaderboard_wakes_those_without_a_job() {
 }
 
 #[test]
-fn counts_follow_each_change() {
-    let mut a = submission("a", "x", 1, json!({"state": "Pending"}));
-    let world = World::new(one(), &[&a, &submission("b", "y", 1, json!({"state": "Running"}))]);
+fn counts_follow_each_change_of_the_conditions_and_not_the_stored_state() {
+    let mut a = submission("a", "x", 1, json!({"state": "Finished"}));
+    let world = World::new(
+        one(),
+        &[
+            &a,
+            &submission("b", "y", 1, json!({"conditions": [condition("Running", "True")]})),
+        ],
+    );
     let counts = |world: &World| {
         let (counts, in_use) = world.slots.census(&world.leaderboard);
         (counts.pending, counts.running, counts.finished, in_use)
     };
     assert_eq!(counts(&world), (1, 1, 0, 2));
     assert!(!world.slots.submission(&a, false), "nothing has changed");
+    let mut finished = condition("Finished", "True");
+    finished["reason"] = json!("Finished");
     a.status = serde_json::from_value(json!({
-        "state": "Finished", "conditions": [condition("Finished", "True"), condition("Published", "False")],
+        "state": "Pending", "conditions": [finished, condition("Published", "False")],
     }))
     .unwrap();
     assert!(world.slots.submission(&a, false));

@@ -200,16 +200,17 @@ impl Actor<'_> {
     /// through can be read from the log without anything else.
     fn log_transition(&self, new: &SubmissionStatus) {
         let old = self.submission().status.as_ref();
-        let standing = |status: &SubmissionStatus| (status.state, status.reason.clone(), status.attempt);
-        if old.map(standing).unwrap_or_default() == standing(new) {
+        let standing =
+            |status: &SubmissionStatus| (status.state_of_conditions(), status.reason.clone(), status.attempt);
+        if new.attempt.is_none() || old.map(standing) == Some(standing(new)) {
             return;
         }
         tracing::info!(
             submission = %format_args!("{}/{}", self.namespace, self.name()),
             leaderboard = self.submission().spec.leaderboard_name,
             attempt = new.attempt,
-            from = old.and_then(|status| status.state).map_or("none", State::as_str),
-            to = new.state.map_or("none", State::as_str),
+            from = old.map_or("none", |status| status.state_of_conditions().as_str()),
+            to = new.state_of_conditions().as_str(),
             reason = new.reason,
             "{}", new.message.as_deref().unwrap_or("the submission's state has changed")
         );

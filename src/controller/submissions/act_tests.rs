@@ -62,8 +62,11 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
     .await;
     assert_eq!(lines.take(), "", "neither the node nor the progress is a transition");
 
+    let condition = json!({"type": "Running", "status": "True", "reason": "Running", "message": "",
+                           "lastTransitionTime": "2026-01-01T00:00:00Z"});
+    let condition = serde_json::from_value(condition).unwrap();
     let running = SubmissionStatus {
-        state: Some(State::Running),
+        conditions: vec![condition],
         reason: Some("AgentRunning".into()),
         message: Some("Agents run.".into()),
         node_name: node,

@@ -82,7 +82,8 @@ async fn bench(state: State) -> Bench {
     let (mut submission, _) = with_job("sub", &board);
     let now = Timestamp::now();
     let status = submission.status.as_mut().unwrap();
-    status.state = Some(state);
+    let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
+    status.failure = (state == State::Failed).then(|| serde_json::from_value(failure).unwrap());
     status.conditions = vec![Condition {
         type_: conditions::FINISHED.into(),
         status: "True".into(),

@@ -102,7 +102,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         run_id: plan.run_id.clone(),
         attempt: attempt_of_run(status),
         team_name: team.name.clone().unwrap_or_default(),
-        submission_status: table_status(status.state).to_owned(),
+        submission_status: table_status(status.state_of_conditions()).to_owned(),
         track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
         track_name: plan.codename.clone(),
         submitted_image_uri: plan.image.clone(),
@@ -128,16 +128,16 @@ pub(super) fn attempt_of_run(status: &SubmissionStatus) -> i64 {
 
 /// Whether its results count.
 pub(super) fn is_finished(status: &SubmissionStatus) -> bool {
-    status.state == Some(State::Finished)
+    status.state_of_conditions() == State::Finished
 }
 
-fn table_status(state: Option<State>) -> &'static str {
+fn table_status(state: State) -> &'static str {
     match state {
-        None | Some(State::Pending) => "SUBMITTED",
-        Some(State::Running | State::Resumed) => "RUNNING",
-        Some(State::Finished) => "FINISHED",
-        Some(State::Failed) => "FAILED",
-        Some(State::Cancelled) => "CANCELLED",
+        State::Pending => "SUBMITTED",
+        State::Running | State::Resumed => "RUNNING",
+        State::Finished => "FINISHED",
+        State::Failed => "FAILED",
+        State::Cancelled => "CANCELLED",
     }
 }
 
@@ -192,16 +192,26 @@ mod tests {
     #[test]
     fn only_the_row_of_a_finished_submission_has_metrics() {
         let report = report(r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]"#);
-        let score = |state: &str| {
-            let status = json!({"state": state, "team": {"id": "3"}, "plan": plan()});
+        let score = |type_: &str, reason: &str| {
+            // The stored state decides nothing.
+            let stored = if reason == "Finished" { "Failed" } else { "Finished" };
+            let condition = json!({"type": type_, "status": "True", "reason": reason, "message": "",
+                                   "lastTransitionTime": "2026-01-01T00:00:00Z"});
+            let status = json!({"state": stored, "conditions": [condition], "team": {"id": "3"}, "plan": plan()});
             let row = row(Some(&report), &serde_json::from_value(status).unwrap()).unwrap();
             assert_eq!(row.metrics.len(), 15, "what is not there is removed");
             row.metrics[0].clone()
         };
-        for state in ["Pending", "Running", "Resumed", "Failed", "Cancelled"] {
-            assert_eq!(score(state), ("driving_score".to_owned(), None), "{state}");
+        for (type_, reason) in [
+            ("Accepted", "Accepted"),
+            ("Running", "Running"),
+            ("Finished", "AgentCrashed"),
+            ("Finished", "Cancelled"),
+        ] {
+            let expected = ("driving_score".to_owned(), None);
+            assert_eq!(score(type_, reason), expected, "{type_} {reason}");
         }
-        assert_eq!(score("Finished").1.as_deref(), Some("43.125"));
+        assert_eq!(score("Finished", "Finished").1.as_deref(), Some("43.125"));
     }
 
     #[test]

@@ -346,3 +346,11 @@ fn a_team_cannot_write_on_the_hosts_terminal() {
     let text = explained(&status);
     assert!(!text.contains(['\u{1b}', '\u{7}']), "{text:?}");
 }
+
+#[test]
+fn a_stored_state_that_somebody_has_edited_changes_nothing() {
+    for status in [waiting(), running(), crashed(), finished(), cancelled()] {
+        let edited = with(status.clone(), &json!({"state": "Resumed"}));
+        assert_eq!(explained(&edited), explained(&status));
+    }
+}

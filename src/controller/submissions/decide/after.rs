@@ -244,7 +244,7 @@ fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bo
     match reading::result_of_end(draft) {
         Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why)),
         Reading::Done if log_left.is_some() => {}
-        Reading::Done => draft.act(Action::UpdateEvalai(match state::of(&draft.status) {
+        Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {
             State::Finished => EvalaiUpdate::Finished,
             State::Cancelled => EvalaiUpdate::Cancelled,
             _ => EvalaiUpdate::Failed,
@@ -291,7 +291,7 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
 fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
     let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
     let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
-    differs && draft.status.plan.is_none() && state::of(&draft.status) == State::Cancelled
+    differs && draft.status.plan.is_none() && draft.status.state_of_conditions() == State::Cancelled
 }
 
 /// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
@@ -340,7 +340,7 @@ fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
 /// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
 fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
-    if state::of(&draft.status) == State::Cancelled {
+    if draft.status.state_of_conditions() == State::Cancelled {
         return Delivery::Done;
     }
     draft.status.failure = None;

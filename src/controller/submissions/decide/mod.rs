@@ -22,7 +22,6 @@ mod plan_builder;
 mod reading;
 mod retention;
 mod start;
-mod state;
 mod stop;
 #[cfg(test)]
 mod tests;

@@ -109,7 +109,7 @@ impl<'a> PlanBuilder<'a> {
 
     /// Its results count.
     pub(super) fn is_successful(&self) -> bool {
-        state::of(&self.status) == State::Finished
+        self.status.state_of_conditions() == State::Finished
     }
 
     /// How often the report of a live run is read.
@@ -119,7 +119,7 @@ impl<'a> PlanBuilder<'a> {
 
     /// Its agents run, or have run and come back.
     pub(super) fn is_running(&self) -> bool {
-        matches!(state::of(&self.status), State::Running | State::Resumed)
+        matches!(self.status.state_of_conditions(), State::Running | State::Resumed)
     }
 
     /// Whether the present Job was there. Only then does its absence mean that it was deleted: a crash of the controller before
@@ -306,7 +306,7 @@ impl<'a> PlanBuilder<'a> {
     pub(super) fn into_plan(mut self, report: Option<ReportDemand>) -> Plan {
         // Without an attempt nothing was decided yet.
         if self.status.attempt.is_some() {
-            self.status.state = Some(state::of(&self.status));
+            self.status.state = Some(self.status.state_of_conditions());
             self.note_transition();
         }
         self.status.fit();
@@ -321,9 +321,9 @@ impl<'a> PlanBuilder<'a> {
 
     /// Publishes a changed state or reason, once.
     fn note_transition(&mut self) {
-        let new = (state::of(&self.status), self.status.reason.clone());
+        let new = (self.status.state_of_conditions(), self.status.reason.clone());
         let old = self.submission().status.as_ref();
-        if old.is_some_and(|old| (state::of(old), &old.reason) == (new.0, &new.1)) {
+        if old.is_some_and(|old| (old.state_of_conditions(), &old.reason) == (new.0, &new.1)) {
             return;
         }
         let (state, Some(reason)) = new else { return };

@@ -95,7 +95,7 @@ pub(super) fn replacing(draft: &mut PlanBuilder<'_>, message: &str) {
 }
 
 fn show_running(draft: &mut PlanBuilder<'_>) {
-    let reason = if state::is_resumed(&draft.status) {
+    let reason = if draft.status.is_resumed() {
         reasons::RESUMED
     } else {
         reasons::RUNNING

@@ -1,0 +1,98 @@
+//! The state of a submission, computed from its conditions. `status.state` is for people and their selectors: programs compute it, so
+//! that a state that was edited decides nothing.
+//!
+//! Called by everyone who reads a status. Pure.
+
+use crate::conditions::{self, FINISHED, RUNNING};
+use crate::{State, SubmissionStatus, reasons};
+
+impl SubmissionStatus {
+    /// The state that the conditions show.
+    pub fn state_of_conditions(&self) -> State {
+        let end = conditions::get(&self.conditions, FINISHED).filter(|c| c.status == "True");
+        let running = conditions::get(&self.conditions, RUNNING);
+        match end {
+            Some(end) if end.reason == reasons::FINISHED => State::Finished,
+            Some(_) if self.failure.is_some() => State::Failed,
+            Some(_) => State::Cancelled,
+            // Once its agents ran it is never Pending again while it has a Job.
+            None if running.is_some_and(|c| c.status == "True" || c.reason == reasons::REPLACING) => {
+                if self.is_resumed() {
+                    State::Resumed
+                } else {
+                    State::Running
+                }
+            }
+            None => State::Pending,
+        }
+    }
+
+    /// Whether its run continues from stored results.
+    pub fn is_resumed(&self) -> bool {
+        self.plan.as_ref().is_some_and(|plan| plan.resume) || self.attempt > Some(1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn the_state_follows_the_conditions_whatever_the_stored_one_says() {
+        let failure =
+            json!({"class": "Participant", "charged": true, "reason": "AgentCrashed", "message": "It crashed."});
+        for (expected, attempt, finished, running, failed) in [
+            (State::Pending, 1, None, None, false),
+            (
+                State::Pending,
+                1,
+                Some(("False", "Preparing")),
+                Some(("False", "Preparing")),
+                false,
+            ),
+            (
+                State::Running,
+                1,
+                Some(("False", "Preparing")),
+                Some(("True", "Running")),
+                false,
+            ),
+            (State::Running, 1, None, Some(("False", "Replacing")), false),
+            (State::Resumed, 2, None, Some(("True", "Running")), false),
+            // An agent that was not stopped yet is no state.
+            (
+                State::Finished,
+                1,
+                Some(("True", "Finished")),
+                Some(("True", "Running")),
+                false,
+            ),
+            (
+                State::Failed,
+                1,
+                Some(("True", "AgentCrashed")),
+                Some(("False", "Ended")),
+                true,
+            ),
+            (State::Cancelled, 2, Some(("True", "Cancelled")), None, false),
+        ] {
+            let condition = |type_: &str, (truth, reason): (&str, &str)| {
+                json!({"type": type_, "status": truth, "reason": reason, "message": "",
+                       "lastTransitionTime": "2026-01-01T00:00:00Z"})
+            };
+            let conditions = [(FINISHED, finished), (RUNNING, running)];
+            let conditions = conditions
+                .into_iter()
+                .filter_map(|(type_, is)| Some(condition(type_, is?)));
+            for stored in ["Pending", "Running", "Resumed", "Finished", "Failed", "Cancelled"] {
+                let status = json!({
+                    "state": stored, "attempt": attempt, "conditions": conditions.clone().collect::<Vec<_>>(),
+                    "failure": failed.then_some(&failure),
+                });
+                let status: SubmissionStatus = serde_json::from_value(status).unwrap();
+                assert_eq!(status.state_of_conditions(), expected, "{stored}: {status:?}");
+            }
+        }
+    }
+}
