@@ -38,7 +38,7 @@ use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options, Timeouts, Timing};
 use crate::services::meter::Meter;
 use crate::services::table::Recorder;
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";
@@ -240,8 +240,8 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     submission.metadata.creation_timestamp = Some(now.clone());
     submission.metadata.finalizers = Some(vec![names::FINALIZER_SUBMISSION.into()]);
     let (track, image) = (&board.spec.tracks[0], "agent:1".to_owned());
-    let plan = effective::plan(&board.spec, track, name.into(), image, false);
-    let job_name = names::job(name, 1, 0);
+    let plan = effective::plan(&board.spec, track, name.parse().unwrap(), image, false);
+    let job_name = names::job(name, JobNumber::first(1));
     submission.status = Some(SubmissionStatus {
         state: Some(State::Pending),
         attempt: Some(1),

@@ -17,6 +17,7 @@ use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
 use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, cut};
+use leaderboard_api::RunId;
 
 /// Bytes read of one file at once.
 const CHUNK: u64 = 256 << 10;
@@ -59,7 +60,7 @@ pub struct Shipper {
 
 impl Shipper {
     /// Goes on where the last one was. What a Pod before this one has stored was also sent by it.
-    pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &str, pairs: usize, restored: &Memory) -> Self {
+    pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &RunId, pairs: usize, restored: &Memory) -> Self {
         let agents = (1..=pairs).map(|n| (format!("agent/agent{n}/leaderboard.log"), format!("{run_id}/agent-{n}")));
         let simulators = (1..=pairs).map(|n| (console(n), format!("{run_id}/simulator-{n}")));
         let streams: BTreeMap<String, String> = agents

@@ -20,7 +20,7 @@ use tokio::io::AsyncWriteExt;
 
 use crate::services::aws::Aws;
 use crate::services::meter::Meter;
-use leaderboard_api::{Storage, effective};
+use leaderboard_api::{RunId, Storage, effective};
 
 pub use error::{ArchiveError, Cause};
 pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};
@@ -122,11 +122,16 @@ impl Archive {
     }
 
     /// The prefix of a run.
-    pub fn of_run(aws: &Aws, storage: &Storage, run_id: &str) -> Self {
+    pub fn of_run(aws: &Aws, storage: &Storage, run_id: &RunId) -> Self {
+        Self::of_storage(aws, storage).at_prefix(effective::key_prefix(storage, run_id))
+    }
+
+    /// The prefix of all runs.
+    pub fn of_storage(aws: &Aws, storage: &Storage) -> Self {
         let client = aws.s3(storage.region.as_deref(), storage.endpoint.as_deref());
         Self {
             meter: aws.meter().clone(),
-            ..Self::new(client, &storage.bucket, effective::key_prefix(storage, run_id))
+            ..Self::new(client, &storage.bucket, storage.prefix.as_deref().unwrap_or_default())
         }
     }
 

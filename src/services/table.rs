@@ -25,6 +25,7 @@ use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
 use leaderboard_api as api;
+use leaderboard_api::RunId;
 
 /// Column with the attempt, a number.
 const ATTEMPT: &str = "attempt";
@@ -46,7 +47,7 @@ pub struct Row {
     /// Partition key: id of the team.
     pub team_id: String,
     /// Sort key: id of the run.
-    pub run_id: String,
+    pub run_id: RunId,
     /// Attempt, from 1.
     pub attempt: i64,
     /// Name of the team.
@@ -165,7 +166,7 @@ pub enum TableError {
     #[error(
         "table {table} already holds a later attempt or another end of submission {run_id}; the row is left as it is"
     )]
-    Stale { table: String, run_id: String },
+    Stale { table: String, run_id: RunId },
 }
 
 impl TableError {
@@ -244,7 +245,10 @@ impl Table {
                 &self.partition.name,
                 self.key_value(&self.partition, &row.team_id, "team")?,
             )
-            .key(&self.sort.name, self.key_value(&self.sort, &row.run_id, "submission")?)
+            .key(
+                &self.sort.name,
+                self.key_value(&self.sort, row.run_id.as_str(), "submission")?,
+            )
             .condition_expression(condition(row))
             .expression_attribute_names("#attempt", ATTEMPT)
             .expression_attribute_names("#status", STATUS)

@@ -13,7 +13,7 @@ use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, ResourceExt};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names};
 use leaderboard_operator::controller::runtime::leader;
 use leaderboard_operator::pod::report::{OWNER_KEY, Owner};
 use leaderboard_operator::services::archive::Archive;
@@ -264,7 +264,11 @@ async fn what_can_never_be_an_image_fails_at_once_and_the_participant_reads_why(
         assert!(fetched.contains("ImageInvalid (participant): The subm"), "{fetched}");
         let is_published = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::PUBLISHED);
         world.until(&name, "it is published", is_published).await;
-        let job = world.api::<Job>().get_opt(&names::job(&name, 1, 0)).await.unwrap();
+        let job = world
+            .api::<Job>()
+            .get_opt(&names::job(&name, JobNumber::first(1)))
+            .await
+            .unwrap();
         assert_eq!(job, None);
     }
 }

@@ -237,7 +237,7 @@ fn run(bucket: &str) -> Run {
         uid: "uid-1".to_owned(),
         attempt: 1,
         plan: RunPlan {
-            run_id: "77".to_owned(),
+            run_id: "77".parse().unwrap(),
             leaderboard_version: LeaderboardVersion::V2,
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),

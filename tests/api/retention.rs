@@ -14,7 +14,7 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
 use kube::runtime::wait::{await_condition, conditions};
-use leaderboard_api::{State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, names, reasons};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -91,7 +91,11 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     };
     world.until(&name, "it has ended in EvalAI", ended).await;
     until_deleted(&world, &name, &uid).await;
-    let job = world.api::<Job>().get_opt(&names::job(&name, 1, 0)).await.unwrap();
+    let job = world
+        .api::<Job>()
+        .get_opt(&names::job(&name, JobNumber::first(1)))
+        .await
+        .unwrap();
     assert_eq!(job, None);
     assert_eq!(in_evalai(), Status::Failed);
     assert_eq!(row(&world, &table).await, ("1".to_owned(), "FAILED".to_owned()));
@@ -99,7 +103,7 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     // The cluster's garbage collector, which does not run here.
     let pods = world.api::<Pod>();
     let now = DeleteParams::default().grace_period(0);
-    pods.delete(&format!("{}-x", names::job(&name, 1, 0)), &now)
+    pods.delete(&format!("{}-x", names::job(&name, JobNumber::first(1))), &now)
         .await
         .unwrap();
 

@@ -12,7 +12,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Leaderboard, Storage, Submission, SubmissionStatus, names};
+use leaderboard_api::{JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names};
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
 use leaderboard_operator::controller::settings::Settings;
@@ -189,7 +189,7 @@ impl World {
     pub(super) fn archive(&self, run: u64) -> Archive {
         let storage = json!({"bucket": self.bucket, "endpoint": self.aws.endpoint});
         let storage: Storage = serde_json::from_value(storage).unwrap();
-        Archive::of_run(&self.aws.aws, &storage, &run.to_string())
+        Archive::of_run(&self.aws.aws, &storage, &run.to_string().parse().unwrap())
     }
 
     /// The Job runs, its agent prints the routes and crashes, logcopy stores the log, and the Job ends as requested.
@@ -210,7 +210,7 @@ impl World {
     /// Waits for the Job of the first attempt that follows so many failures of the infrastructure.
     pub(super) async fn job(&self, name: &str, retry: i32) -> Job {
         let is_there = |job: Option<&Job>| job.is_some();
-        let job_name = names::job(name, 1, retry);
+        let job_name = names::job(name, JobNumber { attempt: 1, retry });
         let job = timeout(LIMIT, await_condition(self.api(), &job_name, is_there)).await;
         job.expect("a Job is made").unwrap().unwrap()
     }

@@ -208,7 +208,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
         uid: format!("uid of {id}"),
         attempt: 1,
         plan: RunPlan {
-            run_id: id.to_owned(),
+            run_id: id.parse().unwrap(),
             leaderboard_version: format,
             track: "sensors".to_owned(),
             codename: "SENSORS".to_owned(),

@@ -5,8 +5,7 @@
 use k8s_openapi::api::core::v1::ResourceRequirements;
 
 use super::leaderboard_parts::{Deadlines, LeaderboardVersion, Storage, Track, TrackContainer};
-use super::submission::Submission;
-use super::{LeaderboardSpec, RouteSlice, RunPlan};
+use super::{LeaderboardSpec, RouteSlice, RunId, RunPlan};
 
 /// How many of what one track runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -78,21 +77,13 @@ pub fn resources(
     own.and_then(|own| own.resources.as_ref()).or(leaderboards).cloned()
 }
 
-/// Run id of a Submission: its id in EvalAI, else its name.
-pub fn run_id(submission: &Submission) -> String {
-    match &submission.spec.evalai {
-        Some(evalai) => evalai.submission.to_string(),
-        None => submission.metadata.name.clone().unwrap_or_default(),
-    }
-}
-
 /// Key prefix of a run in its bucket, with the final slash.
-pub fn key_prefix(storage: &Storage, run_id: &str) -> String {
+pub fn key_prefix(storage: &Storage, run_id: &RunId) -> String {
     format!("{}{run_id}/", storage.prefix.as_deref().unwrap_or_default())
 }
 
 /// Address of a run's results for people.
-pub fn results_url(storage: &Storage, run_id: &str) -> String {
+pub fn results_url(storage: &Storage, run_id: &RunId) -> String {
     format!(
         "s3://{}/{}{run_id}",
         storage.bucket,
@@ -101,7 +92,7 @@ pub fn results_url(storage: &Storage, run_id: &str) -> String {
 }
 
 /// The plan of a submission's first attempt. `image` is the participant's, `resume` says that stored results are taken up.
-pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: String, image: String, resume: bool) -> RunPlan {
+pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String, resume: bool) -> RunPlan {
     let shape = shape(spec, track);
     RunPlan {
         run_id,

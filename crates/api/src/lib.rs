@@ -9,6 +9,7 @@ pub mod conditions;
 pub mod effective;
 pub mod image;
 pub mod ingested;
+mod job_number;
 pub mod leaderboard;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
@@ -19,6 +20,7 @@ pub mod ranges;
 pub mod reasons;
 mod retention;
 mod route_slice;
+mod run_id;
 mod state;
 pub mod submission;
 pub mod submission_status;
@@ -28,6 +30,7 @@ mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
 pub use ingested::{Ingested, RefusedAttempt};
+pub use job_number::JobNumber;
 pub use leaderboard::{
     EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,
 };
@@ -36,6 +39,7 @@ pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};
 pub use progress::{Progress, Score};
 pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
+pub use run_id::{NotARunId, RunId};
 pub use submission::{EvalaiRef, Submission, SubmissionSpec};
 pub use submission_status::*;
 pub use team::{Team, TeamStatus};

@@ -2,6 +2,8 @@
 //!
 //! Pure. A name changed here is an API change.
 
+use crate::JobNumber;
+
 /// Label: name of the Submission, on Jobs and Pods.
 pub const LABEL_SUBMISSION: &str = "leaderboard.carla.org/submission";
 /// Label: attempt, on Jobs and Pods.
@@ -66,11 +68,7 @@ pub fn submission(id: i64) -> String {
     format!("submission-{id}")
 }
 
-/// Name of the Job of one attempt; `retry` counts the Jobs that infrastructure failures ended before it.
-pub fn job(submission: &str, attempt: i64, retry: i32) -> String {
-    if retry == 0 {
-        format!("{submission}-{attempt}")
-    } else {
-        format!("{submission}-{attempt}-r{retry}")
-    }
+/// Name of a Job of a submission.
+pub fn job(submission: &str, number: JobNumber) -> String {
+    format!("{submission}-{}", number.suffix())
 }

@@ -11,6 +11,7 @@ use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::pair_status::PairStatus;
 use super::progress::{Progress, Score};
 use super::route_slice::RouteSlice;
+use super::run_id::RunId;
 use super::team::TeamStatus;
 use super::waiting::Waiting;
 
@@ -167,7 +168,7 @@ fn cut(text: &mut String, longest: usize) {
 pub struct RunPlan {
     /// Run id: S3 prefix, sort key, log streams.
     #[schemars(length(max = 128))]
-    pub run_id: String,
+    pub run_id: RunId,
     /// Which Leaderboard it is of: chooses the format of the checkpoints, flags and defaults.
     pub leaderboard_version: LeaderboardVersion,
     /// Name of the track.

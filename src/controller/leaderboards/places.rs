@@ -19,7 +19,7 @@ use leaderboard_api::Leaderboard;
 /// Time one answer may take.
 const LIMIT: Duration = Duration::from_secs(10);
 /// A run that nobody has: the list below it is empty, and costs nothing.
-const NO_RUN: &str = "none";
+const NO_RUN: &str = "none/";
 
 /// Asks what is due.
 pub(super) async fn look(aws: &Aws, leaderboard: &Leaderboard, mut reach: Reach, now: Timestamp) -> Reach {
@@ -77,7 +77,8 @@ fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFutur
     let spec = &leaderboard.spec;
     match (place, &spec.table, &spec.queue) {
         (Place::Bucket, ..) => {
-            let archive = Archive::of_run(aws, &spec.storage, NO_RUN);
+            let prefix = format!("{}{NO_RUN}", spec.storage.prefix.as_deref().unwrap_or_default());
+            let archive = Archive::of_storage(aws, &spec.storage).at_prefix(prefix);
             async move { of_bucket(archive.prefix_is_empty().await.map(|_| ())) }.boxed()
         }
         (Place::Table, Some(table), _) => {

@@ -22,7 +22,7 @@ use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Labels, Target};
 use crate::services::token::{Token, TokenSource};
-use leaderboard_api::{Evalai, Leaderboard, Submission, Token as TokenPlace, effective};
+use leaderboard_api::{Evalai, JobNumber, Leaderboard, Submission, Token as TokenPlace, effective};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -250,7 +250,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard) -> Option<DynamicO
     let plan = effective::plan(
         &leaderboard.spec,
         track,
-        "sample".into(),
+        sample.run_id(),
         "example/agent:1".into(),
         false,
     );
@@ -258,8 +258,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard) -> Option<DynamicO
         submission: &sample,
         leaderboard,
         plan: &plan,
-        attempt: 1,
-        retry: 0,
+        number: JobNumber::first(1),
         settings,
         now: Timestamp::now(),
     }))

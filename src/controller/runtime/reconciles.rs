@@ -139,10 +139,7 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
             policies.is_in_place(board)
         });
         let plan = decide(&view);
-        let creates_job = plan
-            .actions
-            .iter()
-            .any(|a| matches!(a, decide::Action::CreateJob { .. }));
+        let creates_job = plan.actions.iter().any(|a| matches!(a, decide::Action::CreateJob(_)));
         if !turn.may_continue(creates_job) {
             return Ok(None);
         }

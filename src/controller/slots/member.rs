@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 
-use leaderboard_api::{State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
 
 pub(super) struct Member {
     pub(super) name: String,
@@ -45,10 +45,13 @@ impl Member {
         let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
         let known = status.attempt.unwrap_or(spec.attempt);
         let is_over = is_finished && spec.attempt <= known;
-        let (attempt, retry) = if is_finished && !is_over {
-            (spec.attempt, 0)
+        let number = if is_finished && !is_over {
+            JobNumber::first(spec.attempt)
         } else {
-            (known, status.retry)
+            JobNumber {
+                attempt: known,
+                retry: status.retry,
+            }
         };
         let times = &status.times;
         let began = times.scheduled.as_ref().or(times.started.as_ref());
@@ -58,8 +61,8 @@ impl Member {
         Self {
             team: submission.team().unwrap_or_default().to_owned(),
             track: status.track.clone().or(spec.track.clone()).unwrap_or_default(),
-            attempt,
-            job: names::job(&name, attempt, retry),
+            attempt: number.attempt,
+            job: names::job(&name, number),
             name,
             stand: match status {
                 _ if is_over => Stand::Over,

@@ -26,7 +26,7 @@ use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{State, Submission, SubmissionStatus, names};
+use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, names};
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
@@ -111,7 +111,7 @@ impl Actor<'_> {
     async fn carry_out(&self, action: &Action, status: &SubmissionStatus) -> Result<(), ActError> {
         match action {
             Action::ReleaseFinalizer => self.set_finalizer(false).await,
-            Action::CreateJob { attempt, retry } => self.create_job(status, *attempt, *retry).await,
+            Action::CreateJob(number) => self.create_job(status, *number).await,
             Action::DeleteJob {
                 name,
                 uid,
@@ -156,7 +156,7 @@ impl Actor<'_> {
             // The finalizer goes before the status; the others are requests to the API server.
             Action::AddFinalizer
             | Action::ReleaseFinalizer
-            | Action::CreateJob { .. }
+            | Action::CreateJob(_)
             | Action::DeleteJob { .. }
             | Action::ForceDeletePod { .. }
             | Action::DeleteSubmission { .. }
@@ -216,7 +216,7 @@ impl Actor<'_> {
         );
     }
 
-    async fn create_job(&self, status: &SubmissionStatus, attempt: i64, retry: i32) -> Result<(), ActError> {
+    async fn create_job(&self, status: &SubmissionStatus, number: JobNumber) -> Result<(), ActError> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
         };
@@ -224,12 +224,11 @@ impl Actor<'_> {
             submission: self.submission(),
             leaderboard,
             plan,
-            attempt,
-            retry,
+            number,
             settings: self.uses.settings,
             now: self.view.now,
         });
-        let name = names::job(&self.name(), attempt, retry);
+        let name = names::job(&self.name(), number);
         let api = self.writes::<Job>();
         let params = PostParams {
             field_manager: Some(names::MANAGER_CHILDREN.into()),
@@ -360,8 +359,7 @@ impl Actor<'_> {
 
 fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {
     LogDemand {
-        attempt: status.attempt.unwrap_or(1),
-        retry: status.retry,
+        job: status.job_number(),
         places: places.to_vec(),
         is_over: status.times.finished.is_some(),
     }

@@ -19,7 +19,7 @@ use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
-use leaderboard_api::{Ingested, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{Ingested, JobNumber, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct ExternalSystems {
@@ -188,7 +188,7 @@ fn run_of(submission: &Submission) -> Run {
     let status = submission.status.as_ref().filter(|s| s.attempt == Some(attempt));
     Run {
         attempt,
-        job: names::job(&submission.name_any(), attempt, 0),
+        job: names::job(&submission.name_any(), JobNumber::first(attempt)),
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
         has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
         ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),

@@ -14,6 +14,7 @@ use kube::{Api, Client};
 
 use super::view::{LogAt, LogPlace};
 use crate::services::archive::Archive;
+use leaderboard_api::JobNumber;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 
@@ -31,8 +32,7 @@ const TRY: Duration = Duration::from_secs(5);
 /// Which log is to be kept.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogDemand {
-    pub attempt: i64,
-    pub retry: i32,
+    pub job: JobNumber,
     pub places: Vec<LogPlace>,
     /// The submission has come to its end, so that its log is stored too.
     pub is_over: bool,
@@ -129,7 +129,7 @@ async fn look(client: &Client, archive: &Archive, (namespace, name): (&str, &str
         let read = tokio::time::timeout(TRY, read).await;
         match read.unwrap_or_else(|_| Err("no answer in time".into())) {
             Ok(Some(bytes)) => {
-                if let Some(found) = found(demand.attempt, place, &bytes) {
+                if let Some(found) = found(demand.job.attempt, place, &bytes) {
                     return Look::Found(found);
                 }
             }

@@ -9,7 +9,7 @@ use leaderboard_runner::verdict::Verdict;
 use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
-use leaderboard_api::{Leaderboard, Rerun, Submission};
+use leaderboard_api::{JobNumber, Leaderboard, Rerun, Submission};
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]
@@ -183,8 +183,7 @@ pub enum Stage {
 /// Which report a decision needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReportDemand {
-    pub attempt: i64,
-    pub retry: i32,
+    pub job: JobNumber,
     /// UID of the Pod.
     pub pod: Option<String>,
     pub stage: Stage,

@@ -17,7 +17,7 @@ async fn each_line_arrives_once_and_in_order() {
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let shipper = || {
         let memory = pod.uploader().memory().clone();
-        ship::Shipper::new(client.clone(), Arc::clone(&tree), "77", 2, &memory)
+        ship::Shipper::new(client.clone(), Arc::clone(&tree), &"77".parse().unwrap(), 2, &memory)
     };
     let lines = |from: usize, to: usize| {
         let lines: Vec<String> = (from..to)

@@ -27,7 +27,7 @@ use crate::controller::objects::{Wake, uid_of};
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use leaderboard_api::{Storage, Submission, SubmissionStatus, effective};
+use leaderboard_api::{JobNumber, Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
 
@@ -94,17 +94,17 @@ impl ArchiveWorkers {
     pub fn observe(&self, submission: &Submission, pod: Option<&str>, is_over: bool) -> Observed {
         let now = Instant::now();
         let status = submission.status.as_ref();
-        let (attempt, retry) = try_of(status);
+        let job = job_of(status);
         let found = status.and_then(|status| self.known_bucket(status));
         let uid = uid_of(submission);
         let nothing = State::default();
         let guard = found.as_ref().map(|bucket| bucket.state());
         let state = guard.as_deref().unwrap_or(&nothing);
         Observed {
-            report: state.report(&uid, attempt, retry, pod, now),
+            report: state.report(&uid, job, pod, now),
             texts: state.texts(&uid),
-            fence: state.fence(&uid, attempt, retry, now),
-            log: state.log(&uid, attempt, retry, is_over, now),
+            fence: state.fence(&uid, job, now),
+            log: state.log(&uid, job, is_over, now),
         }
     }
 
@@ -129,7 +129,7 @@ impl ArchiveWorkers {
         let since = status.times.stopping.as_ref().map_or(0, |t| t.0.as_second());
         let mark = format!("controller-{since}");
         self.ask(submission, status, |state, uid, target, now| {
-            state.want_fence(uid, target, try_of(Some(status)), mark, now);
+            state.want_fence(uid, target, status.job_number(), mark, now);
         });
     }
 
@@ -142,10 +142,9 @@ impl ArchiveWorkers {
 
     /// The log of the failure that a status describes.
     pub fn tail(&self, submission: &Submission, status: &SubmissionStatus) -> Option<Tail> {
-        let (attempt, retry) = try_of(Some(status));
         let bucket = self.known_bucket(status)?;
         let state = bucket.state();
-        state.tail(&uid_of(submission), attempt, retry)
+        state.tail(&uid_of(submission), status.job_number())
     }
 
     /// Drops all that is known of an object.
@@ -186,8 +185,8 @@ impl ArchiveWorkers {
     }
 }
 
-fn try_of(status: Option<&SubmissionStatus>) -> (i64, i32) {
-    status.map_or((1, 0), |status| (status.attempt.unwrap_or(1), status.retry))
+fn job_of(status: Option<&SubmissionStatus>) -> JobNumber {
+    status.map_or(JobNumber::first(1), SubmissionStatus::job_number)
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -207,7 +206,7 @@ impl ArchiveWorker {
         let bucket = Arc::new(Bucket::default());
         let worker = Self {
             id,
-            archive: Archive::of_run(&shared.aws, storage, ""),
+            archive: Archive::of_storage(&shared.aws, storage),
             shared: Arc::clone(shared),
             bucket: Arc::clone(&bucket),
         };

@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, TextProblem, Texts};
-use leaderboard_api::Storage;
+use leaderboard_api::{JobNumber, RunId, Storage};
 
 pub(super) type Uid = Arc<str>;
 
@@ -30,7 +30,7 @@ pub struct Target {
     pub namespace: String,
     pub name: String,
     pub storage: Storage,
-    pub run_id: String,
+    pub run_id: RunId,
 }
 
 /// Something to do now.
@@ -52,8 +52,7 @@ pub(super) enum What {
         sent: Option<Sent>,
     },
     Fence {
-        attempt: i64,
-        retry: i32,
+        job: JobNumber,
         mark: String,
         left: Duration,
     },

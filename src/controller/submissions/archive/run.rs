@@ -8,6 +8,7 @@ use super::request::{Answer, KINDS, Sent, Target};
 use crate::controller::submissions::failure_log::{LogDemand, Tail};
 use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
 use crate::controller::submissions::view::{ObservedLog, ObservedTexts, ReportDemand, Stage, Texts};
+use leaderboard_api::JobNumber;
 
 pub(super) struct Run {
     pub target: Arc<Target>,
@@ -45,8 +46,7 @@ pub(super) struct TextsRun {
 }
 
 pub(super) struct FenceRun {
-    pub attempt: i64,
-    pub retry: i32,
+    pub job: JobNumber,
     pub mark: String,
     pub since: Instant,
     pub is_held: bool,
@@ -62,14 +62,10 @@ pub(super) struct LogRun {
     pub end: Option<ObservedLog>,
 }
 
-fn is_same_run(one: &ReportDemand, other: &ReportDemand) -> bool {
-    one.attempt == other.attempt && one.retry == other.retry
-}
-
 /// Whether an answer that was asked for by one demand is one to the other.
 pub(super) fn answers(sent: &ReportDemand, wanted: &ReportDemand) -> bool {
     let is_of_pod = sent.pod == wanted.pod || sent.stage == Stage::JobEnded;
-    is_same_run(sent, wanted) && is_of_pod && sent.stage >= wanted.stage
+    sent.job == wanted.job && is_of_pod && sent.stage >= wanted.stage
 }
 
 impl TextsRun {

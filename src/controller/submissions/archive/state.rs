@@ -17,6 +17,7 @@ use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedLog, ObservedReport, ObservedTexts, ReportDemand, Stage,
 };
+use leaderboard_api::JobNumber;
 
 /// Time between two reads of reports in one bucket: at most 100 a second.
 const SPACING: Duration = Duration::from_millis(10);
@@ -86,8 +87,8 @@ impl State {
         }
     }
 
-    /// What is known of a report, seen from a run that is at `attempt` and `retry` with this Pod.
-    pub fn report(&self, uid: &str, attempt: i64, retry: i32, pod: Option<&str>, now: Instant) -> SeenReport {
+    /// What is known of a report, seen from a run that is at this Job with this Pod.
+    pub fn report(&self, uid: &str, job: JobNumber, pod: Option<&str>, now: Instant) -> SeenReport {
         let known = self.runs.get(uid).and_then(|run| run.report.as_ref());
         let Some(known) = known else {
             return SeenReport {
@@ -98,13 +99,13 @@ impl State {
         };
         let is_of = |sent: &&ReportDemand| {
             let is_of_pod = sent.pod.as_deref() == pod || sent.stage == Stage::JobEnded;
-            sent.attempt == attempt && sent.retry == retry && is_of_pod
+            sent.job == job && is_of_pod
         };
         let report = match (&known.error, &known.content) {
             (Some(why), _) => ObservedReport::Unreadable(why.clone()),
             (None, None) => ObservedReport::NotRead,
             (None, Some(Content::Absent)) => ObservedReport::Absent,
-            (None, Some(Content::Report(report))) if report.attempt == attempt => {
+            (None, Some(Content::Report(report))) if report.attempt == job.attempt => {
                 ObservedReport::Ours(Arc::clone(report))
             }
             (None, Some(Content::Foreign | Content::Report(_))) => ObservedReport::Foreign,
@@ -144,25 +145,13 @@ impl State {
     }
 
     /// Asks for our own mark in the place of a lost Pod's.
-    pub fn want_fence(
-        &mut self,
-        uid: &Uid,
-        target: &Arc<Target>,
-        (attempt, retry): (i64, i32),
-        mark: String,
-        now: Instant,
-    ) {
+    pub fn want_fence(&mut self, uid: &Uid, target: &Arc<Target>, job: JobNumber, mark: String, now: Instant) {
         let run = self.run(uid, target);
-        let is_known = run
-            .fence
-            .as_ref()
-            .is_some_and(|f| (f.attempt, f.retry) == (attempt, retry));
-        if is_known {
+        if run.fence.as_ref().is_some_and(|fence| fence.job == job) {
             return;
         }
         run.fence = Some(FenceRun {
-            attempt,
-            retry,
+            job,
             mark,
             since: now,
             is_held: false,
@@ -171,9 +160,9 @@ impl State {
         self.plan(uid, Kind::Fence, Some(now));
     }
 
-    pub fn fence(&self, uid: &str, attempt: i64, retry: i32, now: Instant) -> ObservedFence {
+    pub fn fence(&self, uid: &str, job: JobNumber, now: Instant) -> ObservedFence {
         let fence = self.runs.get(uid).and_then(|run| run.fence.as_ref());
-        match fence.filter(|fence| (fence.attempt, fence.retry) == (attempt, retry)) {
+        match fence.filter(|fence| fence.job == job) {
             None => ObservedFence::NotRequested,
             Some(fence) if fence.is_held => ObservedFence::Held,
             Some(fence) if fence.has_failed => ObservedFence::Failed(now.saturating_duration_since(fence.since)),
@@ -194,7 +183,7 @@ impl State {
             tail,
             end: None,
         };
-        let known = known.filter(|log| (log.demand.attempt, log.demand.retry) == (demand.attempt, demand.retry));
+        let known = known.filter(|log| log.demand.job == demand.job);
         run.log = Some(match known {
             Some(log) if log.demand == demand || (log.demand.is_over && !demand.is_over) => log,
             // Found already, and nothing more is to be done with it.
@@ -215,10 +204,8 @@ impl State {
         }
     }
 
-    pub fn log(&self, uid: &str, attempt: i64, retry: i32, is_over: bool, now: Instant) -> ObservedLog {
-        let log = self
-            .log_of(uid, attempt, retry)
-            .filter(|log| log.demand.is_over == is_over);
+    pub fn log(&self, uid: &str, job: JobNumber, is_over: bool, now: Instant) -> ObservedLog {
+        let log = self.log_of(uid, job).filter(|log| log.demand.is_over == is_over);
         log.map_or(ObservedLog::NotRequested, |log| {
             log.end
                 .unwrap_or_else(|| ObservedLog::Pending(now.saturating_duration_since(log.since)))
@@ -226,13 +213,13 @@ impl State {
     }
 
     /// The log that was kept.
-    pub fn tail(&self, uid: &str, attempt: i64, retry: i32) -> Option<Tail> {
-        self.log_of(uid, attempt, retry)?.tail.clone()
+    pub fn tail(&self, uid: &str, job: JobNumber) -> Option<Tail> {
+        self.log_of(uid, job)?.tail.clone()
     }
 
-    fn log_of(&self, uid: &str, attempt: i64, retry: i32) -> Option<&LogRun> {
+    fn log_of(&self, uid: &str, job: JobNumber) -> Option<&LogRun> {
         let log = self.runs.get(uid)?.log.as_ref()?;
-        ((log.demand.attempt, log.demand.retry) == (attempt, retry)).then_some(log)
+        (log.demand.job == job).then_some(log)
     }
 
     /// Drops all that is known of an object.
@@ -317,17 +304,15 @@ impl State {
                 }
                 is_new
             }
-            (What::Fence { attempt, retry, .. }, Done::Fence(result)) => {
-                self.fence_done(&work.uid, (*attempt, *retry), &result, now)
-            }
+            (What::Fence { job, .. }, Done::Fence(result)) => self.fence_done(&work.uid, *job, &result, now),
             (What::Log { demand, .. }, Done::Log(answer)) => self.log_done(&work.uid, demand, answer, now),
             _ => false,
         }
     }
 
-    fn fence_done(&mut self, uid: &Uid, of: (i64, i32), result: &Result<(), String>, now: Instant) -> bool {
+    fn fence_done(&mut self, uid: &Uid, of: JobNumber, result: &Result<(), String>, now: Instant) -> bool {
         let fence = self.runs.get_mut(uid).and_then(|run| run.fence.as_mut());
-        let Some(fence) = fence.filter(|fence| (fence.attempt, fence.retry) == of) else {
+        let Some(fence) = fence.filter(|fence| fence.job == of) else {
             return false;
         };
         let had_failed = fence.has_failed;
@@ -345,7 +330,7 @@ impl State {
             return false;
         };
         log.is_under_way = false;
-        if (log.demand.attempt, log.demand.retry) != (of.attempt, of.retry) {
+        if log.demand.job != of.job {
             self.plan(uid, Kind::Log, Some(now));
             return false;
         }
@@ -387,8 +372,7 @@ impl State {
             Kind::Fence => {
                 let fence = run.fence.as_ref()?;
                 What::Fence {
-                    attempt: fence.attempt,
-                    retry: fence.retry,
+                    job: fence.job,
                     mark: fence.mark.clone(),
                     left: (fence.since + FENCE_TRIES).saturating_duration_since(now),
                 }

@@ -19,12 +19,16 @@ fn uid(name: &str) -> Uid {
 
 fn demand(stage: Stage) -> ReportDemand {
     ReportDemand {
-        attempt: 1,
-        retry: 0,
+        job: JobNumber::first(1),
         pod: Some("p".into()),
         stage,
         period: Duration::from_secs(10),
     }
+}
+
+/// The Job after so many that infrastructure failures ended.
+fn again(retry: i32) -> JobNumber {
+    JobNumber { attempt: 1, retry }
 }
 
 fn found(done: u32) -> Answer {
@@ -49,7 +53,7 @@ impl Bench {
                 namespace: "one".into(),
                 name: "sub".into(),
                 storage,
-                run_id: "7".into(),
+                run_id: "7".parse().unwrap(),
             }),
         }
     }
@@ -87,7 +91,7 @@ impl Bench {
     }
 
     fn seen(&self) -> SeenReport {
-        self.state.report("u", 1, 0, Some("p"), self.now)
+        self.state.report("u", JobNumber::first(1), Some("p"), self.now)
     }
 
     fn stage(&self) -> Option<Stage> {
@@ -100,11 +104,11 @@ impl Bench {
 
     fn want_fence(&mut self, retry: i32) {
         self.state
-            .want_fence(&uid("u"), &self.target, (1, retry), "m".into(), self.now);
+            .want_fence(&uid("u"), &self.target, again(retry), "m".into(), self.now);
     }
 
     fn fence(&self) -> ObservedFence {
-        self.state.fence("u", 1, 0, self.now)
+        self.state.fence("u", JobNumber::first(1), self.now)
     }
 
     fn want_log(&mut self, is_over: bool) {
@@ -112,15 +116,14 @@ impl Bench {
     }
 
     fn log(&self, is_over: bool) -> ObservedLog {
-        self.state.log("u", 1, 0, is_over, self.now)
+        self.state.log("u", JobNumber::first(1), is_over, self.now)
     }
 }
 
 fn log(is_over: bool) -> LogDemand {
     let key = "agent/agent1/leaderboard.log".to_owned();
     LogDemand {
-        attempt: 1,
-        retry: 0,
+        job: JobNumber::first(1),
         places: vec![LogPlace {
             container: "agent-1".into(),
             at: LogAt::Bucket { key },
@@ -190,12 +193,12 @@ fn what_was_read_for_one_pod_or_job_is_no_answer_for_another() {
     let mut bench = Bench::new();
     bench.demand(Stage::RunEnded);
     bench.read(found(4));
-    let of = |bench: &Bench, retry, pod| bench.state.report("u", 1, retry, pod, bench.now).stage;
+    let of = |bench: &Bench, retry, pod| bench.state.report("u", again(retry), pod, bench.now).stage;
     assert_eq!(of(&bench, 0, Some("p")), Some(Stage::RunEnded));
     assert_eq!(of(&bench, 0, Some("q")), None);
     assert_eq!(of(&bench, 0, None), None);
     assert_eq!(of(&bench, 1, Some("p")), None);
-    let seen = bench.state.report("u", 2, 0, Some("p"), bench.now);
+    let seen = bench.state.report("u", JobNumber::first(2), Some("p"), bench.now);
     assert_eq!(seen.report, ObservedReport::Foreign, "another attempt's");
     // The Pod goes with its Job.
     bench.wait(SPACING);
@@ -369,7 +372,7 @@ fn a_fence_is_tried_until_it_is_held_or_its_time_is_over() {
     );
     let work = bench.begin();
     bench.state.done(&work, Done::Fence(Ok(())), bench.now);
-    assert_eq!(bench.state.fence("u", 1, 1, bench.now), ObservedFence::Held);
+    assert_eq!(bench.state.fence("u", again(1), bench.now), ObservedFence::Held);
     assert!(bench.is_idle());
 }
 
@@ -403,11 +406,11 @@ fn a_log_that_was_found_is_stored_at_the_end_and_given_up_after_some_tries() {
     }
     assert_eq!(bench.log(true), ObservedLog::GivenUp);
     assert_eq!(
-        bench.state.tail("u", 1, 0),
+        bench.state.tail("u", JobNumber::first(1)),
         Some(tail()),
         "EvalAI's hosts get it all the same"
     );
-    assert_eq!(bench.state.tail("u", 1, 1), None);
+    assert_eq!(bench.state.tail("u", again(1)), None);
     assert!(bench.is_idle());
 }
 

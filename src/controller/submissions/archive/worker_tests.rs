@@ -78,8 +78,7 @@ impl Bench {
 
     fn demand(&self, stage: Stage) {
         let demand = ReportDemand {
-            attempt: 1,
-            retry: 0,
+            job: JobNumber::first(1),
             pod: None,
             stage,
             period: std::time::Duration::from_secs(10),

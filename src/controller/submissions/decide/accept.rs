@@ -316,7 +316,7 @@ fn pin(
         Some(pinned) => pinned,
         None => {
             let resume = resumed || draft.spec().attempt > 1;
-            let plan = effective::plan(leaderboard, track, effective::run_id(draft.submission()), image, resume);
+            let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
             leaderboard_api::RunPlan {
                 earlier_attempts: earlier_attempts(draft, info),
                 ..plan

@@ -130,11 +130,10 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
 
 fn start_job(draft: &mut PlanBuilder<'_>) {
     let name = own_job_name(draft);
-    let (attempt, retry) = (draft.status.attempt.unwrap_or(1), draft.status.retry);
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
     draft.status.job_name = Some(name);
-    draft.act(Action::CreateJob { attempt, retry });
+    draft.act(Action::CreateJob(draft.status.job_number()));
     draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
     if draft.is_running() {
         let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";

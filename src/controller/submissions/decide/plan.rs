@@ -6,7 +6,7 @@ use crate::controller::slots::turns::InLine;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
-use leaderboard_api::{SubmissionStatus, names};
+use leaderboard_api::{JobNumber, SubmissionStatus, names};
 
 /// What a pass wants: the status to show, then the actions in order, then the events.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,8 +29,8 @@ pub enum Action {
     ReleaseFinalizer,
     /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
     JoinLine(InLine),
-    /// Create the Job of this attempt and retry.
-    CreateJob { attempt: i64, retry: i32 },
+    /// Create this Job.
+    CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.
     DeleteJob {
         name: String,
@@ -84,5 +84,5 @@ pub struct Event {
 
 /// Name of the Job that the present attempt has or will have.
 pub fn job_name(submission: &str, status: &SubmissionStatus) -> String {
-    names::job(submission, status.attempt.unwrap_or(1), status.retry)
+    names::job(submission, status.job_number())
 }

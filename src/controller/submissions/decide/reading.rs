@@ -44,8 +44,7 @@ pub(super) fn demand(draft: &PlanBuilder<'_>) -> Option<ReportDemand> {
         stage_of_live(draft)?
     };
     Some(ReportDemand {
-        attempt: status.attempt.unwrap_or(1),
-        retry: status.retry,
+        job: status.job_number(),
         pod: draft.view.pod.as_ref().map(|pod| pod.uid.clone()),
         stage,
         period: draft.period(),
@@ -73,7 +72,7 @@ fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
         ObservedJob::Ours(_) => draft.status.times.scheduled.as_ref().map(|_| Stage::Live),
         ObservedJob::Created => None,
         // One that is created only now is not there either, and what is stored is not its own.
-        ObservedJob::Absent if draft.does(|action| matches!(action, Action::CreateJob { .. })) => None,
+        ObservedJob::Absent if draft.does(|action| matches!(action, Action::CreateJob(_))) => None,
         // Whether the first Job of an attempt was there, its report shows.
         ObservedJob::Absent if draft.is_first_job() => Some(Stage::JobEnded),
         ObservedJob::Absent | ObservedJob::Foreign => {

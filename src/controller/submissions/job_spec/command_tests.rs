@@ -256,7 +256,7 @@ fn a_resumed_attempt_says_so() {
     let image = Image::new("resume");
     image.program("python3", FAKE_PYTHON);
     let mut case = Case::new("V2", json!({}));
-    case.attempt = 2;
+    case.number.attempt = 2;
     let (words, env) = agent(&case, 1, &image, &TEAM);
     assert!(words.contains(&"--resume=1".to_owned()));
     assert_eq!(env["RESUME"], "1");

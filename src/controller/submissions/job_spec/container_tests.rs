@@ -58,7 +58,7 @@ fn the_pairs_share_out_what_the_plan_says() {
 fn resume_is_1_or_empty() {
     for (attempt, taken_up, expected) in [(1, false, ""), (1, true, "1"), (2, false, "1"), (2, true, "1")] {
         let mut case = Case::new("V2", json!({}));
-        case.attempt = attempt;
+        case.number.attempt = attempt;
         case.plan.resume = taken_up;
         let job = case.json();
         assert_eq!(
@@ -192,7 +192,7 @@ fn the_run_document_is_the_plan_and_its_times() {
         "V2",
         json!({"syncPeriodSeconds": 5, "verify": "Refuse", "logGroup": {"name": "g"}}),
     );
-    case.attempt = 2;
+    case.number.attempt = 2;
     let run = run_document(&case.input());
     assert_eq!(
         (run.namespace.as_str(), run.submission.as_str(), run.uid.as_str()),

@@ -32,8 +32,8 @@ use crate::controller::objects::owner_reference;
 use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 use leaderboard_api::{
-    Deadlines, Enforcement, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track, conditions,
-    effective, names, reasons,
+    Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track,
+    conditions, effective, names, reasons,
 };
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
@@ -56,10 +56,8 @@ pub struct JobInput<'a> {
     pub leaderboard: &'a Leaderboard,
     /// What is run, pinned at acceptance.
     pub plan: &'a RunPlan,
-    /// From 1.
-    pub attempt: i64,
-    /// Jobs of this attempt that infrastructure failures ended.
-    pub retry: i32,
+    /// Which Job it is.
+    pub number: JobNumber,
     /// The operator's own image, with `workspace` and `logcopy` in it, and its region.
     pub settings: &'a Settings,
     /// When it is made.
@@ -129,7 +127,7 @@ fn run_document(input: &JobInput<'_>) -> Run {
         namespace: meta.namespace.clone().unwrap_or_default(),
         submission: input.submission_name().to_owned(),
         uid: meta.uid.clone().unwrap_or_default(),
-        attempt: input.attempt,
+        attempt: input.number.attempt,
         plan: input.plan.clone(),
         verify: spec.verify,
         period_seconds: unsigned(spec.sync_period_seconds),
@@ -182,12 +180,12 @@ fn ours(input: &JobInput<'_>) -> Job {
 
 fn metadata(input: &JobInput<'_>) -> ObjectMeta {
     ObjectMeta {
-        name: Some(names::job(input.submission_name(), input.attempt, input.retry)),
+        name: Some(names::job(input.submission_name(), input.number)),
         namespace: input.submission.metadata.namespace.clone(),
         labels: Some(labels(input)),
         annotations: Some(BTreeMap::from([(
             names::ANNOTATION_RETRY.into(),
-            input.retry.to_string(),
+            input.number.retry.to_string(),
         )])),
         owner_references: Some(vec![owner_reference(input.submission)]),
         ..ObjectMeta::default()
@@ -199,9 +197,9 @@ fn labels(input: &JobInput<'_>) -> BTreeMap<String, String> {
     BTreeMap::from([
         (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
         (names::LABEL_SUBMISSION.into(), input.submission_name().to_owned()),
-        (names::LABEL_ATTEMPT.into(), input.attempt.to_string()),
+        (names::LABEL_ATTEMPT.into(), input.number.attempt.to_string()),
         (names::LABEL_LEADERBOARD.into(), leaderboard),
-        (names::LABEL_RUN.into(), input.plan.run_id.clone()),
+        (names::LABEL_RUN.into(), input.plan.run_id.to_string()),
     ])
 }
 

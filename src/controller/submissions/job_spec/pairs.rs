@@ -123,7 +123,11 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         .unwrap_or(SCENARIOS_FILE);
     let slice = plan.slices.get(pair - 1).map(ToString::to_string).unwrap_or_default();
     // The evaluator takes any text for a yes.
-    let resume = if plan.resume || input.attempt > 1 { "1" } else { "" };
+    let resume = if plan.resume || input.number.attempt > 1 {
+        "1"
+    } else {
+        ""
+    };
     let mut env = vec![
         variable("CARLA_PORT", &port(pair).to_string()),
         variable("CARLA_TM_PORT", &(port(pair) + 10).to_string()),

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::{Value, json};
 
 use super::*;
-use leaderboard_api::effective;
+use leaderboard_api::{JobNumber, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
 
@@ -15,8 +15,7 @@ pub(super) struct Case {
     pub(super) submission: Submission,
     pub(super) leaderboard: Leaderboard,
     pub(super) plan: RunPlan,
-    pub(super) attempt: i64,
-    pub(super) retry: i32,
+    pub(super) number: JobNumber,
     pub(super) settings: Settings,
 }
 
@@ -50,7 +49,7 @@ impl Case {
         let plan = effective::plan(
             &leaderboard.spec,
             &leaderboard.spec.tracks[0],
-            "4711".into(),
+            "4711".parse().unwrap(),
             image,
             false,
         );
@@ -58,8 +57,7 @@ impl Case {
             submission,
             leaderboard,
             plan,
-            attempt: 1,
-            retry: 0,
+            number: JobNumber::first(1),
             settings: Settings {
                 image: OPERATOR_IMAGE.into(),
                 image_pull_policy: None,
@@ -76,8 +74,7 @@ impl Case {
             submission: &self.submission,
             leaderboard: &self.leaderboard,
             plan: &self.plan,
-            attempt: self.attempt,
-            retry: self.retry,
+            number: self.number,
             settings: &self.settings,
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }
@@ -145,8 +142,8 @@ fn the_job_of_leaderboard_2_is_as_committed() {
             }],
         }),
     );
-    case.attempt = 3;
-    case.retry = 1;
+    case.number.attempt = 3;
+    case.number.retry = 1;
     golden("v2.json", &case);
 }
 
@@ -186,8 +183,8 @@ fn an_overlay_that_is_refused_is_not_applied() {
 fn names_fit_wherever_kubernetes_puts_them() {
     let mut case = Case::new("V2", json!({"pairs": 16, "routes": 100}));
     case.submission.metadata.name = Some("s".repeat(52));
-    case.attempt = 99_999;
-    case.retry = 100;
+    case.number.attempt = 99_999;
+    case.number.retry = 100;
     let job = case.json();
     // Kubernetes makes a label of it.
     assert!(job["metadata"]["name"].as_str().unwrap().len() <= 63);
@@ -207,7 +204,7 @@ fn names_fit_wherever_kubernetes_puts_them() {
 #[test]
 fn jobs_and_pods_say_whose_they_are() {
     let mut case = Case::new("V2", json!({}));
-    (case.attempt, case.retry) = (2, 3);
+    case.number = JobNumber { attempt: 2, retry: 3 };
     let job = case.json();
     assert_eq!(job["metadata"]["name"], "submission-4711-2-r3");
     assert_eq!(job["metadata"]["annotations"]["leaderboard.carla.org/retry"], "3");

@@ -10,14 +10,13 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{Standing, Turn};
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
-use leaderboard_api::{FailureClass, SubmissionStatus, Team, conditions, reasons};
+use leaderboard_api::{FailureClass, JobNumber, SubmissionStatus, Team, conditions, reasons};
 
 #[test]
 fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
     let mut world = World::local();
     let plan = world.pass_to(Pending, reasons::PREPARING);
-    let (attempt, retry) = (1, 0);
-    assert_eq!(plan.actions[0], Action::CreateJob { attempt, retry });
+    assert_eq!(plan.actions[0], Action::CreateJob(JobNumber::first(1)));
     assert!(events(&plan).is_empty(), "the status shows it");
     assert_eq!(condition(&plan, ACCEPTED), ("True".into(), reasons::ACCEPTED.into()));
     assert_eq!(condition(&plan, FINISHED).0, "False");
@@ -68,7 +67,7 @@ fn evalais_submission_takes_team_and_time_from_evalai_and_says_queued() {
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
     let status = world.status();
-    assert_eq!(status.plan.as_ref().unwrap().run_id, "77");
+    assert_eq!(status.plan.as_ref().unwrap().run_id.as_str(), "77");
     assert_eq!(
         status.plan.unwrap().image,
         "team/agent:1",

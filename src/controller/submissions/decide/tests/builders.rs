@@ -428,7 +428,7 @@ pub fn has(plan: &Plan, matches: impl Fn(&Action) -> bool) -> bool {
 }
 
 pub fn creates(plan: &Plan) -> bool {
-    has(plan, |a| matches!(a, Action::CreateJob { .. }))
+    has(plan, |a| matches!(a, Action::CreateJob(_)))
 }
 
 /// Status and reason of a condition.

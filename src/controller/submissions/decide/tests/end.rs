@@ -6,11 +6,11 @@ use super::builders::*;
 use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
 use crate::pod::report::Report;
-use leaderboard_api::Failure;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
 use leaderboard_api::reasons;
+use leaderboard_api::{Failure, JobNumber};
 
 #[test]
 fn complete_results_that_count_finish() {
@@ -259,7 +259,7 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
         world.wait(1);
         let plan = world.pass();
-        assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: n }));
+        assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber { attempt: 1, retry: n })));
         world.see_job();
         let now = world.view.now;
         world.view.pod = Some(crate::controller::submissions::view::PodView {

@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::controller::submissions::decide::Action;
 use crate::controller::submissions::view::{ObservedNode, PodView};
 use leaderboard_api::State::{Pending, Running};
-use leaderboard_api::reasons;
+use leaderboard_api::{JobNumber, reasons};
 
 #[test]
 fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
@@ -30,7 +30,7 @@ fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
     assert!(!creates(&plan), "after a pause");
     world.wait(10);
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: 1 }));
+    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber { attempt: 1, retry: 1 })));
     assert_eq!(evalai_updates(&plan), [], "EvalAI keeps saying running");
     assert_eq!(plan.status.job_name.as_deref(), Some("sub-1-r1"));
 }

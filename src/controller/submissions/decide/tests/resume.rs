@@ -7,7 +7,7 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{EvalaiView, ObservedReport};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Resumed};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, STALLED};
-use leaderboard_api::{names, reasons};
+use leaderboard_api::{JobNumber, names, reasons};
 
 fn failed() -> World {
     let mut world = World::evalai().running();
@@ -58,7 +58,7 @@ fn the_plan_is_kept_and_the_images_renewed() {
             ..EvalaiView::default()
         });
         let plan = world.pass();
-        assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 2, retry: 0 }));
+        assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(2))));
         assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
         let pinned = plan.status.plan.unwrap();
         assert!(pinned.resume);
@@ -103,7 +103,7 @@ fn a_jump_or_a_first_attempt_above_one_is_an_attempt_like_any() {
     world.submission().spec.attempt = 2;
     assert_eq!(world.pass_to(Pending, reasons::PREPARING).actions, []);
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 2, retry: 0 }));
+    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(2))));
     assert!(plan.status.plan.unwrap().resume);
 }
 
@@ -114,7 +114,7 @@ fn what_the_old_pipeline_left_is_taken_up_without_status_or_report() {
     world.in_evalai().info.as_mut().unwrap().standing = crate::controller::submissions::view::Standing::Resumed;
     world.view.report = ObservedReport::Absent;
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob { attempt: 1, retry: 0 }));
+    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(1))));
     assert!(
         plan.status.plan.as_ref().unwrap().resume,
         "workspace restores what is there"

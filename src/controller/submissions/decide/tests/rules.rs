@@ -66,18 +66,18 @@ fn terminal_states_stay(view: &View, plan: &Plan) {
 
 fn one_job(view: &View, plan: &Plan) {
     let created = plan.actions.iter().filter_map(|a| match a {
-        Action::CreateJob { attempt, retry } => Some((*attempt, *retry)),
+        Action::CreateJob(number) => Some(*number),
         _ => None,
     });
     let created: Vec<_> = created.collect();
     assert!(created.len() <= 1, "two Jobs in one pass");
-    if let Some((attempt, retry)) = created.first() {
+    if let Some(number) = created.first() {
         assert!(
             !matches!(view.job, ObservedJob::Ours(_) | ObservedJob::Created),
             "a second Job next to the present one"
         );
         assert!(!is_finished(&plan.status));
-        assert_eq!((plan.status.attempt, plan.status.retry), (Some(*attempt), *retry));
+        assert_eq!(plan.status.job_number(), *number);
         assert_eq!(plan.status.job_name, Some(job_name("sub", &plan.status)));
         assert!(plan.status.plan.is_some(), "a Job without a plan");
         let leaderboard = view.leaderboard.as_ref().expect("a Job without a Leaderboard");
