@@ -297,7 +297,8 @@ impl Rounds {
     async fn store_statuses(&mut self, statuses: &[StatusFile]) -> Result<(), ArchiveError> {
         let empty = Object::new(Bytes::new());
         let key = |file: &StatusFile| format!("{STATUS_FOLDER}/{}", file.name());
-        let (stored, endless): (Vec<_>, Vec<_>) = statuses.iter().partition(|file| is_of_first_rounds(file));
+        let (stored, endless): (Vec<&StatusFile>, Vec<&StatusFile>) =
+            statuses.iter().partition(|file| is_of_first_rounds(file));
         if let Some(first) = endless.first() {
             self.uploader.complain(&key(first), &Complaint::Statuses(STATUS_ROUNDS));
         }
