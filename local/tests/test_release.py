@@ -1,5 +1,6 @@
 """The version in its three places, and the manifest of krew."""
 
+import re
 import tempfile
 import unittest
 from pathlib import Path
@@ -8,6 +9,7 @@ from labkit import release
 from labkit.errors import LabError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+WORKFLOWS = REPOSITORY / ".github" / "workflows"
 SUMS = {release.archive("1.2.3", name): "0" * 64 for name in release.PLATFORMS}
 
 
@@ -53,3 +55,48 @@ class Krew(unittest.TestCase):
         sums = {name: digest for name, digest in SUMS.items() if "darwin-arm64" not in name}
         with self.assertRaisesRegex(LabError, "darwin-arm64"):
             release.krew("1.2.3", "https://x.example", sums)
+
+
+class Workflows(unittest.TestCase):
+    """What can be known of them without running them."""
+
+    def setUp(self) -> None:
+        self.release = (WORKFLOWS / "release.yaml").read_text()
+
+    def test_every_action_is_pinned_to_a_commit_with_its_version(self) -> None:
+        for file in sorted(WORKFLOWS.iterdir()):
+            used = re.findall(r"uses: (.+)", file.read_text())
+            self.assertTrue(used, file.name)
+            for action in used:
+                self.assertRegex(action, r"^[\w./-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+$", file.name)
+
+    def test_no_job_has_more_rights_than_it_names(self) -> None:
+        for file in sorted(WORKFLOWS.iterdir()):
+            top = re.search(r"^permissions:\n((?:  .+\n)+)", file.read_text(), re.MULTILINE)
+            self.assertIsNotNone(top, file.name)
+            self.assertEqual(top[1] if top else "", "  contents: read\n", file.name)
+
+    def test_the_plugin_is_built_for_each_machine_of_the_manifest_under_its_name(self) -> None:
+        built = dict(re.findall(r"- \{name: ([\w-]+), runner: \S+ target: \S+ program: ([\w.-]+)\}", self.release))
+        self.assertEqual(built, {name: program for name, (_, _, program) in release.PLATFORMS.items()})
+        name = re.search(r"ARCHIVE: (.+)", self.release)
+        expected = release.archive("${{ needs.plan.outputs.version }}", "${{ matrix.name }}")
+        self.assertEqual(name[1] if name else "", expected)
+
+    def test_the_bases_that_are_resolved_are_those_of_the_dockerfile(self) -> None:
+        dockerfile = (REPOSITORY / "Dockerfile").read_text()
+        used = re.findall(r"^FROM (\S+)", dockerfile, re.MULTILINE)
+        self.assertEqual(used, ["${BUILD_IMAGE}", "${BASE_IMAGE}"])
+        for name in ("BUILD_IMAGE", "BASE_IMAGE"):
+            self.assertRegex(dockerfile, rf"(?m)^ARG {name}=\S+:\S+$")
+            self.assertIn(f'--build-arg "{name}=${name}"', self.release)
+
+    def test_advisories_are_asked_for_every_week_and_before_a_release(self) -> None:
+        weekly = (WORKFLOWS / "advisories.yml").read_text()
+        self.assertIn("- cron:", weekly)
+        self.assertIn("cargo deny --locked check advisories", weekly)
+        self.assertIn("cargo deny --locked check\n", self.release)
+
+    def test_images_and_chart_and_checksums_are_signed(self) -> None:
+        for signed in ('"$IMAGE@$digest"', '"$CHARTS/leaderboard-operator@$digest"', "checksums.txt"):
+            self.assertRegex(self.release, rf"cosign sign(-blob)? --yes .*{re.escape(signed)}")
