@@ -2,6 +2,7 @@
 
 import re
 import tempfile
+import tomllib
 import unittest
 from pathlib import Path
 
@@ -100,3 +101,25 @@ class Workflows(unittest.TestCase):
     def test_images_and_chart_and_checksums_are_signed(self) -> None:
         for signed in ('"$IMAGE@$digest"', '"$CHARTS/leaderboard-operator@$digest"', "checksums.txt"):
             self.assertRegex(self.release, rf"cosign sign(-blob)? --yes .*{re.escape(signed)}")
+
+
+class Crates(unittest.TestCase):
+    def test_every_crate_comes_from_one_public_registry_with_its_checksum(self) -> None:
+        packages = tomllib.loads((REPOSITORY / "Cargo.lock").read_text())["package"]
+        foreign = [package for package in packages if "source" in package]
+        self.assertEqual(len({package["source"] for package in foreign}), 1)
+        self.assertTrue(all(package["source"].startswith("registry+") for package in foreign))
+        self.assertEqual([package["name"] for package in foreign if "checksum" not in package], [])
+
+    def test_no_crate_of_the_operator_may_be_unsafe(self) -> None:
+        workspace = tomllib.loads((REPOSITORY / "Cargo.toml").read_text())["workspace"]
+        self.assertEqual(workspace["lints"]["rust"]["unsafe_code"], "forbid")
+        for member in (".", *(member for member in workspace["members"] if member.startswith("crates/"))):
+            manifest = tomllib.loads((REPOSITORY / member / "Cargo.toml").read_text())
+            self.assertEqual(manifest["lints"], {"workspace": True}, member)
+
+    def test_nothing_turns_the_verification_of_tls_off(self) -> None:
+        sources = [*(REPOSITORY / "src").rglob("*.rs"), *(REPOSITORY / "crates").rglob("*.rs")]
+        switches = re.compile(r"danger_\w+|dangerous\(|accept_invalid\w*|ServerCertVerifier|insecure_skip")
+        self.assertGreater(len(sources), 200)
+        self.assertEqual([str(file) for file in sources if switches.search(file.read_text())], [])
