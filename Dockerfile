@@ -2,7 +2,11 @@
 # The operator's image, for those who have a container engine: `docker build -t leaderboard-operator:dev .`
 # `make image` makes the same one without an engine; local/operator-image.toml is its list of files.
 
-FROM rust:1.95-bookworm AS build
+# The release workflow resolves both names to digests and records them (docs/release.md); by hand they are what the tags point at.
+ARG BUILD_IMAGE=rust:1.95-bookworm
+ARG BASE_IMAGE=gcr.io/distroless/cc-debian12:nonroot
+
+FROM ${BUILD_IMAGE} AS build
 WORKDIR /src
 # The commit, for the first line of the log: --build-arg REVISION="$(git rev-parse --short HEAD)"
 ARG REVISION=""
@@ -17,7 +21,7 @@ RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,targe
     && install -D -t /out target/release/leaderboard-operator "target/$triple/release/leaderboard-runner"
 
 # Has the C library, the authorities for TLS, the user 65532, and no shell.
-FROM gcr.io/distroless/cc-debian12:nonroot
+FROM ${BASE_IMAGE}
 COPY --from=build /out/leaderboard-operator /out/leaderboard-runner /usr/local/bin/
 USER 65532:65532
 ENTRYPOINT ["leaderboard-operator"]

@@ -51,6 +51,7 @@ REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
     (('podMonitor.interval="30"',), "interval"),
     (("podMonitor.intervall=1",), "intervall"),
     (("prometheusRule.enable=true",), "enable"),
+    (('prometheusRule.runbooksURL="docs/runbooks"',), "runbooksURL"),
     (('dashboard.namespace="My_Namespace"',), "namespace"),
     (('extraObjects=[{"kind":"ConfigMap"}]',), "extraObjects"),
     # What the templates refuse: a cluster without the kind, and two values that exclude each other.

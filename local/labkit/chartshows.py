@@ -409,6 +409,16 @@ WATCHING = [
         {"prometheusRule": {"enabled": True, "labels": {"release": "prometheus"}, "annotations": {"a": "b"}}},
         (f"PrometheusRule/{RELEASE}", "metadata", {"labels": {"release": "prometheus"}, "annotations": {"a": "b"}}),
         (f"PrometheusRule/{RELEASE}", "spec.groups.0.rules.0", {"alert": "LeaderboardOperatorAbsent"}),
+        (f"PrometheusRule/{RELEASE}", "spec.groups.0.rules.0.annotations.runbook_url", ABSENT),
+        kinds=("PrometheusRule",),
+    ),
+    case(
+        {"prometheusRule": {"enabled": True, "runbooksURL": "https://docs.example/runbooks/"}},
+        (
+            f"PrometheusRule/{RELEASE}",
+            "spec.groups.0.rules.0.annotations.runbook_url",
+            "https://docs.example/runbooks/LeaderboardOperatorAbsent.md",
+        ),
         kinds=("PrometheusRule",),
     ),
     case(

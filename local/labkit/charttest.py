@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from . import apiserver, chartcases, chartdocs, chartrender, schemas, tools
+from . import apiserver, chartcases, chartdocs, chartrender, doccheck, release, schemas, tools
 from .chartcases import RELEASE, SYSTEM, Access
 from .chartrender import documents
 from .console import say, seconds
@@ -35,6 +35,8 @@ def run(settings: Settings, update: bool) -> None:
     check("a reason above every rule", lambda: rules_have_reasons(chart))
     check("values.yaml and the README's table", lambda: chartdocs.same_table(chart))
     check("values.yaml and its schema", lambda: chartdocs.same_schema(chart))
+    check("one version", lambda: release.version(settings.repository))
+    check("a runbook for each alert", lambda: doccheck.runbooks(settings.repository))
     started = time.monotonic()
     with apiserver.running(settings, folder) as kube:
         say(f"an API server of its own is ready ({seconds(time.monotonic() - started)})")

@@ -7,7 +7,21 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from . import aws, chartdocs, chartrender, charttest, cluster, crash, demo, image, kube, pythonenv, testrun, tools
+from . import (
+    aws,
+    chartdocs,
+    chartrender,
+    charttest,
+    cluster,
+    crash,
+    demo,
+    image,
+    kube,
+    pythonenv,
+    release,
+    testrun,
+    tools,
+)
 from .console import say
 from .errors import LabError
 from .settings import API_SERVICE_ADDRESS, HOST_ADDRESS, PORTS, Settings, client_environment, load
@@ -54,6 +68,10 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("chart-docs", help="write the table of values in the chart's README")
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
+    commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
+    manifest = commands.add_parser("krew-manifest", help="print the manifest by which krew installs the plugin")
+    manifest.add_argument("base", metavar="URL", help="the folder from which the archives are downloaded")
+    manifest.add_argument("archives", nargs="+", type=Path, metavar="ARCHIVE", help="the plugin for each machine")
     images = commands.add_parser(
         "image", help="make images and push them to the cluster's registry; prints their references"
     )
@@ -98,6 +116,10 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
         case "install-yaml":
             helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")
+        case "version":
+            print(release.version(settings.repository))
+        case "krew-manifest":
+            print(release.krew_manifest(settings.repository, arguments.base, arguments.archives))
         case "image":
             target = image.target_folder(settings.repository, os.environ)
             search = image.Search(image.given_binaries(arguments.bin), target, arguments.profile)

@@ -311,3 +311,7 @@ fn put<'a>(subject: &SubmissionRef, status: &'a str, results: bool, payload: &'a
 #[cfg(test)]
 #[path = "client_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "client_strangers_tests.rs"]
+mod strangers_tests;

@@ -1,0 +1,135 @@
+"""Owns what the documents promise about the repository: a runbook for each alert, links that lead somewhere, tests that exist.
+
+Pure but for reading files. Called by the chart's test and by local/tests.
+"""
+
+import re
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .errors import LabError
+
+ALERTS = "charts/leaderboard-operator/files/alerts.yaml"
+RUNBOOKS = "docs/runbooks"
+ALERT = re.compile(r"^\s+- alert: (\w+)$", re.MULTILINE)
+RUNBOOK_PARTS = ("**Meaning.**", "**Impact.**", "**Find out**", "**Fix.**")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+ROW = re.compile(r"^\| (\d+) \| (.+) \| (\w[\w ]*) \| (.+) \|$", re.MULTILINE)
+TEST = re.compile(r"`([\w./-]+\.(?:rs|py))::(\w+)`")
+RUST_TEST = re.compile(r"#\[(?:tokio::)?test[^\]]*\](?:\s*#\[[^\]]*\])*\s*(?:async )?fn (\w+)")
+PYTHON_TEST = re.compile(r"^    def (test_\w+)", re.MULTILINE)
+# The chart's test is no unittest: it checks by functions, each of which it names once.
+CHART_CHECK = re.compile(r"^ +check\(\".+\", lambda: (?:\w+\.)?(\w+)\(", re.MULTILINE)
+KINDS = ("held", "by policy", "inherent", "open")
+# How the sums are written in the text, so that it cannot contradict its table.
+SUMS = re.compile(
+    r"Of (\d+) attacks (\d+) are held, (\d+) are held by policy, (\d+) are inherent, and (\d+) are open\."
+)
+
+
+@dataclass(frozen=True)
+class Attack:
+    """One row of the table in docs/security.md. `tests` are pairs of a file and a test's name."""
+
+    number: int
+    kind: str
+    tests: tuple[tuple[str, str], ...]
+
+
+def runbook_faults(repository: Path) -> Iterator[str]:
+    """What is missing between alerts and pages, in both directions."""
+    alerts = set(ALERT.findall((repository / ALERTS).read_text()))
+    folder = repository / RUNBOOKS
+    index = (folder / "README.md").read_text()
+    pages = {page.stem for page in folder.glob("*.md")} - {"README"}
+    if not alerts:
+        yield f"{ALERTS} names no alert that doccheck.py could read"
+    yield from (f"{name} has no page: write {RUNBOOKS}/{name}.md" for name in sorted(alerts - pages))
+    yield from (f"{RUNBOOKS}/{name}.md is about no alert: delete it" for name in sorted(pages - alerts))
+    for name in sorted(alerts & pages):
+        text = (folder / f"{name}.md").read_text()
+        parts = (f"# {name}\n", *RUNBOOK_PARTS)
+        yield from (f"{RUNBOOKS}/{name}.md lacks {part.strip()}" for part in parts if part not in text)
+        if f"]({name}.md)" not in index:
+            yield f"{RUNBOOKS}/README.md does not list {name}"
+
+
+def runbooks(repository: Path) -> str:
+    """For the chart's test: raises unless each alert has its page."""
+    faults = list(runbook_faults(repository))
+    if faults:
+        raise LabError("; ".join(faults))
+    return f"{len(ALERT.findall((repository / ALERTS).read_text()))} alerts"
+
+
+def pages(repository: Path) -> list[Path]:
+    """Every Markdown file that git knows or would add."""
+    argv = ["git", "-C", str(repository), "ls-files", "--cached", "--others", "--exclude-standard", "*.md"]
+    listed = subprocess.run(argv, capture_output=True, text=True, check=True).stdout.splitlines()
+    return [repository / name for name in sorted(set(listed)) if (repository / name).exists()]
+
+
+def anchors(text: str) -> set[str]:
+    """The places of a page that a link can name, as GitHub makes them of headings."""
+    headings = HEADING.findall(FENCE.sub("", text))
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+
+
+def link_faults(page: Path) -> Iterator[str]:
+    """Links of a page to files, and places in them, that do not exist."""
+    for link in LINK.findall(FENCE.sub("", page.read_text())):
+        if re.match(r"[a-z]+:", link):
+            continue
+        target, _, place = link.partition("#")
+        file = (page.parent / target).resolve() if target else page
+        if not file.exists():
+            yield f"{page.name}: {link} leads nowhere"
+        elif place and file.suffix == ".md" and place not in anchors(file.read_text()):
+            yield f"{page.name}: {link}: there is no heading {place}"
+
+
+def attacks(text: str) -> list[Attack]:
+    """The rows of the table, in the order of the page."""
+    rows = ROW.findall(text)
+    return [Attack(int(number), kind, tuple(TEST.findall(why))) for number, _, kind, why in rows]
+
+
+def attack_faults(text: str, expected: int) -> Iterator[str]:
+    """What is wrong with the table of attacks by itself: numbers, kinds, missing tests, and the sums in the text."""
+    found = attacks(text)
+    numbers = [attack.number for attack in found]
+    if numbers != list(range(1, expected + 1)):
+        odd = sorted(set(numbers) ^ set(range(1, expected + 1)))
+        yield f"the rows must be 1 to {expected} in order; wrong or missing: {odd or 'the order'}"
+    for attack in found:
+        if attack.kind not in KINDS:
+            yield f"attack {attack.number} is {attack.kind!r}, not one of {', '.join(KINDS)}"
+        if attack.kind in ("held", "by policy") and not attack.tests:
+            yield f"attack {attack.number} is {attack.kind} and names no test"
+    sums = SUMS.search(text)
+    counted = [len(found), *(sum(attack.kind == kind for attack in found) for kind in KINDS)]
+    if sums is None:
+        yield "the sums are not in the text"
+    elif [int(number) for number in sums.groups()] != counted:
+        yield f"the text says {list(map(int, sums.groups()))}, the table has {counted}"
+
+
+def test_faults(repository: Path, named: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """Tests that a document names and that do not exist."""
+    for path, name in sorted(set(named)):
+        file = repository / path
+        if not file.exists():
+            yield f"{path} does not exist, which has {name}"
+        elif name not in tests_of(file.read_text(), file.suffix):
+            yield f"{path} has no test {name}"
+
+
+def tests_of(text: str, suffix: str) -> set[str]:
+    """The names of the tests in a file."""
+    if suffix == ".py":
+        return {*PYTHON_TEST.findall(text), *CHART_CHECK.findall(text)}
+    return set(RUST_TEST.findall(text))

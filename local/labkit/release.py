@@ -1,0 +1,81 @@
+"""Owns the version, which stands in three places that must agree, and the manifest by which krew installs the plugin."""
+
+import hashlib
+import json
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .errors import LabError
+
+# Of the archives: what krew calls the machine, and how the program is called in it.
+PLATFORMS = {
+    "linux-amd64": ("linux", "amd64", "kubectl-leaderboard"),
+    "linux-arm64": ("linux", "arm64", "kubectl-leaderboard"),
+    "darwin-amd64": ("darwin", "amd64", "kubectl-leaderboard"),
+    "darwin-arm64": ("darwin", "arm64", "kubectl-leaderboard"),
+    "windows-amd64": ("windows", "amd64", "kubectl-leaderboard.exe"),
+}
+
+
+def version(repository: Path) -> str:
+    """The version of programs and chart; raises unless all places have the same."""
+    cargo = tomllib.loads((repository / "Cargo.toml").read_text())
+    own: str = cargo["workspace"]["package"]["version"]
+    apart = [member for member in (".", *cargo["workspace"]["members"]) if not shares(repository / member)]
+    if apart:
+        raise LabError(f"{', '.join(apart)} has a version of its own: write `version.workspace = true`")
+    chart = (repository / "charts" / "leaderboard-operator" / "Chart.yaml").read_text()
+    for key in ("version", "appVersion"):
+        found = re.search(rf"^{key}: \"?([^\"\s]+)\"?$", chart, re.MULTILINE)
+        if found is None or found[1] != own:
+            raise LabError(
+                f"Chart.yaml: {key} is {found[1] if found else 'missing'}, Cargo.toml says {own}: write that"
+            )
+    return own
+
+
+def shares(member: Path) -> bool:
+    return bool(tomllib.loads((member / "Cargo.toml").read_text())["package"]["version"] == {"workspace": True})
+
+
+def archive(release: str, platform: str) -> str:
+    """The file name of the plugin for a machine."""
+    return f"kubectl-leaderboard-{release}-{platform}.tar.gz"
+
+
+def krew(release: str, base: str, sums: Mapping[str, str]) -> dict[str, Any]:
+    """The manifest of the plugin. `base` is the address of the folder with the archives, `sums` their SHA-256 by name."""
+    return {
+        "apiVersion": "krew.googlecontainertools.github.com/v1alpha2",
+        "kind": "Plugin",
+        "metadata": {"name": "leaderboard"},
+        "spec": {
+            "version": f"v{release}",
+            "shortDescription": "Explain, cancel and resume challenge submissions",
+            "description": "Explains why a submission of leaderboard-operator waits, runs or failed, and cancels or resumes it.\n",
+            "platforms": [platform(release, base.rstrip("/"), name, sums) for name in PLATFORMS],
+        },
+    }
+
+
+def platform(release: str, base: str, name: str, sums: Mapping[str, str]) -> dict[str, Any]:
+    system, machine, program = PLATFORMS[name]
+    file = archive(release, name)
+    if file not in sums:
+        raise LabError(f"{file} is not among the given archives: krew needs one for each machine")
+    return {
+        "selector": {"matchLabels": {"os": system, "arch": machine}},
+        "uri": f"{base}/{file}",
+        "sha256": sums[file],
+        "bin": program,
+        "files": [{"from": program, "to": "."}, {"from": "LICENSE", "to": "."}],
+    }
+
+
+def krew_manifest(repository: Path, base: str, archives: Sequence[Path]) -> str:
+    """The manifest as JSON, which is YAML too."""
+    sums = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in archives}
+    return json.dumps(krew(version(repository), base, sums), indent=2)

@@ -1,0 +1,76 @@
+"""What the documents promise: runbooks, links, and the tests that the table of attacks names."""
+
+import unittest
+from pathlib import Path
+
+from labkit import doccheck
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+# Numbered as in the review that they come from, so that none can be lost.
+ATTACKS = 107
+TABLE = """
+Of 4 attacks 1 are held, 1 are held by policy, 1 are inherent, and 1 are open.
+
+| # | attack | | why |
+|---|---|---|---|
+| 1 | a | held | `src/a.rs::a_test` |
+| 2 | b \\| c | by policy | Named: `tests/b.rs::b_test`, `local/tests/test_c.py::test_c` |
+
+| 3 | c | inherent | So it is |
+| 4 | d | open | Nobody does |
+"""
+
+
+class Runbooks(unittest.TestCase):
+    def test_each_alert_has_its_page_and_each_page_its_alert(self) -> None:
+        self.assertEqual(list(doccheck.runbook_faults(REPOSITORY)), [])
+
+
+class Links(unittest.TestCase):
+    def test_a_heading_has_the_anchor_that_github_gives_it(self) -> None:
+        text = "# Why a submission is `Pending`\n```sh\n# no heading\n```\n## `verify`: do the scores follow?\n"
+        self.assertEqual(doccheck.anchors(text), {"why-a-submission-is-pending", "verify-do-the-scores-follow"})
+
+    def test_every_link_between_documents_leads_somewhere(self) -> None:
+        pages = doccheck.pages(REPOSITORY)
+        self.assertGreater(len(pages), 20)
+        self.assertEqual([fault for page in pages for fault in doccheck.link_faults(page)], [])
+
+
+class Security(unittest.TestCase):
+    def setUp(self) -> None:
+        self.text = (REPOSITORY / "docs" / "security.md").read_text()
+
+    def test_every_attack_has_its_row_and_the_sums_are_right(self) -> None:
+        self.assertEqual(list(doccheck.attack_faults(self.text, ATTACKS)), [])
+
+    def test_every_test_that_is_named_exists(self) -> None:
+        named = [test for attack in doccheck.attacks(self.text) for test in attack.tests]
+        self.assertGreater(len(named), ATTACKS // 2)
+        self.assertEqual(list(doccheck.test_faults(REPOSITORY, named)), [])
+
+    def test_rows_are_read_with_their_tests(self) -> None:
+        rows = doccheck.attacks(TABLE)
+        self.assertEqual([(row.number, row.kind) for row in rows][1:3], [(2, "by policy"), (3, "inherent")])
+        self.assertEqual(rows[1].tests, (("tests/b.rs", "b_test"), ("local/tests/test_c.py", "test_c")))
+        self.assertEqual(list(doccheck.attack_faults(TABLE, 4)), [])
+
+    def test_what_is_wrong_with_a_table_is_named(self) -> None:
+        for text, attacks, word in (
+            (TABLE.replace("| 3 |", "| 5 |"), 4, "[3, 5]"),
+            (TABLE, 5, "[5]"),
+            (TABLE.replace("1 are open", "2 are open"), 4, "the text says [4, 1, 1, 1, 2]"),
+            (TABLE.replace("Of 4", "About 4"), 4, "the sums are not in the text"),
+            (TABLE.replace("| open |", "| closed |"), 4, "'closed'"),
+            (TABLE.replace("`src/a.rs::a_test`", "it is"), 4, "attack 1 is held and names no test"),
+        ):
+            with self.subTest(word):
+                self.assertTrue(any(word in fault for fault in doccheck.attack_faults(text, attacks)))
+
+    def test_tests_are_found_under_their_attributes(self) -> None:
+        rust = "#[test]\nfn a_name() {}\n#[tokio::test(start_paused = true)]\n#[ignore]\nasync fn another() {}\nfn none() {}"
+        self.assertEqual(doccheck.tests_of(rust, ".rs"), {"a_name", "another"})
+        python = 'class A:\n    def test_x(self):\n    def none(self):\n    check("a", lambda: b.c(d))\n'
+        self.assertEqual(doccheck.tests_of(python, ".py"), {"test_x", "c"})
+        faults = list(doccheck.test_faults(REPOSITORY, [("src/none.rs", "a"), ("src/lib.rs", "b")]))
+        self.assertEqual(faults, ["src/lib.rs has no test b", "src/none.rs does not exist, which has a"])
