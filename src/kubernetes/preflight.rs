@@ -164,7 +164,8 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
         spec,
         ..Default::default()
     };
-    let asked = reviews.create(&PostParams::default(), &review);
+    let params = PostParams::default();
+    let asked = reviews.create(&params, &review);
     match call_within(CALL_LIMIT, "a review of access", need.resource, asked).await {
         Ok(answer) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
         Ok(_) => Some(format!("may not {need}; add the verb to the operator's role")),
