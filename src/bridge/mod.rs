@@ -21,12 +21,12 @@ use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 use tokio::time::Instant;
 
-use crate::kubernetes::{Clients, Shape, Watch, guarded, spawn_watch};
+use crate::kubernetes::{Clients, Shape, Watch, call_within, guarded, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::aws::Aws;
 use crate::services::meter::Meter;
-use leaderboard_api::{Leaderboard, client_errors};
+use leaderboard_api::Leaderboard;
 use pollers::{Pollers, Problems, desired};
 
 /// An answer of the API server that is younger than this is taken for granted.
@@ -79,16 +79,12 @@ impl Shared {
         }
         let api = guarded::<Leaderboard>(self.client.clone(), self.namespace.as_deref());
         let first = ListParams::default().limit(1);
-        match tokio::time::timeout(PULSE_LIMIT, api.list_metadata(&first)).await {
-            Ok(Ok(_)) => {
-                *self.last_pulse.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
-                // A watch that stays broken meanwhile is a reason to restart.
-                self.telemetry.liveness.answered();
-                Ok(())
-            }
-            Ok(Err(error)) => Err(client_errors::kube(&error)),
-            Err(_) => Err(format!("no answer within {} s", PULSE_LIMIT.as_secs())),
-        }
+        let listed = call_within(PULSE_LIMIT, "a list", "one Leaderboard", api.list_metadata(&first)).await;
+        listed.map_err(|error| error.cause())?;
+        *self.last_pulse.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+        // A watch that stays broken meanwhile is a reason to restart.
+        self.telemetry.liveness.answered();
+        Ok(())
     }
 }
 

@@ -20,8 +20,9 @@ use super::queue::{QueueError, Reader, Received, batch_size};
 use super::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
 use super::{PULSE_LIMIT, Shared};
 use crate::backoff::Backoff;
+use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Leaderboard, client_errors, names, reasons};
+use leaderboard_api::{Leaderboard, names, reasons};
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);
@@ -288,14 +289,9 @@ impl Poller {
         };
         let reference = leaderboard.object_ref(&());
         let published = self.shared.recorder.publish(&event, &reference);
-        match tokio::time::timeout(PULSE_LIMIT, published).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => tracing::warn!(
-                error = client_errors::kube(&error),
-                reason,
-                "an event could not be written"
-            ),
-            Err(_) => tracing::warn!(reason, "an event could not be written in time"),
+        let name = reference.name.as_deref().unwrap_or_default();
+        if let Err(error) = call_within(PULSE_LIMIT, "an event", name, published).await {
+            tracing::warn!(reason, "{error}");
         }
     }
 

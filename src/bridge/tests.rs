@@ -88,7 +88,10 @@ async fn an_answer_of_the_api_server_counts_for_five_seconds() {
 async fn a_silent_api_server_keeps_the_queue_unread() {
     let (shared, _handle, _stop) = shared().await;
     let begun = Instant::now();
-    assert_eq!(shared.check_pulse().await, Err("no answer within 5 s".to_owned()));
+    assert_eq!(
+        shared.check_pulse().await,
+        Err("the API server did not answer within 5 s".to_owned())
+    );
     assert_eq!(begun.elapsed(), PULSE_LIMIT);
 }
 

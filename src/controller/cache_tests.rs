@@ -9,7 +9,7 @@ use crate::controller::submissions::job_spec::{JobInput, build_object};
 use crate::controller::submissions::observe::team;
 use crate::kubernetes::objects::{Job, Pod, Texts};
 use crate::kubernetes::{Index, Item, Store, Watchable};
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{JobNumber, Leaderboard, Submission};
 
 /// As many as one page of a list has.
 const COUNT: usize = 100;
@@ -64,8 +64,7 @@ fn job(number: usize) -> Value {
         submission: &submission,
         leaderboard: &board(),
         plan,
-        attempt: 1,
-        retry: 0,
+        number: JobNumber::first(1),
         settings: &settings(),
         now: jiff::Timestamp::now(),
     }));

@@ -11,17 +11,18 @@ use k8s_openapi::api::authorization::v1::{ResourceAttributes, SelfSubjectAccessR
 use kube::api::PostParams;
 use kube::core::GroupVersion;
 use kube::{Api, Client, discovery};
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
+use super::call::{CallError, call_within};
 use crate::observability::Observability;
-use leaderboard_api::{GROUP, VERSION, client_errors};
+use leaderboard_api::{GROUP, VERSION};
 
 /// Name of the check for our kinds.
 const KINDS_CHECK: &str = "custom resources";
 /// Name of the check for permissions.
 const ACCESS_CHECK: &str = "permissions";
 /// For any one request.
-const CALL_TIMEOUT: Duration = Duration::from_secs(10);
+const CALL_LIMIT: Duration = Duration::from_secs(10);
 /// Between checks of the kinds.
 const KINDS_PAUSE: Duration = Duration::from_secs(2);
 /// Between checks of the permissions.
@@ -91,19 +92,20 @@ pub async fn await_kinds(client: &Client, plurals: &[&str], telemetry: &Observab
 
 async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
     let version = GroupVersion::gv(GROUP, VERSION);
-    let served = match timeout(CALL_TIMEOUT, discovery::pinned_group(client, &version)).await {
-        Ok(Ok(group)) => group.versioned_resources(VERSION),
+    let served = match call_within(
+        CALL_LIMIT,
+        "discovery",
+        GROUP,
+        discovery::pinned_group(client, &version),
+    )
+    .await
+    {
+        Ok(group) => group.versioned_resources(VERSION),
         // For an unknown group the server answers plain text, so that only the code is used.
-        Ok(Err(kube::Error::Api(status))) if status.code == 404 => Vec::new(),
+        Err(error) if error.is_gone() => Vec::new(),
         // For a group without kinds discovery has an error of its own.
-        Ok(Err(kube::Error::Discovery(_))) => Vec::new(),
-        Ok(Err(error)) => return Some(client_errors::kube(&error)),
-        Err(_) => {
-            return Some(format!(
-                "the API server has not answered within {} s",
-                CALL_TIMEOUT.as_secs()
-            ));
-        }
+        Err(CallError::Refused { source, .. }) if matches!(*source, kube::Error::Discovery(_)) => Vec::new(),
+        Err(error) => return Some(error.cause()),
     };
     let is_served = |plural: &str| served.iter().any(|(kind, _)| kind.plural == plural);
     let missing: Vec<_> = plurals.iter().filter(|plural| !is_served(plural)).copied().collect();
@@ -162,17 +164,12 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
         spec,
         ..Default::default()
     };
-    match timeout(CALL_TIMEOUT, reviews.create(&PostParams::default(), &review)).await {
-        Ok(Ok(answer)) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
-        Ok(Ok(_)) => Some(format!("may not {need}; add the verb to the operator's role")),
-        Ok(Err(error)) => Some(format!(
-            "can't ask whether it may {need}: {}",
-            client_errors::kube(&error)
-        )),
-        Err(_) => Some(format!(
-            "can't ask whether it may {need}: no answer within {} s",
-            CALL_TIMEOUT.as_secs()
-        )),
+    let params = PostParams::default();
+    let asked = reviews.create(&params, &review);
+    match call_within(CALL_LIMIT, "a review of access", need.resource, asked).await {
+        Ok(answer) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
+        Ok(_) => Some(format!("may not {need}; add the verb to the operator's role")),
+        Err(error) => Some(format!("can't ask whether it may {need}: {}", error.cause())),
     }
 }
 

@@ -439,7 +439,7 @@ async fn the_preflight_names_each_missing_verb() {
     );
     assert_eq!(
         missing[1],
-        "can't ask whether it may list pods in all namespaces: no answer within 10 s"
+        "can't ask whether it may list pods in all namespaces: the API server did not answer within 10 s"
     );
     assert_eq!(missing.len(), 2);
 }

@@ -25,7 +25,6 @@ use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
 use leaderboard_api as api;
-use leaderboard_api::RunId;
 
 /// Column with the attempt, a number.
 const ATTEMPT: &str = "attempt";
@@ -47,7 +46,7 @@ pub struct Row {
     /// Partition key: id of the team.
     pub team_id: String,
     /// Sort key: id of the run.
-    pub run_id: RunId,
+    pub run_id: String,
     /// Attempt, from 1.
     pub attempt: i64,
     /// Name of the team.
@@ -166,7 +165,7 @@ pub enum TableError {
     #[error(
         "table {table} already holds a later attempt or another end of submission {run_id}; the row is left as it is"
     )]
-    Stale { table: String, run_id: RunId },
+    Stale { table: String, run_id: String },
 }
 
 impl TableError {
@@ -245,10 +244,7 @@ impl Table {
                 &self.partition.name,
                 self.key_value(&self.partition, &row.team_id, "team")?,
             )
-            .key(
-                &self.sort.name,
-                self.key_value(&self.sort, row.run_id.as_str(), "submission")?,
-            )
+            .key(&self.sort.name, self.key_value(&self.sort, &row.run_id, "submission")?)
             .condition_expression(condition(row))
             .expression_attribute_names("#attempt", ATTEMPT)
             .expression_attribute_names("#status", STATUS)

@@ -248,9 +248,12 @@ impl World {
     async fn end(&self, name: &str, state: &str) {
         let attempt = self.submissions().get(name).await.unwrap().spec.attempt;
         let condition = json!({
-            "type": "Finished", "status": "True", "reason": "Test", "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"
+            "type": "Finished", "status": "True", "reason": state, "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"
         });
-        let status = json!({"status": {"state": state, "attempt": attempt, "conditions": [condition]}});
+        let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
+        let failure = (state == "Failed").then_some(failure);
+        let status =
+            json!({"status": {"state": state, "attempt": attempt, "failure": failure, "conditions": [condition]}});
         let patched = self
             .submissions()
             .patch_status(name, &PatchParams::default(), &Patch::Merge(status))

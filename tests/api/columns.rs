@@ -14,7 +14,7 @@ const AS_TABLE: &str = "application/json;as=Table;g=meta.k8s.io;v=v1";
 /// A status with every field.
 pub fn full_status() -> Value {
     let time = "2026-11-01T10:00:00Z";
-    let condition = |type_: &str| json!({"type": type_, "status": "True", "reason": "Resumed", "message": "", "lastTransitionTime": time});
+    let condition = |type_: &str, reason: &str| json!({"type": type_, "status": "True", "reason": reason, "message": "", "lastTransitionTime": time});
     json!({
         "state": "Running",
         "observedGeneration": 1,
@@ -65,7 +65,7 @@ pub fn full_status() -> Value {
         "resultsURL": "s3://results/a/42",
         "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": "The node is gone. Look at it.",
                     "nextStep": "Look at it.", "charged": false},
-        "conditions": [condition("Running"), condition("Published")],
+        "conditions": [condition("Running", "Resumed"), condition("Published", "Published")],
     })
 }
 
@@ -137,7 +137,7 @@ submission-42   local         sensors   Running   Resumed   12/20      ~41.20   
         "\
 NAME            LEADERBOARD   TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE     TEAM         ATTEMPT   FAILURE          PUBLISHED   DURATION   NODE     RESULTS
 new             local         <none>    <none>    <none>    <none>     <none>   <none>           <age>   <none>       <none>    <none>           <none>      <none>     <none>   <none>
-submission-42   local         sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>   Team Seven   2         Infrastructure   True        1h25m      node-1   s3://results/a/42
+submission-42   local         sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>   Team Seven   2         Infrastructure   Published   1h25m      node-1   s3://results/a/42
 "
     );
 }

@@ -80,7 +80,7 @@ async fn rows(stand_in: &StandIn, name: &str) -> Vec<BTreeMap<String, String>> {
 fn row(attempt: i64, status: &str) -> Row {
     Row {
         team_id: "12".into(),
-        run_id: "7".parse().unwrap(),
+        run_id: "7".into(),
         attempt,
         submission_status: status.into(),
         progress: format!("{attempt}/9"),
@@ -319,7 +319,7 @@ async fn a_key_that_is_a_number_takes_no_name() {
     ];
     let numbers = table(&stand_in, "numbers", &keys).await;
     let local = Row {
-        run_id: "my-run".parse().unwrap(),
+        run_id: "my-run".into(),
         ..row(1, "PENDING")
     };
     let text = Table::describe(&stand_in.aws, &numbers)

@@ -60,7 +60,7 @@ mod tests {
             ),
             (State::Running, 1, None, Some(("False", "Replacing")), false),
             (State::Resumed, 2, None, Some(("True", "Running")), false),
-            // An agent that was not stopped yet is no state.
+            // The end counts, although its agents still run.
             (
                 State::Finished,
                 1,

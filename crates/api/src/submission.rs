@@ -39,7 +39,7 @@ use super::team::Team;
     printcolumn = r#"{"name":"Team","type":"string","jsonPath":".status.team.displayName","priority":1}"#,
     printcolumn = r#"{"name":"Attempt","type":"integer","jsonPath":".status.attempt","priority":1}"#,
     printcolumn = r#"{"name":"Failure","type":"string","jsonPath":".status.failure.class","priority":1}"#,
-    printcolumn = r#"{"name":"Published","type":"string","jsonPath":".status.conditions[?(@.type==\"Published\")].status","priority":1}"#,
+    printcolumn = r#"{"name":"Published","type":"string","jsonPath":".status.conditions[?(@.type==\"Published\")].reason","priority":1}"#,
     printcolumn = r#"{"name":"Duration","type":"string","jsonPath":".status.duration","priority":1}"#,
     printcolumn = r#"{"name":"Node","type":"string","jsonPath":".status.nodeName","priority":1}"#,
     printcolumn = r#"{"name":"Results","type":"string","jsonPath":".status.resultsURL","priority":1}"#

@@ -40,9 +40,10 @@ impl Waiting {
             end: None,
         };
         let status = submission.status.as_ref().filter(|s| s.attempt >= Some(self.attempt));
-        let Some((status, state)) = status.and_then(|s| Some((s, s.state?))) else {
+        let Some(status) = status else {
             return nothing;
         };
+        let state = status.state_of_conditions();
         let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
         let end = is_over.then_some(state);
         let reason = status.reason.clone().unwrap_or_default();

@@ -117,11 +117,10 @@ fn repetitions_of_v1_share_their_id() {
     );
 }
 
-/// One edit of an honest file, and the words the participant gets.
-#[test]
-fn a_pod_refuses_with_a_reason() {
-    let record = "/_checkpoint/records/1";
-    let table: Vec<(&str, Value, &str)> = vec![
+type Edit = (&'static str, Value, &'static str);
+
+fn edits_of_routes() -> Vec<Edit> {
+    vec![
         (
             "/route_id",
             json!("RouteScenario_7_rep0"),
@@ -159,6 +158,11 @@ fn a_pod_refuses_with_a_reason() {
             "route RouteScenario_1_rep0: its status is not one of the known ones",
         ),
         ("/status", json!(null), "`status` is not a text"),
+    ]
+}
+
+fn edits_of_numbers() -> Vec<Edit> {
+    vec![
         (
             "/scores/score_route",
             json!(100.5),
@@ -203,9 +207,16 @@ fn a_pod_refuses_with_a_reason() {
             json!(["no distance"]),
             "does not tell the distance",
         ),
-    ];
+    ]
+}
+
+/// One edit of an honest file, and the words the participant gets.
+#[test]
+fn a_pod_refuses_with_a_reason() {
+    let record = "/_checkpoint/records/1";
+    let table = edits_of_routes().into_iter().chain(edits_of_numbers());
     let plan = pod(V2, 1, &[(0, 2)]);
-    for (i, (place, value, words)) in table.into_iter().enumerate() {
+    for (i, (place, value, words)) in table.enumerate() {
         let mut edited = perfect(V2, 0..=2);
         if i == 0 {
             edited["_checkpoint"]["records"][0] = json!([]);

@@ -27,7 +27,7 @@ use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{JobNumber, Submission, SubmissionStatus, conditions, names, reasons};
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;

@@ -34,14 +34,14 @@ pub(super) fn original(
     let others: Vec<_> = others()
         .into_iter()
         .filter(|other| {
-            other.metadata.name.as_deref() != Some(&own)
+            other.metadata.name.as_deref() != Some(own.as_str())
                 && other.spec.leaderboard_name == submission.spec.leaderboard_name
                 && of_phase(other) == of_phase(submission)
                 && other.status.as_ref().and_then(|s| s.team.as_ref()?.id.as_ref()) == team.as_ref()
         })
         .collect();
     let mut names = row.jobs.iter().rev().filter_map(|job| submission_of(job));
-    let named = names.find(|name| others.iter().any(|other| other.metadata.name.as_deref() == Some(name)));
+    let named = names.find(|name| others.iter().any(|other| other.metadata.name.as_deref() == Some(*name)));
     let name = named.map(str::to_owned).or_else(|| copied(row, submission, &others))?;
     Some(Rerun {
         submission_name: name,

@@ -99,7 +99,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
     };
     Some(Row {
         team_id: team.id.clone()?,
-        run_id: plan.run_id.clone(),
+        run_id: plan.run_id.to_string(),
         attempt: attempt_of_run(status),
         team_name: team.name.clone().unwrap_or_default(),
         submission_status: table_status(status.state_of_conditions()).to_owned(),

@@ -209,7 +209,7 @@ mod tests {
         let row = Row {
             attempt,
             progress: progress.into(),
-            run_id: "7".parse().unwrap(),
+            run_id: "7".into(),
             ..Row::default()
         };
         RowUpdate { row: row.into(), end }

@@ -210,7 +210,8 @@ pub fn waiting() -> Value {
 pub fn running() -> Value {
     json!({
         "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
-        "jobName": "a-1", "times": {"started": TIME}, "conditions": [condition("Finished", "False", "Preparing")],
+        "jobName": "a-1", "times": {"started": TIME},
+        "conditions": [condition("Finished", "False", "Preparing"), condition("Running", "True", "Running")],
     })
 }
 

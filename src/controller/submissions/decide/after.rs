@@ -8,7 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
-use super::{accept, log, retention, state, stop};
+use super::{accept, log, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, ObservedJob, ObservedTexts};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;

@@ -6,7 +6,6 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, Event, Plan};
-use super::state;
 use crate::controller::submissions::view::{ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{

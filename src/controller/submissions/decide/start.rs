@@ -9,7 +9,6 @@ use jiff::Timestamp;
 use super::failure::{self, infrastructure, participant};
 use super::next_steps::for_both;
 use super::plan_builder::{PlanBuilder, after};
-use super::state;
 use super::trouble::{self, Trouble};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use leaderboard_api::conditions::{self, Truth};
