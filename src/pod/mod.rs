@@ -11,6 +11,7 @@ pub mod identity;
 pub mod isolation;
 pub mod judge;
 pub mod logcopy;
+mod name_files;
 pub mod ownlog;
 pub mod places;
 pub mod report;
