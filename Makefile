@@ -52,7 +52,7 @@ build: ## Build the operator
 
 static: ## Build the programs that go into other images, statically
 	$(STATIC) cargo build --release --target x86_64-unknown-linux-gnu -p leaderboard-runner
-	$(STATIC) cargo build --profile $(PROFILE) --target x86_64-unknown-linux-gnu -p challenge-stand-in
+	$(STATIC) cargo build --profile $(PROFILE) --target x86_64-unknown-linux-gnu -p challenge-stand-in -p challenge-probe
 
 image: build static ## Make the operator's image without a container engine and push it to the local registry
 	$(LAB) image local/operator-image.toml --profile $(PROFILE)
