@@ -5,6 +5,7 @@ pub mod archive;
 pub mod aws;
 pub mod evalai;
 pub mod fault;
+pub mod held_text;
 pub mod logs;
 pub mod meter;
 pub mod queue;

@@ -21,6 +21,7 @@ both:       --ready-seconds 3600   how long a server may take until its port ans
             --peer-seconds 600     how long to wait for the other side's end of a round
             --log-limit 2147483648 bytes of output that are kept in the log
             --termination-log /dev/termination-log  where the verdict is written
+            --inotify true         false: files are looked for once a second
 simulator:  --flush-seconds 1800   how long to hold the exit until the results are stored
             --cancel-seconds 120   the same after a cancel
             --answer-seconds 10    how long a server may take to answer when its agent has crashed
@@ -47,6 +48,8 @@ pub struct Job {
     /// Bytes of output that are kept in the log.
     pub log_limit: u64,
     pub termination_log: PathBuf,
+    /// Whether changed files wake it; else it looks once a second.
+    pub inotify: bool,
     pub role: Role,
     /// The command and its arguments; never empty.
     pub command: Vec<OsString>,
@@ -136,6 +139,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         termination_log: options
             .take("--termination-log")?
             .map_or_else(|| TERMINATION_LOG.into(), PathBuf::from),
+        inotify: options.optional("--inotify", "true or false")?.unwrap_or(true),
         role: role(side, &mut options)?,
         command,
     };
@@ -281,7 +285,7 @@ mod tests {
             }
         );
         assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
-        assert_eq!(job.log_limit, 2 << 30);
+        assert_eq!((job.log_limit, job.inotify), (2 << 30, true));
         assert_eq!(
             [job.ready, job.grace, job.peer].map(|time| time.as_secs()),
             [3600, 20, 600]
@@ -339,6 +343,10 @@ mod tests {
                 "--status: \"\" is not a path",
             ),
             ("simulator --pair 1 --status /s --port", "--port needs a value"),
+            (
+                "simulator --pair 1 --status /s --port 1 --inotify off -- a",
+                "--inotify: \"off\" is not true or false",
+            ),
             (
                 "simulator --pair 1 --status /s --port 1",
                 "the command after -- is missing",

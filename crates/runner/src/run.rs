@@ -14,7 +14,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
 
 use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Phase, Seen, Skip};
-use crate::group::{Group, spawn_code};
+use crate::group::{self, Group, spawn_code};
 use crate::keep::Keeper;
 use crate::launch;
 use crate::server::{self, Listener, Question};
@@ -67,7 +67,7 @@ impl Runner {
             Role::Simulator { .. } => None,
         };
         let watched = checkpoint.map(std::path::PathBuf::as_path);
-        let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy], watched);
+        let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy], watched, job.inotify);
         let kept = job.status.join(me.to_string()).join(KEPT_CHECKPOINT);
         let keeper = checkpoint.map(|checkpoint| Keeper::new(checkpoint.clone(), kept));
         let round = Progress::read(&job.status, me).crashes;
@@ -321,7 +321,7 @@ impl Runner {
     }
 
     /// Ends everything the command has started: SIGTERM to its group, after the grace SIGKILL, also to what had left the
-    /// group; then reads the rest of the output.
+    /// group; then reads the rest of the output. In a container nothing is left that could write over the verdict.
     fn end_processes(&mut self) {
         if let Some(group) = &self.group {
             group.signal(Signal::SIGTERM);
@@ -335,6 +335,7 @@ impl Runner {
                 group.signal(Signal::SIGKILL);
             }
             let stragglers = if !group_lives || spent >= grace {
+                group::kill_all_others();
                 Group::kill_children()
             } else {
                 0

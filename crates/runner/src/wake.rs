@@ -1,7 +1,6 @@
 //! What wakes the runner: signals (SIGCHLD among them), changes in the folders of its peer and of `logcopy`, and a checkpoint
 //! that was written. Called by `run` only. It says that something may have changed, never what: the caller looks again.
 
-use std::env;
 use std::ffi::OsString;
 use std::io::{self, Read};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -76,16 +75,17 @@ struct Written {
 }
 
 impl Folders {
-    /// Watches `root` and `folders` in it, and the writers of `file`. Without inotify (`LEADERBOARD_INOTIFY=off`, or the
-    /// node has none left) the caller's slow poll does alone.
-    pub(crate) fn watch(root: &Path, folders: &[String], file: Option<&Path>) -> Self {
-        let inotify = if env::var_os("LEADERBOARD_INOTIFY").is_some_and(|value| value == "off") {
-            None
+    /// Watches `root` and `folders` in it, and the writers of `file`. Without inotify (`is_wanted` says no, or the node has none
+    /// left) the caller's slow poll does alone.
+    pub(crate) fn watch(root: &Path, folders: &[String], file: Option<&Path>, is_wanted: bool) -> Self {
+        let opened = if is_wanted {
+            Inotify::init(InitFlags::IN_NONBLOCK | InitFlags::IN_CLOEXEC).map_err(|error| error.to_string())
         } else {
-            Inotify::init(InitFlags::IN_NONBLOCK | InitFlags::IN_CLOEXEC)
-                .inspect_err(|error| crate::say(format_args!("no inotify ({error}): looking once a second instead")))
-                .ok()
+            Err("it is switched off".to_owned())
         };
+        let inotify = opened
+            .inspect_err(|why| crate::say(format_args!("no inotify ({why}): looking once a second instead")))
+            .ok();
         let missing = [root.to_owned()]
             .into_iter()
             .chain(folders.iter().map(|folder| root.join(folder)))

@@ -121,18 +121,40 @@ fn an_agent_is_stopped_even_while_nobody_reads_its_output_and_none_of_it_is_lost
 }
 
 #[test]
-fn the_image_cannot_lead_the_verdict_elsewhere() {
+fn no_variable_of_an_image_steers_its_runner() {
     let mut pod = pod();
     let elsewhere = pod.path("elsewhere");
     fs::write(&elsewhere, "").unwrap();
-    let variable = "LEADERBOARD_TERMINATION_LOG".to_owned();
-    pod.environment.push((variable, elsewhere.display().to_string()));
+    // A variable for each option that there is: its only way in is the command line.
+    let options = leaderboard_runner::args::USAGE
+        .split(|c: char| c.is_whitespace() || c == '|')
+        .filter_map(|word| word.strip_prefix("--"))
+        .filter(|option| !option.is_empty());
+    for option in options.chain(["no-option"]) {
+        let variable = format!("LEADERBOARD_{}", option.to_uppercase().replace('-', "_"));
+        let value = match option {
+            "inotify" => "off".to_owned(),
+            "port" | "pair" | "log-limit" => "7".to_owned(),
+            _ if option.ends_with("-seconds") => "0".to_owned(),
+            _ => elsewhere.display().to_string(),
+        };
+        pod.environment.push((variable, value));
+    }
+    for needed in [
+        "LEADERBOARD_TERMINATION_LOG",
+        "LEADERBOARD_INOTIFY",
+        "LEADERBOARD_IDLE_SECONDS",
+    ] {
+        assert!(pod.environment.iter().any(|(name, _)| name == needed), "{needed}");
+    }
     let forged = r#"{"what":"notReady","round":0,"why":""}"#;
     let log = pod.path("agent-1.termination");
-    let mut agent = pod.agent(&format!("echo '{forged}' > {}; exit 3", log.display()));
+    let mut agent = pod.agent(&format!("echo '{forged}' > {}; echo printed; exit 3", log.display()));
     assert_eq!(agent.code(), 1);
     assert_eq!((agent.verdict().what, agent.verdict().round), (What::Exited, Some(0)));
     assert_eq!(fs::read_to_string(elsewhere).unwrap(), "");
+    assert_eq!(fs::read_to_string(pod.log()).unwrap(), "printed\n");
+    assert!(!agent.stderr().contains("no inotify"), "{}", agent.stderr());
 }
 
 #[test]

@@ -75,8 +75,7 @@ fn a_pair_runs_to_its_end_and_the_simulator_holds_until_the_results_are_stored()
 #[test]
 fn a_pair_runs_to_its_end_without_inotify() {
     let mut pod = Pod::new();
-    pod.environment
-        .push(("LEADERBOARD_INOTIFY".to_owned(), "off".to_owned()));
+    pod.options.push("--inotify=false".to_owned());
     runs_to_its_end(&pod);
 }
 

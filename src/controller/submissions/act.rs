@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams, Preconditions};
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
 use kube::runtime::reflector::ObjectRef;
@@ -17,7 +18,7 @@ use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::significance::{Change, change, patience};
-use super::view::{LogPlace, View};
+use super::view::{LogPlace, ObservedTexts, View};
 use crate::controller::objects::uid_of;
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
@@ -26,7 +27,7 @@ use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{State, Submission, SubmissionStatus, names};
+use leaderboard_api::{State, Submission, SubmissionStatus, conditions, names, reasons};
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
@@ -86,7 +87,18 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for action in &plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
+    if view.texts != ObservedTexts::NotRead && !needs_texts(&plan.status) {
+        uses.archive.drop_texts(&view.submission, &plan.status);
+    }
     Ok(held_back)
+}
+
+/// Whether texts that were read are still to be sent with an end. Those of a live run are with EvalAI's side already.
+fn needs_texts(status: &SubmissionStatus) -> bool {
+    let published = conditions::get(&status.conditions, conditions::PUBLISHED);
+    let is_open =
+        |c: &Condition| c.status == "False" && ![reasons::NOT_REQUIRED, reasons::REFUSED].contains(&c.reason.as_str());
+    conditions::is_true(&status.conditions, conditions::FINISHED) && published.is_some_and(is_open)
 }
 
 struct Actor<'a> {

@@ -9,6 +9,7 @@ use leaderboard_runner::verdict::Verdict;
 use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
+use crate::services::held_text::HeldText;
 use leaderboard_api::{Leaderboard, Rerun, Submission};
 
 /// Everything a decision may depend on.
@@ -246,10 +247,12 @@ pub struct Texts {
     pub result: String,
     /// The same over the routes so far, while the run goes on.
     pub partial: Option<String>,
-    pub stdout: String,
-    pub metadata: String,
+    pub stdout: HeldText,
+    pub metadata: HeldText,
     /// Why `stdout` and `metadata` are not there.
     pub problem: Option<TextProblem>,
+    /// Why one of them will never be there.
+    pub left_out: Option<String>,
 }
 
 /// Why there is no text of a result.

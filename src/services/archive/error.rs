@@ -49,6 +49,13 @@ pub enum Cause {
     Parts(#[from] PartsError),
 }
 
+impl ArchiveError {
+    /// Whether there is more than was to be read.
+    pub fn is_too_large(&self) -> bool {
+        matches!(self.cause, Cause::TooLarge(_))
+    }
+}
+
 impl Cause {
     /// What to do about it, as one sentence.
     pub fn next_step(&self) -> &'static str {

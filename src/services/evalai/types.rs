@@ -10,6 +10,7 @@ use jiff::Timestamp;
 use super::row::Row;
 use super::status::{Outcome, Progress, Status};
 pub use crate::services::ObjectKey as Key;
+use crate::services::held_text::HeldText;
 use crate::services::token::Token;
 
 /// The challenge of a Leaderboard and how it is asked.
@@ -97,11 +98,11 @@ pub struct Payload {
     /// JSON text of the list of results; not sent with `failed` and `cancelled`.
     pub result: String,
     /// Shown to the participant.
-    pub stdout: String,
+    pub stdout: HeldText,
     /// Shown to the participant.
     pub stderr: String,
     /// JSON text, shown to the hosts.
-    pub metadata: String,
+    pub metadata: HeldText,
     /// Shown to the hosts; only with an end.
     pub environment_log: String,
 }

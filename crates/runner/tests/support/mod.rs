@@ -43,6 +43,8 @@ pub struct Pod {
     pub environment: Vec<(String, String)>,
     /// Options of every container, before `--`.
     pub options: Vec<String>,
+    /// The program that starts the runner, with its arguments; empty: the test itself.
+    pub starter: Vec<String>,
 }
 
 pub struct Container {
@@ -82,6 +84,7 @@ impl Pod {
             port,
             environment: Vec::new(),
             options: vec!["--grace-seconds=2".to_owned()],
+            starter: Vec::new(),
         }
     }
 
@@ -138,7 +141,10 @@ impl Pod {
         fs::write(&verdict, "").unwrap();
         let stderr = self.path(&format!("{member}.stderr"));
         let log = fs::OpenOptions::new().append(true).create(true).open(&stderr).unwrap();
-        let child = Command::new(env!("CARGO_BIN_EXE_leaderboard-runner"))
+        let runner = env!("CARGO_BIN_EXE_leaderboard-runner").to_owned();
+        let words = self.starter.iter().chain([&runner]).collect::<Vec<_>>();
+        let child = Command::new(words[0])
+            .args(&words[1..])
             .args([member.side.name(), "--pair=1"])
             .arg(format!("--status={}", self.status().display()))
             .arg(format!("--termination-log={}", verdict.display()))

@@ -7,6 +7,7 @@
 mod request;
 mod run;
 mod state;
+mod text_budget;
 mod work;
 
 use std::collections::HashMap;
@@ -30,6 +31,7 @@ use crate::services::aws::Aws;
 use leaderboard_api::{Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
+use text_budget::TextBudget;
 
 /// A worker whose bucket nobody uses ends after this long: the next submission of a quiet Leaderboard finds it ready.
 const LINGERS: Duration = Duration::from_mins(1);
@@ -42,6 +44,7 @@ struct Shared {
     client: Client,
     wake: Wake<Submission>,
     tasks: Tasks,
+    texts: TextBudget,
     buckets: Mutex<HashMap<String, Arc<Bucket>>>,
 }
 
@@ -86,6 +89,7 @@ impl ArchiveWorkers {
             client,
             wake,
             tasks,
+            texts: TextBudget::new(),
             buckets: Mutex::default(),
         }))
     }
@@ -122,6 +126,14 @@ impl ArchiveWorkers {
         self.ask(submission, status, |state, uid, target, now| {
             state.want_texts(uid, target, of, now);
         });
+    }
+
+    /// Drops the texts of a report: they are with EvalAI's side, or nobody wants them.
+    pub fn drop_texts(&self, submission: &Submission, status: &SubmissionStatus) {
+        if let Some(bucket) = self.known_bucket(status) {
+            bucket.state().drop_texts(&uid_of(submission));
+            bucket.notify.notify_one();
+        }
     }
 
     /// Asks for our own mark in the place of a lost Pod's.
@@ -200,6 +212,7 @@ struct ArchiveWorker {
     shared: Arc<Shared>,
     bucket: Arc<Bucket>,
     archive: Archive,
+    texts: TextBudget,
 }
 
 impl ArchiveWorker {
@@ -208,6 +221,7 @@ impl ArchiveWorker {
         let worker = Self {
             id,
             archive: Archive::of_run(&shared.aws, storage, ""),
+            texts: shared.texts.of_another(),
             shared: Arc::clone(shared),
             bucket: Arc::clone(&bucket),
         };
@@ -256,7 +270,7 @@ impl ArchiveWorker {
         let archive = self
             .archive
             .at_prefix(effective::key_prefix(&target.storage, &target.run_id));
-        let done = work::carry_out(&self.shared.client, &archive, &work).await;
+        let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work).await;
         (work, done)
     }
 

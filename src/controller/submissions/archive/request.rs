@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::view::{ReportDemand, TextProblem, Texts};
+use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
 use leaderboard_api::Storage;
 
 pub(super) type Uid = Arc<str>;
@@ -69,6 +69,13 @@ pub(super) struct Sent {
     pub demand: ReportDemand,
     /// Of which memory of the run: what was dropped since is not answered.
     pub memory: u64,
+}
+
+impl Sent {
+    /// Whether the run went on when it was sent.
+    pub(super) fn is_live(&self) -> bool {
+        self.demand.stage == Stage::Live
+    }
 }
 
 /// What a read of the report brought.

@@ -138,6 +138,21 @@ impl State {
         self.plan(uid, Kind::Texts, Some(again));
     }
 
+    /// Drops texts that nobody needs any more; those that are just being read are kept.
+    pub fn drop_texts(&mut self, uid: &str) {
+        let Some((uid, run)) = self.runs.get_key_value(uid) else {
+            return;
+        };
+        if run.texts.as_ref().is_some_and(|texts| !texts.is_under_way) {
+            let uid = uid.clone();
+            self.plan(&uid, Kind::Texts, None);
+            if let Some(run) = self.runs.get_mut(&uid) {
+                run.texts = None;
+            }
+            self.tidy(&uid);
+        }
+    }
+
     pub fn texts(&self, uid: &str) -> ObservedTexts {
         let texts = self.runs.get(uid).and_then(|run| run.texts.as_ref());
         texts.map_or(ObservedTexts::NotRead, |texts| texts.got.clone())

@@ -162,13 +162,38 @@ async fn texts_count_only_with_the_digest_that_the_report_names() {
         };
         assert_eq!(texts.problem, problem.map(|why| TextProblem::Unfit(why.into())));
         assert_eq!(
-            (texts.result.as_str(), texts.metadata.as_str()),
+            (texts.result.as_str(), &*texts.metadata),
             ("[1]", ""),
             "the numbers are the report's"
         );
-        assert_eq!(texts.stdout, if problem.is_none() { "all is well" } else { "" });
+        assert_eq!(&*texts.stdout, if problem.is_none() { "all is well" } else { "" });
         bench.workers().forget("uid-of-sub");
     }
+}
+
+#[tokio::test]
+async fn a_text_that_is_too_large_is_left_out_at_once_and_said() {
+    let mut bench = bench().await;
+    let mut named: serde_json::Value = serde_json::from_str(&report("all is well")).unwrap();
+    // It is not even asked for: the bucket of this test has none.
+    named["files"]["evalai/metadata.json"] = json!({"size": (4 << 20) + 1, "sha256": ""});
+    bench.stores("logcopy/report.json", named.to_string());
+    bench.stores("evalai/stdout.txt", "all is well");
+    let workers = bench.workers();
+    workers.want_texts(&bench.submission, &bench.status(), ReportId::default());
+    let ObservedTexts::Read(texts) = bench.answer().await.texts else {
+        panic!("no texts")
+    };
+    assert_eq!((texts.problem.as_ref(), &*texts.stdout, &*texts.metadata), (None, "all is well", ""));
+    assert_eq!(
+        texts.left_out.as_deref(),
+        Some(
+            "evalai/metadata.json was left out: it has 4194305 bytes, and EvalAI is sent texts of up to 4 MiB. It is in the \
+             bucket."
+        )
+    );
+    bench.workers().drop_texts(&bench.submission, &bench.status());
+    assert_eq!(bench.seen().texts, ObservedTexts::NotRead);
 }
 
 #[tokio::test(start_paused = true)]

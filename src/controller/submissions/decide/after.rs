@@ -9,7 +9,7 @@ use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
 use super::{accept, log, retention, state, stop};
-use crate::controller::submissions::view::{EvalaiEnd, ObservedJob};
+use crate::controller::submissions::view::{EvalaiEnd, ObservedJob, ObservedTexts};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
@@ -280,7 +280,11 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
              {ours}. Set the team back in EvalAI, or correct the table."
         )
     });
-    let shown = message.clone().unwrap_or_default();
+    let left_out = match &draft.view.texts {
+        ObservedTexts::Read(texts) => texts.left_out.clone(),
+        ObservedTexts::NotRead | ObservedTexts::Unread(_) => None,
+    };
+    let shown = message.clone().or(left_out).unwrap_or_default();
     draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
     if let Some(message) = message {
         draft.event(true, reasons::TEAM_DIFFERS, message);

@@ -30,9 +30,10 @@ pub(super) fn last_crash(
     agent: Option<&ContainerView>,
     now: Timestamp,
 ) -> Option<Crash> {
-    let agent = agent
-        .and_then(|container| container.last.as_ref())
-        .filter(|end| is_crash(end));
+    let agent = agent.and_then(|container| {
+        let end = container.last.as_ref()?;
+        (is_crash(end) || is_false_claim(simulator, container, end)).then_some(end)
+    });
     let own_end = simulator.and_then(|container| container.last.as_ref());
     // A simulator that was ended from outside explains its own round, and nothing else.
     let explains = |end: &&EndView| match what(end) {
@@ -58,6 +59,21 @@ pub(super) fn last_crash(
 pub(super) fn is_crash(end: &EndView) -> bool {
     let is_asked_for = matches!(what(end), Some(What::Stopped | What::Cancelled | What::Finished));
     end.exit_code != 0 && !is_asked_for
+}
+
+/// Whether an agent says that it was asked to end, and it was not: its simulator had to end because of it, or the kubelet starts it
+/// again, which it does in no Pod that is being ended. Where the simulator was ended from outside, too, the agent may be right.
+fn is_false_claim(simulator: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
+    if end.exit_code == 0 {
+        return false;
+    }
+    let own_end = simulator.and_then(|container| container.last.as_ref());
+    let goes_on = agent.running || agent.waiting.is_some();
+    match own_end.map(|own| (own, what(own))) {
+        Some((_, Some(What::Stopped | What::Cancelled))) => false,
+        Some((own, Some(What::PeerCrashed))) => goes_on || order(simulator, own, end) == Order::SameRound,
+        _ => goes_on,
+    }
 }
 
 fn what(end: &EndView) -> Option<What> {

@@ -92,7 +92,8 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
         let Some(cause) = cause(pair) else { continue };
         let pod = draft.view.pod.as_ref();
         let crash = pod.and_then(|pod| last_crash(pod, pair.id, draft.now()));
-        match crash.filter(|crash| !crash.is_settled) {
+        // Who goes on to fail while the other side's word is waited for puts its end off no further.
+        match crash.filter(|crash| !crash.is_settled && pair.crashes <= limit) {
             None => return Some(of_pair(pair.id, pair.crashes, cause)),
             Some(crash) => awaited = awaited.or(crash.at),
         }

@@ -138,11 +138,66 @@ fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_word() {
             restarted("agent-1", 2, "exited", 1, 40),
             Awaited(Unseen),
         ),
+    ]);
+}
+
+#[test]
+fn an_agent_that_claims_to_have_been_asked_to_end_is_the_cause_unless_its_simulator_was_ended_too() {
+    use EndReason::{Killed, SimulatorCrashed};
+    let followed = || ended("simulator-1", 2, "peerCrashed", 1, 100);
+    let claim = |what| ended("agent-1", 2, what, 143, 100);
+    let again = |what| restarted("agent-1", 3, what, 143, 100);
+    let mut paused = claim("stopped");
+    paused.waiting = Some(("CrashLoopBackOff".into(), String::new()));
+    let outside = |mut simulator: ContainerView| {
+        simulator.running = true;
+        simulator
+    };
+    check(vec![
         row(
-            "asks its runner to end",
-            ended("simulator-1", 2, "peerCrashed", 1, 100),
-            ended("agent-1", 2, "stopped", 143, 100),
-            Awaited(Unseen),
+            "its simulator followed it",
+            followed(),
+            claim("stopped"),
+            Settled(Killed),
+        ),
+        row("and it runs again", followed(), again("stopped"), Settled(Killed)),
+        row("it says cancelled", followed(), claim("cancelled"), Settled(Killed)),
+        row("it says finished", followed(), claim("finished"), Settled(Killed)),
+        row(
+            "it claims no round",
+            followed(),
+            claims(None, claim("stopped")),
+            Settled(Killed),
+        ),
+        row(
+            "it runs again alone",
+            running("simulator-1"),
+            again("stopped"),
+            Awaited(Killed),
+        ),
+        row(
+            "it is started again soon",
+            running("simulator-1"),
+            paused,
+            Awaited(Killed),
+        ),
+        row(
+            "its simulator failed",
+            ended("simulator-1", 2, "exited", 1, 100),
+            again("stopped"),
+            Settled(SimulatorCrashed),
+        ),
+        row(
+            "its Pod is being ended",
+            running("simulator-1"),
+            claim("stopped"),
+            NoCrash,
+        ),
+        row(
+            "its node was started again, and with it both sides",
+            outside(ended("simulator-1", 2, "stopped", 143, 100)),
+            again("stopped"),
+            NoCrash,
         ),
     ]);
 }

@@ -300,6 +300,40 @@ fn a_crash_that_only_the_simulator_has_told_of_waits_for_the_agents_own_word() {
 }
 
 #[test]
+fn an_agent_that_claims_to_have_been_stopped_is_charged_and_ends_with_one_job() {
+    let mut world = World::local().running();
+    for round in 0..3 {
+        let second = 20 + i64::from(round) * 20;
+        world.see_alone(restarted("simulator-1", round + 1, "peerCrashed", 1, second));
+        world.see_alone(restarted("agent-1", round + 1, "stopped", 143, second));
+        world.go_to(second);
+        world.pass_to(Running, reasons::RUNNING);
+    }
+    world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 80));
+    world.see_alone(ended("agent-1", 3, "stopped", 143, 80));
+    world.go_to(81);
+    world.pass_to(Running, reasons::STOPPING);
+    // The stop itself ends the simulator from outside.
+    world.see_alone(ended("simulator-1", 4, "stopped", 143, 90));
+    world.complete();
+    let status = world.pass_to(Failed, reasons::AGENT_CRASHED).status;
+    let failure = status.failure.unwrap();
+    assert_eq!((failure.class, failure.charged, status.retry), (Participant, true, 0));
+}
+
+#[test]
+fn an_agent_puts_its_end_off_no_longer_by_failing_again_before_its_simulators_word() {
+    let mut world = World::local().running();
+    world.see_alone(ended("agent-1", 3, "silentDeath", 137, 100));
+    world.go_to(101);
+    world.pass_to(Running, reasons::RUNNING);
+    world.see_alone(ended("agent-1", 4, "silentDeath", 137, 150));
+    world.go_to(151);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(failure.reason, reasons::AGENT_CRASHED);
+}
+
+#[test]
 fn ends_on_command_are_no_crashes() {
     let mut world = World::local().running();
     world.report(report(1));
