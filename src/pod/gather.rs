@@ -11,18 +11,13 @@ use std::sync::Arc;
 use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness};
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Progress, Side};
 
+use super::keys::{EVALAI, MERGED, checkpoint_path};
 use super::report::{ReportPair, StoredFile};
 use super::run::{Run, STATUS_FOLDER, results_format};
 use super::tree::{Stamp, Tree, TreeError};
 use super::upload::Object;
 use leaderboard_api::{PairState, Verify};
 
-/// Key of the merged file.
-pub const MERGED: &str = "agent/agent_results.json";
-/// Before the keys of EvalAI's texts.
-pub const EVALAI: &str = "evalai/";
-/// Before the key of a refused checkpoint: no agent can put a file of its own there.
-pub const REFUSED: &str = "logcopy/refused/";
 /// The merged file under EvalAI's name.
 const METADATA: &str = "evalai/metadata.json";
 
@@ -54,11 +49,6 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
     }
     plan.check()?;
     Ok(plan)
-}
-
-/// The checkpoint of a pair, below the volume's root.
-pub fn checkpoint_path(pair: usize) -> String {
-    format!("agent/agent{pair}/agent_results.json")
 }
 
 /// Its last whole copy, which the agent's runner keeps.

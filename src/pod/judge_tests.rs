@@ -127,7 +127,8 @@ mod seen_on_a_volume {
 
     use super::super::*;
     use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
-    use crate::pod::gather::{EVALAI, Gatherer, MERGED, results_plan};
+    use crate::pod::gather::{Gatherer, results_plan};
+    use crate::pod::keys::{EVALAI, MERGED};
     use crate::pod::tree::Tree;
     use leaderboard_api::{PairState, RouteSlice};
 

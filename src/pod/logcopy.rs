@@ -22,8 +22,9 @@ use super::gather::{Gatherer, results_plan};
 use super::identity;
 use super::places::{Places, Setting};
 use super::run::Stop;
-use super::ship::Shipper;
+use super::ship::{STREAM_A_DAY, Shipper};
 use super::tree::{Tree, TreeError};
+use super::upload::quota::Quota;
 use super::upload::send::Uploader;
 use super::watch::Watch;
 use crate::observability::shutdown;
@@ -83,8 +84,9 @@ pub async fn work(
 ) -> Result<(), LogcopyError> {
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
     let gatherer = Gatherer::new(results_plan(&setting.run)?, Arc::clone(&tree))?;
-    let limit = setting.run.plan.storage.size_limit.bytes();
-    let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), limit);
+    let plan = &setting.run.plan;
+    let quota = Quota::new(plan.storage.size_limit.bytes(), plan.slices.len());
+    let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), quota);
 
     let (end, ending) = shutdown::Stop::new();
     let tasks = Tasks::new(ending);
@@ -120,7 +122,8 @@ fn ship(
         let plan = &setting.run.plan;
         let client = LogClient::of_group(aws, group);
         let pairs = plan.slices.len();
-        let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, uploader.memory());
+        let memory = uploader.memory();
+        let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, memory, STREAM_A_DAY);
         tasks.stay("logs to CloudWatch", shipper.run(SHIP_PERIOD, receiver))
     });
     (sender, task)
@@ -253,7 +256,8 @@ mod tests {
     use super::*;
     use crate::controller::fixtures;
     use crate::pod::upload::Haste;
-    use crate::pod::upload::send::Wanted;
+    use crate::pod::upload::send::Window;
+    use crate::pod::upload::wanted::Wanted;
 
     /// Longer than a stop takes to be noticed, and still an end of a test that would hang.
     const PATIENCE: Duration = Duration::from_secs(20);
@@ -298,7 +302,7 @@ mod tests {
         // Nothing is stored here, only how the file is read is tested.
         let nowhere = "http://127.0.0.1:9";
         let s3 = fixtures::aws(nowhere).await.s3(None, Some(nowhere));
-        let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), 1 << 20);
+        let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), Quota::new(1 << 20, 1));
         let (_end, ending) = shutdown::Stop::new();
         let tasks = Tasks::new(ending);
         let (mut stop, watching) = watch_stop(places.clone(), &tasks);
@@ -318,7 +322,7 @@ mod tests {
             let _ = seen.send(());
         };
         // One thread for all: a read that blocks it blocks the watch of the stop as well.
-        let (_, ()) = tokio::join!(uploader.sync(&files, None), asked);
+        let (_, ()) = tokio::join!(uploader.sync(&files, Window::default()), asked);
         assert!(
             disk.join().unwrap(),
             "the stop was noticed only when the disk answered again"

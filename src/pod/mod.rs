@@ -4,12 +4,14 @@
 //! are read. The programs know S3 and the Pod's volumes; they know no Kubernetes API, no EvalAI and no DynamoDB.
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
+pub mod daily;
 #[cfg(test)]
 pub(crate) mod fixtures;
 pub mod gather;
 pub mod identity;
 pub mod isolation;
 pub mod judge;
+pub mod keys;
 pub mod logcopy;
 pub mod ownlog;
 pub mod places;

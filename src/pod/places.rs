@@ -72,6 +72,10 @@ pub struct Pace {
     pub least: Duration,
     /// Longest pause after rounds that failed.
     pub backoff: Duration,
+    /// Shortest time that logs get in a round of a running run.
+    pub logs: Duration,
+    /// What a file that is being sent gets beyond the time for logs in a round: the next report waits that long at most.
+    pub in_air: Duration,
     /// How long a network plugin may take until it enforces the policy of a new Pod.
     pub enforced_within: Duration,
 }
@@ -84,6 +88,8 @@ impl Default for Pace {
             grace: Duration::from_secs(25),
             least: Duration::from_secs(1),
             backoff: Duration::from_mins(1),
+            logs: Duration::from_secs(10),
+            in_air: Duration::from_mins(1),
             enforced_within: Duration::from_mins(1),
         }
     }
@@ -100,6 +106,8 @@ impl Pace {
             grace: part(self.grace),
             least: part(self.least),
             backoff: part(self.backoff),
+            logs: part(self.logs),
+            in_air: part(self.in_air),
             enforced_within: part(self.enforced_within),
         }
     }

@@ -12,11 +12,13 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use super::blocking;
+use super::daily::{Daily, Spent, today};
+use super::keys::agent_log;
 use super::ownlog::OWN_LOG;
 use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
-use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, cut};
+use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, OVERHEAD, cut};
 
 /// Bytes read of one file at once.
 const CHUNK: u64 = 256 << 10;
@@ -26,6 +28,9 @@ const BATCHES: usize = 64;
 const NOTE: &str = "logcopy/.shipped.json";
 /// Largest note that is read, in bytes.
 const NOTE_LIMIT: u64 = 1 << 20;
+/// Bytes that one stream gets on a day, as CloudWatch bills them: whoever replaces or rewrites a log all the time ends its stream
+/// for that day. S3 has the log all the same.
+pub const STREAM_A_DAY: u64 = 512 << 20;
 /// Time the last round may take.
 const LAST_ROUND: Duration = Duration::from_secs(20);
 
@@ -34,6 +39,15 @@ const LAST_ROUND: Duration = Duration::from_secs(20);
 struct Mark {
     inode: u64,
     offset: u64,
+}
+
+/// What is noted next to the files.
+#[derive(Serialize, Deserialize, Clone, Debug, Default, PartialEq, Eq)]
+struct Note {
+    /// By path.
+    marks: BTreeMap<String, Mark>,
+    /// By stream.
+    sent: Daily,
 }
 
 /// What may have been sent: a batch whose answer never came.
@@ -51,16 +65,19 @@ pub struct Shipper {
     tree: Arc<Tree>,
     /// Stream by path.
     streams: BTreeMap<String, String>,
-    marks: BTreeMap<String, Mark>,
+    note: Note,
+    /// Bytes of one stream on a day.
+    a_day: u64,
     made: BTreeSet<String>,
     doubt: Option<Doubt>,
     newest: i64,
 }
 
 impl Shipper {
-    /// Goes on where the last one was. What a Pod before this one has stored was also sent by it.
-    pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &str, pairs: usize, restored: &Memory) -> Self {
-        let agents = (1..=pairs).map(|n| (format!("agent/agent{n}/leaderboard.log"), format!("{run_id}/agent-{n}")));
+    /// Goes on where the last one was. What a Pod before this one has stored was also sent by it. `a_day`: bytes that one stream
+    /// gets on a day.
+    pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &str, pairs: usize, restored: &Memory, a_day: u64) -> Self {
+        let agents = (1..=pairs).map(|n| (agent_log(n), format!("{run_id}/agent-{n}")));
         let simulators = (1..=pairs).map(|n| (console(n), format!("{run_id}/simulator-{n}")));
         let streams: BTreeMap<String, String> = agents
             .chain(simulators)
@@ -68,9 +85,11 @@ impl Shipper {
             .collect();
         let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();
         let noted = note.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());
-        let marks = noted.unwrap_or_else(|| {
-            let known = streams.keys().filter_map(|path| Some((path, restored.0.get(path)?)));
-            known
+        let note = noted.unwrap_or_else(|| {
+            let known = streams
+                .keys()
+                .filter_map(|path| Some((path, restored.stored.get(path)?)));
+            let marks = known
                 .map(|(path, stored)| {
                     let mark = Mark {
                         inode: stored.stamp.inode,
@@ -78,13 +97,16 @@ impl Shipper {
                     };
                     (path.clone(), mark)
                 })
-                .collect()
+                .collect();
+            let sent = Daily::default();
+            Note { marks, sent }
         });
         Self {
             client,
             tree,
             streams,
-            marks,
+            note,
+            a_day,
             made: BTreeSet::new(),
             doubt: None,
             newest: 0,
@@ -132,7 +154,11 @@ impl Shipper {
 
     /// Sends one batch of a file. Returns whether there may be more.
     async fn send(&mut self, path: &str, stream: &str, last: bool) -> Result<bool, LogsError> {
-        let mark = self.marks.get(path).copied().unwrap_or_default();
+        self.note.sent.begin(today());
+        if self.note.sent.of(stream).bytes >= self.a_day {
+            return Ok(false);
+        }
+        let mark = self.note.marks.get(path).copied().unwrap_or_default();
         // A file that can't be read is the uploader's to complain about.
         let (tree, file) = (Arc::clone(&self.tree), path.to_owned());
         let Ok(Ok(Some((bytes, mark)))) = blocking(move || next(&tree, &file, mark)).await else {
@@ -150,6 +176,9 @@ impl Shipper {
             ..mark
         };
         let sent = Instant::now();
+        if self.note.sent.of(stream).bytes.saturating_add(billed(&events)) > self.a_day {
+            return self.end_for_today(path, stream).await.map(|()| false);
+        }
         self.put(path, stream, &events, after).await?;
         self.note(path, after).await;
         let more = is_full || consumed < bytes.len();
@@ -157,6 +186,29 @@ impl Shipper {
             tokio::time::sleep(BETWEEN_BATCHES.saturating_sub(sent.elapsed())).await;
         }
         Ok(more)
+    }
+
+    /// Says in the stream and in logcopy's own log that no more of it comes today.
+    async fn end_for_today(&mut self, path: &str, stream: &str) -> Result<(), LogsError> {
+        let text = format!(
+            "logcopy: the daily limit of {} bytes of this stream is reached; it goes on tomorrow (UTC). {path} in S3 has \
+             all. Have less printed.",
+            self.a_day
+        );
+        let line = LogEvent {
+            time: self.newest,
+            text,
+        };
+        // Noted first: whatever becomes of the line, nothing more is sent.
+        let rest = Spent {
+            requests: 1,
+            bytes: self.a_day,
+        };
+        self.note.sent.add(stream, rest);
+        self.write_note().await;
+        tracing::warn!(stream, "not in CloudWatch Logs: {}", line.text);
+        let mark = self.note.marks.get(path).copied().unwrap_or_default();
+        self.put(path, stream, &[line], mark).await
     }
 
     async fn put(&mut self, path: &str, stream: &str, events: &[LogEvent], after: Mark) -> Result<(), LogsError> {
@@ -168,6 +220,13 @@ impl Shipper {
             self.made.insert(stream.to_owned());
         }
         let result = self.client.put(stream, events).await;
+        if !matches!(result, Err(LogsError::Refused { .. })) {
+            let cost = Spent {
+                requests: 1,
+                bytes: billed(events),
+            };
+            self.note.sent.add(stream, cost);
+        }
         match &result {
             Err(LogsError::Refused { missing: true, .. }) => {
                 self.made.remove(stream);
@@ -203,10 +262,14 @@ impl Shipper {
     }
 
     async fn note(&mut self, path: &str, mark: Mark) {
-        self.marks.insert(path.to_owned(), mark);
-        let (marks, tree) = (self.marks.clone(), Arc::clone(&self.tree));
+        self.note.marks.insert(path.to_owned(), mark);
+        self.write_note().await;
+    }
+
+    async fn write_note(&self) {
+        let (note, tree) = (self.note.clone(), Arc::clone(&self.tree));
         let write = move || {
-            let bytes = serde_json::to_vec(&marks).map_err(std::io::Error::other)?;
+            let bytes = serde_json::to_vec(&note).map_err(std::io::Error::other)?;
             tree.write(NOTE, &bytes)
         };
         if let Err(error) = blocking(write).await.map_err(TreeError::from).flatten() {
@@ -227,6 +290,12 @@ fn next(tree: &Tree, path: &str, mark: Mark) -> Result<Option<(Vec<u8>, Mark)>, 
     file.read_exact_at(&mut bytes, offset)?;
     let inode = stamp.inode;
     Ok((len > 0).then_some((bytes, Mark { inode, offset })))
+}
+
+/// Bytes that events count.
+fn billed(events: &[LogEvent]) -> u64 {
+    let sizes = events.iter().map(|event| event.text.len().saturating_add(OVERHEAD));
+    sizes.fold(0, |sum: u64, size| sum.saturating_add(size as u64))
 }
 
 fn milliseconds() -> i64 {

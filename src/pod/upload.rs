@@ -1,10 +1,14 @@
 //! When which file is stored: the rules, and the memory of what is stored already.
 //!
 //! `decide_upload` is pure. [`send::Uploader`] carries it out; `logcopy` calls that each round, `workspace` fills the memory
-//! with what it restored. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
+//! with what it restored. [`quota`] says how much may be stored and sent. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
 //! logcopy does not send everything again.
 
+pub mod complaints;
+mod job;
+pub mod quota;
 pub mod send;
+pub mod wanted;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,6 +20,7 @@ use hyper::body::Bytes;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::daily::Daily;
 use super::report::StoredFile;
 use super::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::MIN_PART;
@@ -43,6 +48,25 @@ pub struct Stored {
     /// When, on the clock of this process; zero for what an earlier one stored.
     #[serde(skip)]
     pub at: Duration,
+}
+
+impl Stored {
+    /// An object of which only the size is known: it counts, and is replaced by whatever is to be stored there.
+    pub fn unknown(size: u64) -> Self {
+        Self {
+            stamp: Stamp {
+                size,
+                ..Stamp::default()
+            },
+            etag: None,
+            fingerprint: String::new(),
+            at: Duration::ZERO,
+        }
+    }
+
+    fn is_unknown(&self) -> bool {
+        self.stamp.inode == 0 && self.etag.is_none() && self.fingerprint.is_empty()
+    }
 }
 
 /// A result that is stored from memory. Its content is shared, never copied.
@@ -91,7 +115,7 @@ pub enum Haste {
 
 /// What is done with a file now. `now` is on the clock of [`Stored::at`].
 pub fn decide_upload(found: &Stamp, stored: Option<&Stored>, now: Duration, haste: Haste) -> Decision {
-    let Some(stored) = stored else {
+    let Some(stored) = stored.filter(|stored| !stored.is_unknown()) else {
         return Decision::PutWhole;
     };
     let before = &stored.stamp;
@@ -148,27 +172,32 @@ pub fn hex(bytes: &[u8]) -> String {
     )
 }
 
-/// What is stored, by key.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Memory(pub BTreeMap<String, Stored>);
+/// What is stored, and what was sent today.
+#[derive(Serialize, Deserialize, Clone, Debug, Default, PartialEq, Eq)]
+pub struct Memory {
+    /// By key.
+    pub stored: BTreeMap<String, Stored>,
+    /// What was sent, by purse.
+    pub sent: Daily,
+}
 
 impl Memory {
     /// What an earlier program of this Pod left; nothing if that can't be read, which costs one upload of everything.
     pub fn load(tree: &Tree) -> Self {
         let read = tree.read(MEMORY, MEMORY_LIMIT).ok().flatten();
-        let map = read.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());
-        Self(map.unwrap_or_default())
+        let memory = read.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());
+        memory.unwrap_or_default()
     }
 
     /// Leaves it for the next program of this Pod.
     pub fn save(&self, tree: &Tree) -> Result<(), TreeError> {
-        let bytes = serde_json::to_vec(&self.0).map_err(io::Error::other)?;
+        let bytes = serde_json::to_vec(self).map_err(io::Error::other)?;
         tree.write(MEMORY, &bytes)
     }
 
     /// Bytes that are stored.
     pub fn bytes(&self) -> u64 {
-        let sizes = self.0.values().map(|stored| stored.stamp.size);
+        let sizes = self.stored.values().map(|stored| stored.stamp.size);
         sizes.fold(0, u64::saturating_add)
     }
 }
@@ -229,7 +258,9 @@ mod tests {
                 "{name}"
             );
         }
-        assert_eq!(decide_upload(&stamp(0), None, Duration::ZERO, Soon), WHOLE);
+        for stored in [None, Some(&Stored::unknown(0))] {
+            assert_eq!(decide_upload(&stamp(0), stored, Duration::ZERO, Soon), WHOLE);
+        }
     }
 
     #[test]
@@ -276,11 +307,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let tree = Tree::open(folder.path()).unwrap();
         assert_eq!(Memory::load(&tree), Memory::default());
-        let memory = Memory(BTreeMap::from([("a/b".to_owned(), stored(5))]));
+        let memory = Memory {
+            stored: BTreeMap::from([("a/b".to_owned(), stored(5))]),
+            ..Memory::default()
+        };
         memory.save(&tree).unwrap();
         let loaded = Memory::load(&tree);
-        assert_eq!(loaded.0["a/b"].stamp, stamp(5));
-        assert_eq!((loaded.bytes(), loaded.0["a/b"].at), (5, Duration::ZERO));
+        assert_eq!(loaded.stored["a/b"].stamp, stamp(5));
+        assert_eq!((loaded.bytes(), loaded.stored["a/b"].at), (5, Duration::ZERO));
         tree.write(MEMORY, b"{").unwrap();
         assert_eq!(Memory::load(&tree), Memory::default());
     }

@@ -9,7 +9,7 @@ mod parts;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
@@ -324,13 +324,14 @@ impl Archive {
     }
 
     /// Stores the first `size` bytes of a file in parts; what is stored of it already is copied inside S3. At most one part
-    /// is in memory. Returns the new object's entity tag.
+    /// is in memory. What is not done at `cut_at` is aborted. Returns the new object's entity tag.
     pub async fn upload(
         &self,
         key: &str,
         file: &Arc<File>,
         kept: Option<Kept<'_>>,
         size: u64,
+        cut_at: Option<Instant>,
     ) -> Result<Option<String>, ArchiveError> {
         const OP: &str = "storing";
         let parts = parts::plan(kept.map_or(0, |kept| kept.size), size);
@@ -342,7 +343,13 @@ impl Archive {
         let Some(id) = output.upload_id else {
             return Err(self.error(OP, key, Cause::Refused("no upload id in the answer".to_owned())));
         };
-        let stored = self.send_parts(key, &id, file, kept, &parts).await;
+        let sending = self.send_parts(key, &id, file, kept, &parts);
+        let stored = match cut_at {
+            Some(cut_at) => tokio::time::timeout_at(cut_at.into(), sending)
+                .await
+                .unwrap_or_else(|_| Err(self.error(OP, key, Cause::Slow))),
+            None => sending.await,
+        };
         if stored.is_err() {
             let abort = self.client.abort_multipart_upload().bucket(&self.bucket);
             // What is left over costs storage only; the bucket's lifecycle rule ends it.

@@ -5,9 +5,11 @@ mod archives;
 mod cloudwatch;
 mod endpoints;
 mod hostile;
+mod limits;
 mod measure;
 mod preparing;
 mod role;
+mod shelf;
 mod sidecar;
 mod uploads;
 
@@ -27,7 +29,9 @@ use leaderboard_operator::pod::places::{Pace, Places, Setting};
 use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_operator::pod::run::{Run, SCHEMA, STATUS_FOLDER, Stop};
 use leaderboard_operator::pod::tree::Tree;
-use leaderboard_operator::pod::upload::send::{Sent, Uploader, Wanted};
+use leaderboard_operator::pod::upload::quota::{LEAST, Quota};
+use leaderboard_operator::pod::upload::send::{Sent, Uploader, Window};
+use leaderboard_operator::pod::upload::wanted::Wanted;
 use leaderboard_operator::pod::upload::{Haste, Object};
 use leaderboard_operator::pod::workspace::{self, WorkspaceError, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_operator::pod::{identity, ship};
@@ -89,6 +93,8 @@ impl Pod {
                     grace: Duration::from_secs(5),
                     least: Duration::from_millis(100),
                     backoff: Duration::from_millis(500),
+                    logs: Duration::from_secs(10),
+                    in_air: Duration::from_mins(1),
                     enforced_within: Duration::from_secs(2),
                 },
             },
@@ -165,7 +171,7 @@ impl Pod {
 
     fn uploader(&self) -> Uploader {
         let tree = Arc::new(Tree::open(self.logs()).unwrap());
-        Uploader::new(self.archive.clone(), tree, LIMIT)
+        Uploader::new(self.archive.clone(), tree, Quota::new(LIMIT, 2))
     }
 
     /// Starts logcopy.

@@ -1,7 +1,7 @@
-//! Checkpoints as large as they may be, of as many pairs as there may be, and larger ones: logcopy reads, merges and stores them
-//! far below the memory it is given.
+//! Checkpoints as large as they may be, of as many pairs as there may be, and larger ones, next to 24,000 files with long names
+//! and sparse ones: logcopy reads, merges and stores them far below the memory it is given.
 
-use std::fs;
+use std::fs::{self, File};
 use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -22,8 +22,37 @@ const PAIRS: usize = 16;
 const MEMORY: u64 = 512 << 20;
 const LIMIT: Duration = Duration::from_mins(3);
 
-/// The checkpoint of a pair that has finished one of its two routes, filled up to `bytes`.
-fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
+/// Files of each agent, of which more than are looked at, and of the simulators.
+const AGENT_FILES: usize = 1_250;
+const SIMULATOR_FILES: usize = 4_000;
+/// Of each agent, next to a sparse leaderboard.log.
+const SPARSE_FILES: usize = 4;
+
+/// Fills the folders of all containers.
+fn flood(logs: &Path) {
+    let folder = |of: &str| {
+        let folder = logs.join(of).join("x".repeat(150));
+        fs::create_dir_all(&folder).unwrap();
+        folder
+    };
+    let name = |number: usize| format!("{}{number}", "y".repeat(200));
+    for pair in 1..=PAIRS {
+        let (own, folder) = (format!("agent/agent{pair}"), folder(&format!("agent/agent{pair}")));
+        for number in 0..AGENT_FILES {
+            File::create(folder.join(name(number))).unwrap();
+        }
+        let sparse = |name: &str, size: u64| File::create(logs.join(&own).join(name)).unwrap().set_len(size).unwrap();
+        (0..SPARSE_FILES).for_each(|number| sparse(&format!("sparse-{number}"), 60 << 20));
+        sparse("leaderboard.log", 4 << 40);
+    }
+    let folder = folder("simulator");
+    for number in 0..SIMULATOR_FILES {
+        File::create(folder.join(name(number))).unwrap();
+    }
+}
+
+/// The checkpoint of a pair that has finished one of its two routes, filled up to `bytes` with small objects and long texts.
+fn checkpoint(pair: usize, bytes: usize, values: usize, fill: &str) -> String {
     let infractions = [
         "collisions_pedestrian",
         "collisions_vehicle",
@@ -42,6 +71,7 @@ fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
         .map(|name| (name.to_owned(), json!([])))
         .into_iter()
         .collect();
+    let small = vec!["{\"\":0}"; values.saturating_sub(200) / 2].join(",");
     let file = |texts: &[String]| {
         let record = json!({
             "index": 0,
@@ -52,6 +82,7 @@ fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
             "scores": {"score_route": 100.0, "score_penalty": 1.0, "score_composed": 100.0},
             "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
             "texts": texts,
+            "small": ["small"],
         });
         let checkpoint = json!({"global_record": {}, "progress": [1, 2], "records": [record]});
         json!({
@@ -63,6 +94,7 @@ fn checkpoint(pair: usize, bytes: usize, fill: &str) -> String {
             "labels": [],
         })
         .to_string()
+        .replacen("[\"small\"]", &format!("[{small}]"), 1)
     };
     let mut left = bytes - file(&[]).len();
     let mut texts = Vec::new();
@@ -82,16 +114,16 @@ fn put(logs: &Path, pair: usize, text: &str) {
 }
 
 /// Waits for a report that says so, while logcopy stays below its memory.
-async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) {
+async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) -> Report {
     let began = Instant::now();
     loop {
         let memory = most_memory(pid);
         assert!(memory < MEMORY, "{} MiB", memory >> 20);
         let report = Report::parse(&sink.report.lock().unwrap());
-        if report.as_ref().is_ok_and(&what) {
-            return;
+        match report {
+            Ok(report) if what(&report) => return report,
+            report => assert!(began.elapsed() < LIMIT, "{report:?}"),
         }
-        assert!(began.elapsed() < LIMIT, "{report:?}");
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
 }
@@ -107,12 +139,17 @@ async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys
         })
         .collect();
     submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
-    let most = results_plan(&submission.run).unwrap().limits_of(0).bytes;
+    // Half of it is for the agents' files, so some of the sparse ones are sent and the others are not.
+    submission.run.plan.storage.size_limit = leaderboard_api::ByteQuantity::gibibytes(1);
+    let limits = results_plan(&submission.run).unwrap().limits_of(0);
+    // With more values the merged file, which has a line for each, would be larger than it may be.
+    let (most, values) = (limits.bytes, limits.values / 4);
     let kubelet = Kubelet::new(&submission);
     let root = kubelet.folder().join("pod-1");
     make_volumes(&root);
     let logs = root.join("logs");
     fs::create_dir_all(logs.join(STATUS_FOLDER)).unwrap();
+    flood(&logs);
     let mut logcopy = submission
         .own("logcopy", &root, "pod-1")
         .kill_on_drop(true)
@@ -121,28 +158,37 @@ async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys
     let pid = logcopy.id().unwrap();
 
     for pair in 0..PAIRS {
-        put(&logs, pair, &checkpoint(pair, most, "x"));
+        put(&logs, pair, &checkpoint(pair, most, values, "x"));
     }
-    reported(&sink, pid, |report| report.done == 16).await;
-    let before = sink.bytes.load(Ordering::Relaxed);
+    let merged = |report: &Report| {
+        report
+            .files
+            .get("evalai/metadata.json")
+            .map(|file| (file.size, file.sha256.clone()))
+    };
+    let first = reported(&sink, pid, |report| report.done == 16).await;
+    let size = merged(&first).map_or(0, |(size, _)| size);
+    assert!(size > 40 << 20, "{size} bytes are merged");
     for pair in 0..PAIRS {
-        put(&logs, pair, &checkpoint(pair, most, "y"));
+        put(&logs, pair, &checkpoint(pair, most, values, "y"));
     }
-    reported(&sink, pid, |_| {
-        sink.bytes.load(Ordering::Relaxed) > before + (PAIRS * most) as u64
+    reported(&sink, pid, |report| {
+        report.done == 16 && merged(report) != merged(&first)
     })
     .await;
     for pair in 0..4 {
-        put(&logs, pair, &checkpoint(pair, 63 << 20, "z"));
+        put(&logs, pair, &checkpoint(pair, 63 << 20, 0, "z"));
     }
     reported(&sink, pid, |report| {
         report.why.as_ref().is_some_and(|why| why.contains("that are read"))
     })
     .await;
     println!(
-        "{} pairs of {most} bytes: {} MiB of memory",
-        PAIRS,
-        most_memory(pid) >> 20
+        "{PAIRS} pairs of {most} bytes and {values} values, merged {} MiB, next to {} files: {} MiB of memory, {} MiB sent",
+        size >> 20,
+        PAIRS * AGENT_FILES + SIMULATOR_FILES,
+        most_memory(pid) >> 20,
+        sink.bytes.load(Ordering::Relaxed) >> 20
     );
     logcopy.kill().await.unwrap();
     serving.abort();

@@ -3,39 +3,34 @@
 //! Called by the loop of the parent module. The content of a report is in [`super::describe`].
 
 use std::collections::BTreeMap;
-use std::collections::hash_map::DefaultHasher;
 use std::ffi::OsStr;
-use std::hash::{Hash, Hasher};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use hyper::body::Bytes;
-use leaderboard_runner::protocol::{self, Side, StatusFile};
+use leaderboard_runner::protocol::{self, Mark, Side, StatusFile};
 use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
-use super::{LogcopyError, create};
+use super::{LAST_FLUSH, LogcopyError, create};
 use crate::pod::blocking;
-use crate::pod::gather::{Gathered, Gatherer, REFUSED, checkpoint_path};
+use crate::pod::gather::{Gathered, Gatherer};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
-use crate::pod::ownlog::OWN_LOG;
 use crate::pod::places::Setting;
 use crate::pod::report::{OWNER_KEY, Owner, REPORT_KEY, Report};
 use crate::pod::run::{STATUS_FOLDER, Stop};
-use crate::pod::tree::{Stamp, Tree};
-use crate::pod::upload::send::{Uploader, Wanted};
+use crate::pod::tree::Tree;
+use crate::pod::upload::complaints::Why as Complaint;
+use crate::pod::upload::send::{Uploader, Window};
+use crate::pod::upload::wanted::{Files, Wanted};
 use crate::pod::upload::{Haste, Object};
 use crate::pod::watch::Watch;
 use crate::services::archive::{Archive, ArchiveError, Fetched};
 
-/// Entries read in one agent's folder.
-const AGENT_ENTRIES: usize = 5_000;
-/// Entries read in the simulators' folder.
-const SIMULATOR_ENTRIES: usize = 20_000;
+/// Rounds of a container whose status files are stored: far more than retries a host forgives.
+const STATUS_ROUNDS: u32 = 64;
 /// Bytes of the owner that are read.
 const OWNER_BYTES: u64 = 1024;
-/// Shortest time that logs get in a round of a running run.
-const LOG_TIME: Duration = Duration::from_secs(10);
 
 /// Why there is a round.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,6 +48,8 @@ struct Found {
     logs: Vec<Wanted>,
     statuses: Vec<StatusFile>,
     activity: u64,
+    /// Entries that are not looked at.
+    left_out: usize,
 }
 
 /// The rounds of one life.
@@ -73,7 +70,9 @@ pub(super) struct Rounds {
     owner_etag: Option<String>,
     owner_missed: bool,
     ending: Option<Ending>,
-    /// The final report is stored.
+    /// Until when the last logs are stored, and in which kind of round that began.
+    logs_until: Option<(Why, Instant)>,
+    /// The final report is stored, and the logs as far as there was time.
     finished: bool,
     /// Another Pod owns the prefix.
     fenced: bool,
@@ -107,6 +106,7 @@ impl Rounds {
             owner_etag: None,
             owner_missed: false,
             ending: None,
+            logs_until: None,
             finished,
             fenced: false,
         }
@@ -115,6 +115,15 @@ impl Rounds {
     /// How long storing may take at the end.
     pub(super) fn flush(&self) -> Duration {
         Duration::from_secs(self.setting.run.flush_seconds)
+    }
+
+    /// What the last logs get of it: as much is left for what comes after them.
+    fn time_for_last_logs(&self, why: Why) -> Duration {
+        let longest = match why {
+            Why::Period => self.flush(),
+            Why::Shutdown => self.flush().min(LAST_FLUSH),
+        };
+        longest.checked_div(2).unwrap_or(longest)
     }
 
     fn period(&self) -> Duration {
@@ -181,29 +190,21 @@ impl Rounds {
             self.give_up().await;
             return Ok(self.period());
         }
-        if self.finished {
-            // Only what has come since: the last status files and our own last lines.
-            self.store_statuses(&found.statuses).await?;
-            self.store_logs(found.logs, true).await?;
-            return Ok(self.period());
-        }
         let at_end = self.ending.is_some() || why == Why::Shutdown;
-        self.uploader.put(&found.gathered.objects).await?;
-        self.store_statuses(&found.statuses).await?;
-        if at_end {
-            self.store_logs(found.logs, true).await?;
-            // Storing logs can take minutes, in which another Pod may have come.
-            if !self.owns_prefix().await? {
-                self.give_up().await;
-                return Ok(self.period());
-            }
-            self.report(&found.gathered).await?;
-        } else {
-            // A long upload of logs must not keep the progress back.
-            self.report(&found.gathered).await?;
-            self.store_logs(found.logs, false).await?;
+        if !self.finished {
+            self.uploader.put(&found.gathered.objects).await?;
         }
-        if self.ending.is_some() {
+        // After the final report only what has come since: the last status files and our own last lines.
+        self.store_statuses(&found.statuses).await?;
+        if !self.finished {
+            // Logs must keep neither the progress back nor the end.
+            self.report(&found.gathered).await?;
+        }
+        if found.left_out > 0 {
+            self.uploader.complain("logs", &Complaint::Entries(found.left_out));
+        }
+        self.store_logs(found.logs, at_end.then_some(why)).await?;
+        if self.ending.is_some() && !self.finished {
             self.finish(&found.gathered).await?;
         }
         Ok(pause)
@@ -216,12 +217,13 @@ impl Rounds {
         let pairs = self.pairs();
         let read = move || {
             let gathered = reader.lock().unwrap_or_else(PoisonError::into_inner).round();
-            let (files, activity) = logs(&tree, pairs);
+            let files = Files::find(&tree, pairs);
             Found {
-                logs: wanted(&files, &gathered),
+                logs: files.wanted(&gathered.refused),
                 gathered,
                 statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX)),
-                activity,
+                activity: files.activity,
+                left_out: files.left_out,
             }
         };
         Ok(blocking(read).await?)
@@ -294,20 +296,49 @@ impl Rounds {
     /// what an agent puts into its own is never read.
     async fn store_statuses(&mut self, statuses: &[StatusFile]) -> Result<(), ArchiveError> {
         let empty = Object::new(Bytes::new());
-        let keys = statuses.iter().map(|file| format!("{STATUS_FOLDER}/{}", file.name()));
-        let objects: BTreeMap<String, Object> = keys.map(|key| (key, empty.clone())).collect();
+        let key = |file: &StatusFile| format!("{STATUS_FOLDER}/{}", file.name());
+        let (stored, endless): (Vec<&StatusFile>, Vec<&StatusFile>) =
+            statuses.iter().partition(|file| is_of_first_rounds(file));
+        if let Some(first) = endless.first() {
+            self.uploader.complain(&key(first), &Complaint::Statuses(STATUS_ROUNDS));
+        }
+        let objects: BTreeMap<String, Object> = stored.into_iter().map(|file| (key(file), empty.clone())).collect();
         self.uploader.put(&objects).await.map(drop)
     }
 
-    /// The logs: all of them at the end, else what is due, and no longer than a period.
-    async fn store_logs(&mut self, mut files: Vec<Wanted>, all: bool) -> Result<(), ArchiveError> {
-        if all {
-            for file in &mut files {
-                file.haste = Haste::Now;
-            }
+    /// The logs: what is due, no longer than a period, and what is in the air then not much longer. `last`: all of them, in a
+    /// part of the time that the end may take.
+    async fn store_logs(&mut self, mut files: Vec<Wanted>, last: Option<Why>) -> Result<(), ArchiveError> {
+        let now = Instant::now();
+        let Some(why) = last else {
+            let begin_until = now.checked_add(self.period().max(self.setting.pace.logs));
+            let cut_at = begin_until.and_then(|until| until.checked_add(self.setting.pace.in_air));
+            let window = Window {
+                begin_until,
+                cut_at,
+                is_last: false,
+            };
+            return self.uploader.sync(&files, window).await.map(drop);
+        };
+        for file in &mut files {
+            file.haste = Haste::Now;
         }
-        let until = Instant::now().checked_add(self.period().max(LOG_TIME));
-        self.uploader.sync(&files, until.filter(|_| !all)).await.map(drop)
+        let until = match self.logs_until {
+            // A round that failed has used some of it.
+            Some((begun, until)) if begun == why => until,
+            _ => now.checked_add(self.time_for_last_logs(why)).unwrap_or(now),
+        };
+        self.logs_until = Some((why, until));
+        let window = Window {
+            begin_until: Some(until),
+            cut_at: Some(until),
+            is_last: true,
+        };
+        let sent = self.uploader.sync(&files, window).await?;
+        if sent.late > 0 {
+            self.uploader.complain("logs", &Complaint::Ended(sent.late));
+        }
+        Ok(())
     }
 
     /// Stores the report, if it differs from the last one.
@@ -343,40 +374,12 @@ impl Rounds {
     }
 }
 
-/// The files of the containers, and a digest that changes when an agent writes something.
-fn logs(tree: &Tree, pairs: usize) -> (BTreeMap<String, Stamp>, u64) {
-    let mut files = BTreeMap::new();
-    for pair in 1..=pairs {
-        files.extend(tree.walk(&format!("agent/agent{pair}"), AGENT_ENTRIES).files);
+/// An agent can make any number of them.
+fn is_of_first_rounds(file: &StatusFile) -> bool {
+    match file {
+        StatusFile::Of(_, Mark::Start(round) | Mark::Crash(round)) => *round < STATUS_ROUNDS,
+        _ => true,
     }
-    let mut activity = DefaultHasher::new();
-    files.hash(&mut activity);
-    files.extend(tree.walk("simulator", SIMULATOR_ENTRIES).files);
-    if let Ok(Some((_, stamp))) = tree.file(OWN_LOG) {
-        files.insert(OWN_LOG.to_owned(), stamp);
-    }
-    (files, activity.finish())
-}
-
-/// The logs to store. A checkpoint is none: it is stored from memory, whole. One that is refused is kept as evidence under
-/// another name, so that nothing is resumed from it.
-fn wanted(files: &BTreeMap<String, Stamp>, gathered: &Gathered) -> Vec<Wanted> {
-    let of_pair: BTreeMap<String, bool> = (1..)
-        .zip(&gathered.refused)
-        .map(|(pair, refused)| (checkpoint_path(pair), refused.is_some()))
-        .collect();
-    let wanted = files.iter().filter_map(|(path, stamp)| {
-        let wanted = Wanted::new(path, *stamp, Haste::Soon);
-        match of_pair.get(path) {
-            None => Some(wanted),
-            Some(true) => Some(Wanted {
-                key: format!("{REFUSED}{path}"),
-                ..wanted
-            }),
-            Some(false) => None,
-        }
-    });
-    wanted.collect()
 }
 
 /// What can't wait for the period: a container's new status file, or its new folder. A checkpoint can wait: an agent that

@@ -1,47 +1,29 @@
 //! Stores files by the rules of the parent module: a few at a time, at most one part of each in memory.
 //!
-//! Called by `logcopy`. A file that can't be read is left out and named; only S3's own failures end a round.
+//! Called by `logcopy`. A file that can't be read, or for which there is no room, is left out and named; only S3's own failures
+//! end a round.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures::StreamExt;
 
-use super::{Decision, Haste, Memory, Object, Stored, decide_upload, fingerprint};
+use super::complaints::{Complaints, Why};
+use super::job::{Job, Outcome, Put};
+use super::quota::{Ledger, Quota, cost};
+use super::wanted::Wanted;
+use super::{Decision, Memory, Object, Stored, decide_upload};
 use crate::pod::blocking;
+use crate::pod::daily::{Spent, today};
 use crate::pod::tree::{Stamp, Tree, TreeError};
-use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};
+use crate::services::archive::{Archive, ArchiveError, Cause};
 
 /// Files in the air at once.
 const AT_ONCE: usize = 4;
-
-/// A file that is to be stored.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Wanted {
-    /// Its key below the run's prefix.
-    pub key: String,
-    /// Its path below the volume's root.
-    pub path: String,
-    /// As it was found.
-    pub stamp: Stamp,
-    /// How soon.
-    pub haste: Haste,
-}
-
-impl Wanted {
-    /// A file whose key is its path.
-    pub fn new(path: &str, stamp: Stamp, haste: Haste) -> Self {
-        Self {
-            key: path.to_owned(),
-            path: path.to_owned(),
-            stamp,
-            haste,
-        }
-    }
-}
+/// Pause before a file that was cut is tried again; doubled each time.
+const AFTER_A_CUT: Duration = Duration::from_mins(10);
 
 /// What became of one round of files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -50,8 +32,19 @@ pub struct Sent {
     pub objects: usize,
     /// Files that were due when the time was over.
     pub late: usize,
-    /// Files that could not be read, or did not fit into the limit.
+    /// Files that could not be read, did not fit into a limit, or took too long.
     pub left_out: usize,
+}
+
+/// How long files may take.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Window {
+    /// From then on no file is begun.
+    pub begin_until: Option<Instant>,
+    /// What is in the air then is cut.
+    pub cut_at: Option<Instant>,
+    /// There is no later time for what would wait: neither the day's allowance nor an earlier cut holds it back.
+    pub is_last: bool,
 }
 
 /// Stores the files of one run.
@@ -60,29 +53,48 @@ pub struct Uploader {
     archive: Archive,
     tree: Arc<Tree>,
     memory: Memory,
-    limit: u64,
+    quota: Quota,
     epoch: Instant,
-    complained: BTreeSet<String>,
+    complaints: Complaints,
+    /// Files that were cut.
+    slow: BTreeMap<String, Slow>,
 }
 
-/// What became of one file.
-enum Outcome {
-    Stored(Box<Stored>, bool),
-    LeftOut(String),
-    Failed(ArchiveError),
-    Late,
+/// A file that was cut.
+#[derive(Clone, Copy, Debug)]
+struct Slow {
+    /// When it is tried again, on the clock of [`Stored::at`].
+    again: Duration,
+    times: u32,
+}
+
+/// Who pays for a file, and how much.
+struct Bill {
+    key: String,
+    purse: String,
+    cost: Spent,
+}
+
+/// A file that is due.
+#[derive(Clone, Copy, Debug)]
+struct Due {
+    decision: Decision,
+    /// With as many bytes as it may have.
+    stamp: Stamp,
+    cost: Spent,
 }
 
 impl Uploader {
-    /// With the memory of what an earlier program of this Pod stored. `limit`: bytes the run may store.
-    pub fn new(archive: Archive, tree: Arc<Tree>, limit: u64) -> Self {
+    /// With the memory of what an earlier program of this Pod stored.
+    pub fn new(archive: Archive, tree: Arc<Tree>, quota: Quota) -> Self {
         Self {
             memory: Memory::load(&tree),
             archive,
             tree,
-            limit,
+            quota,
             epoch: Instant::now(),
-            complained: BTreeSet::new(),
+            complaints: Complaints::default(),
+            slow: BTreeMap::new(),
         }
     }
 
@@ -91,12 +103,17 @@ impl Uploader {
         &self.memory
     }
 
+    /// Says once why something is not stored.
+    pub fn complain(&mut self, key: &str, why: &Why) {
+        self.complaints.say(key, why);
+    }
+
     /// Stores results that are in memory, each that is not what is stored already. They are stored even beyond the limit: what
     /// is in memory is bounded.
     pub async fn put(&mut self, objects: &BTreeMap<String, Object>) -> Result<Sent, ArchiveError> {
         let now = self.epoch.elapsed();
         let is_stored = |key: &String, object: &Object| {
-            let known = self.memory.0.get(key);
+            let known = self.memory.stored.get(key);
             known.is_some_and(|known| {
                 known.stamp.size == object.digest.size && known.fingerprint == object.digest.sha256
             })
@@ -108,122 +125,176 @@ impl Uploader {
                 archive: self.archive.clone(),
                 key: key.clone(),
                 object: object.clone(),
-                known: self.memory.0.get(key).and_then(|known| known.etag.clone()),
+                known: self.memory.stored.get(key).and_then(|known| known.etag.clone()),
                 now,
             })
             .collect();
         let work = jobs.into_iter().map(Put::store);
         let outcomes = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
         let mut sent = Sent::default();
-        let failed = self.settle(outcomes, &mut sent);
+        let failed = self.settle(outcomes, None, &mut sent);
         if sent.objects > 0 || failed.is_some() {
             self.remember().await;
         }
         failed.map_or(Ok(sent), Err)
     }
 
-    /// Stores what is due, in the order given as far as several at once allow. After `until` no file is begun. The first
-    /// failure of S3 ends it; what was stored until then is remembered.
-    pub async fn sync(&mut self, files: &[Wanted], until: Option<Instant>) -> Result<Sent, ArchiveError> {
-        let (jobs, left_out) = self.due(files);
-        let mut sent = Sent {
-            left_out: left_out.len(),
-            ..Sent::default()
-        };
-        self.complain(&left_out);
-        // What is in the air comes to its end, so that it is remembered; nothing new is begun.
+    /// Stores what is due, the known logs first, as far as several at once allow. The first failure of S3 ends it; what was
+    /// stored until then is remembered.
+    pub async fn sync(&mut self, files: &[Wanted], window: Window) -> Result<Sent, ArchiveError> {
+        let began = Instant::now();
+        let mut sent = Sent::default();
+        self.memory.sent.begin(today());
+        let (jobs, left_out) = self.due(files, window.is_last);
+        sent.left_out = left_out.len();
+        for (key, why) in &left_out {
+            self.complaints.say(key, why);
+        }
+        for (job, bill) in jobs.iter().filter(|(job, _)| job.is_shortened) {
+            self.complaints.say(&bill.key, &Why::Shortened(job.wanted.stamp.size));
+        }
+        // What is in the air comes to its end or is cut, so that it is remembered; nothing new is begun.
         let broken = Arc::new(AtomicBool::new(false));
-        let work = jobs.into_iter().map(|job| {
+        let work = jobs.into_iter().map(|(job, bill)| {
             let broken = Arc::clone(&broken);
             async move {
-                if broken.load(Ordering::Relaxed) || until.is_some_and(|until| Instant::now() >= until) {
-                    return (job.wanted.key, Outcome::Late);
+                let is_over = window.begin_until.is_some_and(|until| Instant::now() >= until);
+                if is_over || broken.load(Ordering::Relaxed) {
+                    return (bill, Outcome::Late);
                 }
-                let outcome = job.store().await;
+                let outcome = job.store(window.cut_at).await;
                 if matches!(outcome, Outcome::Failed(_)) {
                     broken.store(true, Ordering::Relaxed);
                 }
-                (job.wanted.key, outcome)
+                (bill, outcome)
             }
         });
-        let outcomes = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
-        let failed = self.settle(outcomes, &mut sent);
-        if sent.objects > 0 || failed.is_some() {
+        let outcomes: Vec<(Bill, Outcome)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        let mut has_begun = false;
+        for (bill, _) in outcomes.iter().filter(|(_, outcome)| !matches!(outcome, Outcome::Late)) {
+            has_begun = true;
+            self.memory.sent.add(&bill.purse, bill.cost);
+        }
+        let outcomes = outcomes
+            .into_iter()
+            .map(|(bill, outcome)| (bill.key, outcome))
+            .collect();
+        let time = window.cut_at.map(|cut_at| cut_at.saturating_duration_since(began));
+        let failed = self.settle(outcomes, time, &mut sent);
+        if has_begun {
             self.remember().await;
         }
         failed.map_or(Ok(sent), Err)
     }
 
-    /// Takes in what became of the files. Returns S3's failure, if there was one.
-    fn settle(&mut self, outcomes: Vec<(String, Outcome)>, sent: &mut Sent) -> Option<ArchiveError> {
-        let (mut complaints, mut failed) = (BTreeMap::new(), None);
+    /// Takes in what became of the files, of which none had more time than `time`. Returns S3's failure, if there was one.
+    fn settle(
+        &mut self,
+        outcomes: Vec<(String, Outcome)>,
+        time: Option<Duration>,
+        sent: &mut Sent,
+    ) -> Option<ArchiveError> {
+        let mut failed = None;
         for (key, outcome) in outcomes {
             match outcome {
                 Outcome::Stored(stored, written) => {
                     sent.objects = sent.objects.saturating_add(usize::from(written));
-                    self.memory.0.insert(key, *stored);
+                    self.slow.remove(&key);
+                    self.memory.stored.insert(key, *stored);
                 }
                 Outcome::LeftOut(why) => {
                     sent.left_out = sent.left_out.saturating_add(1);
-                    complaints.insert(key, why);
+                    self.complaints.say(&key, &Why::File(why));
+                }
+                Outcome::Slow => {
+                    sent.left_out = sent.left_out.saturating_add(1);
+                    self.complaints.say(&key, &Why::Slow(time.unwrap_or_default()));
+                    self.wait_after_a_cut(key);
                 }
                 Outcome::Late => sent.late = sent.late.saturating_add(1),
                 Outcome::Failed(error) => {
                     if matches!(error.cause, Cause::Changed) {
                         // Another writer's object: it is written whole the next time.
-                        self.memory.0.remove(&key);
+                        self.forget_content(&key);
                     }
                     failed = Some(error);
                 }
             }
         }
-        self.complain(&complaints);
         failed
     }
 
-    /// The files that are due and fit, and why the others don't.
-    fn due(&self, files: &[Wanted]) -> (Vec<Job>, BTreeMap<String, String>) {
+    /// What is stored under a key is another's, or not known. It counts all the same.
+    fn forget_content(&mut self, key: &str) {
+        if let Some(known) = self.memory.stored.get_mut(key) {
+            *known = Stored::unknown(known.stamp.size);
+        }
+    }
+
+    fn wait_after_a_cut(&mut self, key: String) {
+        let times = self.slow.get(&key).map_or(0, |slow| slow.times);
+        let pause = AFTER_A_CUT.saturating_mul(1 << times.min(8));
+        let again = self.epoch.elapsed().saturating_add(pause);
+        let times = times.saturating_add(1);
+        self.slow.insert(key, Slow { again, times });
+    }
+
+    /// The files that are due and fit, the known logs first, and what is to be said of the others.
+    fn due(&self, files: &[Wanted], is_last: bool) -> (Vec<(Job, Bill)>, Vec<(String, Why)>) {
         let now = self.epoch.elapsed();
-        let mut used = self.memory.bytes();
-        let (mut jobs, mut left_out, mut keys) = (Vec::new(), BTreeMap::new(), BTreeSet::new());
+        let stored = self.memory.stored.iter();
+        let stored = stored.map(|(key, stored)| (key.as_str(), stored.stamp.size));
+        let (mut ledger, mut planned) = (self.quota.ledger(stored), self.memory.sent.clone());
+        let mut files: Vec<&Wanted> = files.iter().collect();
+        files.sort_by_key(|file| self.quota.kind(&file.key));
+        let (mut jobs, mut left_out, mut keys) = (Vec::new(), Vec::new(), BTreeSet::new());
         for file in files {
+            let key = file.key.as_str();
             // Two files under one key would overwrite each other in any order.
-            if !keys.insert(file.key.as_str()) {
-                left_out.insert(file.key.clone(), "another file has the same key".to_owned());
+            if !keys.insert(key) {
+                left_out.push((key.to_owned(), Why::SameKey));
                 continue;
             }
-            let known = self.memory.0.get(&file.key);
-            let decision = decide_upload(&file.stamp, known, now, file.haste);
-            if decision == Decision::Keep {
+            if !is_last && self.slow.get(key).is_some_and(|slow| slow.again > now) {
                 continue;
             }
-            let before = known.map_or(0, |known| known.stamp.size);
-            let after = used.saturating_sub(before).saturating_add(file.stamp.size);
-            if after > self.limit && after > used {
-                let why = format!("storage.sizeLimit of {} bytes is reached", self.limit);
-                left_out.insert(file.key.clone(), why);
-                continue;
+            let known = self.memory.stored.get(key);
+            let (purse, allowed) = self.quota.purse(key);
+            match due(file, known, &ledger, now) {
+                Ok(None) => {}
+                Err(why) => left_out.push((key.to_owned(), why)),
+                Ok(Some(due)) if !is_last && !planned.of(purse).plus(due.cost).fits(allowed) => {
+                    left_out.push((key.to_owned(), Why::Day));
+                }
+                Ok(Some(due)) => {
+                    ledger.take(key, known.map(|known| known.stamp.size), due.stamp.size);
+                    planned.add(purse, due.cost);
+                    jobs.push(self.job(file, due, purse, now));
+                }
             }
-            used = after;
-            jobs.push(Job {
-                archive: self.archive.clone(),
-                tree: Arc::clone(&self.tree),
-                wanted: file.clone(),
-                decision,
-                known: known.cloned(),
-                now,
-            });
         }
         (jobs, left_out)
     }
 
-    /// Logs once per file why it is left out.
-    fn complain(&mut self, left_out: &BTreeMap<String, String>) {
-        for (key, why) in left_out {
-            if self.complained.len() < 1000 && self.complained.insert(key.clone()) {
-                tracing::warn!(file = %key, "not stored: {why}");
-            }
-        }
+    fn job(&self, file: &Wanted, due: Due, purse: &str, now: Duration) -> (Job, Bill) {
+        let bill = Bill {
+            key: file.key.clone(),
+            purse: purse.to_owned(),
+            cost: due.cost,
+        };
+        let job = Job {
+            archive: self.archive.clone(),
+            tree: Arc::clone(&self.tree),
+            wanted: Wanted {
+                stamp: due.stamp,
+                ..file.clone()
+            },
+            is_shortened: due.stamp.size < file.stamp.size,
+            decision: due.decision,
+            known: self.memory.stored.get(&file.key).cloned(),
+            now,
+        };
+        (job, bill)
     }
 
     async fn remember(&self) {
@@ -235,155 +306,20 @@ impl Uploader {
     }
 }
 
-/// One object of memory on its way.
-struct Put {
-    archive: Archive,
-    key: String,
-    object: Object,
-    /// Entity tag of what was stored last.
-    known: Option<String>,
-    now: Duration,
-}
-
-impl Put {
-    async fn store(self) -> (String, Outcome) {
-        let Object { bytes, digest } = self.object;
-        let outcome = match self.archive.replace(&self.key, bytes, self.known.as_deref()).await {
-            Ok(etag) => {
-                let stamp = Stamp {
-                    size: digest.size,
-                    ..Stamp::default()
-                };
-                let stored = Stored {
-                    stamp,
-                    etag,
-                    fingerprint: digest.sha256,
-                    at: self.now,
-                };
-                Outcome::Stored(Box::new(stored), true)
-            }
-            Err(error) => Outcome::Failed(error),
-        };
-        (self.key, outcome)
+/// Whether a file is due, and how much of it there is room for.
+fn due(file: &Wanted, known: Option<&Stored>, ledger: &Ledger<'_>, now: Duration) -> Result<Option<Due>, Why> {
+    if decide_upload(&file.stamp, known, now, file.haste) == Decision::Keep {
+        return Ok(None);
     }
-}
-
-/// One file on its way.
-struct Job {
-    archive: Archive,
-    tree: Arc<Tree>,
-    wanted: Wanted,
-    decision: Decision,
-    known: Option<Stored>,
-    now: Duration,
-}
-
-/// A file that is open, and the fingerprint of its beginning.
-struct Opened {
-    file: Arc<File>,
-    stamp: Stamp,
-    fingerprint: String,
-    /// Of as many bytes as were stored before.
-    of_known: String,
-}
-
-impl Opened {
-    /// None if there is no such file. Of one that has grown since it was counted, no more than the counted bytes are there: the
-    /// next round counts and sends the others.
-    fn open(tree: &Tree, path: &str, known_size: u64, counted: u64) -> Result<Option<Self>, TreeError> {
-        let Some((file, found)) = tree.file(path)? else {
-            return Ok(None);
-        };
-        let stamp = Stamp {
-            size: found.size.min(counted),
-            ..found
-        };
-        Ok(Some(Self {
-            of_known: fingerprint(&file, known_size.min(stamp.size))?,
-            fingerprint: fingerprint(&file, stamp.size)?,
-            file: Arc::new(file),
-            stamp,
-        }))
+    let before = known.map(|known| known.stamp.size);
+    let size = ledger.admit(&file.key, before, file.stamp.size).map_err(Why::Limit)?;
+    let stamp = Stamp { size, ..file.stamp };
+    let is_whole = size == file.stamp.size;
+    // Of a log that is too large the beginning is stored, and that does not change while it grows.
+    if !is_whole && known.is_some_and(|known| known.stamp.inode == stamp.inode && known.stamp.size >= size) {
+        return Ok(None);
     }
-}
-
-enum Problem {
-    Local(TreeError),
-    Archive(ArchiveError),
-}
-
-impl From<std::io::Error> for Problem {
-    fn from(error: std::io::Error) -> Self {
-        Self::Local(error.into())
-    }
-}
-
-impl From<TreeError> for Problem {
-    fn from(error: TreeError) -> Self {
-        Self::Local(error)
-    }
-}
-
-impl From<ArchiveError> for Problem {
-    fn from(error: ArchiveError) -> Self {
-        Self::Archive(error)
-    }
-}
-
-impl Job {
-    async fn store(&self) -> Outcome {
-        match self.send().await {
-            Ok(fate) => fate,
-            Err(Problem::Local(error)) => Outcome::LeftOut(error.to_string()),
-            Err(Problem::Archive(error)) => match error.cause {
-                // The file shrank meanwhile; the next round finds what it became.
-                Cause::Local(_) | Cause::Parts(_) => Outcome::LeftOut(error.cause.to_string()),
-                _ => Outcome::Failed(error),
-            },
-        }
-    }
-
-    /// Sends the first bytes of the file, as many as it had when it was opened, and no more than were counted.
-    async fn send(&self) -> Result<Outcome, Problem> {
-        let known_size = self.known.as_ref().map_or(0, |known| known.stamp.size);
-        let (tree, path) = (Arc::clone(&self.tree), self.wanted.path.clone());
-        let counted = self.wanted.stamp.size;
-        let opened = blocking(move || Opened::open(&tree, &path, known_size, counted)).await??;
-        let Some(opened) = opened else {
-            return Ok(Outcome::LeftOut("it is gone".to_owned()));
-        };
-        let Opened {
-            file,
-            stamp,
-            fingerprint,
-            of_known,
-        } = opened;
-        let stored = |etag| {
-            Box::new(Stored {
-                stamp,
-                etag,
-                fingerprint: fingerprint.clone(),
-                at: self.now,
-            })
-        };
-        let prefix = self.known.as_ref();
-        let prefix = prefix.filter(|known| known_size <= stamp.size && known.fingerprint == of_known);
-        if let Some(known) = prefix.filter(|_| known_size == stamp.size && stamp.size < MIN_PART) {
-            // Touched, or written again with the same content.
-            return Ok(Outcome::Stored(stored(known.etag.clone()), false));
-        }
-        let etag = prefix.and_then(|known| known.etag.as_deref());
-        let kept = match self.decision {
-            Decision::Append { from } if from == known_size => etag.map(|etag| Kept { etag, size: from }),
-            _ => None,
-        };
-        let key = &self.wanted.key;
-        let etag = if kept.is_none() && stamp.size <= PART {
-            let bytes = read_range(&file, 0..stamp.size).await?;
-            self.archive.put(key, bytes).await?
-        } else {
-            self.archive.upload(key, &file, kept, stamp.size).await?
-        };
-        Ok(Outcome::Stored(stored(etag), true))
-    }
+    let decision = decide_upload(&stamp, known, now, file.haste);
+    let cost = cost(decision, size);
+    Ok((decision != Decision::Keep).then_some(Due { decision, stamp, cost }))
 }

@@ -10,10 +10,12 @@ use futures::{StreamExt, TryStreamExt};
 
 use super::WorkspaceError;
 use crate::pod::blocking;
-use crate::pod::gather::{EVALAI, MERGED, REFUSED};
+use crate::pod::daily::Daily;
+use crate::pod::keys::{EVALAI, MERGED, REFUSED};
 use crate::pod::report::{OWNER_KEY, REPORT_KEY};
 use crate::pod::run::{Run, STATUS_FOLDER};
 use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
+use crate::pod::upload::quota::{LEAST, Quota};
 use crate::pod::upload::{Memory, Stored, fingerprint};
 use crate::services::archive::{Archive, Listed};
 use leaderboard_api::names::FAILURE_LOG_KEY;
@@ -45,18 +47,31 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
         tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
     }
     let limit = run.plan.storage.size_limit.bytes();
-    let chosen = choose(listing.objects, run.plan.slices.len(), limit);
+    let chosen = choose(
+        listing.objects,
+        &Quota::new(limit, run.plan.slices.len()),
+        run.plan.slices.len(),
+    );
+    let others = chosen.others.iter();
+    let others: Vec<(String, Stored)> = others
+        .map(|other| (other.key.clone(), Stored::unknown(other.size)))
+        .collect();
     let stored: Vec<Option<(String, Stored)>> = futures::stream::iter(chosen.objects)
         .map(|object| download(archive, tree, object))
         .buffer_unordered(AT_ONCE)
         .try_collect()
         .await?;
-    let memory = Memory(stored.into_iter().flatten().collect());
+    let mut memory = Memory {
+        stored: stored.into_iter().flatten().collect(),
+        sent: Daily::default(),
+    };
     let restored = Restored {
-        files: memory.0.len(),
+        files: memory.stored.len(),
         bytes: memory.bytes(),
         left_out: chosen.left_out,
     };
+    // What is not restored is stored all the same, and counts.
+    memory.stored.extend(others);
     memory.save(tree).map_err(|error| volume("logcopy", error))?;
     if restored.left_out > 0 {
         tracing::warn!(
@@ -70,44 +85,58 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
 #[derive(Debug, PartialEq, Eq)]
 struct Chosen {
     objects: Vec<Listed>,
+    /// What stays in the bucket only.
+    others: Vec<Listed>,
+    /// How many of them are not left there on purpose.
     left_out: usize,
 }
 
-/// What is restored: the smallest first, so that a huge log never keeps a checkpoint out.
-fn choose(mut objects: Vec<Listed>, pairs: usize, limit: u64) -> Chosen {
-    let ours = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY, MERGED];
-    // What logcopy makes from the checkpoints it makes again, and evidence is for people.
-    let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];
-    objects.retain(|object| {
-        let key = object.key.as_str();
-        !ours.contains(&key) && !unread.iter().any(|folder| key.starts_with(folder)) && !is_foreign_agent(key, pairs)
-    });
+/// What is restored: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
+fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
+    let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
+    let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
+        .into_iter()
+        .filter(|object| !not_counted.contains(&object.key.as_str()))
+        .partition(|object| is_restored(&object.key, pairs));
     let all = objects.len();
-    objects.retain(|object| object.key.contains('/') && is_plain(&object.key));
-    drop_shadowed(&mut objects);
-    objects.sort_by(|a, b| (a.size, &a.key).cmp(&(b.size, &b.key)));
-    let mut left = limit;
-    objects.retain(|object| {
-        let after = left.checked_sub(object.size);
+    let shadowed = shadowed(&objects);
+    let mut keep = |objects: &mut Vec<Listed>, is_kept: &mut dyn FnMut(&Listed) -> bool| {
+        others.extend(objects.extract_if(.., |object| !is_kept(object)));
+    };
+    keep(&mut objects, &mut |object| {
+        object.key.contains('/') && is_plain(&object.key) && !shadowed.contains(&object.key)
+    });
+    objects.sort_by(|a, b| (quota.kind(&a.key), a.size, &a.key).cmp(&(quota.kind(&b.key), b.size, &b.key)));
+    let mut left = quota.bytes;
+    keep(&mut objects, &mut |object| {
+        let after = left.checked_sub(object.size.max(LEAST));
         left = after.unwrap_or(left);
         after.is_some()
     });
     Chosen {
         left_out: all.saturating_sub(objects.len()),
         objects,
+        others,
     }
 }
 
-/// S3 can hold `a` next to `a/b`; a volume can't.
-fn drop_shadowed(objects: &mut Vec<Listed>) {
-    let keys: BTreeSet<String> = objects.iter().map(|object| object.key.clone()).collect();
-    objects.retain(|object| {
-        let folder = format!("{}/", object.key);
-        !keys
-            .range(folder.clone()..)
+/// Whether a key is one that the run goes on with.
+fn is_restored(key: &str, pairs: usize) -> bool {
+    // What logcopy makes from the checkpoints it makes again, and evidence is for people.
+    let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];
+    key != MERGED && !unread.iter().any(|folder| key.starts_with(folder)) && !is_foreign_agent(key, pairs)
+}
+
+/// S3 can hold `a` next to `a/b`; a volume can't. These are such `a`.
+fn shadowed(objects: &[Listed]) -> BTreeSet<String> {
+    let keys: BTreeSet<&str> = objects.iter().map(|object| object.key.as_str()).collect();
+    let is_shadowed = |key: &&str| {
+        let folder = format!("{key}/");
+        keys.range(folder.as_str()..)
             .next()
             .is_some_and(|next| next.starts_with(&folder))
-    });
+    };
+    keys.iter().copied().filter(is_shadowed).map(str::to_owned).collect()
 }
 
 /// `agent/agent<n>/…` of a pair this run does not have.
@@ -166,6 +195,8 @@ fn volume(path: &str, error: TreeError) -> WorkspaceError {
 mod tests {
     use super::*;
 
+    const MIB: u64 = 1 << 20;
+
     fn listed(key: &str, size: u64) -> Listed {
         Listed {
             key: key.to_owned(),
@@ -196,7 +227,7 @@ mod tests {
             listed("logcopy/.stored.json", 5),
             listed("logcopy/logcopy.log", 40),
         ];
-        let chosen = choose(objects, 2, 1000);
+        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
         let expected = [
             "agent/agent1/agent_results.json",
             "agent/agent2/leaderboard.log",
@@ -216,7 +247,8 @@ mod tests {
             "simulator/",
             "simulator/x",
         ];
-        let chosen = choose(objects.iter().map(|key| listed(key, 1)).collect(), 2, 1000);
+        let objects = objects.iter().map(|key| listed(key, 1)).collect();
+        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
         assert_eq!((keys(&chosen), chosen.left_out), (vec!["simulator/x"], 6));
     }
 
@@ -227,13 +259,50 @@ mod tests {
             listed("simulator/a/b", 1),
             listed("simulator/a-b", 1),
         ];
-        assert_eq!(keys(&choose(objects, 1, 10)), ["simulator/a-b", "simulator/a/b"]);
+        assert_eq!(
+            keys(&choose(objects, &Quota::new(MIB, 1), 1)),
+            ["simulator/a-b", "simulator/a/b"]
+        );
     }
 
     #[test]
-    fn the_limit_leaves_out_the_largest() {
-        let objects = vec![listed("a/large", 90), listed("a/x", 6), listed("a/y", 5)];
-        let chosen = choose(objects, 1, 100);
-        assert_eq!((keys(&chosen), chosen.left_out), (vec!["a/y", "a/x"], 1));
+    fn what_is_not_restored_counts_all_the_same() {
+        let objects = vec![
+            listed("agent/agent_results.json", 30),
+            listed("agent/agent3/leaderboard.log", 20),
+            listed("logcopy/refused/agent/agent1/agent_results.json", 5),
+            listed("logcopy/report.json", 5),
+            listed("plain", 6),
+        ];
+        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        assert_eq!(keys(&chosen), Vec::<&str>::new());
+        let others: Vec<&str> = chosen.others.iter().map(|object| object.key.as_str()).collect();
+        let expected = [
+            "agent/agent_results.json",
+            "agent/agent3/leaderboard.log",
+            "logcopy/refused/agent/agent1/agent_results.json",
+            "plain",
+        ];
+        assert_eq!((others, chosen.left_out), (expected.to_vec(), 1));
+    }
+
+    #[test]
+    fn the_limit_leaves_out_the_largest_of_the_other_files() {
+        let objects = vec![
+            listed("agent/agent1/a", 0),
+            listed("agent/agent1/agent_results.json", MIB / 2),
+            listed("agent/agent1/leaderboard.log", MIB / 2 - 2 * LEAST),
+            listed("agent/agent1/b", 9),
+            listed("agent/agent1/c", 10),
+        ];
+        let chosen = choose(objects, &Quota::new(MIB, 1), 1);
+        let expected = [
+            "agent/agent1/agent_results.json",
+            "agent/agent1/leaderboard.log",
+            "agent/agent1/a",
+            "agent/agent1/b",
+        ];
+        assert_eq!((keys(&chosen), chosen.left_out), (expected.to_vec(), 1));
+        assert_eq!(chosen.others.len(), 1);
     }
 }

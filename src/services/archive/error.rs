@@ -41,6 +41,9 @@ pub enum Cause {
     /// Any other refusal.
     #[error("S3 refuses the request ({0})")]
     Refused(String),
+    /// It is not done in the time that its caller has for it.
+    #[error("it takes too long")]
+    Slow,
     /// The file on this side.
     #[error("the local file can't be used ({0})")]
     Local(#[from] std::io::Error),
@@ -69,6 +72,7 @@ impl Cause {
             Self::TooLarge(_) => "Look at the object: nothing of ours is that large.",
             Self::Away(_) => "It is tried again; check storage.endpoint and the network rules if this stays.",
             Self::Refused(_) => "Check storage.bucket, storage.region and storage.endpoint of the leaderboard.",
+            Self::Slow => "It is tried again later.",
             Self::Local(_) => "Check the volume of the Pod.",
             Self::Parts(_) => "The file is stored whole instead.",
         }

@@ -9,8 +9,9 @@ pub const MIN_PART: u64 = 5 << 20;
 const MAX_PARTS: u64 = 10_000;
 /// Bytes of an ordinary part, which is also what is held in memory of one file.
 pub const PART: u64 = 8 << 20;
-/// Most bytes of a part: several are in memory at once, and a stranger's sparse file can have any size.
-const MAX_PART: u64 = 64 << 20;
+/// Most bytes of a part: several are in memory at once, and a stranger's sparse file can have any size. An object has 156 GiB at
+/// most.
+const MAX_PART: u64 = 16 << 20;
 /// Bytes copied by one request. S3 takes 5 GiB, but answers only when it is done.
 const COPY: u64 = 1 << 30;
 

@@ -17,7 +17,7 @@ async fn each_line_arrives_once_and_in_order() {
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let shipper = || {
         let memory = pod.uploader().memory().clone();
-        ship::Shipper::new(client.clone(), Arc::clone(&tree), "77", 2, &memory)
+        ship::Shipper::new(client.clone(), Arc::clone(&tree), "77", 2, &memory, ship::STREAM_A_DAY)
     };
     let lines = |from: usize, to: usize| {
         let lines: Vec<String> = (from..to)
@@ -69,6 +69,50 @@ async fn logcopy_sends_the_logs_of_its_run() {
     logcopy.end().await;
     assert_eq!(all(&logs, &group, "77/agent-1").await, ["first", "last"]);
     assert_eq!(all(&logs, &group, "77/simulator-1").await, ["listening"]);
+}
+
+#[tokio::test]
+async fn a_log_that_is_replaced_all_the_time_ends_its_stream_for_the_day_also_after_a_restart() {
+    const A_DAY: u64 = 3000;
+    let group = format!("group-{}", fastrand::u64(..));
+    let mut pod = Pod::new().await;
+    pod.setting.run.log_group = Some(LogGroup {
+        name: group.clone(),
+        region: None,
+        endpoint: None,
+    });
+    let logs = pod.aws.logs(None, None);
+    logs.create_log_group().log_group_name(&group).send().await.unwrap();
+    let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group.as_ref().unwrap());
+    let tree = Arc::new(Tree::open(pod.logs()).unwrap());
+    let shipper = || {
+        let memory = pod.uploader().memory().clone();
+        ship::Shipper::new(client.clone(), Arc::clone(&tree), "77", 2, &memory, A_DAY)
+    };
+    let replace = |round: usize| {
+        pod.put(
+            "agent/agent1/next",
+            format!("round {round} {}\n", "x".repeat(500)).as_bytes(),
+        );
+        fs::rename(pod.path("agent/agent1/next"), pod.path("agent/agent1/leaderboard.log")).unwrap();
+    };
+    let mut first = shipper();
+    for round in 0..10 {
+        replace(round);
+        first.pass(false).await.unwrap();
+    }
+    let sent = all(&logs, &group, "77/agent-1").await;
+    // Each line counts 534 bytes or so: five of them fit.
+    assert_eq!(sent.len(), 6, "{sent:?}");
+    assert!(sent[4].starts_with("round 4 "), "{sent:?}");
+    let last = "logcopy: the daily limit of 3000 bytes of this stream is reached";
+    assert!(sent[5].starts_with(last), "{sent:?}");
+    let mut restarted = shipper();
+    replace(10);
+    pod.append("agent/agent2/leaderboard.log", b"another agent\n");
+    restarted.pass(true).await.unwrap();
+    assert_eq!(all(&logs, &group, "77/agent-1").await, sent);
+    assert_eq!(all(&logs, &group, "77/agent-2").await, ["another agent"]);
 }
 
 async fn all(logs: &aws_sdk_cloudwatchlogs::Client, group: &str, stream: &str) -> Vec<String> {

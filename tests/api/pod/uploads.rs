@@ -8,7 +8,7 @@ async fn sync(pod: &Pod, uploader: &mut Uploader, path: &str) -> Sent {
     let tree = Tree::open(pod.logs()).unwrap();
     let (_, stamp) = tree.file(path).unwrap().unwrap();
     let wanted = [Wanted::new(path, stamp, Haste::Now)];
-    uploader.sync(&wanted, None).await.unwrap()
+    uploader.sync(&wanted, Window::default()).await.unwrap()
 }
 
 #[tokio::test]
@@ -81,13 +81,14 @@ async fn a_log_that_was_written_anew_is_stored_anew() {
 async fn the_limit_leaves_files_out_and_keeps_the_rest() {
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), 100);
-    pod.put("simulator/large", &[0; 90]);
+    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(8 * LEAST, 1));
+    // Three quarters are for all but the known logs, and a small file counts as a page.
+    pod.put("simulator/large", &[0; 6 * LEAST as usize]);
     pod.put("simulator/small", &[0; 20]);
     let wanted: Vec<Wanted> = ["simulator/small", "simulator/large"]
         .map(|path| Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now))
         .into();
-    let sent = uploader.sync(&wanted, None).await.unwrap();
+    let sent = uploader.sync(&wanted, Window::default()).await.unwrap();
     assert_eq!((sent.objects, sent.left_out), (1, 1));
     assert_eq!(pod.keys().await, ["simulator/small"]);
 }
@@ -96,21 +97,21 @@ async fn the_limit_leaves_files_out_and_keeps_the_rest() {
 async fn a_file_that_grows_after_it_was_counted_is_sent_as_far_as_it_was_counted() {
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), 100);
+    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(2 * LEAST, 1));
     let path = "agent/agent1/x.log";
     pod.put(path, b"0123456789");
     let counted = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
-    pod.append(path, &[b'x'; 1000]);
-    assert_eq!(uploader.sync(&[counted], None).await.unwrap().objects, 1);
+    pod.append(path, &[b'x'; LEAST as usize]);
+    assert_eq!(uploader.sync(&[counted], Window::default()).await.unwrap().objects, 1);
     assert_eq!(pod.stored(path).await.unwrap(), b"0123456789");
     assert_eq!(uploader.memory().bytes(), 10);
     // The next round counts what it has become.
     let grown = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
-    let sent = uploader.sync(&[grown], None).await.unwrap();
+    let sent = uploader.sync(&[grown], Window::default()).await.unwrap();
     assert_eq!((sent.objects, sent.left_out), (0, 1));
     pod.put(path, b"0123456789ab");
     let shrunk = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
-    assert_eq!(uploader.sync(&[shrunk], None).await.unwrap().objects, 1);
+    assert_eq!(uploader.sync(&[shrunk], Window::default()).await.unwrap().objects, 1);
     assert_eq!(pod.stored(path).await.unwrap(), b"0123456789ab");
 }
 
@@ -118,7 +119,7 @@ async fn a_file_that_grows_after_it_was_counted_is_sent_as_far_as_it_was_counted
 async fn two_files_under_one_key_are_stored_once_and_counted_once() {
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), 100);
+    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(8 * LEAST, 1));
     let both = |first: &[u8], second: &[u8]| {
         pod.put("agent/agent1/first", first);
         pod.put("agent/agent1/second", second);
@@ -133,7 +134,7 @@ async fn two_files_under_one_key_are_stored_once_and_counted_once() {
         wanted.to_vec()
     };
     for (first, second) in [(&[b'1'; 90][..], &b"2"[..]), (b"1", b"22")] {
-        let sent = uploader.sync(&both(first, second), None).await.unwrap();
+        let sent = uploader.sync(&both(first, second), Window::default()).await.unwrap();
         assert_eq!((sent.objects, sent.left_out), (1, 1));
         assert_eq!(pod.stored("agent/agent1/key").await.unwrap(), first);
     }

@@ -1,0 +1,29 @@
+//! Names below a run's prefix in S3, which are also paths below the root of the `logs` volume. Pure.
+//!
+//! Used by all programs of the Pod that read, store or count files.
+
+use super::ownlog::OWN_LOG;
+use super::run::console;
+
+/// Key of the merged file.
+pub const MERGED: &str = "agent/agent_results.json";
+/// Before the keys of EvalAI's texts.
+pub const EVALAI: &str = "evalai/";
+/// Before the key of a refused checkpoint: no agent can put a file of its own there.
+pub const REFUSED: &str = "logcopy/refused/";
+
+/// The checkpoint of a pair.
+pub fn checkpoint_path(pair: usize) -> String {
+    format!("agent/agent{pair}/agent_results.json")
+}
+
+/// What the agent of a pair has printed.
+pub fn agent_log(pair: usize) -> String {
+    format!("agent/agent{pair}/leaderboard.log")
+}
+
+/// The logs by which a run is judged: what each agent and each server has printed, and logcopy's own.
+pub fn known_logs(pairs: usize) -> impl Iterator<Item = String> {
+    let of_pairs = (1..=pairs).flat_map(|pair| [agent_log(pair), console(pair)]);
+    of_pairs.chain([OWN_LOG.to_owned()])
+}
