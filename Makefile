@@ -63,7 +63,7 @@ images: image ## Make and push all images of the demo
 crds: ## Generate crds/ from the types
 	UPDATE_CRDS=1 cargo test --profile $(PROFILE) --workspace --lib -- crds
 
-docs: ## Write the tables of reasons in docs/states.md
+docs: ## Write docs/security-probes.md and the tables of reasons in docs/states.md
 	UPDATE_DOCS=1 cargo test --profile $(PROFILE) --workspace --lib -- documentation
 
 fmt: ## Format the code
