@@ -26,6 +26,7 @@ mod api {
     mod operator;
     mod plugin;
     mod pod;
+    mod pod_security;
     mod queue;
     mod retention;
     mod rule_cases;

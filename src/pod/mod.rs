@@ -13,6 +13,7 @@ pub mod isolation;
 pub mod judge;
 pub mod keys;
 pub mod logcopy;
+mod name_files;
 pub mod ownlog;
 pub mod places;
 pub mod report;

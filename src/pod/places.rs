@@ -21,6 +21,8 @@ pub struct Places {
     pub tools: PathBuf,
     /// The runner as it comes with the operator.
     pub runner: PathBuf,
+    /// The file system in which the Pod's name files are.
+    pub root: PathBuf,
     /// Folder of the downward API.
     pub podinfo: PathBuf,
     /// The projected token.
@@ -37,6 +39,7 @@ impl Places {
             logs: at(LOGS),
             tools: at(TOOLS),
             runner: at(RUNNER_IN_IMAGE),
+            root: root.to_owned(),
             podinfo: at(PODINFO),
             token: at(IDENTITY).join(IDENTITY_TOKEN_FILE),
             termination_log: at("/dev/termination-log"),

@@ -22,6 +22,9 @@ pub const TOOLS: &str = "/leaderboard-tools";
 pub const RUNNER: &str = "leaderboard-runner";
 /// The runner inside the operator's image.
 pub const RUNNER_IN_IMAGE: &str = "/usr/local/bin/leaderboard-runner";
+/// What a container resolves names by. The kubelet mounts one file of each for the whole Pod, writable; `workspace` copies them into
+/// [`TOOLS`], at the same path below it.
+pub const NAME_FILES: [&str; 3] = ["/etc/hosts", "/etc/resolv.conf", "/etc/hostname"];
 /// Folder of the downward-API file with the stop annotation.
 pub const PODINFO: &str = "/podinfo";
 /// The file in it.

@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use super::gather::results_plan;
 use super::identity;
 use super::isolation::{self, Finding};
+use super::name_files;
 use super::places::{Places, Setting};
 use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, ReportPair, SCHEMA};
 use super::run::{Run, STATUS_FOLDER};
@@ -127,6 +128,14 @@ pub enum WorkspaceError {
         /// The system's own text.
         error: TreeError,
     },
+    /// The files by which names are resolved.
+    #[error("{path} can't be written: {error}. Look at the node's disk and the Pod's volumes.")]
+    NameFile {
+        /// Where to.
+        path: String,
+        /// The system's own text.
+        error: io::Error,
+    },
     /// The runner.
     #[error("the runner can't be copied to {path}: {error}. Use the operator's own image for this container.")]
     Runner {
@@ -146,7 +155,7 @@ impl WorkspaceError {
             Self::NotIsolated(_) => WorkspaceReason::NotIsolated,
             Self::Plan(_) => WorkspaceReason::PlanInvalid,
             Self::Storage(_) => WorkspaceReason::StorageFailed,
-            Self::Volume { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
+            Self::Volume { .. } | Self::NameFile { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
         };
         WorkspaceVerdict {
             reason,
@@ -196,6 +205,10 @@ async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
 pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), WorkspaceError> {
     results_plan(&setting.run)?;
     copy_runner(&setting.places)?;
+    name_files::copy(&setting.places).map_err(|(path, error)| WorkspaceError::NameFile {
+        path: path.display().to_string(),
+        error,
+    })?;
     let tree = folders(&setting.places.logs)?;
     if is_prepared(&tree, &setting.pod_uid) {
         // The node was restarted under the Pod: the volume is newer than what is stored, and the fence may be another's.

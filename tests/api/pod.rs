@@ -83,6 +83,7 @@ impl Pod {
                     logs: at("logs"),
                     tools: at("tools"),
                     runner: at("runner"),
+                    root: folder.path().to_owned(),
                     podinfo: at("podinfo"),
                     token: at("token"),
                     termination_log: at("termination-log"),

@@ -122,9 +122,9 @@ async fn unknown_track(scene: &Scene) {
 
 async fn quota(scene: &Scene) {
     let mut case = Case::open("quota exceeded", "Pending QuotaExceeded; Finished");
-    // A resource that no other Pod here asks for: the quota is of the whole namespace.
-    let disk = json!({"requests": {"ephemeral-storage": "1Mi"}});
-    let none = json!({"metadata": {"name": "none"}, "spec": {"hard": {"requests.ephemeral-storage": "0"}}});
+    // It counts Pods without a time limit alone: all others here have one, and the quota is of the whole namespace.
+    let no_limit = json!({"deadlines": {"runSeconds": 0}});
+    let none = json!({"metadata": {"name": "none"}, "spec": {"hard": {"pods": "0"}, "scopes": ["NotTerminating"]}});
     let none: ResourceQuota = serde_json::from_value(none).unwrap();
     scene.api().create(&PostParams::default(), &none).await.unwrap();
     // The API server counts a new quota's use first.
@@ -132,7 +132,7 @@ async fn quota(scene: &Scene) {
         quota.is_some_and(|quota| quota.status.as_ref().is_some_and(|status| status.hard.is_some()))
     };
     scene.wait("none", "it is counted", SHOWN, counted).await;
-    board(scene, "quota", json!({"agent": {"resources": disk}})).await;
+    board(scene, "quota", no_limit).await;
     case.cause();
     scene.submit_to("quota", "quota", "agent:standard").await;
     case.shows(scene, "quota", "QuotaExceeded", "exceeded quota: none")

@@ -175,7 +175,7 @@ pub struct ContentsContainer {
     /// Requests and limits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resources: Option<ResourceRequirements>,
-    /// In place of the safe default.
+    /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security_context: Option<SecurityContext>,
 }
@@ -201,7 +201,7 @@ pub struct SimulatorContainer {
     /// Requests and limits, for example one `nvidia.com/gpu`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resources: Option<ResourceRequirements>,
-    /// In place of the safe default.
+    /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security_context: Option<SecurityContext>,
 }
@@ -227,7 +227,7 @@ pub struct AgentContainer {
     /// Requests and limits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resources: Option<ResourceRequirements>,
-    /// In place of the safe default.
+    /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security_context: Option<SecurityContext>,
     /// Size of `leaderboard.log` at which it is no longer written: `1Mi` to `1Ti`.

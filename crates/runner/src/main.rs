@@ -19,6 +19,7 @@ use std::io::{self, Write};
 use std::process::ExitCode;
 
 use nix::sys::prctl;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::stat::{Mode, umask};
 
 use crate::run::Runner;
@@ -29,6 +30,8 @@ use leaderboard_runner::args::{self, Request};
 const CODE_USAGE: u8 = 64;
 /// The kernel refuses what the runner cannot do without (EX_OSERR).
 const CODE_KERNEL: u8 = 71;
+/// Bytes of a core dump, which is none. Not 0: the kernel then still starts a program that the node's core_pattern names.
+const CORE_BYTES: u64 = 1;
 
 fn main() -> ExitCode {
     match args::parse(std::env::args_os().skip(1)) {
@@ -55,13 +58,21 @@ fn run(job: args::Job) -> ExitCode {
     for (what, result) in [
         ("dumpable", prctl::set_dumpable(false)),
         ("subreaper", prctl::set_child_subreaper(true)),
+        // A crash of CARLA's would put gigabytes onto the node, where no limit of the Pod counts them.
+        ("core limit", limit_core()),
     ] {
         if let Err(error) = result {
-            say(format_args!("prctl {what}: {error}"));
+            say(format_args!("{what}: {error}"));
         }
     }
     let code = Runner::new(job, signals).run();
     ExitCode::from(u8::try_from(code).unwrap_or(1))
+}
+
+fn limit_core() -> nix::Result<()> {
+    let (_, hard) = getrlimit(Resource::RLIMIT_CORE)?;
+    let most = hard.min(CORE_BYTES);
+    setrlimit(Resource::RLIMIT_CORE, most, most)
 }
 
 fn print(text: &str) -> ExitCode {

@@ -206,6 +206,16 @@ fn the_command_sees_the_environment_that_was_made() {
 }
 
 #[test]
+fn no_program_of_an_image_leaves_a_core_dump_on_the_node() {
+    let pod = pod();
+    let mut agent = pod.agent("grep 'core file size' /proc/self/limits");
+    assert_eq!(agent.code(), 1);
+    let limits = fs::read_to_string(&agent.stdout).unwrap();
+    let bytes: Vec<u64> = limits.split_whitespace().filter_map(|word| word.parse().ok()).collect();
+    assert!(bytes.len() == 2 && bytes.iter().all(|bytes| *bytes <= 1), "{limits}");
+}
+
+#[test]
 fn partial_results_are_resumed_and_a_resume_from_outside_stays() {
     let resumed = |pod: &Pod| {
         let mut agent = pod.agent("echo [$RESUME]");

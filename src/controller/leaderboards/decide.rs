@@ -37,6 +37,8 @@ pub struct LeaderboardView {
     pub measured: Option<WorkspaceVerdict>,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
+    /// What its host should know of its Pods all the same.
+    pub pod_notes: Vec<String>,
     /// What of its bucket, table and queues cannot be reached.
     pub unreachable: Option<Unreachable>,
     pub evalai: EvalaiStanding,
@@ -136,7 +138,7 @@ fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
 }
 
 /// A Leaderboard that is ready shows what its host should know all the same: that a new controller waits with its first write to
-/// EvalAI, and which runs have no limit.
+/// EvalAI, which runs have no limit, and what its Pods give to strangers.
 fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
     let (truth, reason, message) = ready;
     if truth != Truth::True {
@@ -146,6 +148,7 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
     let delay = view.evalai_writes_from.filter(|_| spec.evalai.is_some());
     let notes = [delay.map(previous_controller), without_limit(&view.leaderboard)];
     let texts = [Some(message)].into_iter().chain(notes).flatten();
+    let texts = texts.chain(view.pod_notes.iter().cloned());
     let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
     (truth, reason, texts.join(" "))
 }

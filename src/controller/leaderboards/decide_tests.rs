@@ -51,6 +51,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         policy: Policy::InPlace,
         measured: None,
         invalid_pod: None,
+        pod_notes: Vec::new(),
         unreachable: None,
         evalai: EvalaiStanding::Fits { note: None },
         evalai_writes_from: None,
@@ -222,6 +223,29 @@ fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
             .message,
         ""
     );
+}
+
+#[test]
+fn a_leaderboard_that_is_ready_shows_what_its_pods_give_to_strangers() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let pod_notes = vec!["Unbounded: x.".to_owned(), "Agents can read Secret y.".to_owned()];
+    for (evalai, truth, message) in [
+        (
+            EvalaiStanding::NotRequired,
+            "True",
+            "Unbounded: x. Agents can read Secret y.",
+        ),
+        (EvalaiStanding::NoToken("No token.".into()), "False", "No token."),
+    ] {
+        let seen = LeaderboardView {
+            evalai,
+            pod_notes: pod_notes.clone(),
+            ..view(&one, &[])
+        };
+        let plan = decide(&seen);
+        let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+        assert_eq!((ready.status.as_str(), ready.message.as_str()), (truth, message));
+    }
 }
 
 #[test]

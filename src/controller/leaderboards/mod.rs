@@ -9,6 +9,7 @@ mod foreign;
 pub mod isolation;
 pub mod operator;
 mod places;
+mod pod_notes;
 pub mod probe;
 mod reach;
 pub mod state;
@@ -115,6 +116,7 @@ fn observe(
         policy,
         measured: isolation::measured(stores, uses.policies.state, leaderboard),
         invalid_pod: probe.invalid_pod(),
+        pod_notes: probe.pod_notes(),
         unreachable: probe.unreachable(now),
         evalai: probe.evalai_standing(hub, leaderboard, &key, now),
         evalai_writes_from: hub.writes_from(),

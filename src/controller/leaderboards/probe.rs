@@ -11,6 +11,7 @@ use leaderboard_results::metrics;
 
 use super::Uses;
 use super::places;
+use super::pod_notes::{TrackPods, notes};
 use super::reach::{Reach, Unreachable, sentence};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
@@ -22,7 +23,7 @@ use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Labels, Target};
 use crate::services::token::{Token, TokenSource};
-use leaderboard_api::{Evalai, Leaderboard, Submission, Token as TokenPlace, effective};
+use leaderboard_api::{Evalai, Leaderboard, Submission, Token as TokenPlace, Track, effective};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -37,8 +38,17 @@ pub(super) struct Probe {
     reach: Reach,
     /// The way to EvalAI that follows.
     target: Option<Arc<Target>>,
-    /// Generation whose Pod was tried, and why it was refused.
-    pod: Option<(i64, Option<String>)>,
+    /// Generation whose Pods were tried, and what was found.
+    pod: Option<(i64, TriedPods)>,
+}
+
+/// What was found of a Leaderboard's Pods.
+#[derive(Clone, Default)]
+struct TriedPods {
+    /// Why they would be refused.
+    refused: Option<String>,
+    /// What their host should know all the same.
+    notes: Vec<String>,
 }
 
 /// How a Leaderboard stands with EvalAI.
@@ -63,7 +73,8 @@ impl Probe {
         let client = uses.policies.client;
         let generation = leaderboard.metadata.generation.unwrap_or_default();
         if self.pod.as_ref().is_none_or(|(tried, _)| *tried != generation) {
-            self.pod = Some((generation, refused_pod(client, uses.settings, leaderboard).await));
+            let tried = try_pods(client, uses.settings, leaderboard).await;
+            self.pod = Some((generation, tried));
         }
         let reach = std::mem::take(&mut self.reach);
         // A bucket that hangs must not keep EvalAI waiting.
@@ -91,7 +102,12 @@ impl Probe {
     }
 
     pub(super) fn invalid_pod(&self) -> Option<String> {
-        self.pod.as_ref().and_then(|(_, why)| why.clone())
+        self.pod.as_ref().and_then(|(_, tried)| tried.refused.clone())
+    }
+
+    pub(super) fn pod_notes(&self) -> Vec<String> {
+        let tried = self.pod.as_ref();
+        tried.map(|(_, tried)| tried.notes.clone()).unwrap_or_default()
     }
 
     pub(super) fn unreachable(&self, now: Timestamp) -> Option<Unreachable> {
@@ -217,12 +233,33 @@ fn serve(hub: &Hub, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Toke
     Arc::new(target)
 }
 
-/// Why a Pod of this Leaderboard would be refused: by our own rules, or by the API server's dry run.
-async fn refused_pod(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> Option<String> {
+/// Whether Pods of this Leaderboard would be refused, by our own rules or by the API server's dry run; and what is to be noted.
+async fn try_pods(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
     if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
-        return Some(error.to_string());
+        return TriedPods {
+            refused: Some(error.to_string()),
+            notes: Vec::new(),
+        };
     }
-    let job = sample_job(settings, leaderboard)?;
+    let tracks = leaderboard.spec.tracks.iter();
+    let jobs: Vec<(&Track, DynamicObject)> = tracks
+        .filter_map(|track| Some((track, sample_job(settings, leaderboard, track)?)))
+        .collect();
+    let template = |job: &DynamicObject| job.data.pointer("/spec/template").cloned().unwrap_or_default();
+    let pods = jobs.iter().map(|(track, job)| TrackPods {
+        track: track.name.clone(),
+        template: template(job),
+    });
+    TriedPods {
+        notes: notes(&pods.collect::<Vec<_>>()),
+        refused: match jobs.first() {
+            Some((_, job)) => refused_job(client, leaderboard, job).await,
+            None => None,
+        },
+    }
+}
+
+async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicObject) -> Option<String> {
     let namespace = leaderboard.namespace().unwrap_or_default();
     let resource = ApiResource::erase::<k8s_openapi::api::batch::v1::Job>(&());
     let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), &namespace, &resource);
@@ -233,7 +270,7 @@ async fn refused_pod(client: &Client, settings: &Settings, leaderboard: &Leaderb
     let error = call(
         "a dry run of the Job",
         &leaderboard.name_any(),
-        api.create(&params, &job),
+        api.create(&params, job),
     )
     .await
     .err()?;
@@ -241,8 +278,7 @@ async fn refused_pod(client: &Client, settings: &Settings, leaderboard: &Leaderb
     Some(status.message.clone())
 }
 
-fn sample_job(settings: &Settings, leaderboard: &Leaderboard) -> Option<DynamicObject> {
-    let track = leaderboard.spec.tracks.first()?;
+fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> Option<DynamicObject> {
     let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
     let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
     sample.metadata.namespace = leaderboard.namespace();

@@ -1,6 +1,6 @@
 //! The inside of a Pod as the Job and the rules for an overlay agree on it: volumes, paths, variables. Pure.
 
-use crate::pod::run::{IDENTITY, LOGS, PODINFO, TOOLS};
+use crate::pod::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
 
 pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
 pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
@@ -56,5 +56,7 @@ pub(super) fn protected_mounts() -> impl Iterator<Item = &'static str> {
     let contents = CONTENTS_VOLUMES
         .into_iter()
         .flat_map(|(_, written, read)| [written, read]);
-    contents.chain([LOGS, TOOLS, PODINFO, IDENTITY, STATUS, AGENT, SAVED])
+    contents
+        .chain([LOGS, TOOLS, PODINFO, IDENTITY, STATUS, AGENT, SAVED])
+        .chain(NAME_FILES)
 }

@@ -29,6 +29,29 @@ async fn a_fresh_prefix_is_taken_and_everybody_gets_the_runner() {
 }
 
 #[tokio::test]
+async fn every_pod_start_copies_the_files_by_which_names_are_resolved() {
+    let pod = Pod::new().await;
+    let etc = pod.setting.places.root.join("etc");
+    fs::create_dir(&etc).unwrap();
+    let copy = |name: &str| fs::read_to_string(pod.setting.places.tools.join("etc").join(name)).unwrap();
+    fs::write(etc.join("hosts"), "10.0.0.7\tsubmission-77\n").unwrap();
+    fs::write(etc.join("resolv.conf"), "nameserver 10.96.0.10\n").unwrap();
+    pod.prepare().await.unwrap();
+    assert_eq!(copy("hosts"), "10.0.0.7\tsubmission-77\n");
+    assert_eq!(copy("resolv.conf"), "nameserver 10.96.0.10\n");
+    // Without a file there the kubelet would mount a folder.
+    assert_eq!(copy("hostname"), "");
+    for name in ["hosts", "resolv.conf", "hostname"] {
+        let file = fs::metadata(pod.setting.places.tools.join("etc").join(name)).unwrap();
+        assert_eq!(file.mode() & 0o7777, 0o644, "{name}");
+    }
+    // The node was restarted: the volume is prepared, but the Pod has another address.
+    fs::write(etc.join("hosts"), "10.0.0.8\tsubmission-77\n").unwrap();
+    pod.prepare().await.unwrap();
+    assert_eq!(copy("hosts"), "10.0.0.8\tsubmission-77\n");
+}
+
+#[tokio::test]
 async fn somebody_elses_prefix_is_left_alone() {
     let pod = Pod::new().await;
     pod.prepare().await.unwrap();

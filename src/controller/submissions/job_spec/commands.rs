@@ -3,8 +3,12 @@
 //! Kubernetes replaces `$(NAME)` in a container's words and variables when it starts; the runner does the same with an
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
+use super::gpu::Gpus;
 use crate::controller::submissions::pod_layout::python_path;
 use leaderboard_api::LeaderboardVersion;
+
+/// Draws on the pair's own GPU.
+const ADAPTER: &str = "-ini:[/Script/Engine.RendererSettings]:r.GraphicsAdapter=$(NVIDIA_VISIBLE_DEVICES)";
 
 /// A command with its arguments.
 pub(super) fn words(command: &[String], arguments: Option<&[String]>) -> Vec<String> {
@@ -38,7 +42,7 @@ cp -r ${CARLA_PYTHON_API_ROOT}/* /tmp/CARLA/
 }
 
 /// Starts CARLA's server. The values are Kubernetes' to expand.
-pub(super) fn simulator(format: LeaderboardVersion) -> Vec<String> {
+pub(super) fn simulator(format: LeaderboardVersion, gpus: Gpus) -> Vec<String> {
     let flags: &[&str] = match format {
         LeaderboardVersion::V1 => &["-carla-rpc-port=$(CARLA_PORT)", "-opengl", "-nosound"],
         LeaderboardVersion::V2 => &[
@@ -46,11 +50,16 @@ pub(super) fn simulator(format: LeaderboardVersion) -> Vec<String> {
             "-carla-rpc-port=$(CARLA_PORT)",
             "-RenderOffScreen",
             "-nosound",
-            "-ini:[/Script/Engine.RendererSettings]:r.GraphicsAdapter=$(NVIDIA_VISIBLE_DEVICES)",
         ],
     };
+    let adapter = match (format, gpus) {
+        (LeaderboardVersion::V2, Gpus::NodeIndex) => Some(ADAPTER),
+        // OpenGL takes no adapter, and without a GPU there is none to choose.
+        (LeaderboardVersion::V1, _) | (_, Gpus::None) => None,
+    };
     let words = ["/bin/bash", "/home/carla/CarlaUE4.sh"];
-    words.into_iter().chain(flags.iter().copied()).map(Into::into).collect()
+    let words = words.into_iter().chain(flags.iter().copied()).chain(adapter);
+    words.map(Into::into).collect()
 }
 
 /// Starts the evaluator with the participant's agent.

@@ -208,27 +208,6 @@ fn the_run_document_is_the_plan_and_its_times() {
 }
 
 #[test]
-fn every_container_is_confined_unless_the_host_says_otherwise() {
-    let job = Case::new(
-        "V2",
-        json!({"simulator": {"image": "s", "securityContext": {"privileged": true}}}),
-    )
-    .json();
-    for container in containers(&job) {
-        let context = &container["securityContext"];
-        if container["name"].as_str().unwrap().starts_with("simulator") {
-            assert_eq!(context, &json!({"privileged": true}));
-            continue;
-        }
-        assert_eq!(context["allowPrivilegeEscalation"], false);
-        assert_eq!(context["capabilities"], json!({"drop": ["ALL"]}));
-        assert_eq!(context["seccompProfile"], json!({"type": "RuntimeDefault"}));
-        assert_eq!(context.get("runAsUser").is_some(), is_own(container));
-        assert_eq!(context.get("readOnlyRootFilesystem").is_some(), is_own(container));
-    }
-}
-
-#[test]
 fn status_folders_are_read_by_all_and_written_by_their_own() {
     let job = Case::new("V2", json!({})).json();
     for container in containers(&job)

@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{
     Container, EnvVar, EnvVarSource, ObjectFieldSelector, SecretKeySelector, SecurityContext,
 };
 
-use super::security::{confined, resources};
+use super::security::{confined, context, resources};
 use super::{JobInput, commands, run_document, variable, volumes};
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 use leaderboard_api::names;
@@ -29,7 +29,7 @@ pub(super) fn contents(input: &JobInput<'_>) -> Container {
         command: Some(host.unwrap_or_else(commands::contents)),
         env: (!spec.env.is_empty()).then(|| spec.env.clone()),
         resources: spec.resources.clone(),
-        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
+        security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_contents()),
         ..Container::default()
     }

@@ -4,6 +4,8 @@
 //! Leaderboard. It owns everything the Pod is made of; what the containers then do is in `pod` and in the runner.
 
 mod commands;
+mod disk;
+mod gpu;
 mod init;
 mod pairs;
 mod security;
@@ -13,6 +15,8 @@ mod volumes;
 mod command_tests;
 #[cfg(test)]
 mod container_tests;
+#[cfg(test)]
+mod hardening_tests;
 #[cfg(test)]
 mod tests;
 
@@ -105,6 +109,7 @@ fn build_json(input: &JobInput<'_>) -> Value {
         if let Some(overlay) = overlay {
             pod_overlay::apply(template, overlay);
         }
+        settle(template, input);
         skip_strangers(template);
     }
     job
@@ -295,6 +300,18 @@ fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
     });
     let track = input.track().map(|track| track.tolerations.clone()).unwrap_or_default();
     lost_node.into_iter().chain(track).collect()
+}
+
+/// What depends on all that the host says: filled in where nothing is said, in the containers of the overlay too.
+fn settle(template: &mut Value, input: &JobInput<'_>) {
+    let pod = &mut template["spec"];
+    for list in ["initContainers", "containers"] {
+        for container in pod[list].as_array_mut().into_iter().flatten() {
+            gpu::hide(container);
+            security::settle(container);
+        }
+    }
+    disk::fill(pod, volumes::logs_limit(input));
 }
 
 /// Names every container but our own two for EKS, those of the overlay too.

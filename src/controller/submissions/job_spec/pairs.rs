@@ -4,7 +4,8 @@
 
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 
-use super::security::confined;
+use super::gpu::Gpus;
+use super::security::context;
 use super::{JobInput, commands, variable, volumes};
 use crate::controller::submissions::pod_layout::{
     AGENT, CARLA_ROOT, FIXED_ENV, LEADERBOARD_ROOT, SAVED, SCENARIO_RUNNER_ROOT, STATUS, python_path,
@@ -41,13 +42,14 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         .command
         .as_deref()
         .map(|command| commands::words(command, spec.args.as_deref()));
-    let words = host.unwrap_or_else(|| commands::simulator(input.plan.leaderboard_version));
+    let gpus = Gpus::of(input);
+    let words = host.unwrap_or_else(|| commands::simulator(input.plan.leaderboard_version, gpus));
     Container {
         image: Some(input.plan.simulator_image.clone()),
         command: Some(behind_runner("simulator", pair, flags, words)),
-        env: Some(merged(simulator_env(pair), &spec.env)),
+        env: Some(merged(simulator_env(pair, gpus), &spec.env)),
         resources: effective::resources(own, spec.resources.as_ref()),
-        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
+        security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_simulator(&name)),
         name,
         ..Container::default()
@@ -79,7 +81,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         command: Some(behind_runner("agent", pair, flags, words)),
         env: Some(merged(agent_env(input, pair), &spec.env)),
         resources: effective::resources(own, spec.resources.as_ref()),
-        security_context: Some(spec.security_context.clone().unwrap_or_else(confined)),
+        security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_agent(&name, pair)),
         name,
         ..Container::default()
@@ -107,9 +109,9 @@ fn seconds(what: &str, value: i64) -> String {
     format!("--{what}-seconds={value}")
 }
 
-fn simulator_env(pair: usize) -> Vec<EnvVar> {
+fn simulator_env(pair: usize, gpus: Gpus) -> Vec<EnvVar> {
     let mut env = vec![variable("CARLA_PORT", &port(pair).to_string())];
-    env.extend(graphics(pair));
+    env.extend(gpus.variables(pair));
     env
 }
 
@@ -144,15 +146,8 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         // The original's file lies in the contents, which are read-only here.
         LeaderboardVersion::V2 => variable("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS),
     });
-    env.extend(graphics(pair));
+    env.extend(Gpus::of(input).variables(pair));
     env
-}
-
-fn graphics(pair: usize) -> [EnvVar; 2] {
-    [
-        variable("NVIDIA_VISIBLE_DEVICES", &(pair - 1).to_string()),
-        variable("NVIDIA_DRIVER_CAPABILITIES", "all"),
-    ]
 }
 
 /// The host's variables take the place of ours of the same name, but for those that follow from the plan.

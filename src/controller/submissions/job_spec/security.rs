@@ -4,8 +4,11 @@ use std::collections::BTreeMap;
 
 use k8s_openapi::api::core::v1::{Capabilities, ResourceRequirements, SeccompProfile, SecurityContext};
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use serde_json::Value;
 
-/// No limit on local storage: Kubernetes would take it for the limit of the whole Pod and evict that.
+use crate::controller::submissions::pod_overlay;
+
+/// CPU and memory of a container of ours; what is said of the disk is in `disk`.
 pub(super) fn resources(requests: [&str; 2], memory: &str) -> ResourceRequirements {
     let quantity = |text: &str| Quantity(text.into());
     let [cpu, requested] = requests.map(quantity);
@@ -29,5 +32,25 @@ pub(super) fn confined() -> SecurityContext {
             localhost_profile: None,
         }),
         ..SecurityContext::default()
+    }
+}
+
+/// The default with the host's fields laid over it, each by itself: who sets a uid does not give up the rest. A list takes the
+/// place of ours.
+pub(super) fn context(hosts: Option<&SecurityContext>) -> SecurityContext {
+    let Some(hosts) = hosts else { return confined() };
+    // Both are maps with text as keys, so that neither way can fail.
+    let mut merged = serde_json::to_value(confined()).unwrap_or_default();
+    pod_overlay::apply(&mut merged, &serde_json::to_value(hosts).unwrap_or_default());
+    serde_json::from_value(merged).unwrap_or_else(|_| confined())
+}
+
+/// Kubernetes refuses a privileged container that may not escalate privileges, so a host that asks for the one gives up the other.
+pub(super) fn settle(container: &mut Value) {
+    let context = container.get_mut("securityContext").and_then(Value::as_object_mut);
+    if let Some(context) = context
+        && context.get("privileged") == Some(&Value::Bool(true))
+    {
+        context.remove("allowPrivilegeEscalation");
     }
 }

@@ -10,7 +10,7 @@ use super::JobInput;
 use crate::controller::submissions::pod_layout::{
     AGENT, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, STATUS, TOOLS_VOLUME,
 };
-use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
+use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
 use leaderboard_api::names;
 
 const AUDIENCE: &str = "sts.amazonaws.com";
@@ -40,7 +40,8 @@ pub(super) fn has_role(input: &JobInput<'_>) -> bool {
         .is_some_and(|identity| identity.role_arn.is_some())
 }
 
-fn logs_limit(input: &JobInput<'_>) -> u64 {
+/// Most bytes of the `logs` volume.
+pub(super) fn logs_limit(input: &JobInput<'_>) -> u64 {
     let pairs = u64::try_from(input.pairs()).unwrap_or(u64::MAX);
     let agent_logs = pairs.saturating_mul(input.spec().agent.log_size_limit.bytes());
     input
@@ -125,7 +126,8 @@ pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
 /// What a simulator sees.
 pub(super) fn of_simulator(container: &str) -> Vec<VolumeMount> {
     let own = [mount_part(LOGS_VOLUME, "simulator".into(), SAVED)];
-    runner_and_status(container).into_iter().chain(own).collect()
+    let mounts = runner_and_status(container).into_iter().chain(own);
+    mounts.chain(name_files()).collect()
 }
 
 /// What an agent sees.
@@ -136,7 +138,13 @@ pub(super) fn of_agent(container: &str, pair: usize) -> Vec<VolumeMount> {
         .into_iter()
         .chain(contents)
         .chain(own)
+        .chain(name_files())
         .collect()
+}
+
+/// The Pod's own ones are one file for all containers, and root could write to them.
+fn name_files() -> [VolumeMount; 3] {
+    NAME_FILES.map(|path| read_only(mount_part(TOOLS_VOLUME, path.trim_start_matches('/').to_owned(), path)))
 }
 
 /// The runner; all status files to read, the container's own to write. The kubelet makes a sub-folder when it comes to

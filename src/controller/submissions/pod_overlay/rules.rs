@@ -46,7 +46,7 @@ type Named<'a> = (String, &'a Map<String, Value>);
 const STATUS_IS_READ: &str = "the controller reads how each container ended there";
 const RUN_BY_US: &str = "the operator runs it and knows how";
 /// Fields of the Pod's spec that stay ours.
-const POD_FIELDS: [(&str, &str); 10] = [
+const POD_FIELDS: [(&str, &str); 11] = [
     ("restartPolicy", "a crashed pair resumes by OnFailure"),
     (
         "serviceAccountName",
@@ -65,6 +65,10 @@ const POD_FIELDS: [(&str, &str); 10] = [
         "strangers' images could read logcopy's environment",
     ),
     ("hostPID", "strangers' images could read every process of the node"),
+    (
+        "hostIPC",
+        "strangers' images could read the shared memory of the node's processes",
+    ),
     ("hostNetwork", "the NetworkPolicy would not hold for the Pod"),
     ("activeDeadlineSeconds", "it follows from deadlines; set those"),
     (

@@ -241,6 +241,7 @@ fn what_a_pod_may_not_say() {
         ("automountServiceAccountToken", "true"),
         ("shareProcessNamespace", "true"),
         ("hostPID", "true"),
+        ("hostIPC", "true"),
         ("hostNetwork", "true"),
         ("activeDeadlineSeconds", "1"),
         ("runtimeClassName", "null"),
@@ -361,6 +362,10 @@ fn what_may_not_be_mounted() {
         (
             r#"{"name": "x", "mountPath": "/logs/agent"}"#,
             "the operator mounts /logs",
+        ),
+        (
+            r#"{"name": "x", "mountPath": "/etc/hosts"}"#,
+            "the operator mounts /etc/hosts",
         ),
         (
             r#"{"name": "logs", "mountPath": "/all"}"#,

@@ -1,0 +1,197 @@
+//! What a host should know of the Pods of a Leaderboard although they can be made: shown in `Ready`, which stays True.
+//!
+//! Pure, on the Pods as they are created, so that every way to say a thing is covered: fields, tracks, `podOverrides`.
+
+use std::collections::BTreeSet;
+
+use serde_json::Value;
+
+use crate::controller::submissions::baseline;
+
+/// Pods of one track.
+pub(super) struct TrackPods {
+    pub(super) track: String,
+    pub(super) template: Value,
+}
+
+/// One sentence or two for each thing.
+pub(super) fn notes(tracks: &[TrackPods]) -> Vec<String> {
+    [weak(tracks), secrets(tracks), unbounded(tracks)]
+        .into_iter()
+        .flatten()
+        .collect()
+}
+
+fn weak(tracks: &[TrackPods]) -> Option<String> {
+    let found: BTreeSet<String> = tracks
+        .iter()
+        .flat_map(|pods| baseline::weaknesses(&pods.template))
+        .collect();
+    (!found.is_empty()).then(|| {
+        format!(
+            "Weaker than Pod Security baseline: {}. What breaks out of such a container is on the node; remove it, or keep \
+             nodes for these Pods alone.",
+            listed(found)
+        )
+    })
+}
+
+fn secrets(tracks: &[TrackPods]) -> Option<String> {
+    let found: BTreeSet<String> = tracks
+        .iter()
+        .flat_map(|pods| of_agents(&pods.template["spec"]))
+        .collect();
+    let named = match found.len() {
+        0 => return None,
+        1 => "Secret",
+        _ => "Secrets",
+    };
+    Some(format!(
+        "Agents can read {named} {}: what a participant's program can read, it can print and send; remove the reference from \
+         agent.env or podOverrides.",
+        listed(found)
+    ))
+}
+
+/// Names of the Secrets that agents get as variables or files.
+fn of_agents(pod: &Value) -> Vec<String> {
+    let mut found = Vec::new();
+    for agent in agents(pod) {
+        for variable in list(agent, "env") {
+            found.extend(name(&variable["valueFrom"]["secretKeyRef"]["name"]));
+        }
+        for source in list(agent, "envFrom") {
+            found.extend(name(&source["secretRef"]["name"]));
+        }
+        for mount in list(agent, "volumeMounts").chain(list(agent, "volumeDevices")) {
+            let volumes = list(pod, "volumes").filter(|volume| volume["name"] == mount["name"]);
+            found.extend(volumes.flat_map(of_volume));
+        }
+    }
+    found
+}
+
+fn of_volume(volume: &Value) -> Vec<String> {
+    let projected = list(&volume["projected"], "sources");
+    let projected = projected.filter_map(|source| name(&source["secret"]["name"]));
+    name(&volume["secret"]["secretName"])
+        .into_iter()
+        .chain(projected)
+        .collect()
+}
+
+fn unbounded(tracks: &[TrackPods]) -> Option<String> {
+    let has_none = |pods: &&TrackPods| {
+        agents(&pods.template["spec"]).any(|agent| agent["resources"]["limits"]["memory"].is_null())
+    };
+    let names: Vec<String> = tracks.iter().filter(has_none).map(|pods| pods.track.clone()).collect();
+    let tracks = match names.len() {
+        0 => return None,
+        1 => "track",
+        _ => "tracks",
+    };
+    Some(format!(
+        "Unbounded: agents of the {tracks} {} have no memory limit, so that one agent can use up its node's memory and end what \
+         else runs there; set agent.resources.limits.memory.",
+        listed(names)
+    ))
+}
+
+fn agents(pod: &Value) -> impl Iterator<Item = &Value> {
+    baseline::containers(pod).filter(|container| {
+        let name = container["name"].as_str();
+        name.is_some_and(|name| name.starts_with("agent-"))
+    })
+}
+
+fn list<'a>(object: &'a Value, field: &str) -> impl Iterator<Item = &'a Value> + use<'a> {
+    object[field].as_array().into_iter().flatten()
+}
+
+fn name(value: &Value) -> Option<String> {
+    value.as_str().map(ToOwned::to_owned)
+}
+
+fn listed(names: impl IntoIterator<Item = String>) -> String {
+    names.into_iter().collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    /// A Pod whose agents have `more`, and these volumes.
+    fn pods(track: &str, more: Value, volumes: &Value) -> TrackPods {
+        let mut agent = more;
+        agent["name"] = "agent-1".into();
+        let simulator = json!({"name": "simulator-1", "envFrom": [{"secretRef": {"name": "of-the-host"}}]});
+        TrackPods {
+            track: track.to_owned(),
+            template: json!({"spec": {"containers": [simulator, agent], "volumes": volumes}}),
+        }
+    }
+
+    fn limited() -> Value {
+        json!({"resources": {"limits": {"memory": "8Gi"}}})
+    }
+
+    fn with(field: &str, value: Value) -> Value {
+        let mut agent = limited();
+        agent[field] = value;
+        agent
+    }
+
+    #[test]
+    fn pods_that_give_nothing_away_have_no_note() {
+        assert!(notes(&[pods("sensors", limited(), &json!([]))]).is_empty());
+        assert!(notes(&[]).is_empty());
+    }
+
+    #[test]
+    fn tracks_whose_agents_have_no_memory_limit_are_named() {
+        let unlimited = || json!({"resources": {"requests": {"memory": "1Gi"}, "limits": {"cpu": "1"}}});
+        let all = [
+            pods("sensors", unlimited(), &json!([])),
+            pods("map", limited(), &json!([])),
+            pods("mapless", json!({}), &json!([])),
+        ];
+        let found = notes(&all);
+        assert_eq!(found.len(), 1);
+        let expected = "Unbounded: agents of the tracks sensors, mapless have no memory limit";
+        assert!(found[0].starts_with(expected), "{found:?}");
+    }
+
+    #[test]
+    fn a_secret_that_agents_can_read_is_named_once() {
+        let mount = || json!([{"name": "v", "mountPath": "/v"}]);
+        let variable = json!([{"name": "A", "valueFrom": {"secretKeyRef": {"name": "key", "key": "k"}}}]);
+        let projected = json!([{"name": "v", "projected": {"sources": [{"secret": {"name": "key"}}, {"configMap": {"name": "c"}}]}}]);
+        for (agent, volumes) in [
+            (with("env", variable), json!([])),
+            (with("envFrom", json!([{"secretRef": {"name": "key"}}])), json!([])),
+            (
+                with("volumeMounts", mount()),
+                json!([{"name": "v", "secret": {"secretName": "key"}}]),
+            ),
+            (with("volumeMounts", mount()), projected),
+        ] {
+            let found = notes(&[pods("a", agent.clone(), &volumes), pods("b", agent, &volumes)]);
+            assert_eq!(found.len(), 1);
+            assert!(found[0].starts_with("Agents can read Secret key: "), "{found:?}");
+        }
+        // One that nobody mounts, and one that is no Secret.
+        let volumes = json!([{"name": "w", "secret": {"secretName": "key"}}, {"name": "v", "emptyDir": {}}]);
+        assert!(notes(&[pods("a", with("volumeMounts", mount()), &volumes)]).is_empty());
+    }
+
+    #[test]
+    fn what_is_weaker_than_baseline_is_named_with_its_container() {
+        let privileged = with("securityContext", json!({"privileged": true}));
+        let volumes = json!([{"name": "x11", "hostPath": {"path": "/tmp/.X11-unix"}}]);
+        let found = notes(&[pods("a", privileged, &volumes)]);
+        assert_eq!(found.len(), 1);
+        let expected = "Weaker than Pod Security baseline: Pod: hostPath /tmp/.X11-unix, agents: privileged. ";
+        assert!(found[0].starts_with(expected), "{found:?}");
+    }
+}

@@ -1,0 +1,70 @@
+//! How much of a node's disk a Pod requests and may fill, where its host names nothing. Pure, and on the finished template.
+//!
+//! Kubernetes adds up the limits of a Pod's containers, counts the volumes too, and evicts a Pod that is above the sum. So the
+//! volumes have a share of their own in it, in `logcopy`'s name: without one an agent within its own limit could be evicted
+//! for what its logs hold.
+
+use serde_json::{Value, json};
+
+use leaderboard_api::names;
+
+const DISK: &str = "ephemeral-storage";
+/// Request and limit of an agent. What its image holds does not count.
+const AGENT: [&str; 2] = ["2Gi", "20Gi"];
+/// Of a simulator.
+const SIMULATOR: [&str; 2] = ["2Gi", "10Gi"];
+/// What the volumes usually hold.
+const VOLUMES_REQUEST: &str = "1Gi";
+/// What the volumes of the private contents may hold, which have no limit of their own.
+const CONTENTS_BYTES: u64 = 10 << 30;
+
+/// Fills in what is missing. `logs` is the limit of that volume in bytes.
+///
+/// What a host names stays as it is, with nothing of ours added. A request alone is the choice to have no limit; then the other side
+/// gets none of ours either, since the sum would be the limit of both.
+pub(super) fn fill(pod: &mut Value, logs: u64) {
+    let mut nothing = Vec::new();
+    let pairs = pod["containers"].as_array_mut().unwrap_or(&mut nothing);
+    let is_unlimited = |container: &Value| names_disk(container, "requests") && !names_disk(container, "limits");
+    let unlimited = pairs.iter().any(is_unlimited);
+    for container in pairs.iter_mut().filter(|container| !is_settled(container)) {
+        let is_agent = container["name"]
+            .as_str()
+            .is_some_and(|name| name.starts_with("agent-"));
+        let [request, limit] = if is_agent { AGENT } else { SIMULATOR };
+        set(container, "requests", request);
+        if !unlimited {
+            set(container, "limits", limit);
+        }
+    }
+    let limited = pairs.iter().any(|container| names_disk(container, "limits"));
+    let init = pod["initContainers"].as_array_mut().into_iter().flatten();
+    for logcopy in init.filter(|container| container["name"] == names::CONTAINER_LOGCOPY && !is_settled(container)) {
+        set(logcopy, "requests", VOLUMES_REQUEST);
+        // Alone it would be the limit of the whole Pod.
+        if limited {
+            set(logcopy, "limits", &logs.saturating_add(CONTENTS_BYTES).to_string());
+        }
+    }
+}
+
+fn is_settled(container: &Value) -> bool {
+    names_disk(container, "requests") || names_disk(container, "limits")
+}
+
+fn names_disk(container: &Value, list: &str) -> bool {
+    container["resources"][list]
+        .get(DISK)
+        .is_some_and(|amount| !amount.is_null())
+}
+
+fn set(container: &mut Value, list: &str, amount: &str) {
+    for (object, key) in [("", "resources"), ("/resources", list)] {
+        if let Some(object) = container.pointer_mut(object).and_then(Value::as_object_mut)
+            && object.get(key).is_none_or(Value::is_null)
+        {
+            object.insert(key.to_owned(), json!({}));
+        }
+    }
+    container["resources"][list][DISK] = amount.into();
+}

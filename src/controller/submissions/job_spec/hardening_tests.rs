@@ -1,0 +1,249 @@
+//! What keeps a stranger's container from the node and from its neighbors: security contexts, disk, GPUs, name files.
+
+use serde_json::{Value, json};
+
+use super::tests::{Case, container, containers};
+
+fn is_own(container: &Value) -> bool {
+    container["name"] == "workspace" || container["name"] == "logcopy"
+}
+
+fn variable<'a>(container: &'a Value, name: &str) -> Option<&'a str> {
+    let mut env = container["env"].as_array()?.iter();
+    env.find(|variable| variable["name"] == name)?["value"].as_str()
+}
+
+#[test]
+fn every_container_is_confined_by_default() {
+    for container in containers(&Case::new("V2", json!({})).json()) {
+        let context = &container["securityContext"];
+        assert_eq!(context["allowPrivilegeEscalation"], false);
+        assert_eq!(context["capabilities"], json!({"drop": ["ALL"]}));
+        assert_eq!(context["seccompProfile"], json!({"type": "RuntimeDefault"}));
+        assert_eq!(context.get("runAsUser").is_some(), is_own(container));
+        assert_eq!(context.get("readOnlyRootFilesystem").is_some(), is_own(container));
+    }
+}
+
+#[test]
+fn a_hosts_security_context_is_laid_over_the_default_field_by_field() {
+    let with = |more: Value| {
+        let mut expected = json!({
+            "allowPrivilegeEscalation": false,
+            "capabilities": {"drop": ["ALL"]},
+            "seccompProfile": {"type": "RuntimeDefault"},
+        });
+        for (key, value) in more.as_object().unwrap() {
+            expected[key] = value.clone();
+        }
+        expected.as_object_mut().unwrap().retain(|_, value| !value.is_null());
+        expected
+    };
+    for (hosts, expected) in [
+        (json!({}), with(json!({}))),
+        (json!({"runAsUser": 1000}), with(json!({"runAsUser": 1000}))),
+        (
+            json!({"runAsNonRoot": true, "runAsUser": 1000, "readOnlyRootFilesystem": true}),
+            with(json!({"runAsNonRoot": true, "runAsUser": 1000, "readOnlyRootFilesystem": true})),
+        ),
+        (
+            json!({"capabilities": {"add": ["SYS_NICE"]}}),
+            with(json!({"capabilities": {"drop": ["ALL"], "add": ["SYS_NICE"]}})),
+        ),
+        (
+            json!({"capabilities": {"drop": []}}),
+            with(json!({"capabilities": {"drop": []}})),
+        ),
+        (
+            json!({"seccompProfile": {"type": "Localhost", "localhostProfile": "carla.json"}}),
+            with(json!({"seccompProfile": {"type": "Localhost", "localhostProfile": "carla.json"}})),
+        ),
+        (
+            json!({"allowPrivilegeEscalation": true}),
+            with(json!({"allowPrivilegeEscalation": true})),
+        ),
+        // Kubernetes refuses the two together.
+        (
+            json!({"privileged": true}),
+            with(json!({"privileged": true, "allowPrivilegeEscalation": null})),
+        ),
+    ] {
+        for side in ["contents", "simulator", "agent"] {
+            let mut more = json!({"contents": {"image": "c"}, "simulator": {"image": "s"}, "agent": {}});
+            more[side]["securityContext"] = hosts.clone();
+            let job = Case::new("V2", more).json();
+            for container in containers(&job) {
+                let is_addressed = container["name"].as_str().unwrap().starts_with(side);
+                let expected = if is_addressed { &expected } else { &with(json!({})) };
+                if !is_own(container) {
+                    assert_eq!(&container["securityContext"], expected, "{side} {hosts}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn an_overlay_lays_its_security_context_over_ours_and_null_removes_a_field() {
+    let context = json!({"runAsUser": 7, "seccompProfile": null, "capabilities": {"drop": null, "add": ["KILL"]}});
+    let privileged = json!({"name": "simulator", "securityContext": {"privileged": true}});
+    let overlay = json!({"spec": {"containers": [{"name": "agent", "securityContext": context}, privileged]}});
+    let job = Case::new("V2", json!({"podOverrides": overlay})).json();
+    assert_eq!(
+        container(&job, "agent-3")["securityContext"],
+        json!({"allowPrivilegeEscalation": false, "runAsUser": 7, "capabilities": {"add": ["KILL"]}})
+    );
+    assert_eq!(
+        container(&job, "simulator-2")["securityContext"],
+        json!({"privileged": true, "capabilities": {"drop": ["ALL"]}, "seccompProfile": {"type": "RuntimeDefault"}})
+    );
+}
+
+/// `ephemeral-storage` of a container, as request and limit.
+fn disk(job: &Value, name: &str) -> (Option<String>, Option<String>) {
+    let amount = |list: &str| {
+        let amount = &container(job, name)["resources"][list]["ephemeral-storage"];
+        amount.as_str().map(ToOwned::to_owned)
+    };
+    (amount("requests"), amount("limits"))
+}
+
+fn amounts(request: &str, limit: &str) -> (Option<String>, Option<String>) {
+    let some = |amount: &str| (!amount.is_empty()).then(|| amount.to_owned());
+    (some(request), some(limit))
+}
+
+#[test]
+fn a_pod_requests_and_may_fill_so_much_of_its_nodes_disk() {
+    let gib = 1_u64 << 30;
+    // The logs of two pairs with 20Gi of results and 2Gi of each agent's log, 1Gi to spare, and 10Gi of contents.
+    let volumes = ((20 + 2 * 2 + 1 + 10) * gib).to_string();
+    let of = |simulator: Value, agent: Value| {
+        let simulator = json!({"image": "s", "resources": simulator});
+        let more = json!({"pairs": 2, "simulator": simulator, "agent": {"resources": agent}});
+        let job = Case::new("V2", more).json();
+        assert_eq!(disk(&job, "contents"), (None, None));
+        assert_eq!(disk(&job, "workspace"), (None, None));
+        assert_eq!(disk(&job, "agent-1"), disk(&job, "agent-2"));
+        ["simulator-1", "agent-1", "logcopy"].map(|name| disk(&job, name))
+    };
+    let named = |list: &str, amount: &str| json!({list: {"ephemeral-storage": amount, "memory": "1Gi"}});
+    for (simulator, agent, expected) in [
+        // Nothing is said of the disk.
+        (
+            json!({}),
+            json!({"limits": {"memory": "1Gi"}}),
+            [("2Gi", "10Gi"), ("2Gi", "20Gi"), ("1Gi", &volumes)],
+        ),
+        // The host's own stay alone: Kubernetes takes a limit for the request too.
+        (
+            json!({}),
+            named("limits", "50Mi"),
+            [("2Gi", "10Gi"), ("", "50Mi"), ("1Gi", &volumes)],
+        ),
+        // A request alone is no limit, for the other side too: the sum would be the limit of both.
+        (
+            json!({}),
+            named("requests", "5Gi"),
+            [("2Gi", ""), ("5Gi", ""), ("1Gi", "")],
+        ),
+        (
+            named("requests", "5Gi"),
+            named("limits", "9Gi"),
+            [("5Gi", ""), ("", "9Gi"), ("1Gi", &volumes)],
+        ),
+    ] {
+        let expected = expected.map(|(request, limit)| amounts(request, limit));
+        assert_eq!(of(simulator.clone(), agent.clone()), expected, "{simulator} {agent}");
+    }
+}
+
+#[test]
+fn a_tracks_own_resources_and_the_overlay_count_for_the_disk_as_well() {
+    let disk_of = |amount: &str| json!({"limits": {"ephemeral-storage": amount}});
+    let track = json!({"name": "sensors", "codename": "S", "agent": {"resources": {"limits": {"memory": "1Gi"}}}});
+    let overlay = json!({"spec": {
+        "containers": [{"name": "simulator", "resources": disk_of("1Gi")}],
+        "initContainers": [{"name": "logcopy", "resources": disk_of("90Gi")}],
+    }});
+    let more = json!({"tracks": [track], "agent": {"resources": disk_of("3Gi")}, "podOverrides": overlay});
+    let job = Case::new("V2", more).json();
+    // The track's take the place of all of the Leaderboard's.
+    assert_eq!(disk(&job, "agent-1"), amounts("2Gi", "20Gi"));
+    assert_eq!(disk(&job, "simulator-1"), amounts("", "1Gi"));
+    assert_eq!(disk(&job, "logcopy"), amounts("", "90Gi"));
+    assert_eq!(container(&job, "logcopy")["resources"]["limits"]["memory"], "1Gi");
+}
+
+const GPU: &str = "nvidia.com/gpu";
+
+#[test]
+fn a_container_without_a_gpu_sees_none_of_its_nodes() {
+    let metrics = json!({"name": "metrics", "image": "m", "restartPolicy": "Always"});
+    let gpu_check = json!({"name": "check", "image": "c", "resources": {"limits": {GPU: "1"}}});
+    let overlay = json!({"spec": {"initContainers": [metrics, gpu_check]}});
+    let contents = json!({"image": "c", "env": [{"name": "A", "value": "b"}]});
+    for requested in [json!({GPU: "1"}), json!({}), json!({GPU: "0"})] {
+        let simulator = json!({"image": "s", "resources": {"limits": requested}});
+        let more = json!({"simulator": simulator, "contents": contents, "podOverrides": overlay});
+        let job = Case::new("V2", more).json();
+        for container in containers(&job) {
+            let name = container["name"].as_str().unwrap();
+            let pair = name.strip_prefix("agent-").or(name.strip_prefix("simulator-"));
+            let index = pair.map(|pair| (pair.parse::<u8>().unwrap() - 1).to_string());
+            let expected = match index.as_deref().filter(|_| requested[GPU] == "1") {
+                // NVIDIA's plugin says what it gets.
+                _ if name == "check" => None,
+                Some(index) => Some(index),
+                None => Some("void"),
+            };
+            assert_eq!(
+                variable(container, "NVIDIA_VISIBLE_DEVICES"),
+                expected,
+                "{name} {requested}"
+            );
+            let capabilities = variable(container, "NVIDIA_DRIVER_CAPABILITIES");
+            assert_eq!(
+                capabilities.is_some(),
+                pair.is_some() && requested[GPU] == "1",
+                "{name}"
+            );
+        }
+        let adapter = container(&job, "simulator-1")["command"]
+            .to_string()
+            .contains("GraphicsAdapter");
+        assert_eq!(adapter, requested[GPU] == "1");
+    }
+}
+
+#[test]
+fn gpus_that_the_overlay_or_a_track_requests_are_seen_by_index() {
+    let limits = json!({"limits": {"nvidia.com/mig-1g.5gb": "1"}});
+    let overlay = json!({"spec": {"containers": [{"name": "agent", "resources": limits}]}});
+    let track = json!({"name": "sensors", "codename": "S", "simulator": {"resources": limits}});
+    for more in [json!({"podOverrides": overlay}), json!({"tracks": [track]})] {
+        let mut more = more;
+        more["simulator"] = json!({"image": "s"});
+        let job = Case::new("V2", more).json();
+        for name in ["agent-2", "simulator-2"] {
+            assert_eq!(variable(container(&job, name), "NVIDIA_VISIBLE_DEVICES"), Some("1"));
+        }
+    }
+}
+
+#[test]
+fn strangers_cannot_write_to_the_files_by_which_logcopy_resolves_names() {
+    let job = Case::new("V1", json!({})).json();
+    for container in containers(&job) {
+        let name = container["name"].as_str().unwrap();
+        let mounts = container["volumeMounts"].as_array().unwrap();
+        for path in ["/etc/hosts", "/etc/resolv.conf", "/etc/hostname"] {
+            let found = mounts.iter().find(|mount| mount["mountPath"] == path);
+            let copy = json!({"name": "tools", "mountPath": path, "subPath": &path[1..], "readOnly": true});
+            let is_strangers = name.starts_with("agent") || name.starts_with("simulator");
+            assert_eq!(found, is_strangers.then_some(&copy), "{name}");
+        }
+        let writes = |mount: &&Value| mount["name"] == "tools" && mount["readOnly"] != true;
+        assert_eq!(mounts.iter().any(|mount| writes(&mount)), name == "workspace");
+    }
+}

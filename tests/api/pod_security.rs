@@ -1,0 +1,311 @@
+//! The Pods that the controller makes, in front of the API server's own admission: Pod Security's levels, and the fields by which a host
+//! isolates them further.
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::{Namespace, Pod};
+use k8s_openapi::api::node::v1::RuntimeClass;
+use kube::api::{DynamicObject, PostParams};
+use kube::core::ApiResource;
+use kube::runtime::wait::await_condition;
+use kube::{Api, Client};
+use leaderboard_api::{Leaderboard, conditions};
+use leaderboard_operator::controller::submissions::baseline::weaknesses;
+use serde_json::{Value, json};
+use tokio::time::timeout;
+
+use super::bridge::{LIMIT, StandIn};
+use super::objects::{Kind, create, merge};
+use super::operator::Operator;
+use crate::support::apiserver::server;
+
+/// The whole controller, and namespaces that enforce a level.
+struct World {
+    client: Client,
+    namespace: String,
+    aws: StandIn,
+    operator: Operator,
+}
+
+impl World {
+    async fn new() -> Self {
+        let server = server().await;
+        let aws = StandIn::start().await;
+        let s3 = aws.aws.s3(None, Some(&aws.endpoint));
+        s3.create_bucket().bucket(aws.name("bucket")).send().await.unwrap();
+        let namespace = server.namespace("pod-security").await;
+        Self {
+            client: server.client(),
+            operator: Operator::start(&namespace, aws.aws.clone()).await,
+            namespace,
+            aws,
+        }
+    }
+
+    /// Makes a Leaderboard with this laid over its spec, without any way to EvalAI.
+    async fn leaderboard(&self, name: &str, more: &Value) {
+        let without = json!({"evalai": null, "queue": null, "table": null, "logGroup": null});
+        let storage = json!({"bucket": self.aws.name("bucket"), "endpoint": self.aws.endpoint, "region": null});
+        let mut spec = json!({"spec": more});
+        merge(&mut spec["spec"], &without);
+        spec["spec"]["storage"] = storage;
+        let api = Kind::Leaderboard.api(&self.client, &self.namespace);
+        create(&api, Kind::Leaderboard.object(name, &[&spec]), false)
+            .await
+            .unwrap();
+    }
+
+    /// The Pod's template of a submission to a Leaderboard of its own.
+    async fn template(&self, name: &str, more: &Value) -> Value {
+        self.leaderboard(name, more).await;
+        let patch = json!({"spec": {"leaderboardName": name}});
+        let api = Kind::Submission.api(&self.client, &self.namespace);
+        create(&api, Kind::Submission.object(name, &[&patch]), false)
+            .await
+            .unwrap();
+        let jobs: Api<Job> = Api::namespaced(self.client.clone(), &self.namespace);
+        let job = format!("{name}-1");
+        let made = await_condition(jobs.clone(), &job, |job: Option<&Job>| job.is_some());
+        timeout(LIMIT, made).await.expect("its Job is made").unwrap();
+        // As it is stored, without our types in between.
+        let jobs: Api<DynamicObject> =
+            Api::namespaced_with(self.client.clone(), &self.namespace, &ApiResource::erase::<Job>(&()));
+        jobs.get(&job).await.unwrap().data["spec"]["template"].take()
+    }
+
+    /// Waits until the Leaderboard is ready, and gives its message.
+    async fn ready(&self, name: &str) -> String {
+        let api: Api<Leaderboard> = Api::namespaced(self.client.clone(), &self.namespace);
+        let ready = |board: Option<&Leaderboard>| {
+            let all = board
+                .and_then(|board| board.status.as_ref())
+                .map(|status| &status.conditions);
+            all.is_some_and(|all| conditions::is_true(all, conditions::READY))
+        };
+        let found = timeout(LIMIT, await_condition(api.clone(), name, ready)).await;
+        assert!(found.is_ok(), "not ready: {:?}", api.get(name).await.unwrap().status);
+        let status = api.get(name).await.unwrap().status.unwrap();
+        conditions::get(&status.conditions, conditions::READY)
+            .unwrap()
+            .message
+            .clone()
+    }
+}
+
+/// A namespace that enforces a level of Pod Security.
+async fn enforcing(client: &Client, level: &str) -> String {
+    let name = server().await.namespace(level).await;
+    let label = json!({"metadata": {"labels": {"pod-security.kubernetes.io/enforce": level}}});
+    let api: Api<Namespace> = Api::all(client.clone());
+    let patch = kube::api::Patch::Merge(label);
+    api.patch(&name, &kube::api::PatchParams::default(), &patch)
+        .await
+        .unwrap();
+    name
+}
+
+/// Asks the API server for a Pod of this template, and gives it as it would be, or why it is forbidden.
+async fn pod(client: &Client, namespace: &str, template: &Value) -> Result<Pod, String> {
+    let mut object = template.clone();
+    object["metadata"]["name"] = "pod".into();
+    let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), namespace, &ApiResource::erase::<Pod>(&()));
+    let params = PostParams {
+        dry_run: true,
+        ..PostParams::default()
+    };
+    match api.create(&params, &serde_json::from_value(object).unwrap()).await {
+        Ok(made) => Ok(made.try_parse().unwrap()),
+        Err(kube::Error::Api(status)) if status.code == 403 => Err(status.message),
+        Err(other) => panic!("neither taken nor forbidden: {other}"),
+    }
+}
+
+fn example(file: &str) -> Value {
+    let path = format!("{}/examples/{file}", env!("CARGO_MANIFEST_DIR"));
+    let mut object: Value = serde_saphyr::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
+    object["spec"].take()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_namespace_that_enforces_baseline_takes_the_pods_of_every_default() {
+    let world = World::new().await;
+    let baseline = enforcing(&world.client, "baseline").await;
+    let restricted = enforcing(&world.client, "restricted").await;
+    let role = json!({"serviceAccountName": "worker", "roleARN": "arn:aws:iam::123456789012:role/results"});
+    for (name, more) in [
+        ("default-2", json!({})),
+        ("default-1", json!({"leaderboardVersion": "V1", "pairs": 16})),
+        ("of-role", json!({"podIdentity": role})),
+        ("of-secret", json!({"podIdentity": {"secretName": "aws"}})),
+        ("example-20", example("leaderboard-20.yaml")),
+        ("example-10", example("leaderboard-10.yaml")),
+        ("example-local", example("leaderboard-local.yaml")),
+    ] {
+        let template = world.template(name, &more).await;
+        let made = pod(&world.client, &baseline, &template).await;
+        assert!(made.is_ok(), "{name}: {made:?}");
+        assert!(weaknesses(&template).is_empty(), "{name}");
+        let refused = pod(&world.client, &restricted, &template).await.unwrap_err();
+        // Only what an image has to be able to do.
+        assert!(refused.contains("runAsNonRoot != true"), "{name}: {refused}");
+        assert!(
+            !refused.contains("), "),
+            "{name} is refused for more than that: {refused}"
+        );
+    }
+    world.operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_namespace_that_enforces_restricted_takes_the_pods_of_its_example() {
+    let world = World::new().await;
+    let restricted = enforcing(&world.client, "restricted").await;
+    let template = world
+        .template("restricted", &example("leaderboard-restricted.yaml"))
+        .await;
+    let made = pod(&world.client, &restricted, &template).await;
+    assert!(made.is_ok(), "{made:?}");
+    let more = example("leaderboard-restricted.yaml");
+    assert_eq!(more["contents"]["securityContext"]["runAsNonRoot"], true);
+    world.operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn user_namespaces_and_a_runtime_class_reach_the_pod() {
+    let world = World::new().await;
+    let plain = server().await.namespace("isolated").await;
+    let class = json!({"metadata": {"name": "gvisor-of-tests"}, "handler": "runsc"});
+    let classes: Api<RuntimeClass> = Api::all(world.client.clone());
+    let class = serde_json::from_value(class).unwrap();
+    classes.create(&PostParams::default(), &class).await.unwrap();
+    let more = json!({"runtimeClassName": "gvisor-of-tests", "podOverrides": {"spec": {"hostUsers": false}}});
+    let template = world.template("isolated", &more).await;
+    let made = pod(&world.client, &plain, &template).await.unwrap().spec.unwrap();
+    assert_eq!(made.host_users, Some(false));
+    assert_eq!(made.runtime_class_name.as_deref(), Some("gvisor-of-tests"));
+    world.operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_leaderboard_is_ready_and_names_what_its_pods_give_to_strangers() {
+    let world = World::new().await;
+    world
+        .leaderboard("quiet", &example("leaderboard-restricted.yaml"))
+        .await;
+    assert_eq!(world.ready("quiet").await, "");
+    let socket = json!({"name": "x11", "hostPath": {"path": "/tmp/.X11-unix"}});
+    let key = json!({"name": "KEY", "valueFrom": {"secretKeyRef": {"name": "weights", "key": "k"}}});
+    let more = json!({
+        "simulator": {"image": "simulator:1", "securityContext": {"privileged": true}},
+        "agent": {"env": [key]},
+        "podOverrides": {"spec": {"volumes": [socket]}},
+    });
+    world.leaderboard("weak", &more).await;
+    let message = world.ready("weak").await;
+    for part in [
+        "Weaker than Pod Security baseline: Pod: hostPath /tmp/.X11-unix, simulators: privileged.",
+        "Agents can read Secret weights:",
+        "Unbounded: agents of the track sensors have no memory limit",
+    ] {
+        assert!(message.contains(part), "{message}");
+    }
+    world.operator.end().await;
+}
+
+/// Lays `patch` over a template; the containers are addressed by their numbers in the list.
+fn weakened(template: &Value, pointer: &str, patch: &Value) -> Value {
+    let mut changed = template.clone();
+    merge(changed.pointer_mut(pointer).unwrap(), patch);
+    changed
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_noted_as_weaker_than_baseline_is_what_the_api_server_refuses() {
+    const POD: &str = "/spec";
+    const CONTAINER: &str = "/spec/containers/1";
+    const INIT: &str = "/spec/initContainers/0";
+    let world = World::new().await;
+    let baseline = enforcing(&world.client, "baseline").await;
+    let template = world.template("one", &json!({})).await;
+    let volumes = |volume: Value| {
+        let mut all = template["spec"]["volumes"].as_array().unwrap().clone();
+        all.push(volume);
+        json!({ "volumes": all })
+    };
+    let context = |context: Value| json!({ "securityContext": context });
+    let probe = |host: &str| json!({"readinessProbe": {"httpGet": {"port": 80, "host": host}}});
+    let hook = |host: &str| json!({"lifecycle": {"preStop": {"tcpSocket": {"port": 80, "host": host}}}});
+    let annotation = |profile: &str| {
+        let key = "container.apparmor.security.beta.kubernetes.io/simulator-1";
+        json!({"annotations": {key: profile}})
+    };
+    let sysctl = |name: &str| context(json!({"sysctls": [{"name": name, "value": "1"}]}));
+    let label = |field: &str, label: &str| context(json!({"seLinuxOptions": {field: label}}));
+    let capability = |name: &str| context(json!({"capabilities": {"drop": ["ALL"], "add": [name]}}));
+    let privileged = context(json!({"privileged": true, "allowPrivilegeEscalation": null}));
+    let host_path = json!({"name": "h", "hostPath": {"path": "/tmp"}});
+    let cases = [
+        (true, POD, json!({})),
+        (false, CONTAINER, privileged.clone()),
+        (false, INIT, privileged),
+        (
+            true,
+            CONTAINER,
+            context(json!({"allowPrivilegeEscalation": true, "capabilities": null})),
+        ),
+        (true, CONTAINER, capability("KILL")),
+        (true, CONTAINER, capability("SETFCAP")),
+        (false, CONTAINER, capability("SYS_ADMIN")),
+        (false, CONTAINER, capability("NET_RAW")),
+        (false, POD, volumes(host_path)),
+        (
+            true,
+            POD,
+            volumes(json!({"name": "m", "emptyDir": {"medium": "Memory"}})),
+        ),
+        (
+            false,
+            CONTAINER,
+            json!({"ports": [{"containerPort": 80, "hostPort": 80}]}),
+        ),
+        (true, CONTAINER, json!({"ports": [{"containerPort": 80}]})),
+        (
+            false,
+            CONTAINER,
+            context(json!({"seccompProfile": {"type": "Unconfined"}})),
+        ),
+        (false, POD, context(json!({"seccompProfile": {"type": "Unconfined"}}))),
+        (true, CONTAINER, context(json!({"seccompProfile": null}))),
+        (
+            false,
+            CONTAINER,
+            context(json!({"appArmorProfile": {"type": "Unconfined"}})),
+        ),
+        (false, POD, context(json!({"appArmorProfile": {"type": "Unconfined"}}))),
+        (
+            true,
+            POD,
+            context(json!({"appArmorProfile": {"type": "RuntimeDefault"}})),
+        ),
+        (false, "/metadata", annotation("unconfined")),
+        (true, "/metadata", annotation("runtime/default")),
+        (false, CONTAINER, label("type", "spc_t")),
+        (true, CONTAINER, label("type", "container_t")),
+        (false, POD, label("user", "system_u")),
+        (false, POD, label("role", "system_r")),
+        (true, POD, label("level", "s0:c1,c2")),
+        (false, POD, sysctl("kernel.msgmax")),
+        (true, POD, sysctl("net.ipv4.tcp_syncookies")),
+        (false, CONTAINER, probe("192.0.2.1")),
+        (true, CONTAINER, probe("")),
+        (false, CONTAINER, hook("192.0.2.1")),
+        (true, POD, json!({"hostUsers": false})),
+    ];
+    for (allowed, pointer, patch) in cases {
+        let changed = weakened(&template, pointer, &patch);
+        let answer = pod(&world.client, &baseline, &changed).await;
+        assert_eq!(answer.is_ok(), allowed, "{pointer} {patch}: {answer:?}");
+        let found = weaknesses(&changed);
+        assert_eq!(found.is_empty(), allowed, "{pointer} {patch}: {found:?}");
+    }
+    world.operator.end().await;
+}
