@@ -139,7 +139,7 @@ async fn sixteen_pairs_with_the_largest_checkpoints_stay_within_half_of_logcopys
         })
         .collect();
     submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
-    // Half of it is for the agents' files, so some of the sparse ones are sent and the others are not.
+    // Half of it is for the agents' files, so the sparse ones are sent in part.
     submission.run.plan.storage.size_limit = leaderboard_api::ByteQuantity::gibibytes(1);
     let limits = results_plan(&submission.run).unwrap().limits_of(0);
     // With more values the merged file, which has a line for each, would be larger than it may be.

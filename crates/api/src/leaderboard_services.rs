@@ -168,7 +168,7 @@ pub struct Storage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub endpoint: Option<String>,
-    /// What one run may store, `16Mi` to `1Ti`; files beyond it are left out and named.
+    /// What one run may store, `16Mi` to `1Ti`; what is beyond it is left out, and logcopy's log says so. A file counts at least 4 KiB.
     #[serde(default = "defaults::size_limit")]
     pub size_limit: ByteQuantity,
 }

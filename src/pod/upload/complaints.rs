@@ -53,8 +53,8 @@ impl fmt::Display for Why {
             ),
             Self::Ended(files) => write!(
                 f,
-                "nor are {files} further files: half of deadlines.flushSeconds is over. Raise it, or have less written at \
-                 the end"
+                "{files} files at the end: half of deadlines.flushSeconds is over. Raise it, or have less written at the \
+                 end"
             ),
             Self::Statuses(rounds) => write!(
                 f,

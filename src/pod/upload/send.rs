@@ -153,6 +153,7 @@ impl Uploader {
         for (job, bill) in jobs.iter().filter(|(job, _)| job.is_shortened) {
             self.complaints.say(&bill.key, &Why::Shortened(job.wanted.stamp.size));
         }
+        let new = self.count_new(&jobs).await;
         // What is in the air comes to its end or is cut, so that it is remembered; nothing new is begun.
         let broken = Arc::new(AtomicBool::new(false));
         let work = jobs.into_iter().map(|(job, bill)| {
@@ -170,21 +171,41 @@ impl Uploader {
             }
         });
         let outcomes: Vec<(Bill, Outcome)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
-        let mut has_begun = false;
-        for (bill, _) in outcomes.iter().filter(|(_, outcome)| !matches!(outcome, Outcome::Late)) {
-            has_begun = true;
-            self.memory.sent.add(&bill.purse, bill.cost);
-        }
-        let outcomes = outcomes
-            .into_iter()
-            .map(|(bill, outcome)| (bill.key, outcome))
-            .collect();
+        let has_changed = !outcomes.is_empty();
+        let outcomes = outcomes.into_iter().map(|(bill, outcome)| {
+            if !matches!(outcome, Outcome::Late) {
+                self.memory.sent.add(&bill.purse, bill.cost);
+            }
+            if matches!(outcome, Outcome::Late | Outcome::LeftOut(_)) && new.contains(&bill.key) {
+                self.memory.stored.remove(&bill.key);
+            }
+            (bill.key, outcome)
+        });
+        let outcomes = outcomes.collect();
         let time = window.cut_at.map(|cut_at| cut_at.saturating_duration_since(began));
         let failed = self.settle(outcomes, time, &mut sent);
-        if has_begun {
+        if has_changed {
             self.remember().await;
         }
         failed.map_or(Ok(sent), Err)
+    }
+
+    /// Counts the objects that are going to be made, before the first of them is: a logcopy that is killed meanwhile must not
+    /// forget any. Returns their keys.
+    async fn count_new(&mut self, jobs: &[(Job, Bill)]) -> BTreeSet<String> {
+        let new = jobs
+            .iter()
+            .filter(|(_, bill)| !self.memory.stored.contains_key(&bill.key));
+        let new: BTreeMap<String, u64> = new
+            .map(|(job, bill)| (bill.key.clone(), job.wanted.stamp.size))
+            .collect();
+        for (key, size) in &new {
+            self.memory.stored.insert(key.clone(), Stored::unknown(*size));
+        }
+        if !new.is_empty() {
+            self.remember().await;
+        }
+        new.into_keys().collect()
     }
 
     /// Takes in what became of the files, of which none had more time than `time`. Returns S3's failure, if there was one.

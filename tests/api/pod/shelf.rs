@@ -8,8 +8,6 @@ use axum::extract::Request;
 use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 
-use super::*;
-
 /// What is stored under a key.
 #[derive(Clone, Debug, Default)]
 struct Stored {

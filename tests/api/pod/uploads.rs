@@ -3,6 +3,8 @@
 use super::*;
 
 const LOG: &str = "agent/agent1/leaderboard.log";
+/// What a file counts at least.
+const PAGE: usize = 4096;
 
 async fn sync(pod: &Pod, uploader: &mut Uploader, path: &str) -> Sent {
     let tree = Tree::open(pod.logs()).unwrap();
@@ -83,7 +85,7 @@ async fn the_limit_leaves_files_out_and_keeps_the_rest() {
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(8 * LEAST, 1));
     // Three quarters are for all but the known logs, and a small file counts as a page.
-    pod.put("simulator/large", &[0; 6 * LEAST as usize]);
+    pod.put("simulator/large", &[0; 6 * PAGE]);
     pod.put("simulator/small", &[0; 20]);
     let wanted: Vec<Wanted> = ["simulator/small", "simulator/large"]
         .map(|path| Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now))
@@ -101,7 +103,7 @@ async fn a_file_that_grows_after_it_was_counted_is_sent_as_far_as_it_was_counted
     let path = "agent/agent1/x.log";
     pod.put(path, b"0123456789");
     let counted = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
-    pod.append(path, &[b'x'; LEAST as usize]);
+    pod.append(path, &[b'x'; PAGE]);
     assert_eq!(uploader.sync(&[counted], Window::default()).await.unwrap().objects, 1);
     assert_eq!(pod.stored(path).await.unwrap(), b"0123456789");
     assert_eq!(uploader.memory().bytes(), 10);
