@@ -52,7 +52,7 @@ build: ## Build the operator
 
 static: ## Build the programs that go into other images, statically
 	$(STATIC) cargo build --release --target x86_64-unknown-linux-gnu -p leaderboard-runner
-	$(STATIC) cargo build --profile $(PROFILE) --target x86_64-unknown-linux-gnu -p challenge-stand-in
+	$(STATIC) cargo build --profile $(PROFILE) --target x86_64-unknown-linux-gnu -p challenge-stand-in -p challenge-probe
 
 image: build static ## Make the operator's image without a container engine and push it to the local registry
 	$(LAB) image local/operator-image.toml --profile $(PROFILE)
@@ -63,7 +63,7 @@ images: image ## Make and push all images of the demo
 crds: ## Generate crds/ from the types
 	UPDATE_CRDS=1 cargo test --profile $(PROFILE) --workspace --lib -- crds
 
-docs: ## Write the tables of reasons in docs/states.md
+docs: ## Write docs/security-probes.md and the tables of reasons in docs/states.md
 	UPDATE_DOCS=1 cargo test --profile $(PROFILE) --workspace --lib -- documentation
 
 fmt: ## Format the code

@@ -44,6 +44,8 @@ mod cluster {
     mod matrix_runs;
     mod matrix_stops;
     mod matrix_waits;
+    mod probe_endings;
+    mod probes;
     mod publish;
     mod restarts;
     mod runs;

@@ -40,11 +40,12 @@ def programs(settings: Settings) -> None:
 
 
 def static_programs(settings: Settings) -> None:
-    """Builds what goes into other images: the runner, small, and the stand-ins of simulator and agent."""
+    """Builds what goes into other images: the runner, small, the stand-ins of simulator and agent, and the probe."""
     env = {"RUSTFLAGS": STATIC}
     runner = ["build", "--release", "--target", triple(), "--package", "leaderboard-runner"]
     cargo(settings, runner, "building the static runner", 45, env)
-    challenge = ["build", "--profile", PROFILE, "--target", triple(), "--package", "challenge-stand-in"]
+    challenge = ["build", "--profile", PROFILE, "--target", triple()]
+    challenge += ["--package", "challenge-stand-in", "--package", "challenge-probe"]
     cargo(settings, challenge, "building the static stand-ins", 30, env)
 
 

@@ -98,6 +98,7 @@ class Summing(unittest.TestCase):
             passed_alone=[Failure("b", [["y.rs:3:4", "late"]])],
             cases=failed_cases(
                 "one\tCancelled\tFinished\t-\ntwo\tFinished\tas expected\t1.0\nthree\tsoon\tmeasured\t2.0\n"
+                "four\theld\tas expected: denied EPERM\t-\n"
             ),
         )
         self.assertEqual(

@@ -192,6 +192,16 @@ pub fn measured(what: &str, took: Duration, aim: &str) {
     print_line(what, aim, "measured", Some(took));
 }
 
+/// A line of something that was tried without waiting for anything, with what was seen of it.
+pub fn as_expected(name: &str, expected: &str, seen: &str) {
+    print_line(name, expected, &format!("as expected: {seen}"), None);
+}
+
+/// The same where it is not what was expected.
+pub fn not_as_expected(name: &str, expected: &str, seen: &str) {
+    print_line(name, expected, seen, None);
+}
+
 /// Runs cases, so many at once, to the end of all of them; fails if one has failed.
 pub async fn together(width: usize, cases: Vec<LocalBoxFuture<'_, ()>>) {
     let ends: Vec<_> = stream::iter(cases)

@@ -1,0 +1,205 @@
+//! Attacks on the verdict and on what is stored: each is a way for an agent to end, with the end that the submission must have.
+
+/// Which image the attack comes in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Image {
+    /// `challenge/agent:probe`
+    Root,
+    /// `challenge/agent:probe-user`
+    User,
+    /// `challenge/agent:probe-env`: it moves the runner's termination message by a variable of its own.
+    Variable,
+}
+
+impl Image {
+    /// The image's tag.
+    pub const fn tag(self) -> &'static str {
+        match self {
+            Self::Root => "probe",
+            Self::User => "probe-user",
+            Self::Variable => "probe-env",
+        }
+    }
+
+    /// As whom it runs.
+    pub const fn user(self) -> &'static str {
+        match self {
+            Self::Root => "root",
+            Self::User | Self::Variable => "1000",
+        }
+    }
+}
+
+/// Whether it gains anything.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Gain {
+    /// Nothing: it ends like any other failure of the agent, or like a run without it.
+    None,
+    /// What cannot be told from honest work: this is what a host can do.
+    Inherent(&'static str),
+}
+
+/// One way to end.
+#[derive(Debug, Clone, Copy)]
+pub struct Ending {
+    /// Its name in `PROBE_ENDING`.
+    pub id: &'static str,
+    pub attack: &'static str,
+    pub image: Image,
+    /// Laid over the test's Leaderboard, as JSON.
+    pub change: &'static str,
+    /// State, reason, class, charged; number of Jobs.
+    pub expected: &'static str,
+    pub gain: Gain,
+}
+
+/// The variable that chooses.
+pub const VARIABLE: &str = "PROBE_ENDING";
+
+const CRASHED: &str = "Failed AgentCrashed (participant, charged); 1 Job";
+const INVALID: &str = "Failed InvalidResults (participant, charged); 1 Job";
+const FINISHED: &str = "Finished; 1 Job";
+
+const fn ending(id: &'static str, attack: &'static str, image: Image, expected: &'static str) -> Ending {
+    Ending {
+        id,
+        attack,
+        image,
+        change: "{}",
+        expected,
+        gain: Gain::None,
+    }
+}
+
+/// One crash may follow, after which the agent is an honest one.
+const ONCE: &str = r#"{"retries": {"perPair": 1}}"#;
+
+/// All of them. Those that take longest come first.
+pub const ENDINGS: &[Ending] = &[
+    Ending {
+        change: r#"{"pairs": 2, "routes": 4, "simulator": {"env": [{"name": "SIM_KNOBS", "value": "pair=2,crash@1"}]}}"#,
+        ..ending(
+            "take-port",
+            "take the port of another pair's simulator while that is down",
+            Image::User,
+            CRASHED,
+        )
+    },
+    Ending {
+        change: ONCE,
+        ..ending(
+            "status-sparse",
+            "a sparse status file of terabytes",
+            Image::Root,
+            FINISHED,
+        )
+    },
+    Ending {
+        change: ONCE,
+        ..ending("status-content", "a status file with content", Image::User, FINISHED)
+    },
+    Ending {
+        change: r#"{"storage": {"sizeLimit": "16Mi"}}"#,
+        ..ending(
+            "growing-file",
+            "a file that grows while it is stored",
+            Image::User,
+            FINISHED,
+        )
+    },
+    ending(
+        "replaced-log",
+        "replace the log that is stored and shipped, again and again",
+        Image::User,
+        FINISHED,
+    ),
+    ending(
+        "forge-message",
+        "forge `notReady` and write-protect the termination message",
+        Image::Root,
+        CRASHED,
+    ),
+    ending(
+        "forge-variable",
+        "forge `notReady` and lead the runner's message elsewhere by the image's environment",
+        Image::Variable,
+        CRASHED,
+    ),
+    ending(
+        "forge-limit",
+        "forge `notReady` and take the runner's descriptors by prlimit",
+        Image::User,
+        CRASHED,
+    ),
+    ending("forge-peer", "forge `peerCrashed`", Image::Root, CRASHED),
+    ending("forge-stopped", "forge `stopped`", Image::Root, CRASHED),
+    ending("stop-runner", "end the runner by SIGTERM", Image::User, CRASHED),
+    ending(
+        "own-crash",
+        "write the own crash mark, to blame the simulator",
+        Image::User,
+        CRASHED,
+    ),
+    ending("many-crashes", "write a thousand crash marks", Image::User, CRASHED),
+    ending(
+        "own-done",
+        "write the own mark of the end before it",
+        Image::User,
+        INVALID,
+    ),
+    ending(
+        "survivors",
+        "leave processes that outlive the agent and write its last message",
+        Image::User,
+        CRASHED,
+    ),
+    ending(
+        "result-link",
+        "replace the results by a link to another file",
+        Image::Root,
+        INVALID,
+    ),
+    ending(
+        "result-pipe",
+        "replace the results by a pipe that nobody writes",
+        Image::User,
+        INVALID,
+    ),
+    ending(
+        "result-sparse",
+        "replace the results by a sparse file of terabytes",
+        Image::User,
+        INVALID,
+    ),
+    Ending {
+        gain: Gain::Inherent(
+            "the agent's own process computes its score; `verify: Refuse` finds clumsy forgeries only",
+        ),
+        ..ending(
+            "own-score",
+            "write better results than were driven",
+            Image::User,
+            FINISHED,
+        )
+    },
+];
+
+/// The one with this name.
+pub fn named(id: &str) -> Option<&'static Ending> {
+    ENDINGS.iter().find(|ending| ending.id == id)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn each_ending_has_a_name_of_its_own() {
+        let ids: BTreeSet<_> = ENDINGS.iter().map(|ending| ending.id).collect();
+        assert_eq!(ids.len(), ENDINGS.len());
+        assert_eq!(named("survivors").map(|ending| ending.image), Some(Image::User));
+        assert!(named("nothing").is_none());
+    }
+}

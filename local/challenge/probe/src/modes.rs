@@ -1,0 +1,258 @@
+//! The endings, carried out. Called by the program in pair 1; the other pairs are honest.
+
+use std::convert::Infallible;
+use std::env;
+use std::fs::{self, File, Permissions};
+use std::io::{self, Write as _};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::os::unix::fs::{PermissionsExt as _, symlink};
+use std::os::unix::process::CommandExt as _;
+use std::path::Path;
+use std::process::{Command, exit};
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use nix::libc;
+use nix::sys::signal::{Signal, kill};
+use nix::sys::stat::Mode;
+use nix::unistd::{Pid, mkfifo, setsid};
+
+use crate::call::{call, of};
+
+/// The honest agent of the image.
+pub const HONEST: &str = "/usr/bin/challenge-agent";
+const TERMINATION_LOG: &str = "/dev/termination-log";
+const RESULTS: &str = "/tmp/agent/agent_results.json";
+const LOG: &str = "/tmp/agent/leaderboard.log";
+/// Outlives the container.
+const MARKER: &str = "/tmp/agent/probe-was-here";
+const FIRST_PORT: u16 = 2000;
+const PORT_STEP: u16 = 100;
+/// Where pair 1 shows that it waits for the port of pair 2's simulator.
+const READY_PORT: u16 = 2999;
+/// How long whatever outlives the agent goes on, if nobody ends it.
+const LIFE: Duration = Duration::from_mins(1);
+const CRASHES: u32 = 1000;
+const CHAINS: usize = 8;
+/// What a growing file comes to.
+const GROWN: usize = 64 << 20;
+/// 1 MiB of log.
+const LOG_LINES: usize = (1 << 20) / 9;
+
+/// The number of this container's pair, by its port.
+pub fn pair() -> u16 {
+    let port = env::var("CARLA_PORT").ok().and_then(|port| port.parse().ok());
+    let port: u16 = port.unwrap_or(FIRST_PORT);
+    port.saturating_sub(FIRST_PORT) / PORT_STEP + 1
+}
+
+/// Carries out an ending; returns if the agent is to be an honest one from here on.
+pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
+    if id == "take-port" {
+        return take_port();
+    }
+    if pair() != 1 {
+        return Ok(());
+    }
+    match id {
+        "forge-message" => forge("notReady", protect),
+        "forge-variable" => forge("notReady", || Ok(())),
+        "forge-limit" => forge("notReady", silence),
+        "forge-peer" => forge("peerCrashed", protect),
+        "forge-stopped" => forge("stopped", protect),
+        "stop-runner" => {
+            kill(Pid::from_raw(1), Signal::SIGTERM)?;
+            loop {
+                thread::park();
+            }
+        }
+        "own-crash" => mark("crash0"),
+        "many-crashes" => (0..CRASHES).try_for_each(|number| mark(&format!("crash{number}"))),
+        "own-done" => {
+            mark("done")?;
+            exit(0)
+        }
+        "survivors" => {
+            (0..CHAINS).try_for_each(|_| background("survive"))?;
+            exit(1)
+        }
+        "status-content" => first_life(|| fs::write(status("start1"), vec![b'x'; 1 << 20])),
+        "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
+        "growing-file" => background("grow"),
+        "replaced-log" => background("replace"),
+        "result-link" => after_an_honest_run(arguments, || symlink("/etc/passwd", RESULTS)),
+        "result-pipe" => after_an_honest_run(arguments, || Ok(mkfifo(RESULTS, Mode::from_bits_truncate(0o666))?)),
+        "result-sparse" => after_an_honest_run(arguments, || sparse(Path::new(RESULTS))),
+        // The honest agent's own knob.
+        "own-score" => honest(arguments, "forge").map(|never| match never {}),
+        other => Err(io::Error::other(format!("there is no ending {other}"))),
+    }
+}
+
+/// What runs in the background, as `--background NAME`.
+pub fn background_work(name: &str) -> io::Result<()> {
+    let begun = Instant::now();
+    match name {
+        "survive" => survive(),
+        "grow" => grow(begun),
+        "replace" => replace(begun),
+        other => Err(io::Error::other(format!("there is no work {other}"))),
+    }
+}
+
+/// Becomes the honest agent.
+pub fn honest(arguments: &[String], knobs: &str) -> io::Result<Infallible> {
+    let mut command = Command::new(HONEST);
+    if !knobs.is_empty() {
+        command.env("AGENT_KNOBS", knobs);
+    }
+    Err(command.args(arguments).exec())
+}
+
+fn status(mark: &str) -> String {
+    format!("/tmp/status/agent-{0}/agent-{0}.{mark}", pair())
+}
+
+fn mark(name: &str) -> io::Result<()> {
+    File::create(status(name)).map(|_| ())
+}
+
+fn last_words(what: &str) -> io::Result<()> {
+    let verdict = format!(r#"{{"what":"{what}","why":"the simulator was not ready in time"}}"#);
+    fs::write(TERMINATION_LOG, verdict)
+}
+
+/// Leaves a verdict of its own, keeps the runner from replacing it, and ends.
+fn forge(what: &str, keep: impl FnOnce() -> io::Result<()>) -> io::Result<()> {
+    last_words(what)?;
+    keep()?;
+    exit(1)
+}
+
+fn protect() -> io::Result<()> {
+    fs::set_permissions(TERMINATION_LOG, Permissions::from_mode(0o444))
+}
+
+/// The runner can open nothing from now on.
+fn silence() -> io::Result<()> {
+    let limit = [0_u64; 2];
+    let files = usize::try_from(libc::RLIMIT_NOFILE).unwrap_or_default();
+    let runner = 1;
+    call(
+        libc::SYS_prlimit64,
+        of([runner, files, limit.as_ptr().expose_provenance(), 0]),
+    )?;
+    Ok(())
+}
+
+/// Does it in the first container, and crashes there; the next one is honest.
+fn first_life(attack: impl FnOnce() -> io::Result<()>) -> io::Result<()> {
+    match File::create_new(MARKER) {
+        Ok(_) => {
+            attack()?;
+            exit(1)
+        }
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// As large as the file system takes it; it costs no block.
+fn sparse(path: &Path) -> io::Result<()> {
+    let file = File::create(path)?;
+    let mut last = Ok(());
+    for power in (34..=43).rev() {
+        last = file.set_len(1 << power);
+        if last.is_ok() {
+            break;
+        }
+    }
+    last
+}
+
+/// Lets the honest agent drive, then puts something else in the place of the results.
+fn after_an_honest_run(arguments: &[String], replace: impl FnOnce() -> io::Result<()>) -> io::Result<()> {
+    let status = Command::new(HONEST).args(arguments).status()?;
+    fs::remove_file(RESULTS)?;
+    replace()?;
+    exit(status.code().unwrap_or(1))
+}
+
+/// Starts this program again, for work of its own.
+fn background(name: &str) -> io::Result<()> {
+    Command::new("/proc/self/exe").args(["--background", name]).spawn()?;
+    Ok(())
+}
+
+/// Leaves the process group, and is a new process every moment, so that no list of processes shows it for long.
+fn survive() -> io::Result<()> {
+    // A leader of its session already is as good.
+    _ = setsid();
+    last_words("notReady")?;
+    thread::sleep(Duration::from_millis(1));
+    let until = env::var("PROBE_UNTIL").ok().and_then(|until| until.parse().ok());
+    let until: u64 = until.unwrap_or_else(|| now() + LIFE.as_secs());
+    if now() >= until {
+        return Ok(());
+    }
+    Command::new("/proc/self/exe")
+        .args(["--background", "survive"])
+        .env("PROBE_UNTIL", until.to_string())
+        .spawn()?;
+    Ok(())
+}
+
+/// Seconds since 1970: the processes of a chain need one clock.
+fn now() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    since.map_or(0, |since| since.as_secs())
+}
+
+/// A file of one byte at first, of 64 MiB in the end, next to many others that are stored before it.
+fn grow(begun: Instant) -> io::Result<()> {
+    let mut file = File::create("/tmp/agent/zz-growing")?;
+    let piece = vec![b'x'; 64 << 10];
+    let mut size = 0;
+    while size < GROWN && begun.elapsed() < LIFE {
+        file.write_all(&piece)?;
+        size += piece.len();
+        thread::sleep(Duration::from_millis(2));
+    }
+    Ok(())
+}
+
+/// A new log of 1 MiB in the place of the old one, 10 times a second.
+fn replace(begun: Instant) -> io::Result<()> {
+    let lines = "replaced ".repeat(LOG_LINES);
+    while begun.elapsed() < LIFE {
+        fs::write("/tmp/agent/next.log", &lines)?;
+        fs::rename("/tmp/agent/next.log", LOG)?;
+        thread::sleep(Duration::from_millis(100));
+    }
+    Ok(())
+}
+
+/// Pair 1 takes the port of pair 2's simulator as soon as it is free, and shows before that it is about to. Pair 2 drives,
+/// and so lets its simulator crash, only then.
+fn take_port() -> io::Result<()> {
+    if pair() != 1 {
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, READY_PORT));
+        let begun = Instant::now();
+        while TcpStream::connect(address).is_err() && begun.elapsed() < LIFE {
+            thread::sleep(Duration::from_millis(20));
+        }
+        return Ok(());
+    }
+    let _shown = TcpListener::bind((Ipv4Addr::LOCALHOST, READY_PORT))?;
+    let mut taken = None;
+    let mut said = Instant::now();
+    loop {
+        taken = taken.or_else(|| TcpListener::bind((Ipv4Addr::LOCALHOST, FIRST_PORT + PORT_STEP)).ok());
+        // An agent that prints nothing for long is ended for that.
+        if said.elapsed() > Duration::from_secs(1) {
+            said = Instant::now();
+            writeln!(io::stdout(), "has the port: {}", taken.is_some())?;
+        }
+        thread::sleep(Duration::from_millis(1));
+    }
+}
