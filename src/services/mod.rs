@@ -8,6 +8,7 @@ pub mod fault;
 pub mod logs;
 pub mod meter;
 pub mod queue;
+pub mod registry;
 pub mod table;
 pub mod token;
 

@@ -124,6 +124,7 @@ async fn a_leaderboards_places_go_before_those_of_the_environment() {
         "evalai": {"apiServer": evalai.url(), "challenge": 1,
                    "token": {"secretsManager": {"id": token, "endpoint": endpoint}}},
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+        "agent": {"images": []},
         "storage": {"bucket": bucket, "endpoint": endpoint},
         "table": {"name": table, "endpoint": endpoint},
         "queue": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint},

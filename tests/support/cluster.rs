@@ -196,6 +196,7 @@ impl Scene {
             "tracks": [{"name": "sensors", "codename": "SENSORS"}, {"name": "map", "codename": "MAP"}],
             "contents": {"image": self.lab.challenge("contents:1")},
             "simulator": {"image": self.lab.challenge("simulator:1")},
+            "agent": {"images": []},
             "storage": {
                 "bucket": BUCKET,
                 "prefix": self.cloud.prefix,

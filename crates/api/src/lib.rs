@@ -8,6 +8,7 @@ pub mod client_errors;
 pub mod conditions;
 pub mod effective;
 pub mod image;
+pub mod image_pattern;
 pub mod ingested;
 pub mod leaderboard;
 pub mod leaderboard_parts;
@@ -19,6 +20,7 @@ pub mod ranges;
 pub mod reasons;
 mod retention;
 mod route_slice;
+mod route_subset;
 pub mod submission;
 pub mod submission_status;
 mod team;
@@ -26,6 +28,7 @@ pub mod text;
 mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
+pub use image_pattern::{ImagePattern, Repository};
 pub use ingested::{Ingested, RefusedAttempt};
 pub use leaderboard::{
     EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,

@@ -9,6 +9,7 @@ pub mod archive;
 pub mod decide;
 pub mod external;
 pub mod failure_log;
+pub mod images;
 pub mod job_spec;
 pub mod memory;
 pub mod observe;
