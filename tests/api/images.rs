@@ -5,7 +5,7 @@ use evalai_stand_in::model::Status;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Secret;
 use kube::api::{ListParams, PostParams};
-use leaderboard_api::{FailureClass, Submission, conditions, reasons};
+use leaderboard_api::{FailureClass, Submission, conditions, names, reasons};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -106,13 +106,14 @@ async fn every_job_pulls_the_digest_that_the_tag_had_and_the_registry_is_asked_o
     registry.push("one", &config(), 2);
     drop(controller);
     let jobs = world.api::<Job>();
-    let old = jobs.get(&format!("{name}-1")).await.unwrap();
-    jobs.delete(&format!("{name}-1"), &kube::api::DeleteParams::background())
+    let job_name = names::job(&name, 1, 0);
+    let old = jobs.get(&job_name).await.unwrap();
+    jobs.delete(&job_name, &kube::api::DeleteParams::background())
         .await
         .unwrap();
     let _controller = world.controller();
     let is_new = |job: Option<&Job>| job.is_some_and(|job| job.metadata.uid != old.metadata.uid);
-    let again = kube::runtime::wait::await_condition(world.api::<Job>(), &format!("{name}-1"), is_new);
+    let again = kube::runtime::wait::await_condition(world.api::<Job>(), &job_name, is_new);
     let again = timeout(LIMIT, again)
         .await
         .expect("the Job is made again")

@@ -1,6 +1,7 @@
 //! A registry on loopback that holds what a test puts there, and remembers what it was asked.
 
 use std::collections::HashMap;
+use std::fmt::Write;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
@@ -115,8 +116,11 @@ pub fn config() -> Value {
 }
 
 pub fn digest(bytes: &[u8]) -> String {
-    let hex: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-    format!("sha256:{hex}")
+    let mut digest = String::from("sha256:");
+    for byte in Sha256::digest(bytes) {
+        write!(digest, "{byte:02x}").unwrap();
+    }
+    digest
 }
 
 async fn answer(State(stored): State<Arc<Mutex<Stored>>>, request: Request) -> Response {

@@ -50,11 +50,12 @@ fn embedded(address: IpAddr) -> IpAddr {
         IpAddr::V4(Ipv4Addr::new(a, b, c, d))
     };
     match v6.segments() {
-        // `::ffff:0:0/96`, NAT64 and the old form `::a.b.c.d`, whose first two addresses are others.
-        [0, 0, 0, 0, 0, 0xffff, high, low] | [0x64, 0xff9b, 0, 0, 0, 0, high, low] => last(high, low),
+        // `::ffff:0:0/96`, NAT64 and 6to4.
+        [0, 0, 0, 0, 0, 0xffff, high, low] | [0x64, 0xff9b, 0, 0, 0, 0, high, low] | [0x2002, high, low, ..] => {
+            last(high, low)
+        }
+        // The old form `::a.b.c.d`, whose first two addresses are others.
         [0, 0, 0, 0, 0, 0, high, low] if high != 0 => last(high, low),
-        // 6to4
-        [0x2002, high, low, ..] => last(high, low),
         _ => address,
     }
 }

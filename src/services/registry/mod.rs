@@ -10,6 +10,7 @@ mod ecr;
 mod manifest;
 
 use std::collections::HashMap;
+use std::fmt::Write;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -123,12 +124,11 @@ impl Registries {
     /// Asks for an image, with these credentials where its registry is not Amazon's.
     pub async fn look_up(&self, image: &Image, credentials: Option<Credentials>) -> Result<Facts, Fault> {
         let running = self.aws.meter().begin("registry", "look_up");
-        let answer = match self.known_silence(&image.registry) {
-            Some(why) => Err(Fault::Unreachable(why)),
-            None => {
-                let asked = timeout(LOOK_UP, self.ask(image, credentials)).await;
-                asked.unwrap_or_else(|_| Err(Fault::Unreachable("it did not answer in time".into())))
-            }
+        let answer = if let Some(why) = self.known_silence(&image.registry) {
+            Err(Fault::Unreachable(why))
+        } else {
+            let asked = timeout(LOOK_UP, self.ask(image, credentials)).await;
+            asked.unwrap_or_else(|_| Err(Fault::Unreachable("it did not answer in time".into())))
         };
         if let Err(Fault::Unreachable(why)) = &answer {
             self.leave_alone(&image.registry, why);
@@ -425,8 +425,11 @@ async fn body(mut answer: Response, largest: usize) -> Result<Vec<u8>, &'static 
 
 /// The digest of what was read, which has to be the one that was asked for. Another one is the registry's fault, or its network's.
 fn checked(body: &[u8], wanted: Option<&str>) -> Result<String, Fault> {
-    let hex: String = Sha256::digest(body).iter().map(|byte| format!("{byte:02x}")).collect();
-    let digest = format!("sha256:{hex}");
+    let mut digest = String::from("sha256:");
+    for byte in Sha256::digest(body) {
+        // A text takes whatever is written.
+        let _ = write!(digest, "{byte:02x}");
+    }
     if wanted.is_some_and(|wanted| wanted != digest) {
         return Err(Fault::Unusable("its answer is not what its digest says".into()));
     }
