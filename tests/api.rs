@@ -19,6 +19,7 @@ mod api {
     mod evalai;
     mod examples;
     mod failures;
+    mod images;
     mod intake;
     mod isolation;
     mod leader;

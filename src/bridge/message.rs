@@ -6,7 +6,6 @@ use serde_json::{Map, Value};
 use thiserror::Error;
 
 use leaderboard_api::image;
-use leaderboard_api::text::is_harmless;
 
 /// A message that names a submission of EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -66,7 +65,7 @@ pub fn parse(body: &str) -> Result<Message, Malformed> {
 fn fitting(text: &str) -> Option<String> {
     let text = text.trim();
     let starts_well = text.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit());
-    let fits = text.chars().count() <= image::LONGEST && !text.contains(char::is_whitespace) && is_harmless(text);
+    let fits = text.len() <= image::LONGEST && text.bytes().all(|byte| byte.is_ascii_graphic());
     (starts_well && fits).then(|| text.to_owned())
 }
 
@@ -135,6 +134,14 @@ mod tests {
             ),
             (
                 r#"{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"submitted_image_uri":"r.example/a\u001b[2J:1"}"#,
+                None,
+            ),
+            (
+                r#"{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"submitted_image_uri":"r.example/\u202ea:1"}"#,
+                None,
+            ),
+            (
+                r#"{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"submitted_image_uri":"r.example/\u0430:1"}"#,
                 None,
             ),
             (

@@ -26,6 +26,7 @@ use crate::controller::settings::Settings;
 use crate::controller::stores::{Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::team;
@@ -105,6 +106,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         memory: Memory::default(),
         archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), noting(&answering)),
         lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
+        images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),

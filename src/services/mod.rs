@@ -9,6 +9,7 @@ pub mod held_text;
 pub mod logs;
 pub mod meter;
 pub mod queue;
+pub mod registry;
 pub mod table;
 pub mod token;
 

@@ -119,6 +119,7 @@ impl Scene {
             "evalai": {"apiServer": evalai.url(), "challenge": 1,
                        "token": {"secretsManager": {"id": token, "endpoint": endpoint}}},
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+            "agent": {"images": []},
             "storage": {"bucket": bucket, "endpoint": endpoint},
             "table": {"name": table, "endpoint": endpoint},
             "queue": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint},

@@ -253,6 +253,7 @@ impl World {
                 "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
             },
             "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": PHASE}],
+            "agent": {"images": []},
             "storage": {"bucket": bucket, "endpoint": endpoint},
             "queue": {"url": self.queue, "deadLetterURL": self.dead, "endpoint": endpoint, "unknownAfterSeconds": 0},
             "concurrency": {"total": SLOTS},

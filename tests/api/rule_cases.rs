@@ -362,9 +362,28 @@ fn pods_and_tables() -> Vec<Case> {
             &json!({"agent": {"logSizeLimit": "1Mi"}}),
             &json!({"agent": {"logSizeLimit": "1M"}}),
         ),
+        case(
+            "agent.imageSizeLimit must be",
+            &json!({"agent": {"imageSizeLimit": "1Ti"}}),
+            &json!({"agent": {"imageSizeLimit": "2Ti"}}),
+        ),
+        case(
+            "team 7 would get the images of team 17",
+            &images("*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}"),
+            &images("r.example/*{team}"),
+        ),
+        case(
+            "team 7 would get the images of team 17",
+            &images("r.example:5000/{team}/x_{team}.agent/*"),
+            &images("r.example/team-{team}0/*"),
+        ),
         case("are set together", &both, &table(&Value::Null)),
         case("are the same key", &both, &table(&json!("team_id"))),
     ]
+}
+
+fn images(pattern: &str) -> Value {
+    json!({"agent": {"images": [pattern]}})
 }
 
 fn submissions() -> Vec<Case> {

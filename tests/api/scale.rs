@@ -454,6 +454,7 @@ async fn make_board(client: &Client, namespace: &str, size: &Size, evalai: &Hand
             "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
         },
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+        "agent": {"images": []},
         "storage": {"bucket": bucket, "endpoint": endpoint},
         "syncPeriodSeconds": size.period_seconds,
         "pairs": 1,

@@ -123,6 +123,7 @@ impl World {
                 "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
                 "leaderboardVersion": "V2",
                 "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                "agent": {"images": []},
                 "pairs": 1, "routes": 1, "retries": {"perPair": 0}, "syncPeriodSeconds": 1,
                 "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
             },

@@ -198,7 +198,7 @@ impl Scene {
             "contents": {"image": self.lab.challenge("contents:1")},
             // The defaults of many Pods at once are more than the disk of a small machine.
             "simulator": {"image": self.lab.challenge("simulator:1"), "resources": disk},
-            "agent": {"resources": disk},
+            "agent": {"resources": disk, "images": []},
             "storage": {
                 "bucket": BUCKET,
                 "prefix": self.cloud.prefix,

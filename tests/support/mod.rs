@@ -2,4 +2,5 @@
 //! serves the whole test program and ends with it, however that ends.
 
 pub mod apiserver;
+pub mod images;
 pub mod ministack;

@@ -8,7 +8,6 @@
     reason = "durations are named by their unit; the derived schema repeats the struct without its attributes"
 )]
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext, Toleration};
@@ -17,8 +16,9 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
+use super::image_pattern::ImagePattern;
 pub use super::leaderboard_services::*;
-use super::route_slice::{NotASlice, RouteSlice};
+pub use super::route_subset::RouteSubset;
 
 /// A version of CARLA Leaderboard: it chooses the format of the checkpoints, the flags of the programs and some defaults.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
@@ -97,39 +97,6 @@ pub struct Track {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(length(max = 32))]
     pub tolerations: Vec<Toleration>,
-}
-
-/// An entry of `routeSubsets`, such as `5-9`.
-#[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq)]
-#[serde(try_from = "String", into = "String")]
-pub struct RouteSubset(pub RouteSlice);
-
-impl TryFrom<String> for RouteSubset {
-    type Error = NotASlice;
-
-    fn try_from(text: String) -> Result<Self, NotASlice> {
-        text.parse().map(Self)
-    }
-}
-
-impl From<RouteSubset> for String {
-    fn from(subset: RouteSubset) -> Self {
-        subset.0.to_string()
-    }
-}
-
-impl JsonSchema for RouteSubset {
-    fn schema_name() -> Cow<'static, str> {
-        "RouteSubset".into()
-    }
-
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "type": "string", "maxLength": 16, "pattern": "^[0-9]{1,5}-[0-9]{1,5}$" })
-    }
 }
 
 /// Deadlines of one track's runs in place of the Leaderboard's.
@@ -211,6 +178,8 @@ pub struct SimulatorContainer {
 #[serde(rename_all = "camelCase")]
 #[x_kube(
     validation = Rule::new("!has(self.logSizeLimit) || (quantity(self.logSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.logSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.logSizeLimit must be 1Mi to 1Ti"),
+    validation = Rule::new("!has(self.imageSizeLimit) || (quantity(self.imageSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.imageSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.imageSizeLimit must be 1Mi to 1Ti"),
+    validation = Rule::new("!has(self.images) || self.images.all(p, !p.matches('[a-z0-9*}][{]team[}]|[{]team[}][a-z0-9*{]'))").message("an entry of agent.images has a letter, a digit or * next to {team}: team 7 would get the images of team 17; put -, _, . or / between"),
     validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too")
 )]
 pub struct AgentContainer {
@@ -233,6 +202,14 @@ pub struct AgentContainer {
     /// Size of `leaderboard.log` at which it is no longer written: `1Mi` to `1Ti`.
     #[serde(default = "defaults::log_size_limit")]
     pub log_size_limit: ByteQuantity,
+    /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Their registries are asked for size and digest before a Job is made. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image, and no registry is asked. The images of contents and simulator are never among them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(max = 32))]
+    #[x_kube(merge_strategy = ListMerge::Atomic)]
+    pub images: Option<Vec<ImagePattern>>,
+    /// Largest sum of an image's layers as the registry stores them, compressed: `1Mi` to `1Ti`. Checked where a registry is asked.
+    #[serde(default = "defaults::image_size_limit")]
+    pub image_size_limit: ByteQuantity,
 }
 
 /// What is forgiven before a submission fails.
@@ -407,6 +384,8 @@ impl Default for AgentContainer {
             resources: None,
             security_context: None,
             log_size_limit: defaults::log_size_limit(),
+            images: None,
+            image_size_limit: defaults::image_size_limit(),
         }
     }
 }
@@ -457,6 +436,9 @@ mod defaults {
 
     pub(super) fn log_size_limit() -> ByteQuantity {
         ByteQuantity::gibibytes(2)
+    }
+    pub(super) fn image_size_limit() -> ByteQuantity {
+        ByteQuantity::gibibytes(60)
     }
     pub(super) fn retries_per_pair() -> i32 {
         3

@@ -8,6 +8,7 @@ pub mod client_errors;
 pub mod conditions;
 pub mod effective;
 pub mod image;
+pub mod image_pattern;
 pub mod ingested;
 mod job_number;
 pub mod leaderboard;
@@ -20,6 +21,7 @@ pub mod ranges;
 pub mod reasons;
 mod retention;
 mod route_slice;
+mod route_subset;
 mod run_id;
 mod state;
 pub mod submission;
@@ -29,6 +31,7 @@ pub mod text;
 mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
+pub use image_pattern::{ImagePattern, Repository};
 pub use ingested::{Ingested, RefusedAttempt};
 pub use job_number::JobNumber;
 pub use leaderboard::{

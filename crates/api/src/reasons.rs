@@ -117,6 +117,9 @@ reasons! {
              resume it. If the Submission has the wrong phase, delete it within the hour and apply it with the right one.",
             after_failure: "Set the phase back in EvalAI, then resume the submission. If the Submission has the wrong phase, \
              delete it and apply it with the right one.";
+        CHECKING_IMAGE = "CheckingImage",
+            "The registry is being asked for the image's digest, size and platform. Shown if that takes 5 s or longer.",
+            "Nothing. Within a minute the submission goes on, or fails for what the registry says.";
         WAITING_FOR_SLOT = "WaitingForSlot",
             "All slots that `concurrency.total` and `concurrency.perTeam` allow are in use. `status.waiting` has the position in the line \
              and an estimate.",
@@ -161,6 +164,10 @@ reasons! {
         ACCEPTED = "Accepted",
             "Leaderboard, track and image are known, and the plan is pinned (condition `Accepted`).",
             "Nothing.";
+        IMAGE_NOT_PINNED = "ImageNotPinned",
+            "As `Accepted`, but the image's registry could not be asked (condition `Accepted`; the message says why). Size, platform \
+             and volumes of the image were not checked, and its Pods pull it by its tag.",
+            "Let the operator reach the registry, and give it credentials, as docs/images.md says.";
         RUNNING = "Running",
             "The agents of the first attempt are running.",
             "Nothing.";
@@ -229,9 +236,25 @@ reasons! {
             log: "the log of the agent of the first pair that was not done, else of the first pair";
         IMAGE_INVALID = "ImageInvalid",
             "The submitted image is not a valid image reference: empty, no text, upper-case letters in the repository, or white \
-             space. The submission fails at once, usually before a Job is created; where only the kubelet refuses the name, with \
-             the first Pod.",
+             space; or what its registry has under that name is not a container image. The submission fails at once, usually before a \
+             Job is created; where only the kubelet refuses the name, with the first Pod.",
             "Submit again with an image such as registry.example/team/agent:1.";
+        IMAGE_NOT_ALLOWED = "ImageNotAllowed",
+            "`agent.images` of the Leaderboard does not allow the submitted image: it is another team's, of another registry, or the \
+             host's own. No Job is created.",
+            "Push the image to the team's own repository, and submit again.";
+        IMAGE_NOT_FOUND = "ImageNotFound",
+            "The registry does not have the submitted image. No Job is created.",
+            "Push the image under the name that is submitted, and submit again.";
+        IMAGE_TOO_LARGE = "ImageTooLarge",
+            "The layers of the submitted image are larger than `agent.imageSizeLimit`, compressed. No Job is created.",
+            "Make the image smaller, and submit again.";
+        IMAGE_PLATFORM = "ImagePlatform",
+            "The registry has the submitted image for other machines only. No Job is created.",
+            "Build the image for linux/amd64, and submit again.";
+        IMAGE_VOLUMES = "ImageVolumes",
+            "The submitted image declares volumes, whose content no limit of the cluster counts. No Job is created.",
+            "Remove VOLUME from the image's Dockerfile or use a base image without it, and submit again.";
         DISK_FULL = "DiskFull",
             "The Pod was evicted because the agent filled its disk.",
             "Write less to disk or to the log.",
@@ -253,6 +276,9 @@ reasons! {
             "No agent started within `deadlines.startSeconds` after the Pod was scheduled.",
             "Fix this, then resume the submission.",
             log: "the log of `contents`, `workspace` or `logcopy`, whichever fails, read from its node before the Job is deleted";
+        IMAGE_DENIED = "ImageDenied",
+            "The registry refuses the image to the operator's credentials. No Job is created, and there is no retry.",
+            "Give the operator's role or pull secret the right to read the repository, then resume the submission.";
         SCHEDULE_DEADLINE = "ScheduleDeadline",
             "No node accepted the Pod within `deadlines.scheduleSeconds`. There is no retry.",
             "Add a node or free one, then resume the submission.";

@@ -62,7 +62,7 @@ pub struct SubmissionSpec {
     pub leaderboard_name: String,
     /// The participant's image; asked from EvalAI when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][^\s]*$"))]
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][!-~]*$"))]
     pub image: Option<String>,
     /// Its identity in EvalAI.
     #[serde(default, skip_serializing_if = "Option::is_none")]

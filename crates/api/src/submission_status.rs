@@ -92,6 +92,9 @@ pub struct SubmissionStatus {
     /// What is run, pinned at acceptance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<RunPlan>,
+    /// What the participant's image was when its registry was asked; absent where none was, or none answered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image: Option<PinnedImage>,
     /// Routes that are done.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
@@ -204,6 +207,15 @@ pub struct RunPlan {
     /// Attempts of an earlier Submission of this run, which is gone: the table's row counts on from them.
     #[serde(default, skip_serializing_if = "is_none")]
     pub earlier_attempts: i64,
+}
+
+/// The participant's image as it is run by every Job of the submission, wherever its tag moves.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct PinnedImage {
+    /// Digest of the manifest for linux/amd64.
+    #[schemars(length(max = 160), regex(pattern = r"^sha(256|384|512):[0-9a-f]+$"))]
+    pub digest: String,
 }
 
 /// What holds a submission up, and since when.

@@ -14,6 +14,7 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::reruns::Reruns;
@@ -30,6 +31,7 @@ pub struct Context {
     pub memory: Memory,
     pub archive: ArchiveWorkers,
     pub lookups: Lookups,
+    pub images: Images,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
@@ -47,6 +49,7 @@ impl Context {
             slots: &self.slots,
             archive: &self.archive,
             lookups: &self.lookups,
+            images: &self.images,
             reruns: &self.reruns,
             external: &self.external,
         }
@@ -61,6 +64,7 @@ impl Context {
             memory: &self.memory,
             slots: &self.slots,
             archive: &self.archive,
+            images: &self.images,
             external: &self.external,
         }
     }
@@ -90,6 +94,7 @@ impl Context {
     pub fn forget(&self, key: &ObjectKey) {
         self.memory.forget(&key.uid);
         self.archive.forget(&key.uid);
+        self.images.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
         self.external.gone(key);
     }

@@ -31,6 +31,7 @@ use super::settings::Settings;
 use super::stores::{Nodes, Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::{node, team};
@@ -311,6 +312,7 @@ impl Parts {
             memory: Memory::default(),
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered()),
             lookups: Lookups::start(client.clone(), tasks, answered()),
+            images: Images::start(aws, client.clone(), tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),

@@ -13,8 +13,9 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 14] = [
+const TASKS: [&str; 15] = [
     "gauges",
+    "images",
     "lease",
     "lookups",
     "nodes",

@@ -12,9 +12,10 @@ use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 
 use super::archive::ArchiveWorkers;
-use super::decide::{Action, Event, Plan};
+use super::decide::{Action, Event, Plan, pinned};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
+use super::images::Images;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::significance::{Change, change, patience};
@@ -27,7 +28,7 @@ use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{JobNumber, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{JobNumber, RunPlan, Submission, SubmissionStatus, conditions, names, reasons};
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
@@ -42,6 +43,7 @@ pub struct Uses<'a> {
     pub memory: &'a Memory,
     pub slots: &'a SlotAllocator,
     pub archive: &'a ArchiveWorkers,
+    pub images: &'a Images,
     pub external: &'a ExternalSystems,
 }
 
@@ -147,6 +149,7 @@ impl Actor<'_> {
         let (uses, submission) = (self.uses, self.submission());
         match action {
             Action::JoinLine(place) => uses.slots.join(submission, place.clone()),
+            Action::LookUpImage(question) => uses.images.want(submission, question.clone()),
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
@@ -232,10 +235,14 @@ impl Actor<'_> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
         };
+        let plan = RunPlan {
+            image: pinned(&plan.image, status.image.as_ref()),
+            ..plan.clone()
+        };
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
-            plan,
+            plan: &plan,
             number,
             settings: self.uses.settings,
             now: self.view.now,

@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Turn,
+    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Turn,
 };
 use leaderboard_api::State;
 
@@ -98,6 +98,7 @@ async fn bench(state: State) -> Bench {
         submission: Arc::new(submission),
         leaderboard: Some(Arc::new(board)),
         is_policy_in_place: true,
+        image: ObservedImage::NotAsked,
         turn: Turn::Go,
         job: ObservedJob::Absent,
         evalai_waited: std::time::Duration::ZERO,

@@ -10,6 +10,7 @@ pub mod baseline;
 pub mod decide;
 pub mod external;
 pub mod failure_log;
+pub mod images;
 pub mod job_spec;
 pub mod memory;
 pub mod observe;

@@ -10,6 +10,7 @@ use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
+use crate::services::registry::{Facts, Fault};
 use leaderboard_api::{JobNumber, Leaderboard, Rerun, Submission};
 
 /// Everything a decision may depend on.
@@ -20,6 +21,8 @@ pub struct View {
     pub leaderboard: Option<Arc<Leaderboard>>,
     /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place.
     pub is_policy_in_place: bool,
+    /// What its registry has told of its image.
+    pub image: ObservedImage,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
@@ -47,6 +50,15 @@ pub struct View {
     pub simulator_failures_of_team: usize,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
+}
+
+/// What a registry has told of the image, in the present attempt.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ObservedImage {
+    NotAsked,
+    /// It was asked this long ago.
+    Asked(Duration),
+    Answered(Arc<Result<Facts, Fault>>),
 }
 
 /// The Job that the present attempt should have.

@@ -188,6 +188,7 @@ impl World {
                 "apiServer": evalai.url(), "challenge": 1, "requestsPerMinute": 6000,
                 "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
             });
+            spec["agent"] = json!({"images": []});
             spec["tracks"] = json!([{"name": "sensors", "codename": "SENSORS", "phase": 1}]);
             spec["table"] = json!({"name": self.make_table().await, "endpoint": self.aws.endpoint});
         }

@@ -8,11 +8,11 @@ use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
-use super::{end, isolation};
+use super::{end, image, isolation};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{ImageReference, LeaderboardSpec, Team, TeamStatus, Track, effective, reasons};
+use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, effective, reasons};
 
 /// How long EvalAI may take before its silence is shown: an answer within it costs no write.
 const SILENCE: Duration = Duration::from_secs(5);
@@ -49,7 +49,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if let Some(what) = foreign_phase(draft, info.as_ref()) {
         return wait_for_phase(draft, &what);
     }
-    let image = match image(draft, info.as_ref()) {
+    let image = match named_image(draft, info.as_ref()) {
         Image::Named(image) => image,
         Image::Unknown => {
             let message = image_unread(draft);
@@ -57,23 +57,49 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
             return refuse(draft, reasons::IMAGE_MISSING, &message);
         }
         Image::Invalid { image, what } => {
-            // The plan makes it a row of the table, as any other failure.
-            pin(draft, leaderboard, track, image, info.as_ref());
             let found = failure::image_invalid(&what);
-            draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
-            end::failed(draft, found);
-            return false;
+            return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
         }
     };
+    if let Some(found) = image::not_allowed(draft, leaderboard, &image) {
+        return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
+    }
     if let Some(message) = not_ready(draft) {
         return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
     }
     if let Some(missing) = isolation::missing(draft) {
         return wait_for_policy(draft, &missing);
     }
+    let note = match image::decide(draft, leaderboard, &image) {
+        image::Step::Go(note) => note,
+        image::Step::Wait => return false,
+        image::Step::Refuse(found) => {
+            return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
+        }
+    };
     pin(draft, leaderboard, track, image, info.as_ref());
-    draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
+    let reason = if note.is_some() {
+        reasons::IMAGE_NOT_PINNED
+    } else {
+        reasons::ACCEPTED
+    };
+    draft.condition(conditions::ACCEPTED, Truth::True, reason, &note.unwrap_or_default());
     true
+}
+
+/// Ends a submission whose image can never run. The plan makes it a row of the table, as any other failure.
+fn refuse_image(
+    draft: &mut PlanBuilder<'_>,
+    leaderboard: &LeaderboardSpec,
+    track: &Track,
+    image: String,
+    info: Option<&EvalaiInfo>,
+    found: Failure,
+) -> bool {
+    pin(draft, leaderboard, track, image, info);
+    draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
+    end::failed(draft, found);
+    false
 }
 
 /// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
@@ -139,7 +165,7 @@ enum Image {
 }
 
 /// The image that was pinned, else the object's, else that of the file in EvalAI.
-fn image(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Image {
+fn named_image(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Image {
     let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
     let named = pinned
         .filter(|image| !image.is_empty())

@@ -12,6 +12,7 @@ mod blame;
 mod crashes;
 mod end;
 mod failure;
+mod image;
 mod isolation;
 mod line;
 mod live;
@@ -31,6 +32,7 @@ use std::time::Duration;
 
 use super::view::View;
 pub use after::previous_controller;
+pub(super) use image::pinned;
 pub use plan::{Action, EvalaiUpdate, Event, Plan, job_name};
 use plan_builder::PlanBuilder;
 

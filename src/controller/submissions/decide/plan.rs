@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
+use crate::controller::submissions::images::Question;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
@@ -29,6 +30,8 @@ pub enum Action {
     ReleaseFinalizer,
     /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
     JoinLine(InLine),
+    /// Ask the image's registry.
+    LookUpImage(Question),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

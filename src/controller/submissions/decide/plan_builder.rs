@@ -166,6 +166,7 @@ impl<'a> PlanBuilder<'a> {
             team: old.team,
             track: old.track,
             plan: old.plan.map(|plan| leaderboard_api::RunPlan { resume: true, ..plan }),
+            image: old.image,
             progress: old.progress,
             score: old.score.map(Score::so_far),
             results_url: old.results_url,

@@ -228,7 +228,20 @@ fn too_late(found: &Trouble, seconds: i64) -> Failure {
     let what = format!("{} It was tried for {seconds} s.", found.message);
     if found.is_participants {
         let next = for_both("Push the image again and check that it runs on linux/amd64.");
-        participant(reason, &what, &next)
+        let failure = participant(reason, &what, &next);
+        Failure {
+            // A registry's own words, or the network's, would tell a participant what the nodes can reach.
+            participant_message: if reason == reasons::IMAGE_PULL {
+                Some(format!(
+                    "{} {}",
+                    trouble::pull_for_participants(&found.message),
+                    next.participant
+                ))
+            } else {
+                failure.participant_message
+            },
+            ..failure
+        }
     } else {
         infrastructure(reason, &what)
     }

@@ -155,6 +155,19 @@ fn pull_error(words: &str) -> &str {
     words.split_once("ErrImagePull: ").map_or(words, |(_, cause)| cause)
 }
 
+/// All that a participant reads of an image that cannot be pulled.
+pub(super) fn pull_for_participants(words: &str) -> &'static str {
+    let has = |signs: &[&str]| signs.iter().any(|sign| words.contains(sign));
+    match () {
+        () if has(&["no match for platform"]) => "The submitted image is not for linux/amd64.",
+        () if has(&["manifest unknown", "not found"]) => "The submitted image is not in its registry.",
+        () if has(&["401 Unauthorized", "403 Forbidden", "denied", "authorization failed"]) => {
+            "The registry does not let the challenge pull the submitted image."
+        }
+        () => "The submitted image cannot be pulled.",
+    }
+}
+
 /// Whether the registry, or the way to it, is the cause rather than the image.
 fn is_registrys(words: &str) -> bool {
     const SIGNS: [&str; 13] = [

@@ -15,6 +15,7 @@ use kube::runtime::reflector::ObjectRef;
 use super::archive::ArchiveWorkers;
 use super::decide::job_name;
 use super::external::ExternalSystems;
+use super::images::Images;
 use super::memory::Memory;
 use super::reruns::Reruns;
 use super::view::{ObservedJob, ObservedNode, PodView, View};
@@ -36,6 +37,7 @@ pub struct Uses<'a> {
     pub slots: &'a SlotAllocator,
     pub archive: &'a ArchiveWorkers,
     pub lookups: &'a Lookups,
+    pub images: &'a Images,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
@@ -56,6 +58,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     View {
         now,
         is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
+        image: uses.images.observe(&submission),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node(uses, &submission, pod.as_ref()),
         report: archive.report.report,

@@ -8,6 +8,7 @@ mod crashes;
 mod end;
 mod failure;
 mod finalizer;
+mod image;
 mod isolation;
 mod line;
 mod log;

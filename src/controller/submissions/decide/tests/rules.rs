@@ -177,9 +177,9 @@ fn tells_fit(view: &View, plan: &Plan) {
 
 fn status_is_whole(plan: &Plan) {
     let status = &plan.status;
-    let waits = |action: &Action| matches!(action, Action::JoinLine(_) | Action::AskEvalai);
+    let waits = |action: &Action| matches!(action, Action::JoinLine(_) | Action::AskEvalai | Action::LookUpImage(_));
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
-        // Nothing was written of it yet, and its place or EvalAI's answer comes first.
+        // Nothing was written of it yet, and its place, EvalAI's answer or the registry's comes first.
         return;
     }
     let state = status.state.expect("a state");

@@ -1,0 +1,176 @@
+//! Where a look-up may connect to. Participants choose the name of an image, and a registry chooses where a redirect leads: without
+//! this the operator would connect for them to whatever its own network can reach.
+//!
+//! A name is resolved once, and the connection goes to the address that was checked.
+
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+
+use reqwest::Url;
+use reqwest::dns::{Addrs, Name, Resolve, Resolving};
+
+/// How far a request may go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Reach {
+    /// To a registry that the host's patterns name: also one in the host's own network.
+    Registry,
+    /// To where a registry points: public addresses alone.
+    Public,
+}
+
+/// Addresses that answer for a machine of a cloud, and are not link-local.
+const OF_CLOUDS: [IpAddr; 3] = [
+    IpAddr::V4(Ipv4Addr::new(168, 63, 129, 16)),
+    IpAddr::V4(Ipv4Addr::new(100, 100, 100, 200)),
+    IpAddr::V6(Ipv6Addr::new(0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254)),
+];
+
+impl Reach {
+    /// Whether it may go to this address.
+    pub(super) fn allows(self, address: IpAddr) -> bool {
+        let address = embedded(address);
+        let is_machines = address.is_loopback() || address.is_unspecified() || address.is_multicast();
+        if is_machines || is_link_local(address) || OF_CLOUDS.contains(&address) {
+            return false;
+        }
+        self == Self::Registry || is_public(address)
+    }
+}
+
+/// The host of an address as an IP, where it is one.
+pub(super) fn ip(url: &Url) -> Option<IpAddr> {
+    let host = url.host_str()?;
+    host.trim_matches(['[', ']']).parse().ok()
+}
+
+/// The IPv4 address that an IPv6 address stands for.
+fn embedded(address: IpAddr) -> IpAddr {
+    let IpAddr::V6(v6) = address else { return address };
+    let last = |high: u16, low: u16| {
+        let ([a, b], [c, d]) = (high.to_be_bytes(), low.to_be_bytes());
+        IpAddr::V4(Ipv4Addr::new(a, b, c, d))
+    };
+    match v6.segments() {
+        // `::ffff:0:0/96`, NAT64 and 6to4.
+        [0, 0, 0, 0, 0, 0xffff, high, low] | [0x64, 0xff9b, 0, 0, 0, 0, high, low] | [0x2002, high, low, ..] => {
+            last(high, low)
+        }
+        // The old form `::a.b.c.d`, whose first two addresses are others.
+        [0, 0, 0, 0, 0, 0, high, low] if high != 0 => last(high, low),
+        _ => address,
+    }
+}
+
+fn is_link_local(address: IpAddr) -> bool {
+    match address {
+        IpAddr::V4(v4) => v4.is_link_local(),
+        IpAddr::V6(v6) => v6.segments()[0] & 0xffc0 == 0xfe80,
+    }
+}
+
+fn is_public(address: IpAddr) -> bool {
+    match address {
+        IpAddr::V4(v4) => {
+            let [a, b, c, _] = v4.octets();
+            let is_shared = a == 100 && (64..128).contains(&b);
+            let is_of_protocols = (a, b, c) == (192, 0, 0);
+            let is_of_benchmarks = a == 198 && (18..20).contains(&b);
+            !(v4.is_private() || v4.is_documentation() || v4.is_broadcast() || a == 0 || a >= 240)
+                && !(is_shared || is_of_protocols || is_of_benchmarks)
+        }
+        // Global unicast, without the part for documentation and Teredo.
+        IpAddr::V6(v6) => {
+            let [first, second, ..] = v6.segments();
+            first & 0xe000 == 0x2000 && !(first == 0x2001 && (second == 0xdb8 || second == 0))
+        }
+    }
+}
+
+/// A resolver that knows no address out of reach.
+pub(super) struct Resolver(pub(super) Reach);
+
+impl Resolve for Resolver {
+    fn resolve(&self, name: Name) -> Resolving {
+        let reach = self.0;
+        Box::pin(async move {
+            let found = tokio::net::lookup_host((name.as_str(), 0)).await?;
+            let allowed: Vec<SocketAddr> = found.filter(|found| reach.allows(found.ip())).collect();
+            if allowed.is_empty() {
+                return Err(OutOfReach.into());
+            }
+            let addresses: Addrs = Box::new(allowed.into_iter());
+            Ok(addresses)
+        })
+    }
+}
+
+#[derive(thiserror::Error, Debug)]
+#[error("its address is one that no look-up may go to")]
+struct OutOfReach;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_redirect_goes_to_public_addresses_and_a_registry_may_be_the_hosts_own() {
+        for (address, of_registry, is_public) in [
+            ("52.216.1.1", true, true),
+            ("2600:1f00::1", true, true),
+            ("10.0.0.5", true, false),
+            ("172.16.0.1", true, false),
+            ("192.168.1.1", true, false),
+            ("100.64.0.1", true, false),
+            ("198.18.0.1", true, false),
+            ("192.0.0.8", true, false),
+            ("240.0.0.1", true, false),
+            ("255.255.255.255", true, false),
+            ("0.1.2.3", true, false),
+            ("fd12::1", true, false),
+            ("2001:db8::1", true, false),
+            ("64:ff9b::10.0.0.5", true, false),
+            ("::ffff:10.0.0.5", true, false),
+            ("2002:a00:5::", true, false),
+            ("127.0.0.1", false, false),
+            ("::1", false, false),
+            ("::ffff:127.0.0.1", false, false),
+            ("::127.0.0.1", false, false),
+            ("0.0.0.0", false, false),
+            ("::", false, false),
+            ("169.254.169.254", false, false),
+            ("::ffff:169.254.169.254", false, false),
+            ("64:ff9b::169.254.169.254", false, false),
+            ("2002:a9fe:a9fe::", false, false),
+            ("fe80::1", false, false),
+            ("fd00:ec2::254", false, false),
+            ("168.63.129.16", false, false),
+            ("100.100.100.200", false, false),
+            ("224.0.0.1", false, false),
+            ("ff02::1", false, false),
+        ] {
+            let ip: IpAddr = address.parse().unwrap();
+            assert_eq!(Reach::Registry.allows(ip), of_registry, "{address}");
+            assert_eq!(Reach::Public.allows(ip), is_public, "{address}");
+        }
+    }
+
+    #[test]
+    fn an_address_is_known_in_every_spelling() {
+        for (text, wanted) in [
+            ("https://127.1/", Some("127.0.0.1")),
+            ("https://0x7f.0.0.1/", Some("127.0.0.1")),
+            ("https://2130706433/", Some("127.0.0.1")),
+            ("https://[::1]:5000/", Some("::1")),
+            ("https://r.example/", None),
+        ] {
+            let url = Url::parse(text).unwrap();
+            assert_eq!(ip(&url), wanted.map(|ip| ip.parse().unwrap()), "{text}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_name_of_this_machine_resolves_to_nothing() {
+        let name: Name = "localhost".parse().unwrap();
+        let error = Resolver(Reach::Registry).resolve(name).await.err().unwrap();
+        assert!(error.to_string().contains("no look-up may go to"), "{error}");
+    }
+}
