@@ -7,6 +7,7 @@ pub mod evalai;
 pub mod fault;
 pub mod logs;
 pub mod meter;
+pub mod public;
 pub mod queue;
 pub mod table;
 pub mod token;

@@ -10,6 +10,7 @@ pub mod effective;
 pub mod image;
 pub mod ingested;
 pub mod leaderboard;
+pub mod leaderboard_network;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
 pub mod names;

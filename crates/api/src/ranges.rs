@@ -112,6 +112,14 @@ impl Range {
         Self::new(address.parse().ok()?, bits.parse().ok()?)
     }
 
+    /// Reads an address or a range.
+    pub fn of(text: &str) -> Option<Self> {
+        match text.parse() {
+            Ok(address) => Self::alone(address),
+            Err(_) => Self::parse(text),
+        }
+    }
+
     /// The range of `bits` bits around an address.
     pub fn new(address: IpAddr, bits: u8) -> Option<Self> {
         let (v6, number, width) = match address {

@@ -7,8 +7,10 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
 use super::isolation;
+use super::notes;
 use super::probe::EvalaiStanding;
 use super::reach::Unreachable;
+use super::refusal::Refusal;
 use super::state::Policy;
 use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
@@ -35,6 +37,8 @@ pub struct LeaderboardView {
     pub policy: Policy,
     /// What the last of its Pods has found of its isolation.
     pub measured: Option<WorkspaceVerdict>,
+    /// What it names and may not; nothing of it is asked or read then.
+    pub refusal: Option<Refusal>,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
     /// What of its bucket, table and queues cannot be reached.
@@ -136,7 +140,7 @@ fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
 }
 
 /// A Leaderboard that is ready shows what its host should know all the same: that a new controller waits with its first write to
-/// EvalAI, and which runs have no limit.
+/// EvalAI, which runs have no limit, and what its Pods may do that a stranger's should not.
 fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
     let (truth, reason, message) = ready;
     if truth != Truth::True {
@@ -145,7 +149,8 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
     let spec = &view.leaderboard.spec;
     let delay = view.evalai_writes_from.filter(|_| spec.evalai.is_some());
     let notes = [delay.map(previous_controller), without_limit(&view.leaderboard)];
-    let texts = [Some(message)].into_iter().chain(notes).flatten();
+    let weaknesses = notes::weaknesses(spec).into_iter().map(Some);
+    let texts = [Some(message)].into_iter().chain(notes).chain(weaknesses).flatten();
     let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
     (truth, reason, texts.join(" "))
 }
@@ -153,6 +158,9 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
 /// What is wrong with the Leaderboard as it is written.
 fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     let no = |reason, message: String| Some((Truth::False, reason, message));
+    if let Some(refusal) = &view.refusal {
+        return no(refusal.reason, refusal.message.clone());
+    }
     if let Some(older) = phase_conflict(view) {
         return no(
             reasons::PHASE_CONFLICT,
