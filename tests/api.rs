@@ -10,6 +10,7 @@
 mod support;
 
 mod api {
+    mod allowed;
     mod boards;
     mod bridge;
     mod columns;
@@ -30,6 +31,7 @@ mod api {
     mod pod_security;
     mod queue;
     mod retention;
+    mod rights;
     mod rule_cases;
     mod rules;
     mod scale;

@@ -21,9 +21,16 @@ REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
     (('image.repository="registry.example/operator@sha256:0"',), "repository"),
     (('image.digest="0123"',), "digest"),
     (('image.pullPolicy="always"',), "pullPolicy"),
-    (('watchNamespace="My_Namespace"',), "watchNamespace"),
+    (('allNamespaces="yes"',), "boolean"),
+    (("rbac.clusterRoles=true",), "clusterRoles"),
     (('leaderboards=["leaderboard"]',), "leaderboards"),
-    (('leaderboards=[{"namespace":"leaderboard"}]',), "secrets"),
+    (('leaderboards=[{"secrets":["evalai"]}]',), "namespace"),
+    (('leaderboards=[{"namespace":"My_Namespace"}]',), "namespace"),
+    (('leaderboards=[{"namespace":"leaderboard","queue":["submissions"]}]',), "queue"),
+    (('leaderboards=[{"namespace":"leaderboard","queues":["two words"]}]',), "queues"),
+    (('leaderboards=[{"namespace":"leaderboard"},{"namespace":"leaderboard","queues":["a"]}]',), "there twice"),
+    (('leaderboards=[{"namespace":"*","queues":["a"]}]',), "needs allNamespaces"),
+    (("allNamespaces=true", 'leaderboards=[{"namespace":"*","secrets":["evalai"]}]'), "list the namespace"),
     (('leaderboards=[{"namespace":"leaderboard","secrets":["evalai","evalai"]}]',), "equal"),
     (('aws.endpointUrl="localhost:4566"',), "endpointUrl"),
     (('aws.accessKeyId="AKIA"',), "accessKeyId"),
@@ -66,15 +73,16 @@ NOTES: tuple[tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]], ...] = (
     (
         {},
         (
-            "all namespaces",
+            f"the namespace {SYSTEM}.",
+            "Leaderboards elsewhere are left alone",
             f"deployment/{BRIDGE}",
-            "-n NAMESPACE get leaderboards",
+            f"-n {SYSTEM} get leaderboards",
             "may read no Secret",
             "--set 'leaderboards[0].secrets={evalai}'",
             "controller.roleArn and bridge.roleArn",
             "image.repository",
         ),
-        (),
+        ("all namespaces",),
     ),
     (
         {
@@ -82,10 +90,11 @@ NOTES: tuple[tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]], ...] = (
             "leaderboards": [{"namespace": "boards", "secrets": ["evalai"]}],
             "aws.secretName": "aws",
         },
-        ("-n boards get leaderboards",),
-        ("NAMESPACE", "may read no Secret", "roleArn", "image.repository"),
+        ("the namespace boards.", "-n boards get leaderboards"),
+        ("NAMESPACE", "left alone", "may read no Secret", "roleArn", "image.repository"),
     ),
-    ({"watchNamespace": "boards"}, ("the namespace boards", "-n boards get leaderboards"), ("-n NAMESPACE",)),
+    ({"leaderboards": [{"namespace": "b"}, {"namespace": "a"}]}, ("the namespaces a, b.", "-n a get leaderboards"), ()),
+    ({"allNamespaces": True}, ("all namespaces", "-n NAMESPACE get leaderboards"), ("left alone",)),
     ({"controller.roleArn": "arn:aws:iam::123456789012:role/one"}, ("bridge.roleArn",), ("controller.roleArn",)),
     ({"bridge.enabled": False}, ("controller.roleArn",), (f"deployment/{BRIDGE}", "bridge.roleArn")),
 )
@@ -117,26 +126,57 @@ OWN = "leaderboard.carla.org"
 def work(controller: str, namespace: str) -> list[Access]:
     """What the controller can't work without, in one namespace."""
     return [
-        *may(controller, "get list watch patch", f"{OWN}/leaderboards", namespace),
+        *may(controller, "list watch patch", f"{OWN}/leaderboards", namespace),
         *may(controller, "get list watch create patch delete", f"{OWN}/submissions", namespace),
         *may(controller, "patch", f"{OWN}/submissions:status", namespace),
         *may(controller, "patch", f"{OWN}/leaderboards:status", namespace),
         *may(controller, "update", f"{OWN}/submissions:finalizers", namespace),
-        *may(controller, "get list watch create delete", "batch/jobs", namespace),
-        *may(controller, "get list watch patch delete", "pods", namespace),
+        *may(controller, "list watch create delete", "batch/jobs", namespace),
+        *may(controller, "list watch patch delete", "pods", namespace),
         *may(controller, "get", "pods:log", namespace),
-        *may(controller, "get list", "events", namespace),
+        *may(controller, "list", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
-        *may(controller, "get list watch create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may(controller, "list watch create patch", "networking.k8s.io/networkpolicies", namespace),
         *may(controller, "get", "coordination.k8s.io/leases", namespace, "another"),
         *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
+    ]
+
+
+def outside(controller: str, bridge: str, namespace: str) -> list[Access]:
+    """What neither may do in a namespace that is not served."""
+    return [
+        *may_not(controller, "get list watch create patch delete", f"{OWN}/submissions", namespace),
+        *may_not(controller, "get list watch patch", f"{OWN}/leaderboards", namespace),
+        *may_not(controller, "get list watch create delete", "batch/jobs", namespace),
+        *may_not(controller, "get list watch patch delete", "pods", namespace),
+        *may_not(controller, "get", "pods:log", namespace),
+        *may_not(controller, "get", "secrets", namespace, "evalai"),
+        *may_not(controller, "create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may_not(bridge, "get list watch", f"{OWN}/leaderboards", namespace),
+        *may_not(bridge, "get create patch", f"{OWN}/submissions", namespace),
+    ]
+
+
+def people(namespace: str) -> list[Access]:
+    """What the cluster's own roles give: `charttest` binds each to a group of its name."""
+    return [
+        *may("view", "get list watch", f"{OWN}/leaderboards", namespace),
+        *may("view", "get list watch", f"{OWN}/submissions", namespace),
+        *may_not("view", "create patch delete", f"{OWN}/submissions", namespace),
+        *may("edit", "get create patch delete", f"{OWN}/submissions", namespace),
+        *may("edit", "get list watch", f"{OWN}/leaderboards", namespace),
+        *may_not("edit", "create update patch delete", f"{OWN}/leaderboards", namespace),
+        *may_not("admin", "create update patch delete", f"{OWN}/leaderboards", namespace),
+        *may_not("edit", "patch", f"{OWN}/submissions:status", namespace),
+        *may("host", "get create update patch delete", f"{OWN}/leaderboards", namespace),
+        *may_not("host", "patch", f"{OWN}/leaderboards:status", namespace),
     ]
 
 
 def intake(bridge: str, namespace: str) -> list[Access]:
     """What the bridge can't work without, in one namespace."""
     return [
-        *may(bridge, "get list watch", f"{OWN}/leaderboards", namespace),
+        *may(bridge, "list watch", f"{OWN}/leaderboards", namespace),
         *may(bridge, "get create patch", f"{OWN}/submissions", namespace),
         *may(bridge, "create patch", "events.k8s.io/events", namespace),
     ]
@@ -179,6 +219,25 @@ def lease(controller: str) -> list[Access]:
     ]
 
 
+# Of the ClusterRole, unless rbac.clusterRole is false.
+WHOLE = (
+    *may(CONTROLLER, "get list watch", "nodes", ""),
+    *may(CONTROLLER, "get", "coordination.k8s.io/leases", "other", "another"),
+    *may_not(CONTROLLER, "list watch", "coordination.k8s.io/leases", ""),
+    *may_not(CONTROLLER, "list", "pods", ""),
+)
+# One leaderboard's namespace, with the values' defaults.
+DEFAULT = (
+    *work(CONTROLLER, "leaderboard"),
+    *intake(BRIDGE, "leaderboard"),
+    *outside(CONTROLLER, BRIDGE, "other"),
+    *outside(CONTROLLER, BRIDGE, SYSTEM),
+    *never(CONTROLLER, BRIDGE),
+    *lease(CONTROLLER),
+    *WHOLE,
+    *may(CONTROLLER, "get", "secrets", name="evalai"),
+)
+# ci/all-namespaces.yaml.
 CLUSTER_WIDE = (
     *work(CONTROLLER, "leaderboard"),
     *work(CONTROLLER, "other"),
@@ -192,6 +251,10 @@ CLUSTER_WIDE = (
 # ci/roles.yaml: another account, secrets in two namespaces.
 WITH_ROLES = (
     *work("controller", "carla-10"),
+    *work("controller", "carla-20"),
+    *intake(BRIDGE, "carla-10"),
+    *intake(BRIDGE, "carla-20"),
+    *outside("controller", BRIDGE, "leaderboard"),
     *lease("controller"),
     *never("controller", BRIDGE),
     *may("controller", "get", "secrets", "carla-10", "evalai"),
@@ -207,10 +270,8 @@ NAMESPACED = (
     *never(CONTROLLER, BRIDGE),
     *lease(CONTROLLER),
     *may(CONTROLLER, "get", "secrets", name="evalai"),
-    *may_not(CONTROLLER, "get list create patch", f"{OWN}/submissions", "other"),
-    *may_not(CONTROLLER, "get list create", "batch/jobs", "other"),
+    *outside(CONTROLLER, BRIDGE, "other"),
     *may_not(CONTROLLER, "list", "pods", ""),
-    *may_not(CONTROLLER, "get", "pods:log", "other"),
     *may_not(CONTROLLER, "get list watch", "nodes", ""),
-    *may_not(BRIDGE, "get list", f"{OWN}/leaderboards", "other"),
+    *may_not(CONTROLLER, "get", "coordination.k8s.io/leases", "other", "another"),
 )

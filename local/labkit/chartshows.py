@@ -123,7 +123,7 @@ def of_program(component: str, deployment: str) -> list[Case]:
             },
             ("ServiceAccount/own", "metadata.annotations", {"eks.amazonaws.com/role-arn": ROLE, "team": "one"}),
             (deployment, f"{POD}.serviceAccountName", "own"),
-            (f"ClusterRoleBinding/{name}", "subjects.0.name", "own"),
+            (f"RoleBinding/{name}", "subjects.0.name", "own"),
         ),
         case(
             {f"{component}.resources": {"requests": {"cpu": "1"}, "limits": {"memory": "1Gi"}}},
@@ -187,7 +187,7 @@ NAMES = [
         (CONTROLLER, "spec.template.metadata.labels", {"team": "one"}),
         (CONTROLLER, "spec.selector.matchLabels.team", ABSENT),
         (f"Role/{RELEASE}-lease", "metadata.labels", {"team": "one"}),
-        (f"ClusterRole/{RELEASE}-bridge", "metadata.labels", {"team": "one"}),
+        (f"Role/{RELEASE}-bridge", "metadata.labels", {"team": "one"}),
         (f"Service/{RELEASE}-bridge", "metadata.labels", {"team": "one"}),
         (f"Service/{RELEASE}-bridge", "spec.selector.team", ABSENT),
         (CRD, "metadata.labels", ABSENT),
@@ -197,7 +197,7 @@ NAMES = [
         (CONTROLLER, "metadata.annotations", {"team": "one"}),
         (CONTROLLER, "spec.template.metadata.annotations.team", ABSENT),
         (f"Role/{RELEASE}-secrets", "metadata.annotations", {"team": "one"}),
-        (f"ClusterRoleBinding/{RELEASE}-bridge", "metadata.annotations", {"team": "one"}),
+        (f"RoleBinding/{RELEASE}-bridge", "metadata.annotations", {"team": "one"}),
         (f"ServiceAccount/{RELEASE}-bridge", "metadata.annotations", {"team": "one"}),
     ),
     # What is the object's own goes before what is common to all.
@@ -252,15 +252,52 @@ IMAGE = [
 
 PROGRAMS = [
     case(
-        {"watchNamespace": "boards"},
-        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_NAMESPACE", "boards")]),
-        (f"Role/{RELEASE}-controller", "metadata.namespace", "boards"),
-        (f"RoleBinding/{RELEASE}-bridge", "roleRef.kind", "Role"),
-        (f"ClusterRole/{RELEASE}-controller", "", ABSENT),
-        (f"ClusterRole/{RELEASE}-view", "", ABSENT),
+        {"allNamespaces": True, "leaderboards": [{"namespace": "*", "queues": ["shared-*"]}]},
+        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_NAMESPACES", "")]),
+        (
+            BRIDGE,
+            f"{CONTAINER}.env",
+            [env("LEADERBOARD_ALLOWED", '{"*":{"queues":["shared-*"],"secretsManager":[]}}')],
+        ),
+        (f"ClusterRoleBinding/{RELEASE}-bridge", "roleRef.kind", "ClusterRole"),
+        (f"Role/{RELEASE}-controller", "", ABSENT),
     ),
     case(
-        {"leaderboards": [{"namespace": "boards", "secrets": ["evalai"]}]},
+        {},
+        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_NAMESPACES", SYSTEM), env("LEADERBOARD_ALLOWED", "{}")]),
+        (f"Role/{RELEASE}-controller", "metadata.namespace", SYSTEM),
+        (f"ClusterRole/{RELEASE}-controller", "", ABSENT),
+    ),
+    case({"rbac.clusterRole": True}, (f"ClusterRole/{RELEASE}-cluster", "rules.0.resources", ["nodes"])),
+    case(
+        {"rbac.clusterRole": False},
+        (f"ClusterRole/{RELEASE}-cluster", "", ABSENT),
+        (f"ClusterRoleBinding/{RELEASE}-cluster", "", ABSENT),
+        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CLUSTER_RIGHTS", "false")]),
+    ),
+    case(
+        {
+            "leaderboards": [
+                {
+                    "namespace": "boards",
+                    "secrets": ["evalai"],
+                    "secretsManager": ["evalai/*"],
+                    "queues": ["submissions*"],
+                }
+            ]
+        },
+        (
+            CONTROLLER,
+            f"{CONTAINER}.env",
+            [
+                env("LEADERBOARD_NAMESPACES", "boards"),
+                env("LEADERBOARD_CLUSTER_RIGHTS", "true"),
+                env("LEADERBOARD_ALLOWED", '{"boards":{"queues":["submissions*"],"secretsManager":["evalai/*"]}}'),
+            ],
+        ),
+        (f"Role/{RELEASE}-controller", "metadata.namespace", "boards"),
+        (f"RoleBinding/{RELEASE}-bridge", "roleRef.kind", "Role"),
+        (f"RoleBinding/{RELEASE}-bridge", "metadata.namespace", "boards"),
         (f"Role/{RELEASE}-secrets", "metadata.namespace", "boards"),
         (f"Role/{RELEASE}-secrets", "rules.0.resourceNames", ["evalai"]),
         (f"RoleBinding/{RELEASE}-secrets", "subjects.0.namespace", SYSTEM),
@@ -285,7 +322,7 @@ PROGRAMS = [
         {"bridge.enabled": False},
         (BRIDGE, "", ABSENT),
         (f"ServiceAccount/{RELEASE}-bridge", "", ABSENT),
-        (f"ClusterRole/{RELEASE}-bridge", "", ABSENT),
+        (f"Role/{RELEASE}-bridge", "", ABSENT),
         (f"Service/{RELEASE}-bridge", "", ABSENT),
     ),
     case(

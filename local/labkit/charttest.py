@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,8 @@ def run(settings: Settings, update: bool) -> None:
         check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart))
         check("server-side dry run", lambda: dry_run(kube, chart))
         check("one file without Helm", lambda: chartrender.applied(kube, chart))
-        check("install, rights cluster-wide", lambda: installed(kube, chart))
+        check("install, rights in one leaderboard's namespace", lambda: installed(kube, chart))
+        check("rights of people", lambda: people(kube))
         check("examples of Chart.yaml", lambda: examples(kube, chart))
         check("the demo's manifests", lambda: demo_manifests(kube, settings.repository / "examples" / "demo"))
         before = identities(kube)
@@ -58,7 +59,8 @@ def run(settings: Settings, update: bool) -> None:
         check("roll back", lambda: rolled_back(kube))
         check("uninstall keeps the definitions", lambda: uninstalled(kube))
         check("install again, and nothing is lost", lambda: installed_again(kube, chart, before))
-        check("install, rights in one namespace", lambda: namespaced(kube, chart))
+        check("install, rights in all namespaces", lambda: all_namespaces(kube, chart))
+        check("install, and no right of the cluster", lambda: namespaced(kube, chart))
 
 
 def check(what: str, work: Callable[[], str]) -> None:
@@ -194,7 +196,45 @@ def helm(kube: Kube, chart: Path, *more: str) -> None:
 
 def installed(kube: Kube, chart: Path) -> str:
     helm(kube, chart, '--set-json=leaderboards=[{"namespace":"leaderboard","secrets":["evalai"]}]')
-    return rights(kube, chartcases.CLUSTER_WIDE)
+    return rights(kube, chartcases.DEFAULT)
+
+
+def people(kube: Kube) -> str:
+    """Binds the cluster's own roles, and the chart's for hosts. No controller manager runs here that aggregates: it is done by hand."""
+    roles = kube.json("kubectl", "get", "clusterroles")["items"]
+    lists = [aggregated("view", "view", roles), aggregated("edit", "view edit", roles)]
+    lists += [aggregated("admin", "view edit admin", roles)]
+    bindings = [bound("view", "view"), bound("edit", "edit"), bound("admin", "admin"), bound("host", f"{RELEASE}-host")]
+    made = {"apiVersion": "v1", "kind": "List", "items": [*lists, *bindings]}
+    kube.run("kubectl", "apply", "--server-side", "--force-conflicts", "--filename=-", given=json.dumps(made))
+    return rights(kube, tuple(chartcases.people("leaderboard")))
+
+
+def aggregated(name: str, labels: str, roles: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A role with all rules that the labels add to it, as the controller manager would make it."""
+    marks = {f"rbac.authorization.k8s.io/aggregate-to-{label}" for label in labels.split()}
+    parts = [role for role in roles if marks & (role["metadata"].get("labels") or {}).keys()]
+    rules = [rule for role in parts for rule in role.get("rules") or []]
+    return {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "ClusterRole",
+        "metadata": {"name": f"test-{name}"},
+        "rules": rules,
+    }
+
+
+def bound(account: str, role: str) -> dict[str, Any]:
+    return {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "RoleBinding",
+        "metadata": {"name": f"test-{account}", "namespace": "leaderboard"},
+        "roleRef": {
+            "apiGroup": "rbac.authorization.k8s.io",
+            "kind": "ClusterRole",
+            "name": role if role.startswith(RELEASE) else f"test-{role}",
+        },
+        "subjects": [{"kind": "ServiceAccount", "name": account, "namespace": SYSTEM}],
+    }
 
 
 def examples(kube: Kube, chart: Path) -> str:
@@ -236,7 +276,7 @@ def upgraded(kube: Kube, chart: Path) -> str:
 def rolled_back(kube: Kube) -> str:
     """To the first installation, with its rights."""
     kube.run("helm", "rollback", RELEASE, "1", f"--namespace={SYSTEM}")
-    return rights(kube, chartcases.CLUSTER_WIDE)
+    return rights(kube, chartcases.DEFAULT)
 
 
 def identities(kube: Kube) -> dict[str, str]:
@@ -263,6 +303,13 @@ def uninstalled(kube: Kube) -> str:
     if left["items"]:
         raise LabError(f"{len(left['items'])} cluster roles or bindings are left behind")
     return "and nothing else"
+
+
+def all_namespaces(kube: Kube, chart: Path) -> str:
+    helm(kube, chart, f"--values={chart / 'ci' / 'all-namespaces.yaml'}")
+    summary = rights(kube, chartcases.CLUSTER_WIDE)
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
+    return summary
 
 
 def namespaced(kube: Kube, chart: Path) -> str:

@@ -10,14 +10,17 @@ PAUSE_REFERENCE = f"docker.io/{PAUSE_IMAGE}"
 
 
 def audit_policy() -> str:
-    """Every write at Metadata level once it is answered, and no read: so that API writes can be counted."""
+    """Every write at Metadata level once it is answered, so that writes can be counted; of reads those of the admin alone, as whom the
+    operator's programs run in tests, so that each right that they use is known (`rights`)."""
+    reads = ["get", "list", "watch"]
     return as_yaml(
         {
             "apiVersion": "audit.k8s.io/v1",
             "kind": "Policy",
             "omitStages": ["RequestReceived"],
             "rules": [
-                {"level": "None", "verbs": ["get", "list", "watch"]},
+                {"level": "Metadata", "verbs": reads, "users": ["admin"], "omitStages": ["ResponseStarted"]},
+                {"level": "None", "verbs": reads},
                 {"level": "Metadata"},
             ],
         }

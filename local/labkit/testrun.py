@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from . import build, charttest, cluster, demo, kube, pythonenv, tools
+from . import build, charttest, cluster, demo, kube, pythonenv, rights, tools
 from .console import say, seconds
 from .errors import LabError
 from .failures import Failure, Reader, Summary, failed_cases
@@ -173,6 +173,7 @@ def in_cluster(plan: Plan) -> None:
     }
     lines = plan.settings.logs / "matrix.tsv"
     lines.unlink(missing_ok=True)
+    began = rights.now()
     try:
         run_cluster_tests(plan, {**env, "LEADERBOARD_MATRIX": str(lines)})
     finally:
@@ -180,6 +181,9 @@ def in_cluster(plan: Plan) -> None:
             text = lines.read_text()
             plan.summary.cases += failed_cases(text)
             print(matrix(text), flush=True)
+    # Of a part of the tests it would say that the rest is not used.
+    if not plan.filter:
+        say(rights.check(kube.of_lab(plan.settings, folder), plan.settings.repository, plan.settings.audit_log, began))
 
 
 def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:

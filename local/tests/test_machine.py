@@ -144,9 +144,11 @@ class Configuration(unittest.TestCase):
         self.assertEqual(set(served) & {"lambda", "ecs", "ec2", "codebuild", "states", "batch"}, set())
         self.assertLessEqual({"sqs", "s3", "dynamodb", "secretsmanager", "logs", "ecr", "sts"}, set(served))
 
-    def test_reads_are_not_audited(self) -> None:
+    def test_only_the_admins_reads_are_audited(self) -> None:
         rules = json.loads(files.audit_policy())["rules"]
-        self.assertEqual(rules[0], {"level": "None", "verbs": ["get", "list", "watch"]})
+        reads = ["get", "list", "watch"]
+        of_admin = {"level": "Metadata", "verbs": reads, "users": ["admin"], "omitStages": ["ResponseStarted"]}
+        self.assertEqual(rules[:2], [of_admin, {"level": "None", "verbs": reads}])
         self.assertEqual(rules[-1], {"level": "Metadata"})
 
     def test_the_server_s_certificate_names_every_address_it_is_reached_at(self) -> None:

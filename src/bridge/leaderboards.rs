@@ -5,7 +5,9 @@ use std::sync::Arc;
 use kube::Client;
 use kube::api::ListParams;
 
-use crate::kubernetes::{Watch, guarded};
+use super::Scope;
+use crate::allowed::Allowed;
+use crate::kubernetes::Watch;
 use leaderboard_api::Leaderboard;
 
 /// The Leaderboards at one moment.
@@ -19,26 +21,57 @@ pub struct Leaderboards {
 
 impl Leaderboards {
     /// As the watch last observed them.
-    pub fn cached(watch: &Watch<Leaderboard>) -> Self {
+    pub fn cached(watch: &Watch<Leaderboard>, allowed: &Allowed) -> Self {
         // Asked first: what is complete now has all that is read below.
         let is_complete = watch.is_complete();
         Self {
-            all: watch.store.state(),
+            all: served(watch.store.state(), allowed),
             is_complete,
         }
     }
 
     /// Lists them without any cache.
-    pub async fn read(client: Client, namespace: Option<&str>) -> kube::Result<Self> {
-        let list = guarded::<Leaderboard>(client, namespace)
-            .list(&ListParams::default())
-            .await?;
-        let count = list.items.len();
-        let readable = list.items.into_iter().filter_map(|item| item.object.ok());
-        let all: Vec<_> = readable.map(Arc::new).collect();
+    pub async fn read(client: &Client, scope: &Scope) -> kube::Result<Self> {
+        let (mut count, mut all) = (0, Vec::new());
+        for api in scope.namespaces.apis::<Leaderboard>(client) {
+            let list = api.list(&ListParams::default()).await?;
+            count += list.items.len();
+            let readable = list.items.into_iter().filter_map(|item| item.object.ok());
+            all.extend(readable.map(Arc::new));
+        }
         Ok(Self {
             is_complete: all.len() == count,
-            all,
+            all: served(all, &scope.allowed),
         })
+    }
+}
+
+/// One that names what it may not has no queue, and no say in what becomes of another's messages.
+fn served(all: Vec<Arc<Leaderboard>>, allowed: &Allowed) -> Vec<Arc<Leaderboard>> {
+    let is_allowed = |leaderboard: &Arc<Leaderboard>| allowed.refusal(leaderboard).is_none();
+    all.into_iter().filter(is_allowed).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bridge::pollers::desired;
+    use crate::bridge::route::tests::{board, with_queue};
+
+    #[test]
+    fn a_queue_that_a_leaderboard_may_not_name_is_not_read() {
+        let all = || {
+            vec![
+                with_queue(board("a", 1), "https://q/ours"),
+                with_queue(board("b", 2), "https://q/theirs"),
+            ]
+        };
+        let urls = |allowed: &str| -> Vec<String> {
+            let served = served(all(), &allowed.parse().unwrap());
+            desired(&served).into_keys().collect()
+        };
+        assert_eq!(urls(""), ["https://q/ours", "https://q/theirs"]);
+        assert_eq!(urls(r#"{"*": {"queues": ["ours"]}}"#), ["https://q/ours"]);
+        assert_eq!(urls("{}"), Vec::<String>::new());
     }
 }

@@ -21,12 +21,14 @@ use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 use tokio::time::Instant;
 
-use crate::kubernetes::{Clients, Shape, Watch, call_within, guarded, spawn_watch};
+use crate::allowed::Allowed;
+use crate::kubernetes::{Clients, Namespaces, Shape, Watch, call_within, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::aws::Aws;
 use crate::services::meter::Meter;
 use leaderboard_api::Leaderboard;
+use leaderboards::Leaderboards;
 use pollers::{Pollers, Problems, desired};
 
 /// An answer of the API server that is younger than this is taken for granted.
@@ -34,11 +36,17 @@ const PULSE_AGE: Duration = Duration::from_secs(5);
 /// How soon the API server must answer before messages are received.
 const PULSE_LIMIT: Duration = Duration::from_secs(5);
 
+/// Which Leaderboards are served, and which queues they may name.
+#[derive(Clone, Debug)]
+pub struct Scope {
+    pub namespaces: Namespaces,
+    pub allowed: Allowed,
+}
+
 /// What all pollers share.
 struct Shared {
     client: Client,
-    /// The one namespace whose Leaderboards are served; None: all.
-    namespace: Option<String>,
+    scope: Scope,
     leaderboards: Watch<Leaderboard>,
     aws: Aws,
     telemetry: Observability,
@@ -48,8 +56,8 @@ struct Shared {
 }
 
 impl Shared {
-    fn new(clients: Clients, aws: Aws, namespace: Option<String>, telemetry: Observability) -> Self {
-        let guarded = guarded(clients.watch, namespace.as_deref());
+    fn new(clients: Clients, aws: Aws, scope: Scope, telemetry: Observability) -> Self {
+        let apis = scope.namespaces.apis(&clients.watch);
         // The status changes often and means nothing here.
         let shape = Shape {
             trim: |leaderboard: &mut Leaderboard| leaderboard.status = None,
@@ -60,10 +68,10 @@ impl Shared {
             instance: std::env::var("POD_NAME").ok(),
         };
         Self {
-            leaderboards: spawn_watch(guarded, Config::default(), shape, &telemetry),
+            leaderboards: spawn_watch(apis, Config::default(), shape, &telemetry),
             recorder: Recorder::new(clients.api.clone(), reporter),
             client: clients.api,
-            namespace,
+            scope,
             aws: aws.counted_by(Meter::for_metrics(&telemetry.metrics)),
             problems: Problems::new(telemetry.readiness.clone()),
             telemetry,
@@ -77,9 +85,10 @@ impl Shared {
         if last.is_some_and(|at| at.elapsed() < PULSE_AGE) {
             return Ok(());
         }
-        let api = guarded::<Leaderboard>(self.client.clone(), self.namespace.as_deref());
+        let apis = self.scope.namespaces.apis::<Leaderboard>(&self.client);
         let first = ListParams::default().limit(1);
-        let listed = call_within(PULSE_LIMIT, "a list", "one Leaderboard", api.list_metadata(&first)).await;
+        let asked = apis.iter().map(|api| call_within(PULSE_LIMIT, "a list", "one Leaderboard", api.list_metadata(&first)));
+        let listed = futures::future::try_join_all(asked).await;
         listed.map_err(|error| error.cause())?;
         *self.last_pulse.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
         // A watch that stays broken meanwhile is a reason to restart.
@@ -89,17 +98,12 @@ impl Shared {
 }
 
 /// Runs the bridge until the stop of `telemetry`; then finishes what is in hand, within 20 s. It serves the Leaderboards of
-/// one namespace, or of all.
+/// this scope.
 ///
 /// # Errors
 /// If one of its tasks has ended before.
-pub async fn run(
-    clients: Clients,
-    aws: Aws,
-    namespace: Option<String>,
-    telemetry: Observability,
-) -> Result<(), TaskFailed> {
-    let shared = Arc::new(Shared::new(clients, aws, namespace, telemetry.clone()));
+pub async fn run(clients: Clients, aws: Aws, scope: Scope, telemetry: Observability) -> Result<(), TaskFailed> {
+    let shared = Arc::new(Shared::new(clients, aws, scope, telemetry.clone()));
     telemetry.readiness.registered();
     let mut events = shared.leaderboards.subscribe();
     let mut pollers = Pollers::new(shared.clone());
@@ -112,7 +116,8 @@ pub async fn run(
         }
         // A list brings many at once.
         while events.next().now_or_never().flatten().is_some() {}
-        pollers.adjust(&desired(&shared.leaderboards.store.state()));
+        let all = Leaderboards::cached(&shared.leaderboards, &shared.scope.allowed).all;
+        pollers.adjust(&desired(&all));
     }
     pollers.drain().await;
     Ok(())

@@ -139,7 +139,10 @@ impl Poller {
             return;
         };
         let begun = Instant::now();
-        let readers = Readers::of(&self.url, &Leaderboards::cached(&self.shared.leaderboards));
+        let readers = Readers::of(
+            &self.url,
+            &Leaderboards::cached(&self.shared.leaderboards, &self.shared.scope.allowed),
+        );
         let outcomes = self.outcomes(&reader, &received, &readers).await;
         let count = u32::try_from(received.len()).unwrap_or(1);
         self.each = (self.each * 3 + begun.elapsed() / count) / 4;
@@ -298,7 +301,7 @@ impl Poller {
     /// The Leaderboards as they are now, asked once for a batch.
     async fn fresh<'a>(&self, readers: &'a Readers) -> Option<&'a Leaderboards> {
         let ask = || async {
-            let read = Leaderboards::read(self.shared.client.clone(), self.shared.namespace.as_deref());
+            let read = Leaderboards::read(&self.shared.client, &self.shared.scope);
             let read = tokio::time::timeout(PULSE_LIMIT, read).await.ok()?.ok()?;
             Some(Leaderboards {
                 all: route::readers(&self.url, &read.all),

@@ -25,6 +25,13 @@ fn client() -> (Clients, Server) {
     (clients, handle)
 }
 
+fn everything() -> Scope {
+    Scope {
+        namespaces: Namespaces::All,
+        allowed: Allowed::default(),
+    }
+}
+
 fn telemetry() -> (Observability, watch::Sender<bool>) {
     let (stop, signal) = Stop::new();
     (Observability::new(signal), stop)
@@ -57,7 +64,11 @@ fn is_list(request: &Request<Body>) -> bool {
 async fn shared() -> (Shared, Server, watch::Sender<bool>) {
     let (clients, handle) = client();
     let (telemetry, stop) = telemetry();
-    (Shared::new(clients, Aws::load().await, None, telemetry), handle, stop)
+    (
+        Shared::new(clients, Aws::load().await, everything(), telemetry),
+        handle,
+        stop,
+    )
 }
 
 #[tokio::test(start_paused = true)]
@@ -108,7 +119,7 @@ async fn start(telemetry: Observability) -> JoinHandle<Result<(), TaskFailed>> {
             }
         }
     });
-    tokio::spawn(run(clients, Aws::load().await, None, telemetry))
+    tokio::spawn(run(clients, Aws::load().await, everything(), telemetry))
 }
 
 #[tokio::test(start_paused = true)]
@@ -145,7 +156,7 @@ async fn a_broken_watch_of_leaderboards_fails_liveness_while_the_api_server_answ
             });
         }
     });
-    let shared = Shared::new(clients, Aws::load().await, None, telemetry.clone());
+    let shared = Shared::new(clients, Aws::load().await, everything(), telemetry.clone());
     shared.leaderboards.store.wait_until_ready().await.unwrap();
     tokio::time::sleep(Duration::from_mins(12)).await;
     assert_eq!(

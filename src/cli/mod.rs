@@ -9,6 +9,7 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::allowed::Allowed;
 use crate::observability::logging::Format;
 
 /// Runs the submissions of an AI challenge on Kubernetes.
@@ -39,9 +40,12 @@ enum Command {
 /// What the servers have in common.
 #[derive(Args, Debug)]
 struct Server {
-    /// The namespace to serve; all namespaces if empty.
-    #[arg(long, env = "LEADERBOARD_NAMESPACE", default_value = "")]
-    namespace: String,
+    /// A namespace to serve; may be given several times, or with commas. All namespaces if there is none.
+    #[arg(long = "namespace", env = "LEADERBOARD_NAMESPACES", value_delimiter = ',')]
+    namespaces: Vec<String>,
+    /// What Leaderboards may name, as JSON by namespace; everything if empty.
+    #[arg(long, env = "LEADERBOARD_ALLOWED", default_value = "")]
+    allowed: Allowed,
     /// Address of /livez, /readyz and /metrics.
     #[arg(long, env = "LEADERBOARD_HTTP", default_value = "0.0.0.0:8080")]
     http: std::net::SocketAddr,
@@ -63,6 +67,10 @@ struct Controller {
     /// Maximum concurrent reconciles.
     #[arg(long, env = "LEADERBOARD_CONCURRENCY", default_value_t = 16, value_parser = clap::value_parser!(u16).range(1..=256))]
     concurrency: u16,
+    /// Whether the operator may read nodes, and Leases in all namespaces. Without it a lost node is noticed later, and another
+    /// installation only where this one serves.
+    #[arg(long, env = "LEADERBOARD_CLUSTER_RIGHTS", default_value_t = true, action = clap::ArgAction::Set)]
+    cluster_rights: bool,
     /// Namespace of the Lease: the operator's own.
     #[arg(long, env = "POD_NAMESPACE", default_value = "default")]
     lease_namespace: String,

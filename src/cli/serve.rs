@@ -4,6 +4,8 @@
 use std::future::Future;
 use std::process::ExitCode;
 
+use http::HeaderValue;
+use http::header::USER_AGENT;
 use kube::{Client, Config};
 
 use super::{Controller, InPod, Server};
@@ -11,7 +13,7 @@ use crate::bridge;
 use crate::controller::runtime as run;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::controller::settings::Settings;
-use crate::kubernetes::{Clients, watch_client};
+use crate::kubernetes::{Clients, Namespaces, watch_client};
 use crate::observability::Observability;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
@@ -20,6 +22,7 @@ use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
+use leaderboard_api::names::OPERATOR;
 
 /// The commit that was built, where the build was given one.
 const REVISION: Option<&str> = option_env!("LEADERBOARD_REVISION");
@@ -106,7 +109,7 @@ async fn lead(options: Controller) -> Result<(), String> {
     let health = HealthServer::start(options.server.http, telemetry.clone())
         .await
         .map_err(|e| e.to_string())?;
-    let config = cluster().await?;
+    let config = cluster("controller").await?;
     let clients = run::Clients {
         api: Client::try_from(config.clone()).map_err(|e| client_errors::kube(&e))?,
         watch: watch_client(config.clone()).map_err(|e| client_errors::kube(&e))?,
@@ -120,7 +123,9 @@ async fn lead(options: Controller) -> Result<(), String> {
         image_pull_policy: options.image_pull_policy,
         region: aws.region(),
         operator: lease.installation(),
-        namespace: namespace(&options.server.namespace),
+        namespaces: Namespaces::of(options.server.namespaces),
+        has_cluster_rights: options.cluster_rights,
+        allowed: options.server.allowed,
         concurrency: options.concurrency,
     };
     let result = run::run(clients, lease, settings, aws, telemetry).await;
@@ -133,18 +138,23 @@ async fn serve_bridge(options: Server) -> Result<(), String> {
     let server = HealthServer::start(options.http, telemetry.clone())
         .await
         .map_err(|e| e.to_string())?;
-    let clients = Clients::new(cluster().await?).map_err(|e| client_errors::kube(&e))?;
-    let result = bridge::run(clients, Aws::load().await, namespace(&options.namespace), telemetry).await;
+    let clients = Clients::new(cluster("bridge").await?).map_err(|e| client_errors::kube(&e))?;
+    let scope = bridge::Scope {
+        namespaces: Namespaces::of(options.namespaces),
+        allowed: options.allowed,
+    };
+    let result = bridge::run(clients, Aws::load().await, scope, telemetry).await;
     server.close().await;
     result.map_err(|e| e.to_string())
 }
 
-async fn cluster() -> Result<Config, String> {
-    Config::infer().await.map_err(|e| {
+/// How the cluster is reached. Its audit log then names the program.
+async fn cluster(program: &str) -> Result<Config, String> {
+    let mut config = Config::infer().await.map_err(|e| {
         format!("no cluster is configured: {e}; set KUBECONFIG, or run inside a Pod with a service account")
-    })
-}
-
-fn namespace(text: &str) -> Option<String> {
-    (!text.is_empty()).then(|| text.to_owned())
+    })?;
+    let agent = format!("{OPERATOR}-{program}/{}", env!("CARGO_PKG_VERSION"));
+    let agent = HeaderValue::try_from(agent).map_err(|e| format!("the program's name is no header: {e}"))?;
+    config.headers.push((USER_AGENT, agent));
+    Ok(config)
 }

@@ -19,6 +19,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
+use crate::allowed::Allowed;
 use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
@@ -31,6 +32,7 @@ use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::team;
 use crate::controller::submissions::reruns::Reruns;
+use crate::kubernetes::Namespaces;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Store, Synced};
 use crate::observability::shutdown::Stop;
@@ -141,7 +143,9 @@ pub fn settings() -> Settings {
         image_pull_policy: None,
         region: None,
         operator: OPERATOR.into(),
-        namespace: None,
+        namespaces: Namespaces::All,
+        has_cluster_rights: true,
+        allowed: Allowed::default(),
         concurrency: 16,
     }
 }

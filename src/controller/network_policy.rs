@@ -16,9 +16,12 @@ use super::objects::owner_reference;
 use leaderboard_api::ranges::{self, Range};
 use leaderboard_api::{Egress, Leaderboard, names};
 
-/// Where NodeLocal DNSCache answers.
-const NODE_LOCAL_DNS: &str = "169.254.20.10/32";
 const DNS_PORT: i32 = 53;
+/// The cluster's own DNS, CoreDNS among them, has this label everywhere.
+const DNS_PODS: (&str, &str) = ("k8s-app", "kube-dns");
+const DNS_NAMESPACE: &str = "kube-system";
+/// Every namespace has its name as this label.
+const NAME_LABEL: &str = "kubernetes.io/metadata.name";
 
 /// Name of a Leaderboard's policy.
 pub fn name(leaderboard: &Leaderboard) -> String {
@@ -84,20 +87,23 @@ fn egress(leaderboard: &Leaderboard) -> Vec<NetworkPolicyEgressRule> {
     let network = &leaderboard.spec.network;
     network
         .dns
-        .then(dns)
+        .then(|| dns(&network.dns_servers))
         .into_iter()
         .chain(network.egress.iter().filter_map(rule))
         .collect()
 }
 
-/// The cluster's DNS, wherever it runs: any Pod, or the node's cache.
-fn dns() -> NetworkPolicyEgressRule {
+/// The cluster's DNS, and further servers: no other Pod, which might answer on the same port what is no question of names.
+fn dns(servers: &[String]) -> NetworkPolicyEgressRule {
     let pods = NetworkPolicyPeer {
-        namespace_selector: Some(LabelSelector::default()),
-        ..NetworkPolicyPeer::default()
+        namespace_selector: Some(labelled((NAME_LABEL, DNS_NAMESPACE))),
+        pod_selector: Some(labelled(DNS_PODS)),
+        ip_block: None,
     };
+    let servers = servers.iter().filter_map(|server| Range::of(server));
+    let servers = servers.map(|range| block(range.text(), Vec::new()));
     NetworkPolicyEgressRule {
-        to: Some(vec![pods, block(NODE_LOCAL_DNS.into(), Vec::new())]),
+        to: Some([pods].into_iter().chain(servers).collect()),
         ports: Some(["UDP", "TCP"].map(|protocol| port(protocol, DNS_PORT)).into()),
     }
 }
@@ -116,6 +122,13 @@ fn rule(egress: &Egress) -> Option<NetworkPolicyEgressRule> {
         to: Some(vec![block(range.text(), except.collect())]),
         ports: (!egress.ports.is_empty()).then(|| egress.ports.iter().map(|number| port("TCP", *number)).collect()),
     })
+}
+
+fn labelled((key, value): (&str, &str)) -> LabelSelector {
+    LabelSelector {
+        match_labels: Some(BTreeMap::from([(key.into(), value.into())])),
+        match_expressions: None,
+    }
 }
 
 fn block(cidr: String, except: Vec<String>) -> NetworkPolicyPeer {
@@ -171,10 +184,33 @@ mod tests {
                 "policyTypes": ["Ingress", "Egress"],
                 "ingress": [],
                 "egress": [{
-                    "to": [{"namespaceSelector": {}}, {"ipBlock": {"cidr": "169.254.20.10/32"}}],
+                    "to": [
+                        {
+                            "namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}},
+                            "podSelector": {"matchLabels": {"k8s-app": "kube-dns"}},
+                        },
+                        {"ipBlock": {"cidr": "169.254.20.10/32"}},
+                    ],
                     "ports": [{"protocol": "UDP", "port": 53}, {"protocol": "TCP", "port": 53}],
                 }],
             })
+        );
+    }
+
+    #[test]
+    fn names_are_asked_of_the_servers_that_are_named() {
+        let peers = |network: &Value| -> Vec<Value> {
+            let egress = policy(network)["spec"]["egress"].clone();
+            egress[0]["to"].as_array().unwrap()[1..].to_vec()
+        };
+        assert_eq!(peers(&json!({"dnsServers": []})), Vec::<Value>::new());
+        assert_eq!(
+            peers(&json!({"dnsServers": ["10.0.0.10", "10.1.2.3/24", "fd00::a", "nonsense"]})),
+            ["10.0.0.10/32", "10.1.2.0/24", "fd00::a/128"].map(|cidr| json!({"ipBlock": {"cidr": cidr}}))
+        );
+        assert_eq!(
+            policy(&json!({"dns": false, "dnsServers": ["10.0.0.10"]}))["spec"]["egress"],
+            json!([])
         );
     }
 
@@ -198,9 +234,23 @@ mod tests {
 
     #[test]
     fn no_range_reaches_a_metadata_address() {
-        let cases: [(&str, Option<&[&str]>); 11] = [
-            ("0.0.0.0/0", Some(&["169.254.0.0/16"])),
-            ("128.0.0.0/1", Some(&["169.254.0.0/16"])),
+        let cases: [(&str, Option<&[&str]>); 14] = [
+            (
+                "0.0.0.0/0",
+                Some(&[
+                    "169.254.0.0/16",
+                    "100.100.100.200/32",
+                    "168.63.129.16/32",
+                    "192.0.0.192/32",
+                ]),
+            ),
+            (
+                "128.0.0.0/1",
+                Some(&["169.254.0.0/16", "168.63.129.16/32", "192.0.0.192/32"]),
+            ),
+            ("100.64.0.0/10", Some(&["100.100.100.200/32"])),
+            ("168.63.129.16/32", None),
+            ("192.0.0.0/24", Some(&["192.0.0.192/32"])),
             ("169.0.0.0/8", Some(&["169.254.0.0/16"])),
             ("10.0.0.0/8", Some(&[])),
             ("169.254.0.0/16", None),

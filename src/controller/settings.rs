@@ -1,5 +1,8 @@
 //! What the command line sets.
 
+use crate::allowed::Allowed;
+use crate::kubernetes::Namespaces;
+
 /// Settings that come from the command line.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -11,8 +14,12 @@ pub struct Settings {
     pub region: Option<String>,
     /// Name of this installation, `<namespace>/<name>` of its Lease.
     pub operator: String,
-    /// Only this namespace, or all.
-    pub namespace: Option<String>,
+    /// Which namespaces are served.
+    pub namespaces: Namespaces,
+    /// Nodes are watched, and Leases of other installations read wherever they are: rights of the whole cluster.
+    pub has_cluster_rights: bool,
+    /// What Leaderboards may name.
+    pub allowed: Allowed,
     /// Reconciles at once.
     pub concurrency: u16,
 }

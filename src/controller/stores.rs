@@ -24,7 +24,7 @@ pub struct Stores {
     pub policies: Store<NetworkPolicy>,
     /// Whether what `policies` shows can be relied on.
     pub policies_synced: Synced,
-    /// None: an operator of one namespace has no right to nodes.
+    /// None: an operator without rights of the whole cluster has none to nodes.
     pub nodes: Option<Nodes>,
 }
 

@@ -5,8 +5,10 @@
 mod call;
 mod feed;
 mod item;
+mod namespaces;
 pub mod objects;
 pub mod preflight;
+mod source;
 mod store;
 mod watch;
 mod write;
@@ -22,6 +24,7 @@ use kube::{Api, Client};
 pub use call::{CALL_TIMEOUT, CallError, call, call_within};
 pub use feed::{WatchEvent, WatchEvents};
 pub use item::{Item, Malformed, Watchable};
+pub use namespaces::Namespaces;
 pub use store::{Index, Store};
 pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
 pub use write::{Writes, Written};

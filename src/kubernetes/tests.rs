@@ -1,6 +1,7 @@
 //! Watches and the preflight on a mock of the API server's client.
 
 mod lists;
+mod namespaces;
 
 use std::time::Duration;
 
@@ -109,7 +110,7 @@ fn rig(answers: Vec<Answer>) -> Rig {
         trim: |board: &mut Leaderboard| board.metadata.annotations = None,
         ..Shape::default()
     };
-    let watch = spawn_watch(guarded(client, Some("ns")), Config::default(), shape, &telemetry);
+    let watch = spawn_watch(vec![guarded(client, Some("ns"))], Config::default(), shape, &telemetry);
     let events = watch.subscribe();
     Rig {
         watch,
@@ -303,7 +304,7 @@ async fn a_watch_on_a_half_open_connection_ends_by_the_read_timeout_and_begins_a
     let (_stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
     let watch = spawn_watch::<Leaderboard>(
-        guarded(client, Some("ns")),
+        vec![guarded(client, Some("ns"))],
         Config::default(),
         Shape::default(),
         &telemetry,

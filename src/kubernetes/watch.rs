@@ -1,32 +1,28 @@
 //! Watches: one task for each kind, a cache, and a feed of what has changed.
 //!
-//! One task each, because a shared backoff would let one broken watch hold up all others. Errors are logged, counted and
-//! retried here; readers only ever get objects.
+//! One task each, because a shared backoff would let one broken watch hold up all others. A kind may be watched in several
+//! namespaces: each has a list and a backoff of its own (`source`), and the cache is complete once all of them are. Errors are logged,
+//! counted and retried here; readers only ever get objects.
 
 use std::collections::{BTreeSet, HashSet};
-use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
-use futures::{Stream, StreamExt};
+use futures::StreamExt;
 use kube::Api;
 use kube::runtime::watcher::{Config, Error, Event};
-use kube::runtime::{WatchStreamExt, watcher};
 
 use super::feed::{Feed, WatchEvents};
 use super::item::{Item, Watchable};
 use super::objects::Texts;
+use super::source::{self, Source, is_refusal};
 use super::store::{Index, Store, Writer, key_of};
 use crate::observability::Observability;
-use crate::observability::liveness::WatchProbe;
 use crate::observability::metrics::WatchMetrics;
 use crate::observability::readiness::Readiness;
 use crate::observability::shutdown::Stop;
 use leaderboard_api::client_errors;
 
-/// A watch that the API server has refused begins again with a list after this long.
-const REFUSED_AGAIN: Duration = Duration::from_secs(10);
 /// Objects of one page of a list, each of up to 50 KB: a page is in memory as a whole while it is decoded.
 const PAGE: u32 = 100;
 
@@ -118,9 +114,10 @@ impl<K: Watchable> Watch<K> {
     }
 }
 
-/// Starts to watch a kind until the process stops. Until the first list is complete, the process is not ready.
+/// Starts to watch a kind until the process stops, through each of these APIs, of which no two may show the same object. Until their
+/// first lists are complete, the process is not ready.
 pub fn spawn_watch<K: Watchable>(
-    api: Api<Item<K>>,
+    apis: Vec<Api<Item<K>>>,
     config: Config,
     Shape { trim, index }: Shape<K>,
     telemetry: &Observability,
@@ -133,9 +130,15 @@ pub fn spawn_watch<K: Watchable>(
         feed: Feed::new(),
     };
     let kind = K::kind(&()).into_owned();
+    let has_one = apis.len() == 1;
+    let source = |api: &Api<Item<K>>| {
+        let namespace = api.namespace().filter(|_| !has_one);
+        let name = namespace.map_or_else(|| kind.clone(), |namespace| format!("{kind} in {namespace}"));
+        Source::new(namespace, telemetry.liveness.watch(&name))
+    };
     let task = Task {
         check: format!("{} synced", K::plural(&())),
-        probe: telemetry.liveness.watch(&kind),
+        sources: apis.iter().map(source).collect(),
         metrics: telemetry.metrics.watch(&kind),
         readiness: telemetry.readiness.clone(),
         kind,
@@ -145,14 +148,15 @@ pub fn spawn_watch<K: Watchable>(
         feed: watch.feed.clone(),
         synced: watch.synced.clone(),
         unreadable: watch.unreadable.clone(),
-        list: Listing::default(),
+        pending: HashSet::new(),
+        is_complete: false,
     };
     task.missing("the first list has not come yet");
     let name = format!("watch of {}", K::plural(&()));
     let config = config.page_size(PAGE);
     telemetry
         .tasks
-        .stay(name, task.run(api, config, telemetry.stop.clone()));
+        .stay(name, task.run(apis, config, telemetry.stop.clone()));
     watch
 }
 
@@ -160,7 +164,8 @@ struct Task<K: Watchable> {
     kind: String,
     /// Name of the check of readiness.
     check: String,
-    probe: WatchProbe,
+    /// One for each API, in their order.
+    sources: Vec<Source<K>>,
     metrics: WatchMetrics,
     readiness: Readiness,
     trim: fn(&mut K),
@@ -169,93 +174,53 @@ struct Task<K: Watchable> {
     feed: Feed<K>,
     synced: Synced,
     unreadable: Unreadable,
-    list: Listing<K>,
-}
-
-/// A list under way. What it brings is cached at once, so that no second cache is needed, and is an event once the list is
-/// complete.
-struct Listing<K> {
-    /// What this list has shown.
-    shown: HashSet<Box<str>>,
-    /// What it has shown and cannot be read.
-    unreadable: BTreeSet<Box<str>>,
-    /// What has changed since the last list that was complete.
-    changed: HashSet<Box<str>>,
-    /// What was replaced by another object of its name meanwhile.
-    replaced: Vec<Arc<K>>,
-}
-
-impl<K> Default for Listing<K> {
-    fn default() -> Self {
-        Self {
-            shown: HashSet::new(),
-            unreadable: BTreeSet::new(),
-            changed: HashSet::new(),
-            replaced: Vec::new(),
-        }
-    }
-}
-
-type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<Item<K>>, Error>> + Send>>;
-
-/// A list, then what changes.
-fn begin<K: Watchable>(api: &Api<Item<K>>, config: &Config) -> Events<K> {
-    Box::pin(watcher(api.clone(), config.clone()).default_backoff())
-}
-
-/// The right to list or to watch is missing.
-fn is_refusal(error: &Error) -> bool {
-    match error {
-        Error::InitialListFailed(kube::Error::Api(status)) | Error::WatchStartFailed(kube::Error::Api(status)) => {
-            status.code == 403
-        }
-        _ => false,
-    }
+    /// What has come before the cache was complete, and is an event when it is.
+    pending: HashSet<Box<str>>,
+    /// Every source has listed once.
+    is_complete: bool,
 }
 
 impl<K: Watchable> Task<K> {
-    async fn run(mut self, api: Api<Item<K>>, config: Config, stop: Stop) {
-        let mut events = begin(&api, &config);
+    async fn run(mut self, apis: Vec<Api<Item<K>>>, config: Config, stop: Stop) {
+        let mut events = source::all(apis, &config);
         loop {
             let event = tokio::select! {
                 () = stop.wait() => break,
                 event = events.next() => event,
             };
             match event {
-                Some(Ok(event)) => self.event(event),
-                Some(Err(error)) => {
-                    self.error(&error);
-                    // A list, because a watch without news does not show that the right is back.
-                    if matches!(error, Error::WatchStartFailed(_)) && is_refusal(&error) {
-                        tokio::select! { () = stop.wait() => break, () = tokio::time::sleep(REFUSED_AGAIN) => {} }
-                        events = begin(&api, &config);
-                    }
-                }
-                // The stream has no end; if it ends all the same, this task ends, and with it the process.
-                None => break,
+                Some((source, Some(Ok(event)))) => self.event(source, event),
+                Some((source, Some(Err(error)))) => self.error(source, &error),
+                // None of them has an end; if one ends all the same, this task ends, and with it the process.
+                Some((_, None)) | None => break,
             }
         }
         self.feed.close();
     }
 
-    fn event(&mut self, event: Event<Item<K>>) {
+    fn event(&mut self, source: usize, event: Event<Item<K>>) {
+        let from = &mut self.sources[source];
         if matches!(event, Event::Init) {
             // The beginning of a list is a request, not an answer.
-            self.probe.listing();
-            self.list.shown.clear();
-            return self.list.unreadable.clear();
+            from.probe.listing();
+            return from.list.begins();
         }
         self.metrics.event();
         match event {
-            Event::Apply(item) => self.apply(item),
-            Event::Delete(item) => self.delete(item),
-            Event::InitApply(item) => self.listed(item),
-            Event::Init | Event::InitDone => self.list_done(),
+            Event::Apply(item) => {
+                from.probe.running();
+                self.apply(item);
+            }
+            Event::Delete(item) => {
+                from.probe.running();
+                self.delete(item);
+            }
+            Event::InitApply(item) => self.listed(source, item),
+            Event::Init | Event::InitDone => self.list_done(source),
         }
     }
 
     fn apply(&mut self, item: Item<K>) {
-        self.probe.running();
         let object = match self.read(item) {
             Ok(object) => object,
             Err(key) => {
@@ -267,13 +232,12 @@ impl<K: Watchable> Task<K> {
         let (after, before) = self.writer.put(object);
         // The end of an object that was replaced by another one of its name between two reads.
         if let Some(before) = before.filter(|before| before.uid() != after.uid()) {
-            self.feed.push(&before, true);
+            self.tell(&before, true);
         }
-        self.feed.push(&after, false);
+        self.tell(&after, false);
     }
 
     fn delete(&mut self, item: Item<K>) {
-        self.probe.running();
         let (key, last) = match item.object {
             Ok(object) => (key_of(&object), Some(self.trimmed(object))),
             Err(malformed) => (malformed.key(), None),
@@ -282,63 +246,88 @@ impl<K: Watchable> Task<K> {
         let known = self.writer.remove(&key);
         // No event was sent for an object that never could be read.
         if let Some(last) = last.map(Arc::new).or(known) {
-            self.feed.push(&last, true);
+            self.tell(&last, true);
         }
     }
 
-    fn listed(&mut self, item: Item<K>) {
+    /// Nobody learns of an object before the cache is complete, and of one that is gone by then nobody has to.
+    fn tell(&mut self, object: &Arc<K>, is_gone: bool) {
+        if self.is_complete {
+            self.feed.push(object, is_gone);
+        } else if !is_gone {
+            self.pending.insert(key_of(object.as_ref()));
+        }
+    }
+
+    fn listed(&mut self, source: usize, item: Item<K>) {
         let object = match self.read(item) {
             Ok(object) => object,
-            Err(key) => {
-                // One that has become unreadable stays as it was last read: it has not been deleted.
-                self.list.shown.insert(key.clone());
-                self.list.unreadable.insert(key);
-                return;
-            }
+            Err(key) => return self.sources[source].list.unreadable(key),
         };
         let key = key_of(&object);
-        self.list.shown.insert(key.clone());
         let known = self.writer.store().by_key(&key);
         let is_known = known
             .is_some_and(|known| known.uid() == object.uid() && known.resource_version() == object.resource_version());
+        let list = &mut self.sources[source].list;
+        list.shown.insert(key.clone());
         if is_known {
             return;
         }
         let (after, before) = self.writer.put(object);
-        self.list.changed.insert(key);
-        self.list
-            .replaced
+        list.changed.insert(key);
+        list.replaced
             .extend(before.filter(|before| before.uid() != after.uid()));
     }
 
-    fn list_done(&mut self) {
-        let list = std::mem::take(&mut self.list);
+    fn list_done(&mut self, source: usize) {
+        let from = &mut self.sources[source];
+        let list = std::mem::take(&mut from.list);
+        from.is_synced = true;
+        from.has_listed = true;
+        let from = &self.sources[source];
         let mut gone = list.replaced;
-        for key in self.writer.keys_without(|key| list.shown.contains(key)) {
+        for key in self
+            .writer
+            .keys_without(|key| !from.has(key) || list.shown.contains(key))
+        {
             gone.extend(self.writer.remove(&key));
         }
-        *self.unreadable.keys() = list.unreadable;
-        self.probe.listed();
-        // Before anyone is woken by what was listed.
-        self.writer.is_complete();
-        if !self.synced.is_true() {
-            self.synced.set(true);
-            self.readiness.set(&self.check, Ok(()));
-        }
-        for gone in &gone {
-            self.feed.push(gone, true);
-        }
-        let store = self.writer.store();
-        for object in list.changed.iter().filter_map(|key| store.by_key(key)) {
-            self.feed.push(&object, false);
+        let mut unreadable = self.unreadable.keys();
+        unreadable.retain(|key| !from.has(key));
+        unreadable.extend(list.unreadable);
+        drop(unreadable);
+        from.probe.listed();
+        let (changed, left) = (list.changed.len(), gone.len());
+        self.pending.extend(list.changed);
+        if self.sources.iter().all(|source| source.has_listed) {
+            self.complete(&gone);
         }
         tracing::info!(
             kind = self.kind,
-            objects = store.len(),
-            changed = list.changed.len(),
-            gone = gone.len(),
+            namespace = self.sources[source].namespace(),
+            objects = self.writer.store().len(),
+            changed,
+            gone = left,
             "listed"
         );
+    }
+
+    /// The cache holds what every source has listed: what has come since is an event.
+    fn complete(&mut self, gone: &[Arc<K>]) {
+        // Before anyone is woken by what was listed.
+        self.writer.is_complete();
+        self.is_complete = true;
+        if !self.synced.is_true() && self.sources.iter().all(|source| source.is_synced) {
+            self.synced.set(true);
+            self.readiness.set(&self.check, Ok(()));
+        }
+        for gone in gone {
+            self.feed.push(gone, true);
+        }
+        let store = self.writer.store();
+        for object in self.pending.drain().filter_map(|key| store.by_key(&key)) {
+            self.feed.push(&object, false);
+        }
     }
 
     /// The object, trimmed; if it can't be read, its key, and its name is logged.
@@ -362,18 +351,20 @@ impl<K: Watchable> Task<K> {
         object
     }
 
-    fn error(&self, error: &Error) {
+    fn error(&mut self, source: usize, error: &Error) {
         self.metrics.failed();
+        let from = &mut self.sources[source];
         match error {
             // Both come from a watch that had been let in.
-            Error::WatchError(_) | Error::WatchFailed(_) => self.probe.running(),
+            Error::WatchError(_) | Error::WatchFailed(_) => from.probe.running(),
             _ if is_refusal(error) => {
-                self.probe.refused();
+                from.probe.refused();
+                from.is_synced = false;
                 self.synced.set(false);
             }
-            _ => self.probe.failed(),
+            _ => from.probe.failed(),
         }
-        let cause = client_errors::watch(error);
+        let cause = from.cause(client_errors::watch(error));
         if let Error::WatchError(status) = error
             && status.code == 410
         {

@@ -8,6 +8,7 @@ pub mod fault;
 pub mod held_text;
 pub mod logs;
 pub mod meter;
+pub mod public;
 pub mod queue;
 pub mod registry;
 pub mod table;

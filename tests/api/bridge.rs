@@ -15,9 +15,10 @@ use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
 use leaderboard_api::{Ingested, Leaderboard, Submission, names};
+use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::bridge;
 use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
-use leaderboard_operator::kubernetes::Clients;
+use leaderboard_operator::kubernetes::{Clients, Namespaces};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::TaskFailed;
@@ -149,7 +150,11 @@ impl Bridge {
         let (stop, stopped) = Stop::new();
         let telemetry = Observability::new(stopped);
         let aws = stand_in.aws.clone();
-        let running = bridge::run(clients, aws, Some(namespace.to_owned()), telemetry.clone());
+        let scope = bridge::Scope {
+            namespaces: Namespaces::of([namespace.to_owned()]),
+            allowed: Allowed::default(),
+        };
+        let running = bridge::run(clients, aws, scope, telemetry.clone());
         Self {
             telemetry,
             stop,

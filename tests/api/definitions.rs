@@ -86,7 +86,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
             "finalizeSeconds": 900,
         },
         "storage": {"bucket": "results", "sizeLimit": "20Gi"},
-        "network": {"policy": "Managed", "enforcement": "Warn", "dns": true},
+        "network": {"policy": "Managed", "enforcement": "Warn", "dns": true, "dnsServers": ["169.254.20.10"]},
         "concurrency": {},
         "paused": false,
         "verify": "Warn",
@@ -162,12 +162,13 @@ fn half_filled_runs() -> Vec<HalfFilled> {
                 "enforcement": "Warn",
                 "egress": [{"cidr": "10.0.0.0/16"}],
                 "dns": true,
+                "dnsServers": ["169.254.20.10"],
             }),
         ),
         (
             "network",
             json!({"dns": false, "policy": "External"}),
-            json!({"dns": false, "policy": "External", "enforcement": "Warn"}),
+            json!({"dns": false, "dnsServers": ["169.254.20.10"], "policy": "External", "enforcement": "Warn"}),
         ),
         (
             "tracks",

@@ -57,6 +57,27 @@ async fn the_committed_definitions_change_nothing() {
     }
 }
 
+/// In a range of a VPC are the API server's private endpoints, and every other service that speaks HTTPS.
+#[test]
+fn no_example_lets_pods_reach_more_than_single_addresses() {
+    let mut found = 0;
+    for name in [
+        "leaderboard-20.yaml",
+        "leaderboard-10.yaml",
+        "leaderboard-local.yaml",
+        "demo/leaderboard.yaml",
+    ] {
+        let text = std::fs::read_to_string(folder("examples").join(name)).unwrap();
+        let leaderboard: Leaderboard = serde_saphyr::from_str(&text).unwrap();
+        for egress in &leaderboard.spec.network.egress {
+            found += 1;
+            let is_single = egress.cidr.ends_with("/32") || egress.cidr.ends_with("/128");
+            assert!(is_single && !egress.ports.is_empty(), "{name}: {}", egress.cidr);
+        }
+    }
+    assert!(found > 0);
+}
+
 #[test]
 fn examples_run_what_their_comments_say() {
     let read = |name: &str| std::fs::read_to_string(folder("examples").join(name)).unwrap();

@@ -3,10 +3,11 @@
 use std::time::Duration;
 
 use kube::{Client, Config};
+use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
 use leaderboard_operator::controller::runtime::{self as run, Clients, RunError};
 use leaderboard_operator::controller::settings::Settings;
-use leaderboard_operator::kubernetes::watch_client;
+use leaderboard_operator::kubernetes::{Namespaces, watch_client};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::services::aws::Aws;
@@ -17,6 +18,9 @@ use crate::support::apiserver::server;
 
 /// Longer than it takes to end, with a write to EvalAI under way.
 const END_LIMIT: Duration = Duration::from_mins(3);
+
+/// Name of the Lease, in the operator's own namespace.
+pub const LEASE_NAME: &str = "operator";
 
 /// Nobody else wants its Lease.
 const LEASE: Duration = Duration::from_mins(4);
@@ -40,6 +44,18 @@ impl Operator {
         let telemetry = Observability::new(signal);
         Self {
             task: tokio::spawn(Box::pin(run(namespace, aws, config, telemetry.clone()))),
+            telemetry,
+            stop,
+        }
+    }
+
+    /// Starts one with these settings, and with its Lease in this namespace.
+    pub fn start_with(settings: Settings, lease_namespace: &str, aws: Aws, config: Config) -> Self {
+        let (stop, signal) = Stop::new();
+        let telemetry = Observability::new(signal);
+        let lease = lease(lease_namespace);
+        Self {
+            task: tokio::spawn(Box::pin(run_with(settings, lease, aws, config, telemetry.clone()))),
             telemetry,
             stop,
         }
@@ -70,11 +86,25 @@ pub fn run(
     config: Config,
     telemetry: Observability,
 ) -> impl Future<Output = Result<(), RunError>> + Send + use<> {
+    run_with(settings(namespace), lease(namespace), aws, config, telemetry)
+}
+
+fn run_with(
+    settings: Settings,
+    lease: leader::Settings,
+    aws: Aws,
+    config: Config,
+    telemetry: Observability,
+) -> impl Future<Output = Result<(), RunError>> + Send + use<> {
     let clients = Clients {
         api: Client::try_from(config.clone()).unwrap(),
         watch: watch_client(config.clone()).unwrap(),
         lease: leader::lease_client(config).unwrap(),
     };
+    run::run(clients, lease, settings, aws, telemetry)
+}
+
+fn lease(namespace: &str) -> leader::Settings {
     // A machine that compiles something else at the same time may leave an API server silent for ten seconds.
     let timing = Timing {
         lease: LEASE,
@@ -82,17 +112,22 @@ pub fn run(
         call: LEASE / 4,
         ..Timing::default()
     };
-    let lease = leader::Settings {
+    leader::Settings {
         timing,
-        ..leader::Settings::new(namespace, "operator", Identity::random("test"))
-    };
-    let settings = Settings {
+        ..leader::Settings::new(namespace, LEASE_NAME, Identity::random("test"))
+    }
+}
+
+/// What the command line would set, for an operator that serves a namespace.
+pub fn settings(namespace: &str) -> Settings {
+    Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: Some("us-east-1".into()),
-        operator: lease.installation(),
-        namespace: Some(namespace.to_owned()),
+        operator: format!("{namespace}/{LEASE_NAME}"),
+        namespaces: Namespaces::of([namespace.to_owned()]),
+        has_cluster_rights: false,
+        allowed: Allowed::default(),
         concurrency: 16,
-    };
-    run::run(clients, lease, settings, aws, telemetry)
+    }
 }

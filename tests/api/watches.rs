@@ -39,7 +39,7 @@ async fn creations_changes_and_deletions_are_events() {
     let telemetry = Observability::new(stop);
     telemetry.readiness.registered();
     let watch = spawn_watch::<Submission>(
-        guarded(client.clone(), Some(&namespace)),
+        vec![guarded(client.clone(), Some(&namespace))],
         Config::default(),
         Shape::default(),
         &telemetry,

@@ -13,9 +13,11 @@ use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, Pat
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
 use leaderboard_api::{JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names};
+use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
 use leaderboard_operator::controller::settings::Settings;
+use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::services::archive::Archive;
@@ -98,7 +100,9 @@ impl World {
             image_pull_policy: None,
             region: None,
             operator: lease.installation(),
-            namespace: Some(self.namespace.clone()),
+            namespaces: Namespaces::of([self.namespace.clone()]),
+            has_cluster_rights: false,
+            allowed: Allowed::default(),
             concurrency: 4,
         };
         let aws = self.aws.aws.clone();

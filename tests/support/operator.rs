@@ -106,9 +106,15 @@ pub async fn kept(scene: &Scene, start: impl Fn(&Scene) -> Process) -> Infallibl
 impl Start {
     fn controller(scene: &Scene) -> Self {
         let (image, namespace) = (&scene.lab.image, &scene.namespace);
-        let arguments = ["--image", image, "--lease", LEASE, "--lease-namespace", namespace];
+        // Nodes are shared by all tests, and each is asked for by name.
+        let arguments = [
+            ["--image", image],
+            ["--lease", LEASE],
+            ["--lease-namespace", namespace],
+            ["--cluster-rights", "false"],
+        ];
         Self {
-            arguments: arguments.map(str::to_owned).into(),
+            arguments: arguments.as_flattened().iter().map(|&text| text.to_owned()).collect(),
             ..Self::of(scene, "controller")
         }
     }

@@ -59,31 +59,70 @@ annotations:
 {{- (index .root.Values .component).serviceAccount.name | default $own -}}
 {{- end -}}
 
-{{/* A role that is made in the watched namespace, or for the whole cluster: {root, component, rules}. */}}
+{{/* The namespaces that are served, by a space. */}}
+{{- define "operator.namespaces" -}}
+{{- $names := list -}}
+{{- range .Values.leaderboards }}{{- if ne .namespace "*" }}{{- $names = append $names .namespace -}}{{- end }}{{- end -}}
+{{- $names | default (list .Release.Namespace) | uniq | sortAlpha | join " " -}}
+{{- end -}}
+
+{{/* What Leaderboards may name, by namespace, as JSON. */}}
+{{- define "operator.allowed" -}}
+{{- $allowed := dict -}}
+{{- range .Values.leaderboards -}}
+{{- if hasKey $allowed .namespace -}}
+{{- fail (printf "leaderboards: the namespace %s is there twice: put its names into one entry" .namespace) -}}
+{{- end -}}
+{{- if and (eq .namespace "*") (not $.Values.allNamespaces) -}}
+{{- fail "leaderboards: the namespace * needs allNamespaces: true; name the namespaces" -}}
+{{- end -}}
+{{- if and (eq .namespace "*") .secrets -}}
+{{- fail "leaderboards: Secrets are read in a namespace that has a name, and * is none: list the namespace" -}}
+{{- end -}}
+{{- $names := dict "secretsManager" (.secretsManager | default list) "queues" (.queues | default list) -}}
+{{- $allowed = set $allowed .namespace $names -}}
+{{- end -}}
+{{- toJson $allowed -}}
+{{- end -}}
+
+{{/* A role in each namespace that is served, or one for the whole cluster: {root, component, rules}. */}}
 {{- define "operator.role" -}}
-{{- $root := .root -}}
-{{- $name := printf "%s-%s" (include "operator.fullname" $root) .component -}}
-{{- $watched := $root.Values.watchNamespace -}}
-{{- $metadata := include "operator.metadata" (dict "root" $root "name" $name "namespace" $watched) -}}
+{{- $name := printf "%s-%s" (include "operator.fullname" .root) .component -}}
+{{- if .root.Values.allNamespaces -}}
+{{- include "operator.grant" (dict "root" .root "component" .component "rules" .rules "name" $name) }}
+{{- else }}
+{{- $scope := . }}
+{{- range $index, $namespace := include "operator.namespaces" .root | splitList " " }}
+{{- if $index }}
+---
+{{ end }}
+{{- include "operator.grant" (dict "root" $scope.root "component" $scope.component "rules" $scope.rules "name" $name "in" $namespace) }}
+{{- end }}
+{{- end }}
+{{- end -}}
+
+{{/* A role and its binding, in a namespace or, without `in`, for the whole cluster: {root, component, name, in, rules}. */}}
+{{- define "operator.grant" -}}
+{{- $metadata := include "operator.metadata" (dict "root" .root "name" .name "namespace" .in) -}}
 apiVersion: rbac.authorization.k8s.io/v1
-kind: {{ ternary "Role" "ClusterRole" (ne $watched "") }}
+kind: {{ ternary "Role" "ClusterRole" (not (empty .in)) }}
 metadata:
   {{- $metadata | nindent 2 }}
 rules:
 {{ .rules | trimAll "\n" }}
 ---
 apiVersion: rbac.authorization.k8s.io/v1
-kind: {{ ternary "RoleBinding" "ClusterRoleBinding" (ne $watched "") }}
+kind: {{ ternary "RoleBinding" "ClusterRoleBinding" (not (empty .in)) }}
 metadata:
   {{- $metadata | nindent 2 }}
 roleRef:
   apiGroup: rbac.authorization.k8s.io
-  kind: {{ ternary "Role" "ClusterRole" (ne $watched "") }}
-  name: {{ $name }}
+  kind: {{ ternary "Role" "ClusterRole" (not (empty .in)) }}
+  name: {{ .name }}
 subjects:
   - kind: ServiceAccount
     name: {{ include "operator.account" . }}
-    namespace: {{ $root.Release.Namespace }}
+    namespace: {{ .root.Release.Namespace }}
 {{- end -}}
 
 {{/* Environment that controller and bridge have in common. */}}
@@ -95,8 +134,11 @@ subjects:
   valueFrom: {fieldRef: {fieldPath: metadata.namespace}}
 - name: POD_UID
   valueFrom: {fieldRef: {fieldPath: metadata.uid}}
-- name: LEADERBOARD_NAMESPACE
-  value: {{ $values.watchNamespace | quote }}
+- name: LEADERBOARD_NAMESPACES
+  value: {{ $values.allNamespaces | ternary "" (include "operator.namespaces" .root | replace " " ",") | quote }}
+# What Leaderboards may name, where the operator's own AWS identity is used.
+- name: LEADERBOARD_ALLOWED
+  value: {{ include "operator.allowed" .root | quote }}
 - name: LEADERBOARD_HTTP
   value: 0.0.0.0:8080
 - name: LEADERBOARD_LOG_FORMAT

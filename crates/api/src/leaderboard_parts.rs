@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
 use super::image_pattern::ImagePattern;
+pub use super::leaderboard_network::*;
 pub use super::leaderboard_services::*;
 pub use super::route_subset::RouteSubset;
 
@@ -295,71 +296,6 @@ pub struct PodIdentity {
     pub secret_name: Option<String>,
 }
 
-/// Who makes the NetworkPolicy of the Pods.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum PolicySource {
-    /// The operator applies one and restores it; no Job is made without it.
-    #[default]
-    Managed,
-    /// The cluster has policies of its own: the operator applies none and trusts them.
-    External,
-}
-
-/// What follows from the measurement of a run's Pod, made before anything of a stranger runs: whether it can reach an
-/// address that the policy forbids.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Enforcement {
-    /// A Pod that can reach it stops there.
-    Require,
-    /// The run goes on, and the condition `Isolated` shows it.
-    #[default]
-    Warn,
-    /// Nothing is measured.
-    Off,
-}
-
-/// What the Pods of strangers may reach, by NetworkPolicy.
-#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
-#[x_kube(
-    validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed, since the operator does not know what the cluster's own policies forbid; use Managed, or Warn"),
-    validation = Rule::new("!has(self.probe) || (isIP(self.probe.substring(0, self.probe.lastIndexOf(':')).replace('[', '').replace(']', '')) && int(self.probe.substring(self.probe.lastIndexOf(':') + 1)) > 0 && int(self.probe.substring(self.probe.lastIndexOf(':') + 1)) < 65536)").message("network.probe is not an address and port such as 192.0.2.1:443 or [2001:db8::1]:443")
-)]
-pub struct Network {
-    /// `Managed`: the operator applies and restores one NetworkPolicy, and creates no Job without it. `External`: the operator applies none; the cluster's own policies are trusted.
-    #[serde(default)]
-    pub policy: PolicySource,
-    /// What follows when a Pod measures that its NetworkPolicy is not enforced. `Require`: the run fails as NotIsolated. `Warn`: it goes on, and the condition Isolated shows it. `"Off"` (in quotes): nothing is measured.
-    #[serde(default)]
-    pub enforcement: Enforcement,
-    /// Address and port that the Pod connects to, to measure whether the policy is enforced, such as `10.0.0.1:443`. It must answer, and `egress` must not allow it: an address that never answers always looks enforced. Default: the API server's Service address. Set it where `egress` allows that one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(
-        length(max = 64),
-        regex(pattern = r"^([0-9]{1,3}([.][0-9]{1,3}){3}|\[[0-9A-Fa-f:.]+\]):[0-9]{1,5}$")
-    )]
-    pub probe: Option<String>,
-    /// Addresses, S3's first of all: where policies are enforced, nothing can be stored without them.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(length(max = 32))]
-    pub egress: Vec<Egress>,
-    /// Whether names may be looked up.
-    #[serde(default = "defaults::yes")]
-    pub dns: bool,
-}
-
-/// One range of addresses.
-#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
-#[x_kube(validation = Rule::new("isCIDR(self.cidr)").message("network.egress[].cidr is not a range of addresses such as 10.0.0.0/16"))]
-pub struct Egress {
-    /// A range such as `10.0.0.0/16`.
-    #[schemars(length(min = 1, max = 64))]
-    pub cidr: String,
-    /// TCP ports; none means all.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(length(max = 32), inner(range(min = 1, max = 65535)))]
-    pub ports: Vec<i32>,
-}
-
 /// How many submissions run at once; absent means no limit.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
@@ -395,18 +331,6 @@ impl Default for Retries {
         Self {
             per_pair: defaults::retries_per_pair(),
             infrastructure: defaults::retries_infrastructure(),
-        }
-    }
-}
-
-impl Default for Network {
-    fn default() -> Self {
-        Self {
-            policy: PolicySource::default(),
-            enforcement: Enforcement::default(),
-            probe: None,
-            egress: Vec::new(),
-            dns: true,
         }
     }
 }
@@ -469,8 +393,5 @@ mod defaults {
     }
     pub(super) fn finalize_seconds() -> i64 {
         900
-    }
-    pub(super) fn yes() -> bool {
-        true
     }
 }

@@ -12,6 +12,7 @@ pub mod image_pattern;
 pub mod ingested;
 mod job_number;
 pub mod leaderboard;
+pub mod leaderboard_network;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
 pub mod names;

@@ -1,22 +1,96 @@
 //! Ranges of addresses, and which addresses the policy of a Leaderboard lets its Pods reach. Pure.
 //!
-//! Read by the controller, which makes the policy, and in the Pod, which measures whether it is enforced.
+//! Read by the controller, which makes the policy, and in the Pod, which measures whether it is enforced. And which addresses are
+//! public: who follows an address that a stranger has named goes to no other.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr};
 
-/// Where clouds hand out credentials of nodes and Pods: all link-local addresses, and AWS's own of IPv6.
-const FORBIDDEN: [(&str, u8); 3] = [("169.254.0.0", 16), ("fe80::", 10), ("fd00:ec2::", 64)];
+/// Where clouds hand out credentials of nodes and Pods: all link-local addresses, AWS's own of IPv6, and those of Alibaba, Azure and
+/// Oracle that are not link-local.
+const FORBIDDEN: [(&str, u8); 6] = [
+    ("169.254.0.0", 16),
+    ("100.100.100.200", 32),
+    ("168.63.129.16", 32),
+    ("192.0.0.192", 32),
+    ("fe80::", 10),
+    ("fd00:ec2::", 64),
+];
+
+/// What is nobody's on the internet, or leads back into a network of one's own (IANA's registries of special addresses).
+const NOT_PUBLIC: [(&str, u8); 25] = [
+    ("0.0.0.0", 8),
+    ("10.0.0.0", 8),
+    // Between a provider and its customers; EKS gives it to Pods too.
+    ("100.64.0.0", 10),
+    ("127.0.0.0", 8),
+    ("169.254.0.0", 16),
+    // Azure's own services, on every one of its machines.
+    ("168.63.129.16", 32),
+    ("172.16.0.0", 12),
+    ("192.0.0.0", 24),
+    ("192.0.2.0", 24),
+    ("192.88.99.0", 24),
+    ("192.168.0.0", 16),
+    ("198.18.0.0", 15),
+    ("198.51.100.0", 24),
+    ("203.0.113.0", 24),
+    // Multicast, the reserved ones, and broadcast.
+    ("224.0.0.0", 3),
+    // Protocols' own, with tunnels whose end an address names (Teredo).
+    ("2001::", 23),
+    ("2001:db8::", 32),
+    // Tunnels whose end an address names (6to4).
+    ("2002::", 16),
+    ("3fff::", 20),
+    // All that is not 2000::/3: loopback, local, unique local and multicast among it.
+    ("::", 3),
+    ("4000::", 2),
+    ("8000::", 2),
+    ("c000::", 3),
+    ("e000::", 4),
+    ("f000::", 4),
+];
+
+/// What stands before an IPv4 address in one of IPv6 that leads to it: as a socket shows it, and as a NAT64 takes it.
+const LEADS_TO_V4: [(&str, u8); 2] = [("::ffff:0:0", 96), ("64:ff9b::", 96)];
+
+/// Whether an address is one of the internet, which a server of its own answers: not private, local, shared, documentation, multicast or
+/// reserved, and no way to such a one.
+pub fn is_public(address: IpAddr) -> bool {
+    let address = leads_to(address);
+    let Some(alone) = Range::alone(address) else {
+        return false;
+    };
+    !table(&NOT_PUBLIC).any(|range| range.contains(alone))
+}
+
+/// The IPv4 address that one of IPv6 leads to, else the address itself.
+fn leads_to(address: IpAddr) -> IpAddr {
+    let (IpAddr::V6(v6), Some(alone)) = (address, Range::alone(address)) else {
+        return address;
+    };
+    if !table(&LEADS_TO_V4).any(|range| range.contains(alone)) {
+        return address;
+    }
+    let [.., high, low] = v6.segments();
+    let [a, b] = high.to_be_bytes();
+    let [c, d] = low.to_be_bytes();
+    Ipv4Addr::new(a, b, c, d).into()
+}
 
 /// What no policy lets a Pod reach, whatever the host allows.
 pub fn forbidden() -> impl Iterator<Item = Range> {
-    FORBIDDEN
-        .iter()
+    table(&FORBIDDEN)
+}
+
+fn table(rows: &'static [(&str, u8)]) -> impl Iterator<Item = Range> {
+    rows.iter()
         .filter_map(|(address, bits)| Range::new(address.parse().ok()?, *bits))
 }
 
 /// Whether a policy that allows these ranges lets a Pod reach an address, on some port.
 pub fn allows<'a>(mut allowed: impl Iterator<Item = &'a str>, address: IpAddr) -> bool {
-    let Some(alone) = Range::new(address, if address.is_ipv4() { 32 } else { 128 }) else {
+    let Some(alone) = Range::alone(address) else {
         return false;
     };
     let is_in = |cidr: &str| Range::parse(cidr).is_some_and(|range| range.contains(alone));
@@ -38,6 +112,14 @@ impl Range {
         Self::new(address.parse().ok()?, bits.parse().ok()?)
     }
 
+    /// Reads an address or a range.
+    pub fn of(text: &str) -> Option<Self> {
+        match text.parse() {
+            Ok(address) => Self::alone(address),
+            Err(_) => Self::parse(text),
+        }
+    }
+
     /// The range of `bits` bits around an address.
     pub fn new(address: IpAddr, bits: u8) -> Option<Self> {
         let (v6, number, width) = match address {
@@ -49,6 +131,11 @@ impl Range {
             start: number & mask(bits),
             bits,
         })
+    }
+
+    /// The range of one address.
+    pub fn alone(address: IpAddr) -> Option<Self> {
+        Self::new(address, if address.is_ipv4() { 32 } else { 128 })
     }
 
     /// Whether all of another range lies in this one.
@@ -82,7 +169,93 @@ mod tests {
         assert!(allowed(&["fd00::/8"], "fd00:1::1"));
         assert!(!allowed(&[], "10.96.0.1"));
         assert!(!allowed(&["10.96.0.2/32", "::/0", "nonsense"], "10.96.0.1"));
-        assert!(!allowed(&["0.0.0.0/0"], "169.254.169.254"));
+        for metadata in ["169.254.169.254", "168.63.129.16", "100.100.100.200", "192.0.0.192"] {
+            assert!(!allowed(&["0.0.0.0/0"], metadata), "{metadata}");
+        }
+    }
+
+    #[test]
+    fn every_row_of_the_tables_is_read() {
+        assert_eq!(forbidden().count(), FORBIDDEN.len());
+        assert_eq!(table(&NOT_PUBLIC).count(), NOT_PUBLIC.len());
+        assert_eq!(table(&LEADS_TO_V4).count(), LEADS_TO_V4.len());
+        let text = |(address, bits): &(&str, u8)| format!("{address}/{bits}");
+        let rows: Vec<String> = FORBIDDEN.iter().chain(&NOT_PUBLIC).map(text).collect();
+        let read: Vec<String> = forbidden().chain(table(&NOT_PUBLIC)).map(Range::text).collect();
+        assert_eq!(read, rows);
+    }
+
+    #[test]
+    fn only_addresses_of_the_internet_are_public() {
+        let public = [
+            "1.1.1.1",
+            "52.94.133.131",
+            "100.63.255.255",
+            "100.128.0.0",
+            "168.63.129.17",
+            "172.15.255.255",
+            "172.32.0.0",
+            "192.0.1.0",
+            "198.17.255.255",
+            "198.20.0.0",
+            "223.255.255.255",
+            "2600:1f18::1",
+            "2001:200::1",
+            "::ffff:1.1.1.1",
+            "64:ff9b::1.1.1.1",
+        ];
+        for address in public {
+            assert!(is_public(address.parse().unwrap()), "{address}");
+        }
+        let not = [
+            "0.0.0.0",
+            "0.1.2.3",
+            "10.0.0.1",
+            "100.64.0.1",
+            "100.100.100.200",
+            "127.0.0.1",
+            "127.255.255.254",
+            "168.63.129.16",
+            "169.254.169.254",
+            "172.16.0.1",
+            "172.31.255.255",
+            "192.0.0.192",
+            "192.0.2.1",
+            "192.88.99.1",
+            "192.168.1.1",
+            "198.18.0.1",
+            "198.51.100.1",
+            "203.0.113.1",
+            "224.0.0.1",
+            "240.0.0.1",
+            "255.255.255.255",
+            "::",
+            "::1",
+            "::10.0.0.1",
+            "::ffff:10.0.0.1",
+            "::ffff:169.254.169.254",
+            "64:ff9b::10.0.0.1",
+            "64:ff9b::169.254.169.254",
+            "64:ff9b:1::1.1.1.1",
+            "100::1",
+            "2001::1",
+            "2001:db8::1",
+            "2002:a9fe:a9fe::1",
+            "2002:101:101::1",
+            "3fff::1",
+            "4000::1",
+            "5f00::1",
+            "8000::1",
+            "c000::1",
+            "fc00::1",
+            "fd00:ec2::254",
+            "fe80::1",
+            "fec0::1",
+            "ff02::1",
+        ];
+        for address in not {
+            assert!(!is_public(address.parse().unwrap()), "{address}");
+        }
     }
 
     #[test]

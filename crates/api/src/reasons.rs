@@ -371,19 +371,27 @@ reasons! {
     Leaderboard {
         READY = "Ready",
             "Submissions can run. The message may have a note: metrics of a phase's leaderboard that stay empty, a token that \
-             expires soon, or until when nothing is written to EvalAI after a change of operators.",
+             expires soon, until when nothing is written to EvalAI after a change of operators, Secrets that participants can read, \
+             or rights by which their code can leave its Pod.",
             "Nothing, or what the note asks for.";
         OTHER_OPERATOR = "OtherOperator",
             "Only in the log and the metrics of an operator: another installation drives this Leaderboard, which `status.operator` \
              names by its Lease. This one leaves the Leaderboard and its submissions alone, and takes over when that Lease is gone \
              or has not been renewed for 30 s.",
-            "Uninstall one of the two, or let them serve different namespaces (`watchNamespace`).";
+            "Uninstall one of the two, or let them serve different namespaces (`leaderboards` of the chart's values).";
         TOKEN_MISSING = "TokenMissing",
             "EvalAI's token is not where `evalai.token` points.",
             "Create the Secret, or correct the reference.";
         TOKEN_REFUSED = "TokenRefused",
             "EvalAI refuses the token, or its user is no host of the challenge.",
             "Renew the token; or store a host's token, make the user a host, or correct `evalai.challenge`, as the message asks.";
+        NOT_ALLOWED = "NotAllowed",
+            "The Leaderboard names an entry of Secrets Manager or a queue that Leaderboards of its namespace may not name. Its token is \
+             not read, its queue is left alone, and EvalAI is not asked.",
+            "Name another one; or let the operator's administrator allow it under `leaderboards[]` of the chart's values.";
+        INSECURE_SERVER = "InsecureServer",
+            "`evalai.apiServer` begins with http and is on the internet: everyone on the way could read the host's token.",
+            "Use https.";
         PHASE_CONFLICT = "PhaseConflict",
             "An older Leaderboard has the same phase and serves it.",
             "Remove the phase from one of them.";

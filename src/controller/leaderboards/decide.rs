@@ -9,6 +9,7 @@ use kube::ResourceExt;
 use super::isolation;
 use super::probe::EvalaiStanding;
 use super::reach::Unreachable;
+use super::refusal::Refusal;
 use super::state::Policy;
 use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
@@ -35,6 +36,8 @@ pub struct LeaderboardView {
     pub policy: Policy,
     /// What the last of its Pods has found of its isolation.
     pub measured: Option<WorkspaceVerdict>,
+    /// What it names and may not; nothing of it is asked or read then.
+    pub refusal: Option<Refusal>,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
     /// What its host should know of its Pods all the same.
@@ -156,6 +159,9 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
 /// What is wrong with the Leaderboard as it is written.
 fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     let no = |reason, message: String| Some((Truth::False, reason, message));
+    if let Some(refusal) = &view.refusal {
+        return no(refusal.reason, refusal.message.clone());
+    }
     if let Some(older) = phase_conflict(view) {
         return no(
             reasons::PHASE_CONFLICT,

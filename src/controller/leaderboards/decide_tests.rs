@@ -50,6 +50,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         pods: 0,
         policy: Policy::InPlace,
         measured: None,
+        refusal: None,
         invalid_pod: None,
         pod_notes: Vec::new(),
         unreachable: None,
@@ -293,4 +294,23 @@ fn what_is_wrong_with_evalai_is_said() {
         };
         assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.to_owned()));
     }
+}
+
+#[test]
+fn what_it_may_not_name_comes_first_and_weak_pods_are_noted() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let mut seen = view(&one, &[]);
+    seen.refusal = Some(Refusal {
+        reason: reasons::NOT_ALLOWED,
+        message: "no".into(),
+    });
+    seen.invalid_pod = Some("no Pod".into());
+    assert_eq!(reason(&decide(&seen)), ("False".into(), reasons::NOT_ALLOWED.into()));
+
+    let mut weak = one.as_ref().clone();
+    weak.spec.pod_overrides = Some(json!({"spec": {"hostIPC": true}}));
+    let plan = decide(&view(&Arc::new(weak), &[]));
+    let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+    assert_eq!(ready.status, "True");
+    assert!(ready.message.contains("podOverrides.spec.hostIPC"), "{}", ready.message);
 }

@@ -12,6 +12,7 @@ mod places;
 mod pod_notes;
 pub mod probe;
 mod reach;
+mod refusal;
 pub mod state;
 
 use std::sync::Arc;
@@ -31,6 +32,7 @@ use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
 use leaderboard_api::{Leaderboard, names};
 use probe::Probe;
+use refusal::Refusal;
 use state::{COUNTS_EVERY, LeaderboardState, Policy, RESYNC, SOONEST};
 
 /// What a reconcile of a Leaderboard uses.
@@ -74,12 +76,13 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     } = uses.policies;
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
-    let probe = state.probe(&uid).refresh(uses, &leaderboard, now).await;
-    if let Some(target) = probe.target() {
-        uses.external.set_target(&leaderboard, Some(target));
-    }
+    let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
+    let probe = probed(uses, &leaderboard, refusal.as_ref(), now).await;
     state.keep(&uid, probe.clone());
-    let view = observe(uses, &leaderboard, policy, &probe, now);
+    let view = LeaderboardView {
+        refusal,
+        ..observe(uses, &leaderboard, policy, &probe, now)
+    };
     let plan = decide(&view);
     if let Some(wanted) = plan.finalizer {
         set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
@@ -94,6 +97,21 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
     let next = probed.map_or(policy, |probed| probed.min(policy));
     Ok(next.max(SOONEST).min(again))
+}
+
+/// What was tried of it. Where it names what it may not, nothing is asked, and EvalAI is no longer spoken to.
+async fn probed(uses: Uses<'_>, leaderboard: &Arc<Leaderboard>, refusal: Option<&Refusal>, now: Timestamp) -> Probe {
+    if refusal.is_some() {
+        uses.external.set_target(leaderboard, None);
+        uses.external.hub.retire(&key_of(leaderboard.as_ref()));
+        return Probe::default();
+    }
+    let known = uses.policies.state.probe(&uid_of(leaderboard.as_ref()));
+    let probe = known.refresh(uses, leaderboard, now).await;
+    if let Some(target) = probe.target() {
+        uses.external.set_target(leaderboard, Some(target));
+    }
+    probe
 }
 
 fn observe(
@@ -115,6 +133,7 @@ fn observe(
         pods: isolation::pods_left(stores, leaderboard),
         policy,
         measured: isolation::measured(stores, uses.policies.state, leaderboard),
+        refusal: None,
         invalid_pod: probe.invalid_pod(),
         pod_notes: probe.pod_notes(),
         unreachable: probe.unreachable(now),

@@ -17,6 +17,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::core::NamespaceResourceScope;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::watcher::Config;
 use kube::{Api, Client};
@@ -38,7 +39,7 @@ use crate::controller::submissions::observe::{node, team};
 use crate::controller::submissions::reruns::Reruns;
 use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
-use crate::kubernetes::{Shape, Store, Watch, guarded, spawn_watch};
+use crate::kubernetes::{Namespaces, Shape, Store, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::ObjectKey;
@@ -113,14 +114,9 @@ async fn work(
     if !await_kinds(client, &["leaderboards", "submissions"], &telemetry).await {
         return Ok(());
     }
-    let rights = watch_rights(
-        client.clone(),
-        settings.namespace.clone(),
-        lease.clone(),
-        telemetry.clone(),
-    );
+    let rights = watch_rights(client.clone(), settings.clone(), lease.clone(), telemetry.clone());
     telemetry.tasks.may_end("permissions", rights);
-    let watches = Watches::start(&clients.watch, settings.namespace.as_deref(), &telemetry);
+    let watches = Watches::start(&clients.watch, &settings, &telemetry);
     telemetry.readiness.registered();
     let leader = leader::start(clients.lease, lease, &telemetry);
     let parts = Parts {
@@ -139,8 +135,8 @@ async fn work(
     result
 }
 
-async fn watch_rights(client: Client, namespace: Option<String>, lease: leader::Settings, telemetry: Observability) {
-    let needs = needs::needs(namespace.as_deref(), &lease);
+async fn watch_rights(client: Client, settings: Settings, lease: leader::Settings, telemetry: Observability) {
+    let needs = needs::needs(&settings.namespaces, settings.has_cluster_rights, &lease);
     watch_access(client, &needs, &telemetry).await;
 }
 
@@ -151,18 +147,30 @@ pub struct Clients {
     pub lease: Client,
 }
 
+/// Watches a kind in all namespaces that are served.
+fn all<K: Watchable<Scope = NamespaceResourceScope>>(
+    namespaces: &Namespaces,
+    client: &Client,
+    config: Config,
+    shape: Shape<K>,
+    telemetry: &Observability,
+) -> Watch<K> {
+    spawn_watch(namespaces.apis(client), config, shape, telemetry)
+}
+
 struct Watches {
     leaderboards: Watch<Leaderboard>,
     submissions: Watch<Submission>,
     jobs: Watch<Job>,
     pods: Watch<Pod>,
     policies: Watch<NetworkPolicy>,
-    /// None: an operator of one namespace has no right to them.
+    /// None: an operator without rights of the whole cluster has none to them.
     nodes: Option<Watch<Node>>,
 }
 
 impl Watches {
-    fn start(client: &Client, namespace: Option<&str>, telemetry: &Observability) -> Self {
+    fn start(client: &Client, settings: &Settings, telemetry: &Observability) -> Self {
+        let namespaces = &settings.namespaces;
         let children = || Config::default().labels(&children_selector());
         let submissions = Shape {
             index: team::index,
@@ -173,34 +181,15 @@ impl Watches {
             ..Shape::default()
         };
         Self {
-            leaderboards: spawn_watch(
-                guarded(client.clone(), namespace),
-                Config::default(),
-                Shape::default(),
-                telemetry,
-            ),
-            submissions: spawn_watch(
-                guarded(client.clone(), namespace),
-                Config::default(),
-                submissions,
-                telemetry,
-            ),
-            jobs: spawn_watch(
-                guarded(client.clone(), namespace),
-                children(),
-                Shape::default(),
-                telemetry,
-            ),
-            pods: spawn_watch(guarded(client.clone(), namespace), children(), pods, telemetry),
-            policies: spawn_watch(
-                guarded(client.clone(), namespace),
-                children(),
-                Shape::default(),
-                telemetry,
-            ),
-            nodes: namespace
-                .is_none()
-                .then(|| spawn_watch(Api::all(client.clone()), Config::default(), Shape::default(), telemetry)),
+            leaderboards: all(namespaces, client, Config::default(), Shape::default(), telemetry),
+            submissions: all(namespaces, client, Config::default(), submissions, telemetry),
+            jobs: all(namespaces, client, children(), Shape::default(), telemetry),
+            pods: all(namespaces, client, children(), pods, telemetry),
+            policies: all(namespaces, client, children(), Shape::default(), telemetry),
+            nodes: settings.has_cluster_rights.then(|| {
+                let nodes = vec![Api::all(client.clone())];
+                spawn_watch(nodes, Config::default(), Shape::default(), telemetry)
+            }),
         }
     }
 

@@ -7,6 +7,7 @@ use tokio::sync::watch;
 use tower_test::mock::{Handle, pair};
 
 use super::*;
+use crate::allowed::Allowed;
 use crate::controller::fixtures;
 use crate::controller::runtime::leader::Identity;
 use crate::controller::runtime::leader::fake_server::FakeServer;
@@ -85,7 +86,9 @@ async fn leader() -> Process {
         image_pull_policy: None,
         region: None,
         operator: lease.installation(),
-        namespace: None,
+        namespaces: Namespaces::All,
+        has_cluster_rights: true,
+        allowed: Allowed::default(),
         concurrency: 4,
     };
     let aws = fixtures::aws("http://127.0.0.1:9").await;

@@ -11,18 +11,19 @@ use reqwest::{Method, RequestBuilder, Response};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::answer::{About, Answer, Refusal, Silence, classify};
+use super::answer::{Answer, Silence, classify};
+use super::files::Files;
 use super::request::{Reply, Request, SubmissionRef};
-use super::row::image;
-use super::types::{ImageAnswer, Payload};
+use super::types::Payload;
 use crate::services::meter::Meter;
+use crate::services::public::Reach;
 use crate::services::token::Token;
 use leaderboard_api::client_errors;
 
 /// Largest answer that is read, a list of many thousand rows, in bytes.
 const LARGEST: usize = 64 << 20;
 /// Largest uploaded file that is read, in bytes.
-const LARGEST_UPLOAD: usize = 64 << 10;
+pub(super) const LARGEST_UPLOAD: usize = 64 << 10;
 
 /// How long an answer is waited for.
 #[derive(Clone, Copy, Debug)]
@@ -52,7 +53,7 @@ pub struct ClientError(String);
 #[derive(Clone, Debug)]
 pub struct Client {
     api: reqwest::Client,
-    files: reqwest::Client,
+    files: Files,
     base: String,
     timeouts: Timeouts,
     meter: Meter,
@@ -84,21 +85,9 @@ struct Patch<'a> {
 impl Client {
     /// A client of one server, named by its root.
     pub fn new(api_server: &str, timeouts: Timeouts) -> Result<Self, ClientError> {
-        // A program that has installed one already keeps it.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        let builder = || {
-            reqwest::Client::builder()
-                .connect_timeout(timeouts.connect)
-                .user_agent(concat!("leaderboard-operator/", env!("CARGO_PKG_VERSION")))
-                .retry(reqwest::retry::never())
-                // A server closes idle connections when it likes. A write that is sent on one in that moment has no answer, and
-                // may have been served: nothing is written for over a minute. At some 54 requests a minute nothing is kept open.
-                .pool_max_idle_per_host(0)
-        };
-        let made = |builder: reqwest::ClientBuilder| builder.build().map_err(|e| ClientError(client_errors::chain(&e)));
         Ok(Self {
-            api: made(builder().redirect(reqwest::redirect::Policy::none()))?,
-            files: made(builder().redirect(reqwest::redirect::Policy::limited(5)))?,
+            api: made(builder(timeouts).redirect(reqwest::redirect::Policy::none()))?,
+            files: Files::new(api_server, timeouts, Reach::default())?,
             base: format!("{}/api/", api_server.trim_end_matches('/')),
             timeouts,
             meter: Meter::default(),
@@ -122,7 +111,7 @@ impl Client {
     async fn exchange(&self, token: &Token, request: &Request) -> Reply {
         match request {
             Request::Get(s) => Reply::Row(self.get(token, &format!("jobs/submission/{}", s.pk)).await),
-            Request::Image(_, url) => Reply::Image(self.upload(url).await),
+            Request::Image(_, url) => Reply::Image(self.files.image(url).await),
             Request::Progress(s, progress, job) => {
                 let body = Patch {
                     submission: s.pk,
@@ -192,34 +181,28 @@ impl Client {
             .await
             .and_then(|_| Answer::Done(()))
     }
+}
 
-    /// Downloads the participant's uploaded file, without the token: it may lie with a storage provider.
-    async fn upload(&self, url: &str) -> Answer<ImageAnswer> {
-        if !url.starts_with("https://") && !url.starts_with("http://") {
-            return Answer::Refused(Refusal {
-                about: About::Request,
-                status: 0,
-                message: "the address of the uploaded file is neither http nor https; check EvalAI's MEDIA_URL".into(),
-            });
-        }
-        let request = self.files.get(url).timeout(self.timeouts.read);
-        match answer(request, LARGEST_UPLOAD, Need::Body).await {
-            // The file is there, and too large for what names an image.
-            Answer::Refused(refusal) if (200..300).contains(&refusal.status) => {
-                let why = format!("the uploaded file is larger than {LARGEST_UPLOAD} bytes");
-                Answer::Done(ImageAnswer::NotAnImage(why))
-            }
-            other => other.and_then(|(_, body)| {
-                let named = image(&body).map(ImageAnswer::Named);
-                Answer::Done(named.unwrap_or_else(ImageAnswer::NotAnImage))
-            }),
-        }
-    }
+/// What all clients have in common.
+pub(super) fn builder(timeouts: Timeouts) -> reqwest::ClientBuilder {
+    // A program that has installed one already keeps it.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    reqwest::Client::builder()
+        .connect_timeout(timeouts.connect)
+        .user_agent(concat!("leaderboard-operator/", env!("CARGO_PKG_VERSION")))
+        .retry(reqwest::retry::never())
+        // A server closes idle connections when it likes. A write that is sent on one in that moment has no answer, and
+        // may have been served: nothing is written for over a minute. At some 54 requests a minute nothing is kept open.
+        .pool_max_idle_per_host(0)
+}
+
+pub(super) fn made(builder: reqwest::ClientBuilder) -> Result<reqwest::Client, ClientError> {
+    builder.build().map_err(|e| ClientError(client_errors::chain(&e)))
 }
 
 /// What of an answer is worth something.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Need {
+pub(super) enum Need {
     /// A read is nothing without its body.
     Body,
     /// The status line shows that a write was done, also without the rest.
@@ -227,10 +210,13 @@ enum Need {
 }
 
 async fn answer(request: RequestBuilder, largest: usize, need: Need) -> Answer<(u16, Vec<u8>)> {
-    let response = match request.send().await {
-        Ok(response) => response,
-        Err(error) => return Answer::Unanswered(silence(error)),
-    };
+    match request.send().await {
+        Ok(response) => read(response, largest, need).await,
+        Err(error) => Answer::Unanswered(silence(error)),
+    }
+}
+
+pub(super) async fn read(response: Response, largest: usize, need: Need) -> Answer<(u16, Vec<u8>)> {
     let status = response.status();
     let code = status.as_u16();
     let retry_after = response
@@ -263,7 +249,7 @@ async fn body(mut response: Response, largest: usize) -> Result<Vec<u8>, Unread>
     Ok(body)
 }
 
-fn silence(error: reqwest::Error) -> Silence {
+pub(super) fn silence(error: reqwest::Error) -> Silence {
     let error = error.without_url();
     let what = match () {
         () if error.is_timeout() => "EvalAI did not answer in time",

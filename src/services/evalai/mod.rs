@@ -8,6 +8,7 @@
 pub mod answer;
 pub mod budget;
 pub mod client;
+mod files;
 pub mod guard;
 pub mod hub;
 pub mod labels;

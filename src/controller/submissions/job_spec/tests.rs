@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use serde_json::{Value, json};
 
 use super::*;
+use crate::allowed::Allowed;
+use crate::kubernetes::Namespaces;
 use leaderboard_api::{JobNumber, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
@@ -63,7 +65,9 @@ impl Case {
                 image_pull_policy: None,
                 region: None,
                 operator: "system/operator".into(),
-                namespace: None,
+                namespaces: Namespaces::All,
+                has_cluster_rights: true,
+                allowed: Allowed::default(),
                 concurrency: 16,
             },
         }

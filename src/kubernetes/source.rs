@@ -1,0 +1,147 @@
+//! One API of a watch: its events, its list under way, and how it stands. Used by `watch` alone.
+
+use std::collections::{BTreeSet, HashSet};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::future::ready;
+use futures::stream::{self, SelectAll};
+use futures::{Stream, StreamExt};
+use kube::Api;
+use kube::runtime::watcher::{Config, Error, Event};
+use kube::runtime::{WatchStreamExt, watcher};
+
+use super::item::{Item, Watchable};
+use super::store::key;
+use crate::observability::liveness::WatchProbe;
+
+/// A watch that the API server has refused begins again with a list after this long.
+const REFUSED_AGAIN: Duration = Duration::from_secs(10);
+
+/// How one API of a watch stands.
+pub(super) struct Source<K> {
+    /// Its namespace, where it is one of several.
+    namespace: Option<Box<str>>,
+    pub probe: WatchProbe,
+    pub list: Listing<K>,
+    /// It has listed and was not refused since.
+    pub is_synced: bool,
+    pub has_listed: bool,
+}
+
+impl<K> Source<K> {
+    pub(super) fn new(namespace: Option<&str>, probe: WatchProbe) -> Self {
+        Self {
+            namespace: namespace.map(Into::into),
+            probe,
+            list: Listing::default(),
+            is_synced: false,
+            has_listed: false,
+        }
+    }
+
+    /// Whether an object of this key is one that it shows.
+    pub(super) fn has(&self, object: &str) -> bool {
+        self.namespace
+            .as_deref()
+            .is_none_or(|namespace| object.starts_with(&*key(Some(namespace), "")))
+    }
+
+    pub(super) fn namespace(&self) -> Option<&str> {
+        self.namespace.as_deref()
+    }
+
+    /// A cause of failure, with the namespace where there are several.
+    pub(super) fn cause(&self, cause: String) -> String {
+        match &self.namespace {
+            Some(namespace) => format!("{cause} (namespace {namespace})"),
+            None => cause,
+        }
+    }
+}
+
+/// A list under way. What it brings is cached at once, so that no second cache is needed, and is an event once the list is
+/// complete.
+pub(super) struct Listing<K> {
+    /// What this list has shown.
+    pub shown: HashSet<Box<str>>,
+    /// What it has shown and cannot be read.
+    pub unreadable: BTreeSet<Box<str>>,
+    /// What has changed since the last list that was complete.
+    pub changed: HashSet<Box<str>>,
+    /// What was replaced by another object of its name meanwhile.
+    pub replaced: Vec<Arc<K>>,
+}
+
+impl<K> Default for Listing<K> {
+    fn default() -> Self {
+        Self {
+            shown: HashSet::new(),
+            unreadable: BTreeSet::new(),
+            changed: HashSet::new(),
+            replaced: Vec::new(),
+        }
+    }
+}
+
+impl<K> Listing<K> {
+    pub(super) fn begins(&mut self) {
+        self.shown.clear();
+        self.unreadable.clear();
+    }
+
+    /// One that has become unreadable stays as it was last read: it has not been deleted.
+    pub(super) fn unreadable(&mut self, key: Box<str>) {
+        self.shown.insert(key.clone());
+        self.unreadable.insert(key);
+    }
+}
+
+type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<Item<K>>, Error>> + Send>>;
+/// The number of a source, and what comes of it; None is its end.
+type Numbered<K> = (usize, Option<Result<Event<Item<K>>, Error>>);
+type AllEvents<K> = SelectAll<Pin<Box<dyn Stream<Item = Numbered<K>> + Send>>>;
+
+/// What comes of all APIs, each with its number.
+pub(super) fn all<K: Watchable>(apis: Vec<Api<Item<K>>>, config: &Config) -> AllEvents<K> {
+    stream::select_all(apis.into_iter().enumerate().map(|(number, api)| {
+        let events = lasting(api, config.clone()).map(Some);
+        let numbered = events
+            .chain(stream::once(ready(None)))
+            .map(move |event| (number, event));
+        let numbered: Pin<Box<dyn Stream<Item = Numbered<K>> + Send>> = Box::pin(numbered);
+        numbered
+    }))
+}
+
+/// A list, then what changes; a list again after a refusal, because a watch without news does not show that the right is back.
+fn lasting<K: Watchable>(api: Api<Item<K>>, config: Config) -> Events<K> {
+    let begun = begin(&api, &config);
+    Box::pin(stream::unfold((begun, false), move |(mut events, was_refused)| {
+        let (api, config) = (api.clone(), config.clone());
+        async move {
+            if was_refused {
+                tokio::time::sleep(REFUSED_AGAIN).await;
+                events = begin(&api, &config);
+            }
+            let event = events.next().await?;
+            let is_refused = matches!(&event, Err(error @ Error::WatchStartFailed(_)) if is_refusal(error));
+            Some((event, (events, is_refused)))
+        }
+    }))
+}
+
+fn begin<K: Watchable>(api: &Api<Item<K>>, config: &Config) -> Events<K> {
+    Box::pin(watcher(api.clone(), config.clone()).default_backoff())
+}
+
+/// The right to list or to watch is missing.
+pub(super) fn is_refusal(error: &Error) -> bool {
+    match error {
+        Error::InitialListFailed(kube::Error::Api(status)) | Error::WatchStartFailed(kube::Error::Api(status)) => {
+            status.code == 403
+        }
+        _ => false,
+    }
+}

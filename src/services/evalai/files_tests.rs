@@ -1,0 +1,132 @@
+//! Where an uploaded file is read from, against servers on several addresses of this machine: `127.0.0.2` stands for the internet.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpListener;
+
+use super::*;
+
+const FILE: &str = r#"{"submitted_image_uri": "registry.example/agent:1"}"#;
+
+fn is_internet(address: IpAddr) -> bool {
+    address == Ipv4Addr::new(127, 0, 0, 2)
+}
+
+/// A server that gives every request the same answer, and counts them.
+struct Server {
+    url: String,
+    requests: Arc<AtomicUsize>,
+}
+
+impl Server {
+    async fn start(address: &str, answer: String) -> Self {
+        let listener = TcpListener::bind((address, 0)).await.unwrap();
+        let url = format!("http://{}", listener.local_addr().unwrap());
+        let requests = Arc::new(AtomicUsize::new(0));
+        let counted = Arc::clone(&requests);
+        tokio::spawn(async move {
+            while let Ok((mut stream, _)) = listener.accept().await {
+                counted.fetch_add(1, Ordering::SeqCst);
+                let mut request = Vec::new();
+                while !request.ends_with(b"\r\n\r\n") {
+                    request.push(stream.read_u8().await.unwrap());
+                }
+                stream.write_all(answer.as_bytes()).await.unwrap();
+            }
+        });
+        Self { url, requests }
+    }
+
+    async fn with_file(address: &str) -> Self {
+        let head = format!(
+            "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: {}\r\n\r\n",
+            FILE.len()
+        );
+        Self::start(address, head + FILE).await
+    }
+
+    async fn leading_to(address: &str, place: &str) -> Self {
+        let head = "HTTP/1.1 302 Found\r\nconnection: close\r\ncontent-length: 0\r\n";
+        Self::start(address, format!("{head}location: {place}\r\n\r\n")).await
+    }
+
+    fn requests(&self) -> usize {
+        self.requests.load(Ordering::SeqCst)
+    }
+}
+
+async fn read_as(server: &str, url: &str) -> Answer<ImageAnswer> {
+    let files = Files::new(server, Timeouts::default(), Reach::of(is_internet)).unwrap();
+    files.image(url).await
+}
+
+fn named() -> Answer<ImageAnswer> {
+    Answer::Done(ImageAnswer::Named("registry.example/agent:1".into()))
+}
+
+fn refusal(answer: Answer<ImageAnswer>) -> String {
+    match answer {
+        Answer::Refused(refusal) => refusal.message,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn a_file_is_read_from_evalais_own_server_wherever_it_is_and_from_the_internet() {
+    let evalai = Server::with_file("127.0.0.1").await;
+    assert_eq!(
+        read_as(&evalai.url, &format!("{}/media/1.json", evalai.url)).await,
+        named()
+    );
+    let storage = Server::with_file("127.0.0.2").await;
+    assert_eq!(read_as(&evalai.url, &format!("{}/1.json", storage.url)).await, named());
+    let redirecting = Server::leading_to("127.0.0.1", &storage.url).await;
+    assert_eq!(
+        read_as(&redirecting.url, &format!("{}/media/1.json", redirecting.url)).await,
+        named()
+    );
+}
+
+#[tokio::test]
+async fn no_hop_leads_into_a_network_of_the_operators() {
+    let inside = Server::with_file("127.0.0.3").await;
+    let evalai = Server::leading_to("127.0.0.1", &inside.url).await;
+    let storage = Server::leading_to("127.0.0.2", &inside.url).await;
+    let twice = Server::leading_to("127.0.0.2", &storage.url).await;
+    let by_name = Server::leading_to("127.0.0.2", &inside.url.replace("127.0.0.3", "localhost")).await;
+    for first in [&inside, &evalai, &storage, &twice, &by_name] {
+        let said = refusal(read_as(&evalai.url, &format!("{}/1.json", first.url)).await);
+        assert!(said.contains("which is no address of the internet"), "{said}");
+    }
+    assert_eq!(inside.requests(), 0, "nothing was sent there");
+}
+
+#[tokio::test]
+async fn another_port_of_evalais_machine_is_not_evalai() {
+    let evalai = Server::with_file("127.0.0.1").await;
+    let neighbour = Server::with_file("127.0.0.1").await;
+    let said = refusal(read_as(&evalai.url, &format!("{}/1.json", neighbour.url)).await);
+    assert!(said.contains("127.0.0.1"), "{said}");
+    assert_eq!(neighbour.requests(), 0);
+}
+
+#[tokio::test]
+async fn redirects_end() {
+    let own = Server::leading_to("127.0.0.2", "/again").await;
+    let said = refusal(read_as(&own.url, &format!("{}/1.json", own.url)).await);
+    assert!(said.contains("more than 5 redirects"), "{said}");
+    assert_eq!(own.requests(), 6);
+    for (place, expected) in [("file:///etc/passwd", "neither http nor https"), ("http://", "no URL")] {
+        let leading = Server::leading_to("127.0.0.2", place).await;
+        let said = refusal(read_as(&own.url, &format!("{}/1.json", leading.url)).await);
+        assert!(said.contains(expected), "{said}");
+    }
+    let said = refusal(read_as(&own.url, "ftp://storage/1.json").await);
+    assert!(
+        said.contains("neither http nor https; check EvalAI's MEDIA_URL"),
+        "{said}"
+    );
+}

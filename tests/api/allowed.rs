@@ -1,0 +1,89 @@
+//! What a Leaderboard names and may not: shown in `Ready`, and nothing of it is used, until it names what it may.
+#![cfg(test)]
+
+use kube::Api;
+use kube::api::{Patch, PatchParams};
+use kube::runtime::wait::await_condition;
+use leaderboard_api::{Leaderboard, conditions, reasons};
+use leaderboard_operator::controller::settings::Settings;
+use serde_json::{Value, json};
+use tokio::time::timeout;
+
+use super::bridge::LIMIT;
+use super::operator::{self, Operator};
+use super::world::World;
+use crate::support::apiserver::server;
+
+const QUEUE: &str = "https://sqs.us-east-1.amazonaws.com/123456789012/payroll";
+
+async fn change(world: &World, spec: &Value) {
+    let api: Api<Leaderboard> = world.api();
+    let patch = Patch::Merge(json!({ "spec": spec }));
+    api.patch("lb", &PatchParams::default(), &patch).await.unwrap();
+}
+
+/// Waits until `Ready` has this reason; hands back its message.
+async fn until_says(world: &World, reason: &str) -> String {
+    let condition = |board: Option<&Leaderboard>| {
+        let status = board.and_then(|board| board.status.as_ref())?;
+        conditions::get(&status.conditions, conditions::READY).cloned()
+    };
+    let says = |board: Option<&Leaderboard>| condition(board).is_some_and(|ready| ready.reason == reason);
+    let found = timeout(LIMIT, await_condition(world.api::<Leaderboard>(), "lb", says)).await;
+    let Ok(found) = found else {
+        panic!("not {reason}: {:?}", world.api::<Leaderboard>().get("lb").await);
+    };
+    condition(found.unwrap().as_ref()).unwrap().message
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not() {
+    let world = World::new().await;
+    let namespace = &world.namespace;
+    let allowed = json!({ namespace: {"queues": ["submissions"], "secretsManager": []} });
+    let settings = Settings {
+        allowed: allowed.to_string().parse().unwrap(),
+        ..operator::settings(namespace)
+    };
+    let config = server().await.config();
+    let operator = Operator::start_with(settings, namespace, world.aws.aws.clone(), config);
+    world
+        .leaderboard_with("lb", 1, "Hosts", &json!({"queue": {"url": QUEUE}}))
+        .await;
+    let said = until_says(&world, reasons::NOT_ALLOWED).await;
+    for part in ["the queue", QUEUE, "leaderboards[]", "in queues"] {
+        assert!(said.contains(part), "{said}");
+    }
+    let (_, name) = world.submit("lb", 1).await;
+
+    let entry = json!({"secretsManager": {"id": "payroll"}, "secretKeyRef": null});
+    change(&world, &json!({"queue": null, "evalai": {"token": entry}})).await;
+    let refused = timeout(LIMIT, async {
+        while !until_says(&world, reasons::NOT_ALLOWED)
+            .await
+            .contains("Secrets Manager payroll")
+        {
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        }
+    });
+    refused.await.expect("the entry is refused");
+
+    let secret = json!({"secretsManager": null, "secretKeyRef": {"name": "evalai", "key": "token"}});
+    change(&world, &json!({"evalai": {"token": secret}})).await;
+    until_says(&world, reasons::READY).await;
+    world.job(&name, 0).await;
+    operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_is_not_sent_in_clear_over_the_internet() {
+    let world = World::new().await;
+    let _controller = world.controller();
+    let server = json!({"evalai": {"apiServer": "http://evalai.example.org"}});
+    world.leaderboard_with("lb", 1, "Hosts", &server).await;
+    let said = until_says(&world, reasons::INSECURE_SERVER).await;
+    assert!(
+        said.contains("http://evalai.example.org") && said.contains("use https"),
+        "{said}"
+    );
+}
