@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex};
 use axum::http::{Request, StatusCode};
 use evalai_stand_in::Config;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use kube::Client;
 use kube::api::{Api, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_api::{Leaderboard, Submission, conditions};
@@ -149,7 +150,7 @@ impl Scene {
         let is_ready = |board: Option<&Leaderboard>| {
             board.is_some_and(|board| is_true(board.status.as_ref().map(|s| &s.conditions), conditions::READY))
         };
-        let ready = timeout(LIMIT, await_condition(boards.clone(), "board", is_ready)).await;
+        let ready = timeout(LIMIT, Box::pin(await_condition(boards.clone(), "board", is_ready))).await;
         if ready.is_err() {
             let status = boards.get("board").await.unwrap().status;
             panic!("not ready: {status:?}\n{:?}\n{}", self.elsewhere.asked(), self.logs());

@@ -81,7 +81,7 @@ impl World {
                 .map(|status| &status.conditions);
             all.is_some_and(|all| conditions::is_true(all, conditions::READY))
         };
-        let found = timeout(LIMIT, await_condition(api.clone(), name, ready)).await;
+        let found = timeout(LIMIT, Box::pin(await_condition(api.clone(), name, ready))).await;
         assert!(found.is_ok(), "not ready: {:?}", api.get(name).await.unwrap().status);
         let status = api.get(name).await.unwrap().status.unwrap();
         conditions::get(&status.conditions, conditions::READY)

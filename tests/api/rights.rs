@@ -122,7 +122,7 @@ async fn until_ready(client: &Client, namespace: &str, name: &str) {
         let status = board.and_then(|board| board.status.as_ref());
         status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::READY))
     };
-    let ready = timeout(LIMIT, await_condition(boards.clone(), name, is_ready)).await;
+    let ready = timeout(LIMIT, Box::pin(await_condition(boards.clone(), name, is_ready))).await;
     let Ok(ready) = ready else {
         panic!("it is not ready: {:?}", boards.get(name).await);
     };
