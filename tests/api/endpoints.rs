@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex};
 use axum::http::{Request, StatusCode};
 use evalai_stand_in::Config;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+use kube::Client;
 use kube::api::{Api, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_api::{Leaderboard, Submission, conditions};
