@@ -200,7 +200,7 @@ fn a_wait_prints_each_transition_once_and_the_end() {
     assert!(observe(&attempt(waiting())).lines.is_empty());
     assert_eq!(
         observe(&attempt(running())).lines,
-        ["12:00:00  submission-42 is Running (Running): 12/20 routes done."]
+        ["12:00:00  submission-42 is Resumed (Running): 12/20 routes done."]
     );
     let more = with(running(), &json!({"attempt": 2, "message": "13/20 routes done."}));
     assert!(
