@@ -42,7 +42,9 @@ fn flood(logs: &Path) {
             File::create(folder.join(name(number))).unwrap();
         }
         let sparse = |name: &str, size: u64| File::create(logs.join(&own).join(name)).unwrap().set_len(size).unwrap();
-        (0..SPARSE_FILES).for_each(|number| sparse(&format!("sparse-{number}"), 60 << 20));
+        for number in 0..SPARSE_FILES {
+            sparse(&format!("sparse-{number}"), 60 << 20);
+        }
         sparse("leaderboard.log", 4 << 40);
     }
     let folder = folder("simulator");

@@ -133,7 +133,7 @@ impl Job {
     pub(super) async fn store(&self, cut_at: Option<Instant>) -> Outcome {
         // The upload itself is cut in time to abort it; this is for a request that does not end.
         let longest = cut_at.and_then(|cut_at| cut_at.checked_add(ABORTING));
-        match in_time(longest, self.send(cut_at)).await {
+        match in_time(longest, Box::pin(self.send(cut_at))).await {
             None => Outcome::Slow,
             Some(Ok(outcome)) => outcome,
             Some(Err(Problem::Local(error))) => Outcome::LeftOut(error.to_string()),

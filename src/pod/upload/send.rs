@@ -75,6 +75,9 @@ struct Bill {
     cost: Spent,
 }
 
+/// Keys, and why nothing is stored there.
+type LeftOut = Vec<(String, Why)>;
+
 /// A file that is due.
 #[derive(Clone, Copy, Debug)]
 struct Due {
@@ -261,7 +264,7 @@ impl Uploader {
     }
 
     /// The files that are due and fit, the known logs first, and what is to be said of the others.
-    fn due(&self, files: &[Wanted], is_last: bool) -> (Vec<(Job, Bill)>, Vec<(String, Why)>) {
+    fn due(&self, files: &[Wanted], is_last: bool) -> (Vec<(Job, Bill)>, LeftOut) {
         let now = self.epoch.elapsed();
         let stored = self.memory.stored.iter();
         let stored = stored.map(|(key, stored)| (key.as_str(), stored.stamp.size));

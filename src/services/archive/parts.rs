@@ -130,7 +130,7 @@ mod tests {
             (MIN_PART, MIN_PART + 3),
             (50 * MIB, 67 * MIB + 5),
             (3 * COPY + 17, 3 * COPY + 17 + PART * 2),
-            (0, 200_000 * MIB),
+            (0, 150_000 * MIB),
         ];
         for (kept, size) in sizes {
             let parts = plan(kept, size).unwrap();

@@ -191,7 +191,9 @@ async fn a_file_that_never_arrives_keeps_no_report_back() {
     let (shelf, pod) = shelved().await;
     pod.put(LOST[0], &noise(20 * MIB, 1));
     pod.put(LOST[1], b"x");
-    LOST.iter().for_each(|key| shelf.lose(key));
+    for key in LOST {
+        shelf.lose(key);
+    }
     pod.put("agent/agent2/arrives", b"x");
     let logcopy = pod.logcopy();
     until_true(|| shelf.aborted(LOST[0]) == 1).await;

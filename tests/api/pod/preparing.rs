@@ -123,7 +123,7 @@ async fn what_was_restored_is_not_sent_again() {
     let mut uploader = next.uploader();
     let stamp = Tree::open(next.logs()).unwrap().file(log).unwrap().unwrap().1;
     let sent = uploader
-        .sync(&[Wanted::new(log, stamp, Haste::Now)], None)
+        .sync(&[Wanted::new(log, stamp, Haste::Now)], Window::default())
         .await
         .unwrap();
     assert_eq!(sent, Sent::default());

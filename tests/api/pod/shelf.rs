@@ -129,12 +129,16 @@ impl State {
         let prefix = prefix.replace("%2F", "/");
         let prefix = prefix.strip_prefix("runs/77/").unwrap_or_default();
         let objects = self.objects.iter().filter(|(key, _)| key.starts_with(prefix));
-        let contents: String = objects
+        let contents: Vec<String> = objects
             .map(|(key, object)| {
                 let (size, etag) = (object.bytes.len(), &object.etag);
                 format!("<Contents><Key>runs/77/{key}</Key><Size>{size}</Size><ETag>\"{etag}\"</ETag></Contents>")
             })
             .collect();
-        format!("<ListBucketResult><IsTruncated>false</IsTruncated>{contents}</ListBucketResult>").into_response()
+        format!(
+            "<ListBucketResult><IsTruncated>false</IsTruncated>{}</ListBucketResult>",
+            contents.concat()
+        )
+        .into_response()
     }
 }

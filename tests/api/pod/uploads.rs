@@ -85,7 +85,7 @@ async fn the_limit_leaves_files_out_and_keeps_the_rest() {
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(8 * LEAST, 1));
     // Three quarters are for all but the known logs, and a small file counts as a page.
-    pod.put("simulator/large", &[0; 6 * PAGE]);
+    pod.put("simulator/large", &vec![0; 6 * PAGE]);
     pod.put("simulator/small", &[0; 20]);
     let wanted: Vec<Wanted> = ["simulator/small", "simulator/large"]
         .map(|path| Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now))
