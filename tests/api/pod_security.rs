@@ -106,7 +106,10 @@ async fn enforcing(client: &Client, level: &str) -> String {
 /// Asks the API server for a Pod of this template, and gives it as it would be, or why it is forbidden.
 async fn pod(client: &Client, namespace: &str, template: &Value) -> Result<Pod, String> {
     let mut object = template.clone();
-    object["metadata"]["name"] = "pod".into();
+    merge(
+        &mut object,
+        &json!({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "pod"}}),
+    );
     let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), namespace, &ApiResource::erase::<Pod>(&()));
     let params = PostParams {
         dry_run: true,
