@@ -12,6 +12,7 @@ mod support;
 mod api {
     mod boards;
     mod bridge;
+    mod charging;
     mod columns;
     mod counts;
     mod definitions;
@@ -22,6 +23,7 @@ mod api {
     mod intake;
     mod isolation;
     mod leader;
+    mod memory;
     mod objects;
     mod operator;
     mod plugin;

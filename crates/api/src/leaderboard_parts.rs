@@ -17,6 +17,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
+use super::infrastructure_failures::OnRepeatedInfrastructure;
 pub use super::leaderboard_services::*;
 use super::route_slice::{NotASlice, RouteSlice};
 
@@ -247,6 +248,9 @@ pub struct Retries {
     #[serde(default = "defaults::retries_infrastructure")]
     #[schemars(range(min = 0, max = 100))]
     pub infrastructure: i32,
+    /// What becomes of an attempt that ends because of the infrastructure after `infrastructure` others of its team in a row did.
+    #[serde(default)]
+    pub on_repeated_infrastructure: OnRepeatedInfrastructure,
 }
 
 /// Time limits.
@@ -416,6 +420,7 @@ impl Default for Retries {
         Self {
             per_pair: defaults::retries_per_pair(),
             infrastructure: defaults::retries_infrastructure(),
+            on_repeated_infrastructure: OnRepeatedInfrastructure::default(),
         }
     }
 }

@@ -8,6 +8,7 @@ pub mod client_errors;
 pub mod conditions;
 pub mod effective;
 pub mod image;
+pub mod infrastructure_failures;
 pub mod ingested;
 pub mod leaderboard;
 pub mod leaderboard_parts;
@@ -26,6 +27,7 @@ pub mod text;
 mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
+pub use infrastructure_failures::{InfrastructureFailures, OnRepeatedInfrastructure, TeamFailures};
 pub use ingested::{Ingested, RefusedAttempt};
 pub use leaderboard::{
     EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,

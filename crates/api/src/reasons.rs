@@ -232,6 +232,14 @@ reasons! {
              space. The submission fails at once, usually before a Job is created; where only the kubelet refuses the name, with \
              the first Pod.",
             "Submit again with an image such as registry.example/team/agent:1.";
+        REPEATED_FAILURES = "RepeatedFailures",
+            "The attempt ended because of the infrastructure in a way that an agent can cause as well, and so did the team's attempts \
+             before it, while other teams' runs with the same simulator finished. Only with \
+             `retries.onRepeatedInfrastructure: Charge`.",
+            "Look at the log of the simulator and of the agent. If the agent is not the cause, resume the submission; else the \
+             participant fixes the agent and submits again.",
+            log: "the log of simulator `<n>`, read from its node before the Pod ends, else `simulator/console-<n>.log`; where no simulator \
+             failed, the log of `logcopy`";
         DISK_FULL = "DiskFull",
             "The Pod was evicted because the agent filled its disk.",
             "Write less to disk or to the log.",

@@ -33,8 +33,9 @@ use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
-use crate::controller::submissions::observe::{node, team};
+use crate::controller::submissions::observe::node;
 use crate::controller::submissions::reruns::Reruns;
+use crate::controller::submissions::team_history;
 use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
 use crate::kubernetes::{Shape, Store, Watch, guarded, spawn_watch};
@@ -164,7 +165,7 @@ impl Watches {
     fn start(client: &Client, namespace: Option<&str>, telemetry: &Observability) -> Self {
         let children = || Config::default().labels(&children_selector());
         let submissions = Shape {
-            index: team::index,
+            index: team_history::index,
             ..Shape::default()
         };
         let pods = Shape {
@@ -294,7 +295,12 @@ impl Parts {
             rows,
             telemetry.tasks.clone(),
         );
-        let gauges = counts::keep(hub.clone(), watches.submissions.store.clone(), telemetry.clone());
+        let gauges = counts::keep(
+            hub.clone(),
+            watches.leaderboards.store.clone(),
+            watches.submissions.store.clone(),
+            telemetry.clone(),
+        );
         telemetry.tasks.stay("gauges", gauges);
         ExternalSystems::new(hub, recorder)
     }
