@@ -13,6 +13,7 @@ mod api {
     mod allowed;
     mod boards;
     mod bridge;
+    mod charging;
     mod columns;
     mod counts;
     mod definitions;
@@ -24,6 +25,7 @@ mod api {
     mod intake;
     mod isolation;
     mod leader;
+    mod memory;
     mod objects;
     mod operator;
     mod plugin;

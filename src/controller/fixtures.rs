@@ -30,8 +30,8 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
-use crate::controller::submissions::observe::team;
 use crate::controller::submissions::reruns::Reruns;
+use crate::controller::submissions::team_history;
 use crate::kubernetes::Namespaces;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Store, Synced};
@@ -155,7 +155,7 @@ fn stores(cluster: Cluster) -> Stores {
     policies_synced.set(true);
     Stores {
         leaderboards: Store::of(cluster.leaderboards, |_| None),
-        submissions: Store::of(cluster.submissions, team::index),
+        submissions: Store::of(cluster.submissions, team_history::index),
         jobs: Store::of(cluster.jobs, |_| None),
         pods: Store::of(cluster.pods, owner_uid),
         policies: Store::of(cluster.policies, |_| None),

@@ -16,7 +16,7 @@ use leaderboard_api::{Leaderboard, Submission};
 /// Caches of the API server, filled by one task each.
 pub struct Stores {
     pub leaderboards: Store<Leaderboard>,
-    /// Those that their simulators ended by their team too.
+    /// Those with an end of some attempt by their Leaderboard too.
     pub submissions: Store<Submission>,
     pub jobs: Store<Job>,
     /// By the UID of their Job too.

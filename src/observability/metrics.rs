@@ -91,6 +91,7 @@ pub struct Metrics {
     watches: Watches,
     leader: Leader,
     submissions: Family<State, Gauge>,
+    repeating_teams: Gauge,
     evalai: Evalai,
     cloud: Cloud,
 }
@@ -243,6 +244,11 @@ impl Metrics {
             watches: Watches::new(r),
             leader: Leader::new(r),
             submissions: zero(r, "submissions", "Submissions by state"),
+            repeating_teams: zero(
+                r,
+                "teams_with_repeated_infrastructure_failures",
+                "Teams with 3 attempts in a row or more that ended because of the infrastructure in ways that an agent can cause",
+            ),
             evalai: Evalai::new(r),
             cloud: Cloud::new(r),
             registry,
@@ -312,6 +318,11 @@ impl Metrics {
     /// So many Submissions are in a state. States with none are to be set, too.
     pub fn set_submissions(&self, state: &'static str, count: usize) {
         self.submissions.get_or_create(&State { state }).set(whole(count));
+    }
+
+    /// So many teams have repeated failures that an agent can cause.
+    pub fn set_repeating_teams(&self, count: usize) {
+        self.repeating_teams.set(whole(count));
     }
 
     /// A request to EvalAI is over.
@@ -413,6 +424,7 @@ mod tests {
         metrics.set_leading(Some(7));
         metrics.lease_failed("timeout");
         metrics.set_submissions("Running", 2);
+        metrics.set_repeating_teams(1);
         metrics.evalai_request("put_finished", "ok", Duration::from_millis(20));
         metrics.set_evalai_load(54, 1);
         metrics.cloud_call("s3", "GetObject", "ok", Duration::from_secs(1));
@@ -432,6 +444,7 @@ mod tests {
             "leaderboard_leader_term 7",
             "leaderboard_lease_errors_total{reason=\"timeout\"} 1",
             "leaderboard_submissions{state=\"Running\"} 2",
+            "leaderboard_teams_with_repeated_infrastructure_failures 1",
             "leaderboard_evalai_requests_total{op=\"put_finished\",outcome=\"ok\"} 1",
             "leaderboard_evalai_request_seconds_bucket{le=\"0.025\",service=\"evalai\",op=\"put_finished\"} 1",
             "leaderboard_evalai_budget_used 54",

@@ -6,7 +6,7 @@
 
 mod letters;
 mod messages;
-mod program;
+pub(super) mod program;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;

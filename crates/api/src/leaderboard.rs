@@ -10,6 +10,7 @@ use kube::KubeSchema;
 use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
+use super::infrastructure_failures::{MAX_TEAMS, TeamFailures};
 use super::leaderboard_parts::{
     AgentContainer, Concurrency, ContentsContainer, Deadlines, Evalai, LogGroup, Network, PodIdentity, Queue, Retries,
     SimulatorContainer, Storage, Table, Track,
@@ -185,6 +186,12 @@ pub struct LeaderboardStatus {
     /// Use of EvalAI; absent for a local leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evalai: Option<EvalaiUse>,
+    /// Teams with attempts in a row that ended because of the infrastructure in ways that an agent can cause as well; those with the
+    /// most come first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["team".into()]))]
+    #[schemars(length(max = MAX_TEAMS))]
+    pub infrastructure_failures: Vec<TeamFailures>,
     /// What each track effectively runs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]

@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
 use super::image_pattern::ImagePattern;
+use super::infrastructure_failures::OnRepeatedInfrastructure;
 pub use super::leaderboard_network::*;
 pub use super::leaderboard_services::*;
 pub use super::route_subset::RouteSubset;
@@ -225,6 +226,9 @@ pub struct Retries {
     #[serde(default = "defaults::retries_infrastructure")]
     #[schemars(range(min = 0, max = 100))]
     pub infrastructure: i32,
+    /// What becomes of an attempt that ends because of the infrastructure after `infrastructure` others of its team in a row did.
+    #[serde(default)]
+    pub on_repeated_infrastructure: OnRepeatedInfrastructure,
 }
 
 /// Time limits.
@@ -331,6 +335,7 @@ impl Default for Retries {
         Self {
             per_pair: defaults::retries_per_pair(),
             infrastructure: defaults::retries_infrastructure(),
+            on_repeated_infrastructure: OnRepeatedInfrastructure::default(),
         }
     }
 }

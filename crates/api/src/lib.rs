@@ -9,6 +9,7 @@ pub mod conditions;
 pub mod effective;
 pub mod image;
 pub mod image_pattern;
+pub mod infrastructure_failures;
 pub mod ingested;
 mod job_number;
 pub mod leaderboard;
@@ -33,6 +34,7 @@ mod waiting;
 
 pub use image::{ImageReference, NotAnImage};
 pub use image_pattern::{ImagePattern, Repository};
+pub use infrastructure_failures::{InfrastructureFailures, OnRepeatedInfrastructure, TeamFailures};
 pub use ingested::{Ingested, RefusedAttempt};
 pub use job_number::JobNumber;
 pub use leaderboard::{

@@ -255,6 +255,14 @@ reasons! {
         IMAGE_VOLUMES = "ImageVolumes",
             "The submitted image declares volumes, whose content no limit of the cluster counts. No Job is created.",
             "Remove VOLUME from the image's Dockerfile or use a base image without it, and submit again.";
+        REPEATED_FAILURES = "RepeatedFailures",
+            "The attempt ended because of the infrastructure in a way that an agent can cause as well, and so did the team's attempts \
+             before it, while other teams' runs with the same simulator finished. Only with \
+             `retries.onRepeatedInfrastructure: Charge`.",
+            "Look at the log of the simulator and of the agent. If the agent is not the cause, resume the submission; else the \
+             participant fixes the agent and submits again.",
+            log: "the log of simulator `<n>`, read from its node before the Pod ends, else `simulator/console-<n>.log`; where no simulator \
+             failed, the log of `logcopy`";
         DISK_FULL = "DiskFull",
             "The Pod was evicted because the agent filled its disk.",
             "Write less to disk or to the log.",

@@ -7,6 +7,7 @@ use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::infrastructure_failures::InfrastructureFailures;
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::pair_status::PairStatus;
 use super::progress::{Progress, Score};
@@ -137,6 +138,10 @@ pub struct SubmissionStatus {
     /// What went wrong.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Failure>,
+    /// Attempts, since one last finished, that ended because of the infrastructure in ways that an agent can cause as well. A resume
+    /// keeps them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub infrastructure_failures: Option<InfrastructureFailures>,
     /// `Accepted`, `Running`, `Archived`, `Recorded`, `Published`, `Stalled`, `Finished`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]

@@ -42,6 +42,7 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, now: Timestam
     explanation.reason();
     explanation.rerun();
     explanation.failure();
+    explanation.repeated();
     explanation.line();
     explanation.attempt();
     explanation.run();
@@ -201,6 +202,36 @@ impl Explanation<'_> {
         // While the run is being stopped, the message above is that of the stop.
         if self.status.message.as_deref() != Some(failure.message.as_str()) {
             self.page.row("", &failure.message);
+        }
+    }
+
+    /// What of its own, and of its team, ended in ways that are not charged and that an agent can cause.
+    fn repeated(&mut self) {
+        let status = self
+            .leaderboard
+            .leaderboard()
+            .and_then(|leaderboard| leaderboard.status.as_ref());
+        let teams = status
+            .map(|status| status.infrastructure_failures.as_slice())
+            .unwrap_or_default();
+        let of_team = teams
+            .iter()
+            .find(|failures| Some(failures.team.as_str()) == self.submission.team());
+        let own = self.status.infrastructure_failures.as_ref();
+        let parts = [
+            own.map(|own| {
+                format!(
+                    "{} of this submission, the last {}",
+                    own.number,
+                    when(own.last_time.0, self.now)
+                )
+            }),
+            of_team.map(|team| format!("{} of its team since a run of it last finished", team.number)),
+        ];
+        let parts: Vec<String> = parts.into_iter().flatten().collect();
+        if !parts.is_empty() {
+            let what = "attempts that ended because of the infrastructure in ways that an agent can cause as well";
+            self.page.row("Repeated", &format!("{what}: {}.", parts.join("; ")));
         }
     }
 

@@ -17,7 +17,8 @@ use crate::services::evalai::Usage;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, Track, TrackStatus, effective, names, reasons,
+    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TeamFailures, Track, TrackStatus, effective,
+    names, reasons,
 };
 
 /// What one reconcile has read of a Leaderboard.
@@ -28,6 +29,8 @@ pub struct LeaderboardView {
     /// All Leaderboards that the operator watches, this one included.
     pub all: Vec<Arc<Leaderboard>>,
     pub counts: Counts,
+    /// Teams with failures in a row that an agent can cause.
+    pub teams: Vec<TeamFailures>,
     /// Submissions that are live or not yet published and recorded.
     pub in_use: usize,
     /// Its Pods that have not ended, counted while it is being deleted.
@@ -66,6 +69,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let generation = leaderboard.metadata.generation;
     status.observed_generation = generation;
     status.counts = Some(view.counts);
+    status.infrastructure_failures.clone_from(&view.teams);
     status.evalai = view.usage.map(evalai_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);

@@ -46,6 +46,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         leaderboard: Arc::clone(mine),
         all: all.to_vec(),
         counts: Counts::default(),
+        teams: Vec::new(),
         in_use: 0,
         pods: 0,
         policy: Policy::InPlace,

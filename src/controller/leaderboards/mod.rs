@@ -25,12 +25,14 @@ use super::objects::{key_of, uid_of};
 use super::settings::Settings;
 use super::slots::SlotAllocator;
 use super::writes::{apply_status, set_finalizer};
+use crate::controller::stores::Stores;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::team_history;
 use crate::kubernetes::CallError;
 use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
-use leaderboard_api::{Leaderboard, names};
+use leaderboard_api::{Leaderboard, Submission, names};
 use probe::Probe;
 use refusal::Refusal;
 use state::{COUNTS_EVERY, LeaderboardState, Policy, RESYNC, SOONEST};
@@ -129,6 +131,7 @@ fn observe(
         leaderboard: Arc::clone(leaderboard),
         all: stores.leaderboards.state(),
         counts,
+        teams: team_history::teams(&ended(stores, leaderboard)),
         in_use,
         pods: isolation::pods_left(stores, leaderboard),
         policy,
@@ -141,6 +144,13 @@ fn observe(
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),
     }
+}
+
+/// Its Submissions that have an end of some attempt.
+fn ended(stores: &Stores, leaderboard: &Leaderboard) -> Vec<Arc<Submission>> {
+    let namespace = leaderboard.metadata.namespace.as_deref().unwrap_or_default();
+    let name = leaderboard.metadata.name.as_deref().unwrap_or_default();
+    stores.submissions.indexed(&team_history::key_of(namespace, name))
 }
 
 /// Writes the status if it says something new; returns when to look again.

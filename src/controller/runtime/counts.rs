@@ -7,10 +7,12 @@ use std::time::Duration;
 use crate::kubernetes::Store;
 use crate::observability::Observability;
 use crate::services::evalai::Hub;
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{Leaderboard, State, Submission};
 
 /// How often what is not an event is counted: more often than anybody scrapes.
 const EVERY: Duration = Duration::from_secs(5);
+/// So many failures in a row are worth a host's look.
+const REPEATED: i32 = 3;
 /// All states, so that one without submissions says 0.
 const STATES: [State; 6] = [
     State::Pending,
@@ -22,7 +24,12 @@ const STATES: [State; 6] = [
 ];
 
 /// Keeps gauges true until the stop.
-pub(super) async fn keep(hub: Hub, submissions: Store<Submission>, telemetry: Observability) {
+pub(super) async fn keep(
+    hub: Hub,
+    leaderboards: Store<Leaderboard>,
+    submissions: Store<Submission>,
+    telemetry: Observability,
+) {
     let mut tick = tokio::time::interval(EVERY);
     loop {
         tokio::select! { _ = tick.tick() => {}, () = telemetry.stop.wait() => return }
@@ -31,7 +38,19 @@ pub(super) async fn keep(hub: Hub, submissions: Store<Submission>, telemetry: Ob
         for (state, count) in states(&submissions.state()) {
             telemetry.metrics.set_submissions(state, count);
         }
+        telemetry
+            .metrics
+            .set_repeating_teams(repeating_teams(&leaderboards.state()));
     }
+}
+
+/// Teams that have had this often in a row what an agent can cause, by the statuses of the Leaderboards.
+fn repeating_teams(leaderboards: &[Arc<Leaderboard>]) -> usize {
+    let statuses = leaderboards
+        .iter()
+        .filter_map(|leaderboard| leaderboard.status.as_ref());
+    let teams = statuses.flat_map(|status| &status.infrastructure_failures);
+    teams.filter(|team| team.number >= REPEATED).count()
 }
 
 fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {

@@ -35,8 +35,9 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
-use crate::controller::submissions::observe::{node, team};
+use crate::controller::submissions::observe::node;
 use crate::controller::submissions::reruns::Reruns;
+use crate::controller::submissions::team_history;
 use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
 use crate::kubernetes::{Namespaces, Shape, Store, Watch, Watchable, spawn_watch};
@@ -173,7 +174,7 @@ impl Watches {
         let namespaces = &settings.namespaces;
         let children = || Config::default().labels(&children_selector());
         let submissions = Shape {
-            index: team::index,
+            index: team_history::index,
             ..Shape::default()
         };
         let pods = Shape {
@@ -284,7 +285,12 @@ impl Parts {
             rows,
             telemetry.tasks.clone(),
         );
-        let gauges = counts::keep(hub.clone(), watches.submissions.store.clone(), telemetry.clone());
+        let gauges = counts::keep(
+            hub.clone(),
+            watches.leaderboards.store.clone(),
+            watches.submissions.store.clone(),
+            telemetry.clone(),
+        );
         telemetry.tasks.stay("gauges", gauges);
         ExternalSystems::new(hub, recorder)
     }

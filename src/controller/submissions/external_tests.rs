@@ -12,6 +12,7 @@ use tokio::sync::mpsc;
 
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
+use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Turn,
 };
@@ -114,7 +115,7 @@ async fn bench(state: State) -> Bench {
         record: Some(RecordView::default()),
         partial_sent: None,
         rerun_as: None,
-        simulator_failures_of_team: 0,
+        team: TeamHistory::default(),
         evalai_writes_from: None,
     };
     Bench {

@@ -20,4 +20,5 @@ pub mod report_digest;
 pub mod reruns;
 mod result_texts;
 pub mod significance;
+pub mod team_history;
 pub mod view;

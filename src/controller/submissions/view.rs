@@ -7,6 +7,7 @@ use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
 use super::report_digest::{ReportDigest, ReportId};
+use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
@@ -46,8 +47,8 @@ pub struct View {
     pub partial_sent: Option<u32>,
     /// The submission that re-runs this one, as its status says.
     pub rerun_as: Option<Rerun>,
-    /// Ended submissions of the same team and Leaderboard whose simulators failed within a day; counted only once this one crashes.
-    pub simulator_failures_of_team: usize,
+    /// How its team's attempts ended before; read only if this may be the reconcile that ends it.
+    pub team: TeamHistory,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
 }

@@ -101,6 +101,24 @@ fn the_crashes_of_the_failed_pair_are_counted_once() {
 }
 
 #[test]
+fn repeated_failures_of_the_infrastructure_are_counted_for_the_submission_and_its_team() {
+    let time = "2026-11-01T11:57:00Z";
+    let own = json!({"infrastructureFailures": {"number": 2, "firstTime": time, "lastTime": time, "nodes": ["gpu-3"]}});
+    let team = json!({"team": {"id": "7", "name": "Team Seven"}});
+    let board = changed(|board| {
+        let teams = json!([{"team": "7", "number": 3, "lastTime": time}, {"team": "8", "number": 9, "lastTime": time}]);
+        board.status.as_mut().unwrap().infrastructure_failures = serde_json::from_value(teams).unwrap();
+    });
+    let failed = submission(&with(with(node_lost(), &own), &team));
+    let text = printed(&failed, Observed::Found(&board));
+    let words = text.split_whitespace().collect::<Vec<_>>().join(" ");
+    let row = "Repeated: attempts that ended because of the infrastructure in ways that an agent can cause as well: 2 of this \
+               submission, the last 2026-11-01 11:57:00 UTC (3 min ago); 3 of its team since a run of it last finished.";
+    assert!(words.contains(row), "{text}");
+    assert!(!explained(&crashed()).contains("Repeated"));
+}
+
+#[test]
 fn both_submissions_of_a_rerun_name_each_other() {
     let other = |name: &str| json!({"submissionName": name, "time": "2026-11-01T11:57:00Z"});
     let old = explained(&with(finished(), &json!({"rerunAs": other("submission-99")})));

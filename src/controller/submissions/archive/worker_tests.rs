@@ -183,7 +183,10 @@ async fn a_text_that_is_too_large_is_left_out_at_once_and_said() {
     let ObservedTexts::Read(texts) = bench.answer().await.texts else {
         panic!("no texts")
     };
-    assert_eq!((texts.problem.as_ref(), &*texts.stdout, &*texts.metadata), (None, "all is well", ""));
+    assert_eq!(
+        (texts.problem.as_ref(), &*texts.stdout, &*texts.metadata),
+        (None, "all is well", "")
+    );
     assert_eq!(
         texts.left_out.as_deref(),
         Some(

@@ -222,6 +222,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     draft.status.failure = None;
+    draft.status.infrastructure_failures = None;
     let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
     let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
     close(draft, reasons::FINISHED, &message);

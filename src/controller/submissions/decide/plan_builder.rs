@@ -171,6 +171,7 @@ impl<'a> PlanBuilder<'a> {
             score: old.score.map(Score::so_far),
             results_url: old.results_url,
             rerun_of: old.rerun_of,
+            infrastructure_failures: old.infrastructure_failures,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,
                 ..Default::default()

@@ -4,7 +4,6 @@ pub mod job;
 pub mod lookups;
 pub mod node;
 pub mod pod;
-pub mod team;
 
 use std::sync::Arc;
 
@@ -18,6 +17,7 @@ use super::external::ExternalSystems;
 use super::images::Images;
 use super::memory::Memory;
 use super::reruns::Reruns;
+use super::team_history::{self, TeamHistory};
 use super::view::{ObservedJob, ObservedNode, PodView, View};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
@@ -74,7 +74,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         evalai_waited: uses.memory.evalai_waited(&submission),
         partial_sent: uses.memory.partial_sent(&submission),
         rerun_as: uses.reruns.of(&submission),
-        simulator_failures_of_team: simulator_failures(uses.stores, &submission, &job, now),
+        team: team_of(uses.stores, &submission, &job, now),
         evalai_writes_from: uses.external.hub.writes_from(),
         submission,
         leaderboard,
@@ -122,8 +122,8 @@ fn node(uses: Uses<'_>, submission: &Submission, pod: Option<&PodView>) -> Obser
     })
 }
 
-/// How often the simulators of its team have failed. Counted only if this may be the reconcile that ends it.
-fn simulator_failures(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Timestamp) -> usize {
+/// How its team's attempts ended. Read only if this may be the reconcile that ends it.
+fn team_of(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Timestamp) -> TeamHistory {
     let is_under_way = match job {
         ObservedJob::Ours(job) => job.end.is_none(),
         ObservedJob::Created => true,
@@ -134,9 +134,13 @@ fn simulator_failures(stores: &Stores, submission: &Submission, job: &ObservedJo
         status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
     });
     if !may_end {
-        return 0;
+        return TeamHistory::default();
     }
-    team::simulator_failures(&stores.submissions, submission, now)
+    team_history::of(
+        &stores.submissions.indexed(&team_history::key(submission)),
+        submission,
+        now,
+    )
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {

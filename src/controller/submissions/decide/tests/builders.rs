@@ -10,6 +10,7 @@ use super::rules;
 use crate::controller::submissions::decide::blame::is_crash;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
 use crate::controller::submissions::report_digest::ReportDigest;
+use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
     ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, PodView, RecordView, Stage, Standing, Texts,
@@ -122,7 +123,7 @@ impl World {
                 record: Some(RecordView::default()),
                 partial_sent: None,
                 rerun_as: None,
-                simulator_failures_of_team: 0,
+                team: TeamHistory::default(),
                 evalai_writes_from: None,
             },
         }

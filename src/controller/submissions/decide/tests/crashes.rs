@@ -208,7 +208,7 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
 #[test]
 fn simulators_that_fail_in_each_job_are_counted_by_team() {
     let mut world = World::local().running();
-    world.view.simulator_failures_of_team = 2;
+    world.view.team.within_a_day = 2;
     for (retry, pause) in [(1, 10), (2, 20)] {
         world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
         world.pass_to(Running, reasons::STOPPING);
@@ -240,14 +240,14 @@ fn simulators_that_fail_in_each_job_are_counted_by_team() {
     assert_eq!((failure.class, failure.charged), (Infrastructure, false));
     assert_eq!(
         failure.message,
-        "The simulator of pair 1 failed 4 times: it crashed. The attempt had 3 Jobs. Within a day 3 submissions of team t1 ended like this in \
-         this Leaderboard; after 3 of them a submission gets one Job only. Look at the simulator's log, then resume the submission; it \
+        "The simulator of pair 1 failed 4 times: it crashed. The attempt had 3 Jobs. Within a day 3 attempts of team t1 ended like this in \
+         this Leaderboard; after 3 of them an attempt gets one Job only. Look at the simulator's log, then resume the submission; it \
          repeats the route it was at."
     );
     assert!(!failure.participant_message.unwrap().contains("t1"));
 
     let mut often = World::local().running();
-    often.view.simulator_failures_of_team = 3;
+    often.view.team.within_a_day = 3;
     often.see_alone(ended("simulator-1", 3, "exited", 1, 100));
     often.pass_to(Running, reasons::STOPPING);
     often.complete();
@@ -259,7 +259,7 @@ fn simulators_that_fail_in_each_job_are_counted_by_team() {
     assert!(
         failure
             .message
-            .contains("The attempt had 1 Job. Within a day 4 submissions of team t1"),
+            .contains("The attempt had 1 Job. Within a day 4 attempts of team t1"),
         "{}",
         failure.message
     );

@@ -2,6 +2,7 @@
 
 mod accept;
 mod after;
+mod allowance;
 mod blame;
 mod builders;
 mod crashes;

@@ -1,0 +1,62 @@
+//! Attempts that ended because of the infrastructure, in ways that an agent can cause as well: counted by submission and by team.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::KubeSchema;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::reasons;
+
+/// Infrastructure failures that an agent can cause: it can crash its simulator, store more than its time allows, or take its node's
+/// memory.
+pub const CAN_BE_CAUSED: [&str; 3] = [
+    reasons::SIMULATION_CRASHED,
+    reasons::RESULTS_NOT_STORED,
+    reasons::JOB_FAILED,
+];
+
+/// Nodes that are remembered of a submission.
+pub const MAX_NODES: usize = 8;
+
+/// Teams that a Leaderboard shows.
+pub const MAX_TEAMS: usize = 32;
+
+/// What becomes of a team's attempt that ends so after others of the same team.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum OnRepeatedInfrastructure {
+    /// It does not count as an attempt, as ever.
+    #[default]
+    Forgive,
+    /// It counts as an attempt if other teams' runs with the same simulator finish meanwhile.
+    Charge,
+}
+
+/// Attempts of a submission that ended so, since it last finished.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct InfrastructureFailures {
+    /// How many.
+    pub number: i32,
+    /// When the first of them ended.
+    pub first_time: Time,
+    /// When the last of them ended.
+    pub last_time: Time,
+    /// Nodes of their last Pods.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Set)]
+    #[schemars(length(max = MAX_NODES), inner(length(max = 253)))]
+    pub nodes: Vec<String>,
+}
+
+/// Attempts of a team that ended so, since one of the team's last finished.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct TeamFailures {
+    /// Id of the team, or its name if it has none.
+    #[schemars(length(max = 256))]
+    pub team: String,
+    /// How many.
+    pub number: i32,
+    /// When the last of them ended.
+    pub last_time: Time,
+}

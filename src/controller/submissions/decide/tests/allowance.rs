@@ -1,0 +1,110 @@
+//! What infrastructure failures that an agent can cause cost a team.
+
+use super::builders::*;
+use crate::controller::submissions::team_history::{Others, TeamHistory};
+use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::State::{Failed, Finished, Pending, Running};
+use leaderboard_api::{OnRepeatedInfrastructure, reasons};
+
+/// Two attempts of the team in a row, on two nodes, while others finish.
+fn repeated() -> TeamHistory {
+    TeamHistory {
+        within_a_day: 2,
+        in_a_row: 2,
+        nodes: ["node-b".to_owned()].into(),
+        others: Others {
+            finished: 5,
+            ..Others::default()
+        },
+    }
+}
+
+/// Its simulator has failed as often as it may, and its Job has ended.
+fn simulator_failed(history: TeamHistory, policy: OnRepeatedInfrastructure) -> World {
+    let mut world = World::local().running();
+    world.leaderboard().retries.on_repeated_infrastructure = policy;
+    world.view.team = history;
+    world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    world.pass_to(Running, reasons::STOPPING);
+    world.complete();
+    world
+}
+
+#[test]
+fn a_repeated_failure_is_charged_only_where_the_host_says_so_and_only_to_the_likely_cause() {
+    use OnRepeatedInfrastructure::{Charge, Forgive};
+    let alone = TeamHistory {
+        others: Others::default(),
+        ..repeated()
+    };
+    for (what, history, policy) in [
+        ("by default", repeated(), Forgive),
+        ("nobody else finishes", alone, Charge),
+        ("the first one", TeamHistory::default(), Charge),
+    ] {
+        let mut world = simulator_failed(history, policy);
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        assert_eq!(plan.status.retry, 1, "{what}: it is tried again");
+    }
+
+    let mut world = simulator_failed(repeated(), Charge);
+    let status = world.pass_to(Failed, reasons::REPEATED_FAILURES).status;
+    assert_eq!(status.retry, 0, "it ends with one Job");
+    let failure = status.failure.unwrap();
+    assert_eq!(
+        (failure.class, failure.charged, failure.pair),
+        (Participant, true, Some(1))
+    );
+    assert_eq!(
+        failure.message,
+        "The simulator of pair 1 failed 4 times: it crashed. The 2 attempts of the same team before it ended because of the \
+         infrastructure as well, while 5 runs of other teams with the same simulator finished. Team t1: Look at the log of the \
+         simulator and of the agent. If the agent is not the cause, resume the submission; else the participant fixes the agent and \
+         submits again."
+    );
+    let told = failure.participant_message.unwrap();
+    assert!(
+        told.starts_with("The run ended early. The 2 attempts") && !told.contains("t1"),
+        "{told}"
+    );
+    assert_eq!(status.infrastructure_failures.unwrap().number, 1, "the row goes on");
+}
+
+#[test]
+fn a_resume_keeps_the_count_and_a_finish_ends_it() {
+    let mut world = simulator_failed(repeated(), OnRepeatedInfrastructure::Charge);
+    let known = world
+        .pass_to(Failed, reasons::REPEATED_FAILURES)
+        .status
+        .infrastructure_failures;
+    assert_eq!(known.as_ref().unwrap().nodes, ["node-a"]);
+    world.submission().spec.attempt = 2;
+    let plan = world.pass();
+    assert_eq!((plan.status.attempt, &plan.status.failure), (Some(2), &None));
+    assert_eq!(plan.status.infrastructure_failures, known, "whoever resumed it");
+
+    let mut world = World::local().running();
+    let mut status = world.status();
+    status.infrastructure_failures = known;
+    world.submission().status = Some(status);
+    world.report(final_report());
+    world.complete();
+    world.report(final_report());
+    assert_eq!(
+        world
+            .pass_to(Finished, reasons::FINISHED)
+            .status
+            .infrastructure_failures,
+        None
+    );
+}
+
+#[test]
+fn results_that_an_agent_keeps_from_being_stored_are_counted_as_well() {
+    let mut world = World::local().running();
+    world.leaderboard().retries.infrastructure = 0;
+    world.complete();
+    let status = world.pass_to(Failed, reasons::RESULTS_NOT_STORED).status;
+    assert_eq!(status.failure.unwrap().class, Infrastructure);
+    assert_eq!(status.infrastructure_failures.unwrap().number, 1);
+}

@@ -1,0 +1,239 @@
+//! The table of repeated failures: a row for each case.
+
+use serde_json::{Value, json};
+
+use super::*;
+
+/// A Submission of team and simulator that ended at an hour on a node: `finished`, or with so many failures of its own.
+struct Run {
+    team: &'static str,
+    end: End,
+    hour: i64,
+    node: &'static str,
+    simulator: &'static str,
+}
+
+enum End {
+    Finished,
+    Failed(i32),
+    /// It failed so before, and runs again.
+    Resumed(i32),
+}
+
+use End::{Failed, Finished, Resumed};
+
+fn run(team: &'static str, end: End, hour: i64, node: &'static str) -> Run {
+    Run {
+        team,
+        end,
+        hour,
+        node,
+        simulator: "carla:1",
+    }
+}
+
+fn at(hour: i64) -> Timestamp {
+    Timestamp::from_second(1_700_000_000 + hour * 3600).unwrap()
+}
+
+fn submission(number: usize, run: &Run) -> Submission {
+    let plan = json!({
+        "runId": "7", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": [], "routes": 4, "repetitions": 1,
+        "storage": {"bucket": "b"}, "image": "i", "contentsImage": "c", "simulatorImage": run.simulator,
+    });
+    let time = at(run.hour).to_string();
+    let condition = |status: &str, reason: &str| json!([{"type": "Finished", "status": status, "reason": reason, "message": "", "lastTransitionTime": time}]);
+    let failures = |number: i32| json!({"number": number, "firstTime": time, "lastTime": time, "nodes": [run.node]});
+    let mut status: Value = match run.end {
+        Finished => json!({"conditions": condition("True", "Finished"), "times": {"finished": time}}),
+        Failed(number) => json!({
+            "conditions": condition("True", "SimulationCrashed"), "times": {"finished": time},
+            "infrastructureFailures": failures(number),
+        }),
+        Resumed(number) => {
+            json!({"conditions": condition("False", "Preparing"), "infrastructureFailures": failures(number)})
+        }
+    };
+    status["plan"] = plan;
+    status["nodeName"] = json!(run.node);
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+        "metadata": {"name": format!("s{number}"), "namespace": "n", "uid": format!("s{number}")},
+        "spec": {"leaderboardName": "lb", "image": "r/i:1", "team": {"name": run.team}},
+        "status": status,
+    });
+    serde_json::from_value(object).unwrap()
+}
+
+/// Whether an attempt of team `a` that ends so at hour 20 on node `n9` would be the agent's fault, with two free.
+fn is_blamed(before: &[Run]) -> bool {
+    let all: Vec<_> = before
+        .iter()
+        .enumerate()
+        .map(|(i, run)| Arc::new(submission(i, run)))
+        .collect();
+    let own = submission(99, &run("a", Resumed(0), 20, "n9"));
+    of(&all, &own, at(20)).blames_agent(Some("n9"), 2)
+}
+
+#[test]
+fn only_a_row_of_failures_between_other_teams_finishes_blames_the_agent() {
+    let twice = || vec![run("a", Failed(1), 10, "n1"), run("a", Failed(1), 12, "n2")];
+    let with = |mut runs: Vec<Run>, more: Vec<Run>| {
+        runs.extend(more);
+        runs
+    };
+    let other_simulator = Run {
+        simulator: "carla:2",
+        ..run("b", Finished, 15, "n3")
+    };
+    let cases = [
+        (
+            "others finish meanwhile",
+            true,
+            with(twice(), vec![run("b", Finished, 15, "n3")]),
+        ),
+        ("nobody else runs", false, twice()),
+        (
+            "others finished before",
+            false,
+            with(twice(), vec![run("b", Finished, 9, "n3")]),
+        ),
+        (
+            "others finish with another simulator",
+            false,
+            with(twice(), vec![other_simulator]),
+        ),
+        (
+            "its simulator fails for others as well",
+            false,
+            with(
+                twice(),
+                vec![run("b", Finished, 15, "n3"), run("c", Failed(1), 16, "n4")],
+            ),
+        ),
+        (
+            "only its own runs finish",
+            false,
+            with(twice(), vec![run("a", Finished, 9, "n3")]),
+        ),
+        (
+            "one failure only",
+            false,
+            vec![run("a", Failed(1), 10, "n1"), run("b", Finished, 15, "n3")],
+        ),
+        (
+            "a run of its own finished between",
+            false,
+            with(
+                twice(),
+                vec![run("a", Finished, 11, "n1"), run("b", Finished, 15, "n3")],
+            ),
+        ),
+        (
+            "each failure was resumed by the team itself",
+            true,
+            vec![run("a", Resumed(2), 12, "n1"), run("b", Finished, 15, "n3")],
+        ),
+        (
+            "one node has all of its failures, and nobody else uses it",
+            false,
+            vec![run("a", Failed(2), 12, "n9"), run("b", Finished, 15, "n3")],
+        ),
+        (
+            "one node has all of its failures, and others finish there",
+            true,
+            vec![run("a", Failed(2), 12, "n9"), run("b", Finished, 15, "n9")],
+        ),
+        (
+            "others fail on its node, too",
+            false,
+            vec![
+                run("a", Failed(2), 12, "n9"),
+                run("b", Failed(1), 13, "n9"),
+                run("b", Finished, 14, "n3"),
+                run("c", Finished, 15, "n9"),
+            ],
+        ),
+        (
+            "teams that look alike are others",
+            false,
+            vec![
+                run("A", Failed(1), 10, "n1"),
+                run("a ", Failed(1), 11, "n2"),
+                run("\u{430}", Failed(1), 12, "n3"),
+                run("b", Finished, 15, "n4"),
+            ],
+        ),
+    ];
+    for (what, expected, before) in cases {
+        assert_eq!(is_blamed(&before), expected, "{what}");
+    }
+}
+
+#[test]
+fn without_free_failures_the_first_one_is_free_all_the_same() {
+    let own = submission(99, &run("a", Resumed(0), 20, "n9"));
+    let others = [Arc::new(submission(0, &run("b", Finished, 15, "n9")))];
+    assert!(!of(&others, &own, at(20)).blames_agent(Some("n9"), 0));
+}
+
+#[test]
+fn within_a_day_every_attempt_of_the_team_counts_also_those_that_were_resumed() {
+    let runs = [
+        run("a", Failed(2), 10, "n1"),
+        run("a", Resumed(1), 12, "n1"),
+        run("a", Failed(4), -5, "n1"),
+        run("b", Failed(8), 10, "n1"),
+        run("a", Finished, 15, "n1"),
+    ];
+    let all: Vec<_> = runs
+        .iter()
+        .enumerate()
+        .map(|(i, run)| Arc::new(submission(i, run)))
+        .collect();
+    let found = of(&all, &all[0], at(20));
+    assert_eq!((found.within_a_day, found.in_a_row), (3, 0));
+    let mut nobodys = submission(9, &runs[0]);
+    nobodys.spec.team = None;
+    assert_eq!(of(&all, &nobodys, at(20)), TeamHistory::default());
+}
+
+#[test]
+fn a_leaderboard_shows_the_teams_with_the_most_failures_in_a_row() {
+    let runs = [
+        run("a", Failed(1), 10, "n1"),
+        run("b", Failed(2), 11, "n1"),
+        run("b", Resumed(1), 12, "n1"),
+        run("c", Failed(5), 9, "n1"),
+        run("c", Finished, 10, "n1"),
+    ];
+    let all: Vec<_> = runs
+        .iter()
+        .enumerate()
+        .map(|(i, run)| Arc::new(submission(i, run)))
+        .collect();
+    let shown: Vec<_> = teams(&all)
+        .into_iter()
+        .map(|t| (t.team, t.number, t.last_time.0))
+        .collect();
+    assert_eq!(shown, [("b".to_owned(), 3, at(12)), ("a".to_owned(), 1, at(10))]);
+    let many: Vec<_> = (0..40)
+        .map(|i| {
+            let mut one = submission(i, &runs[0]);
+            one.spec.team.as_mut().unwrap().name = Some(format!("team {i}"));
+            Arc::new(one)
+        })
+        .collect();
+    assert_eq!(teams(&many).len(), MAX_TEAMS);
+}
+
+#[test]
+fn only_submissions_with_an_end_are_found_by_their_leaderboard() {
+    let found = |end| index(&submission(0, &run("a", end, 10, "n1")));
+    assert_eq!(found(Finished).as_deref(), Some("n/lb"));
+    assert_eq!(found(Resumed(1)).as_deref(), Some("n/lb"));
+    let mut live = submission(0, &run("a", Resumed(1), 10, "n1"));
+    live.status.as_mut().unwrap().infrastructure_failures = None;
+    assert_eq!(index(&live), None);
+}

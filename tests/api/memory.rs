@@ -1,0 +1,143 @@
+//! The memory of the controller's own process while many results with the largest texts are published: all of them were stored while it
+//! was away.
+#![cfg(test)]
+
+use std::collections::BTreeMap;
+
+use evalai_stand_in::Seed;
+use evalai_stand_in::model::Status;
+use futures::StreamExt;
+use kube::ResourceExt;
+use kube::api::{Patch, PatchParams};
+use leaderboard_api::{Submission, SubmissionStatus, conditions};
+use leaderboard_operator::pod::report::{REPORT_KEY, Report, SCHEMA, StoredFile};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use super::intake::program::Program;
+use super::world::{World, ago};
+
+/// Results at once.
+const RESULTS: usize = 50;
+/// The largest text that is passed on.
+const LARGEST: usize = 4 << 20;
+/// The chart's limit of the controller's memory, in KiB.
+const LIMIT_KIB: u64 = 128 << 10;
+const METADATA: &str = "evalai/metadata.json";
+
+/// JSON of so many bytes in which each fourth is a quotation mark.
+fn metadata(bytes: usize) -> String {
+    let text = r#""a","#.repeat(bytes / 4 - 1);
+    format!("[{text}1 ]")
+}
+
+/// A run that has finished and is stored, with the controller away since.
+async fn ended(world: &World, text: &str) -> (u64, String) {
+    let (pk, name) = world.submit("lb", 1).await;
+    let api = world.api::<Submission>();
+    let uid = api.get(&name).await.unwrap().uid().unwrap();
+    let archive = world.archive(pk);
+    archive.put(METADATA, text.as_bytes().to_vec()).await.unwrap();
+    archive.put(REPORT_KEY, report(uid, text).into_bytes()).await.unwrap();
+    let condition = |type_: &str, status: &str, reason: &str| json!({"type": type_, "status": status, "reason": reason, "message": "", "lastTransitionTime": ago(60)});
+    let status = json!({"status": {
+        "attempt": 1, "jobName": format!("{name}-1"), "track": "sensors",
+        "times": {"submitted": ago(600), "accepted": ago(500), "started": ago(400), "finished": ago(60)},
+        "plan": {
+            "runId": pk.to_string(), "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "phase": 1,
+            "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1,
+            "storage": {"bucket": world.bucket, "endpoint": world.aws.endpoint},
+            "image": "r/team-a:1", "contentsImage": "contents:1", "simulatorImage": "simulator:1",
+        },
+        "conditions": [
+            condition("Accepted", "True", "Accepted"), condition("Archived", "True", "Stored"),
+            condition("Finished", "True", "Finished"), condition("Published", "False", "Waiting"),
+        ],
+    }});
+    let patched = api
+        .patch_status(&name, &PatchParams::default(), &Patch::Merge(status))
+        .await;
+    patched.unwrap();
+    (pk, name)
+}
+
+fn report(submission_uid: String, text: &str) -> String {
+    let labels = &Seed::built_in().unwrap().challenges[0].phases[0].splits[0]
+        .schema
+        .labels;
+    let accuracies: BTreeMap<_, _> = labels.iter().map(|label| (label.clone(), 1.0)).collect();
+    let digest = Sha256::digest(text.as_bytes());
+    let file = StoredFile {
+        size: text.len() as u64,
+        sha256: digest.iter().map(|byte| format!("{byte:02x}")).collect(),
+    };
+    let report = Report {
+        schema: SCHEMA,
+        submission_uid,
+        attempt: 1,
+        pod_uid: "pod".into(),
+        round: 9,
+        done: 1,
+        total: 1,
+        pairs: Vec::new(),
+        score: Some(1.0),
+        route_completion: None,
+        infraction_penalty: None,
+        is_final: true,
+        eligible: true,
+        entry_status: "Finished".into(),
+        stopped: None,
+        why: None,
+        warnings: Vec::new(),
+        results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
+        partial_results: None,
+        files: [(METADATA.to_owned(), file)].into(),
+    };
+    serde_json::to_string(&report).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn fifty_results_with_the_largest_texts_are_published_within_the_charts_limit_of_memory() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let largest = metadata(LARGEST);
+    assert_eq!(largest.len(), LARGEST);
+    let too_large = format!("{largest} ");
+    let all: Vec<_> = (0..RESULTS).map(|_| ended(&world, &largest)).collect();
+    let all: Vec<(u64, String)> = futures::stream::iter(all).buffered(4).collect().await;
+    let (_, left_out) = ended(&world, &too_large).await;
+
+    let controller = Program::start("controller", "controller-0", &world.namespace).await;
+    let is_published = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::PUBLISHED);
+    let says = |s: &SubmissionStatus| {
+        let published = conditions::get(&s.conditions, conditions::PUBLISHED);
+        published.is_some_and(|c| {
+            c.status == "True"
+                && c.message
+                    .starts_with("evalai/metadata.json was left out: it has 4194305 bytes")
+        })
+    };
+    world
+        .until(&left_out, "it is published without its text at once", says)
+        .await;
+    for (_, name) in &all {
+        world.until(name, "it is published", is_published).await;
+    }
+    let most = controller.most_memory();
+    println!(
+        "{RESULTS} results with texts of {} MiB: at most {} MiB",
+        LARGEST >> 20,
+        most >> 10
+    );
+    assert!(
+        most < LIMIT_KIB,
+        "{most} KiB, more than the chart allows; {}",
+        controller.log()
+    );
+    let is_finished = |pk: u64| {
+        world
+            .evalai
+            .with_state(|state| state.submissions[&pk].status == Status::Finished)
+    };
+    assert!(all.iter().all(|(pk, _)| is_finished(*pk)));
+}
