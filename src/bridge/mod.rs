@@ -87,7 +87,9 @@ impl Shared {
         }
         let apis = self.scope.namespaces.apis::<Leaderboard>(&self.client);
         let first = ListParams::default().limit(1);
-        let asked = apis.iter().map(|api| call_within(PULSE_LIMIT, "a list", "one Leaderboard", api.list_metadata(&first)));
+        let asked = apis
+            .iter()
+            .map(|api| call_within(PULSE_LIMIT, "a list", "one Leaderboard", api.list_metadata(&first)));
         let listed = futures::future::try_join_all(asked).await;
         listed.map_err(|error| error.cause())?;
         *self.last_pulse.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());

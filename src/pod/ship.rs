@@ -77,7 +77,14 @@ pub struct Shipper {
 impl Shipper {
     /// Goes on where the last one was. What a Pod before this one has stored was also sent by it. `a_day`: bytes that one stream
     /// gets on a day.
-    pub fn new(client: LogClient, tree: Arc<Tree>, run_id: &RunId, pairs: usize, restored: &Memory, a_day: u64) -> Self {
+    pub fn new(
+        client: LogClient,
+        tree: Arc<Tree>,
+        run_id: &RunId,
+        pairs: usize,
+        restored: &Memory,
+        a_day: u64,
+    ) -> Self {
         let agents = (1..=pairs).map(|n| (agent_log(n), format!("{run_id}/agent-{n}")));
         let simulators = (1..=pairs).map(|n| (console(n), format!("{run_id}/simulator-{n}")));
         let streams: BTreeMap<String, String> = agents

@@ -17,7 +17,14 @@ async fn each_line_arrives_once_and_in_order() {
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let shipper = || {
         let memory = pod.uploader().memory().clone();
-        ship::Shipper::new(client.clone(), Arc::clone(&tree), &"77".parse().unwrap(), 2, &memory, ship::STREAM_A_DAY)
+        ship::Shipper::new(
+            client.clone(),
+            Arc::clone(&tree),
+            &"77".parse().unwrap(),
+            2,
+            &memory,
+            ship::STREAM_A_DAY,
+        )
     };
     let lines = |from: usize, to: usize| {
         let lines: Vec<String> = (from..to)
@@ -87,7 +94,14 @@ async fn a_log_that_is_replaced_all_the_time_ends_its_stream_for_the_day_also_af
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let shipper = || {
         let memory = pod.uploader().memory().clone();
-        ship::Shipper::new(client.clone(), Arc::clone(&tree), &"77".parse().unwrap(), 2, &memory, A_DAY)
+        ship::Shipper::new(
+            client.clone(),
+            Arc::clone(&tree),
+            &"77".parse().unwrap(),
+            2,
+            &memory,
+            A_DAY,
+        )
     };
     let replace = |round: usize| {
         pod.put(
