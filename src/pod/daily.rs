@@ -1,4 +1,4 @@
-//! What was sent to a service on a day, by purse: whoever pays for requests and bytes has a bound for each day. Pure.
+//! What was sent to a service on a day, by purse: requests and bytes cost money, and have a bound for each day. Pure.
 //!
 //! Used for S3 (`upload`) and CloudWatch (`ship`), which note it next to the files, so that a restart does not begin anew.
 

@@ -1,4 +1,5 @@
-//! What a Pod reports to the controller: `logcopy/report.json`, written in each round after the results; and the mark of the prefix's owner.
+//! What a Pod reports to the controller: `logcopy/report.json`, written in each round after the results; and the mark of the
+//! prefix's owner.
 //!
 //! The report is written by `logcopy` and read by the controller as hostile text: bounded in size, checked in every number. Pure.
 

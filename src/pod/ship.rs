@@ -29,7 +29,7 @@ const BATCHES: usize = 64;
 const NOTE: &str = "logcopy/.shipped.json";
 /// Largest note that is read, in bytes.
 const NOTE_LIMIT: u64 = 1 << 20;
-/// Bytes that one stream gets on a day, as CloudWatch bills them: whoever replaces or rewrites a log all the time ends its stream
+/// Bytes that one stream gets on a day, as CloudWatch bills them: an agent that rewrites its log all the time ends its stream
 /// for that day. S3 has the log all the same.
 pub const STREAM_A_DAY: u64 = 512 << 20;
 /// Time the last round may take.
