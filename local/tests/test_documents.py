@@ -67,8 +67,15 @@ class Security(unittest.TestCase):
             with self.subTest(word):
                 self.assertTrue(any(word in fault for fault in doccheck.attack_faults(text, attacks)))
 
-    def test_tests_are_found_under_their_attributes(self) -> None:
-        rust = "#[test]\nfn a_name() {}\n#[tokio::test(start_paused = true)]\n#[ignore]\nasync fn another() {}\nfn none() {}"
+    def test_tests_are_found_under_their_attributes_unless_they_are_ignored(self) -> None:
+        rust = "\n".join(
+            [
+                "#[test]\nfn a_name() {}",
+                "#[tokio::test(start_paused = true)]\n#[cfg(unix)]\nasync fn another() {}",
+                '#[test]\n#[ignore = "takes minutes"]\nfn only_if_asked_for() {}',
+                "fn none() {}",
+            ]
+        )
         self.assertEqual(doccheck.tests_of(rust, ".rs"), {"a_name", "another"})
         python = 'class A:\n    def test_x(self):\n    def none(self):\n    check("a", lambda: b.c(d))\n'
         self.assertEqual(doccheck.tests_of(python, ".py"), {"test_x", "c"})
