@@ -77,7 +77,7 @@ const ONCE: &str = r#"{"retries": {"perPair": 1}}"#;
 /// All of them. Those that take longest come first.
 pub const ENDINGS: &[Ending] = &[
     Ending {
-        change: r#"{"pairs": 2, "routes": 4, "simulator": {"env": [{"name": "SIM_KNOBS", "value": "pair=2,crash@1"}]}}"#,
+        change: r#"{"pairs": 2, "routes": 4, "retries": {"perPair": 1}, "simulator": {"env": [{"name": "SIM_KNOBS", "value": "pair=2,crash@1"}]}}"#,
         ..ending(
             "take-port",
             "take the port of another pair's simulator while that is down",
@@ -152,24 +152,6 @@ pub const ENDINGS: &[Ending] = &[
         "leave processes that outlive the agent and write its last message",
         Image::User,
         CRASHED,
-    ),
-    ending(
-        "result-link",
-        "replace the results by a link to another file",
-        Image::Root,
-        INVALID,
-    ),
-    ending(
-        "result-pipe",
-        "replace the results by a pipe that nobody writes",
-        Image::User,
-        INVALID,
-    ),
-    ending(
-        "result-sparse",
-        "replace the results by a sparse file of terabytes",
-        Image::User,
-        INVALID,
     ),
     Ending {
         gain: Gain::Inherent(

@@ -5,7 +5,7 @@ use std::env;
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write as _};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
-use std::os::unix::fs::{PermissionsExt as _, symlink};
+use std::os::unix::fs::PermissionsExt as _;
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::{Command, exit};
@@ -14,15 +14,13 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use nix::libc;
 use nix::sys::signal::{Signal, kill};
-use nix::sys::stat::Mode;
-use nix::unistd::{Pid, mkfifo, setsid};
+use nix::unistd::{Pid, setsid};
 
 use crate::call::{call, of};
 
 /// The honest agent of the image.
 pub const HONEST: &str = "/usr/bin/challenge-agent";
 const TERMINATION_LOG: &str = "/dev/termination-log";
-const RESULTS: &str = "/tmp/agent/agent_results.json";
 const LOG: &str = "/tmp/agent/leaderboard.log";
 /// Outlives the container.
 const MARKER: &str = "/tmp/agent/probe-was-here";
@@ -80,9 +78,6 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
         "growing-file" => background("grow"),
         "replaced-log" => background("replace"),
-        "result-link" => after_an_honest_run(arguments, || symlink("/etc/passwd", RESULTS)),
-        "result-pipe" => after_an_honest_run(arguments, || Ok(mkfifo(RESULTS, Mode::from_bits_truncate(0o666))?)),
-        "result-sparse" => after_an_honest_run(arguments, || sparse(Path::new(RESULTS))),
         // The honest agent's own knob.
         "own-score" => honest(arguments, "forge").map(|never| match never {}),
         other => Err(io::Error::other(format!("there is no ending {other}"))),
@@ -168,14 +163,6 @@ fn sparse(path: &Path) -> io::Result<()> {
         }
     }
     last
-}
-
-/// Lets the honest agent drive, then puts something else in the place of the results.
-fn after_an_honest_run(arguments: &[String], replace: impl FnOnce() -> io::Result<()>) -> io::Result<()> {
-    let status = Command::new(HONEST).args(arguments).status()?;
-    fs::remove_file(RESULTS)?;
-    replace()?;
-    exit(status.code().unwrap_or(1))
 }
 
 /// Starts this program again, for work of its own.
