@@ -35,7 +35,7 @@ pub(super) fn counted(draft: &mut PlanBuilder<'_>, found: Failure) -> Failure {
         return found;
     };
     if is_charged(draft) {
-        return repeated(draft, found, &team);
+        return repeated(draft, &found, &team);
     }
     let jobs = match draft.status.retry {
         0 => "1 Job".to_owned(),
@@ -88,7 +88,7 @@ fn note(draft: &mut PlanBuilder<'_>) {
 }
 
 /// The failure of an attempt that ends like those before it.
-fn repeated(draft: &PlanBuilder<'_>, found: Failure, team: &str) -> Failure {
+fn repeated(draft: &PlanBuilder<'_>, found: &Failure, team: &str) -> Failure {
     let history = &draft.view.team;
     let others = match history.others.finished {
         1 => "a run of another team".to_owned(),
