@@ -31,7 +31,7 @@ async fn submission(world: &World, name: &str, team: &str, status: Option<Value>
 fn ended(reason: &str, node: &str) -> Value {
     let plan = json!({
         "runId": "old", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": [{"first": 0, "last": 0}],
-        "routes": 1, "repetitions": 1, "storage": {"bucket": "b"}, "image": "r/a:1", "contentsImage": "contents:1",
+        "routes": 1, "repetitions": 1, "storage": {"bucket": "old-results"}, "image": "r/a:1", "contentsImage": "contents:1",
         "simulatorImage": "simulator:1",
     });
     let finished =
