@@ -11,6 +11,7 @@ use kube::ResourceExt;
 use kube::api::{Patch, PatchParams};
 use leaderboard_api::{Submission, SubmissionStatus, conditions};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, SCHEMA, StoredFile};
+use leaderboard_operator::pod::upload::hex;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
@@ -66,10 +67,9 @@ fn report(submission_uid: String, text: &str) -> String {
         .schema
         .labels;
     let accuracies: BTreeMap<_, _> = labels.iter().map(|label| (label.clone(), 1.0)).collect();
-    let digest = Sha256::digest(text.as_bytes());
     let file = StoredFile {
         size: text.len() as u64,
-        sha256: digest.iter().map(|byte| format!("{byte:02x}")).collect(),
+        sha256: hex(&Sha256::digest(text.as_bytes())),
     };
     let report = Report {
         schema: SCHEMA,
