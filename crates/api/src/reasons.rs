@@ -362,7 +362,7 @@ reasons! {
         NOT_ALLOWED = "NotAllowed",
             "The Leaderboard names an entry of Secrets Manager or a queue that Leaderboards of its namespace may not name. Its token is \
              not read, its queue is left alone, and EvalAI is not asked.",
-            "Name another one; or let the operator's administrator allow it under `leaderboards[]` of the chart's values.";
+            "Name another one; or let the operator's administrator allow it under `leaderboards` of the chart's values.";
         INSECURE_SERVER = "InsecureServer",
             "`evalai.apiServer` begins with http and is on the internet: everyone on the way could read the host's token.",
             "Use https.";
