@@ -15,7 +15,7 @@ use support::{AGENT, Pod, SIMULATOR};
 /// Chains of forks at once.
 const CHAINS: usize = 30;
 
-/// Forks for ever, leaves every group, and writes a verdict of its own each time.
+/// Forks without an end, leaves every group, and writes a verdict of its own each time.
 const CHAIN: &str = r#"
 import os, sys
 forged = b'{"what":"notReady","round":0,"schema":2,"why":"forged"}'

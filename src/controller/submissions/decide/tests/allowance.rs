@@ -81,7 +81,7 @@ fn a_resume_keeps_the_count_and_a_finish_ends_it() {
     world.submission().spec.attempt = 2;
     let plan = world.pass();
     assert_eq!((plan.status.attempt, &plan.status.failure), (Some(2), &None));
-    assert_eq!(plan.status.infrastructure_failures, known, "whoever resumed it");
+    assert_eq!(plan.status.infrastructure_failures, known, "also after a resume");
 
     let mut world = World::local().running();
     let mut status = world.status();
