@@ -14,7 +14,7 @@ use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
 
 use super::objects::owner_reference;
 use leaderboard_api::ranges::{self, Range};
-use leaderboard_api::{Egress, Leaderboard, names};
+use leaderboard_api::{Dns, Egress, Leaderboard, names};
 
 const DNS_PORT: i32 = 53;
 /// The cluster's own DNS, CoreDNS among them, has this label everywhere.
@@ -85,9 +85,11 @@ fn plain(spec: NetworkPolicySpec) -> NetworkPolicySpec {
 
 fn egress(leaderboard: &Leaderboard) -> Vec<NetworkPolicyEgressRule> {
     let network = &leaderboard.spec.network;
-    network
-        .dns
-        .then(|| dns(&network.dns_servers))
+    let names = match network.dns {
+        Dns::Cluster => Some(dns(&network.dns_servers)),
+        Dns::None => None,
+    };
+    names
         .into_iter()
         .chain(network.egress.iter().filter_map(rule))
         .collect()
@@ -209,20 +211,20 @@ mod tests {
             ["10.0.0.10/32", "10.1.2.0/24", "fd00::a/128"].map(|cidr| json!({"ipBlock": {"cidr": cidr}}))
         );
         assert_eq!(
-            policy(&json!({"dns": false, "dnsServers": ["10.0.0.10"]}))["spec"]["egress"],
+            policy(&json!({"dns": "None", "dnsServers": ["10.0.0.10"]}))["spec"]["egress"],
             json!([])
         );
     }
 
     #[test]
     fn without_dns_and_addresses_nothing_gets_out() {
-        assert_eq!(policy(&json!({"dns": false}))["spec"]["egress"], json!([]));
+        assert_eq!(policy(&json!({"dns": "None"}))["spec"]["egress"], json!([]));
     }
 
     #[test]
     fn ports_are_tcp_and_none_means_all() {
         let network =
-            json!({"dns": false, "egress": [{"cidr": "10.1.2.3/16", "ports": [443, 4566]}, {"cidr": "192.0.2.0/24"}]});
+            json!({"dns": "None", "egress": [{"cidr": "10.1.2.3/16", "ports": [443, 4566]}, {"cidr": "192.0.2.0/24"}]});
         assert_eq!(
             policy(&network)["spec"]["egress"],
             json!([
@@ -262,7 +264,7 @@ mod tests {
             ("2001:db8::/32", Some(&[])),
         ];
         for (cidr, expected) in cases {
-            let egress = policy(&json!({"dns": false, "egress": [{"cidr": cidr}]}))["spec"]["egress"].clone();
+            let egress = policy(&json!({"dns": "None", "egress": [{"cidr": cidr}]}))["spec"]["egress"].clone();
             let except = |rule: &Value| -> Vec<String> {
                 let list = rule["to"][0]["ipBlock"]["except"]
                     .as_array()

@@ -192,7 +192,7 @@ fn told(job: &Job) -> Value {
 async fn no_job_is_made_before_the_policy_of_the_present_spec() {
     let world = World::new().await;
     let operator = world.operator().await;
-    let to = |cidr: &str| json!({"egress": [{"cidr": cidr, "ports": [443]}], "dns": false});
+    let to = |cidr: &str| json!({"egress": [{"cidr": cidr, "ports": [443]}], "dns": "None"});
     // The submission first: it starts in the moment in which its Leaderboard is seen.
     world.submit("first").await;
     world.leaderboard(&to("192.0.2.1/32")).await;
@@ -268,7 +268,7 @@ async fn an_edited_egress_is_applied_while_the_leaderboards_bucket_hangs() {
     silent.accept().await.unwrap();
     let began = Instant::now();
     world
-        .change(&json!({"egress": [{"cidr": "192.0.2.7/32"}], "dns": false}))
+        .change(&json!({"egress": [{"cidr": "192.0.2.7/32"}], "dns": "None"}))
         .await;
     let follows = |found: &NetworkPolicy| {
         let rules = egress(found);

@@ -29,6 +29,16 @@ pub enum Enforcement {
     Off,
 }
 
+/// Who answers a Pod's questions for names.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Dns {
+    /// The cluster's DNS, and the servers of `dnsServers`.
+    #[default]
+    Cluster,
+    /// Nobody.
+    None,
+}
+
 /// What the Pods of strangers may reach, by NetworkPolicy.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[x_kube(
@@ -55,9 +65,9 @@ pub struct Network {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(length(max = 32))]
     pub egress: Vec<Egress>,
-    /// Whether names may be looked up: at the cluster's DNS, which are the Pods `k8s-app=kube-dns` in `kube-system`, and at `dnsServers`.
-    #[serde(default = "defaults::yes")]
-    pub dns: bool,
+    /// `Cluster`: names are looked up at the cluster's DNS, which are the Pods `k8s-app=kube-dns` in `kube-system`, and at `dnsServers`. `None`: nowhere; `egress` alone counts, and `podOverrides.spec.hostAliases` names the services.
+    #[serde(default)]
+    pub dns: Dns,
     /// Further DNS servers, as addresses or ranges. Default: where NodeLocal DNSCache answers.
     #[serde(default = "defaults::dns_servers")]
     #[schemars(length(max = 8), inner(length(min = 1, max = 64)))]
@@ -84,7 +94,7 @@ impl Default for Network {
             enforcement: Enforcement::default(),
             probe: None,
             egress: Vec::new(),
-            dns: true,
+            dns: Dns::default(),
             dns_servers: defaults::dns_servers(),
         }
     }
@@ -93,8 +103,5 @@ impl Default for Network {
 mod defaults {
     pub(super) fn dns_servers() -> Vec<String> {
         vec!["169.254.20.10".into()]
-    }
-    pub(super) fn yes() -> bool {
-        true
     }
 }
