@@ -47,7 +47,8 @@ impl World {
         let storage = json!({"bucket": self.aws.name("bucket"), "endpoint": self.aws.endpoint, "region": null});
         let mut spec = json!({"spec": more});
         merge(&mut spec["spec"], &without);
-        for track in spec["spec"]["tracks"].as_array_mut().into_iter().flatten() {
+        let tracks = spec.pointer_mut("/spec/tracks").and_then(Value::as_array_mut);
+        for track in tracks.into_iter().flatten() {
             // Only EvalAI has phases.
             merge(track, &json!({"phase": null}));
         }
