@@ -77,15 +77,6 @@ const ONCE: &str = r#"{"retries": {"perPair": 1}}"#;
 /// All of them. Those that take longest come first.
 pub const ENDINGS: &[Ending] = &[
     Ending {
-        change: r#"{"pairs": 2, "routes": 4, "retries": {"perPair": 1}, "simulator": {"env": [{"name": "SIM_KNOBS", "value": "pair=2,crash@1"}]}}"#,
-        ..ending(
-            "take-port",
-            "take the port of another pair's simulator while that is down",
-            Image::User,
-            CRASHED,
-        )
-    },
-    Ending {
         change: ONCE,
         ..ending(
             "status-sparse",
