@@ -52,10 +52,13 @@ async fn run(scene: &Scene, ending: &'static Ending) {
     case.close();
 }
 
-/// How many Jobs a submission had. They are named by their number.
+/// How many Jobs a submission had: that of its only attempt, and those that followed a failure of the infrastructure.
 async fn jobs_of(scene: &Scene, submission: &str) -> usize {
-    let number = |job: &String| job.strip_prefix(submission)?.strip_prefix('-')?.parse::<u32>().ok();
-    scene.jobs().await.iter().filter_map(number).count()
+    let (first, again) = (format!("{submission}-1"), format!("{submission}-1-r"));
+    let jobs = scene.jobs().await;
+    jobs.iter()
+        .filter(|job| **job == first || job.starts_with(&again))
+        .count()
 }
 
 /// Status files are empty in S3 whatever they hold, and no agent stores more than it may.

@@ -32,8 +32,10 @@ pub(crate) const PROBES: &[Probe] = &[
         "mounted read-only but for the own folder",
         || {
             Seen::of_all(["simulation.cancel", "logcopy.done"].map(|name| {
-                let path = format!("{STATUS}/logcopy/{name}");
-                (name.to_owned(), Seen::of_io(&File::create_new(path)))
+                // The folder may not be there yet.
+                let folder = Path::new(STATUS).join("logcopy");
+                let made = fs::create_dir_all(&folder).and_then(|()| File::create_new(folder.join(name)));
+                (name.to_owned(), Seen::of_io(&made))
             }))
         },
     ),
@@ -62,7 +64,8 @@ pub(crate) const PROBES: &[Probe] = &[
         "/proc/sys and /proc/sysrq-trigger are read-only",
         || {
             Seen::of_all(
-                ["/proc/sys/kernel/core_pattern", "/proc/sysrq-trigger"].map(|path| (path.to_owned(), opened(path))),
+                ["/proc/sys/kernel/core_pattern", "/proc/sysrq-trigger"]
+                    .map(|path| (path.to_owned(), opened_if_there(path))),
             )
         },
     ),
@@ -110,6 +113,15 @@ pub(crate) const PROBES: &[Probe] = &[
 
 fn opened(path: &str) -> Seen {
     Seen::of_io(&OpenOptions::new().append(true).open(path))
+}
+
+/// Not every kernel has it.
+fn opened_if_there(path: &str) -> Seen {
+    if Path::new(path).exists() {
+        opened(path)
+    } else {
+        Seen::Denied("not there".to_owned())
+    }
 }
 
 /// Tries to make a file in each of the folders that are there; one at least must be.

@@ -4,7 +4,6 @@ use std::convert::Infallible;
 use std::env;
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write as _};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt as _;
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
@@ -26,8 +25,6 @@ const LOG: &str = "/tmp/agent/leaderboard.log";
 const MARKER: &str = "/tmp/agent/probe-was-here";
 const FIRST_PORT: u16 = 2000;
 const PORT_STEP: u16 = 100;
-/// Where pair 1 shows that it waits for the port of pair 2's simulator.
-const READY_PORT: u16 = 2999;
 /// How long whatever outlives the agent goes on, if nobody ends it.
 const LIFE: Duration = Duration::from_mins(1);
 const CRASHES: u32 = 1000;
@@ -46,9 +43,6 @@ pub fn pair() -> u16 {
 
 /// Carries out an ending; returns if the agent is to be an honest one from here on.
 pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
-    if id == "take-port" {
-        return take_port();
-    }
     if pair() != 1 {
         return Ok(());
     }
@@ -217,29 +211,4 @@ fn replace(begun: Instant) -> io::Result<()> {
         thread::sleep(Duration::from_millis(100));
     }
     Ok(())
-}
-
-/// Pair 1 takes the port of pair 2's simulator as soon as it is free, and shows before that it is about to. Pair 2 drives,
-/// and so lets its simulator crash, only then.
-fn take_port() -> io::Result<()> {
-    if pair() != 1 {
-        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, READY_PORT));
-        let begun = Instant::now();
-        while TcpStream::connect(address).is_err() && begun.elapsed() < LIFE {
-            thread::sleep(Duration::from_millis(20));
-        }
-        return Ok(());
-    }
-    let _shown = TcpListener::bind((Ipv4Addr::LOCALHOST, READY_PORT))?;
-    let mut taken = None;
-    let mut said = Instant::now();
-    loop {
-        taken = taken.or_else(|| TcpListener::bind((Ipv4Addr::LOCALHOST, FIRST_PORT + PORT_STEP)).ok());
-        // An agent that prints nothing for long is ended for that.
-        if said.elapsed() > Duration::from_secs(1) {
-            said = Instant::now();
-            writeln!(io::stdout(), "has the port: {}", taken.is_some())?;
-        }
-        thread::sleep(Duration::from_millis(1));
-    }
 }
