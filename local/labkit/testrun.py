@@ -24,7 +24,7 @@ from .toolsets import ENVTEST_TOOLS
 # Test programs of cargo with a layer of their own, as they need an API server or a node.
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
-# Tests of the cluster that run at once: they wait for the kubelet most of their time.
+# Tests of the API server or of the cluster that run at once: they wait for controllers or the kubelet most of their time.
 AT_ONCE = 4
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
@@ -140,10 +140,10 @@ def api(plan: Plan) -> None:
     require_target(plan.settings, "api")
     target, env = ["--test=api"], test_environment(plan.settings)
 
-    def alone(names: Sequence[str]) -> Outcome:
-        return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": "1"}, ["--exact", *names])
+    def at_once(threads: int, harness: Sequence[str]) -> Outcome:
+        return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
 
-    if not settle(plan.summary, cargo_outcome(plan, target, env, [plan.filter]), alone):
+    if not settle(plan.summary, at_once(AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names])):
         raise LabError("cargo test found failures, see below")
 
 
