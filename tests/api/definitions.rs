@@ -74,7 +74,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "agent": {"logSizeLimit": "2Gi", "imageSizeLimit": "60Gi"},
         "pairs": 4,
         "routes": 20,
-        "retries": {"perPair": 3, "infrastructure": 2},
+        "retries": {"perPair": 3, "infrastructure": 2, "onRepeatedInfrastructure": "Forgive"},
         "deadlines": {
             "scheduleSeconds": 0,
             "startSeconds": 1800,
@@ -133,12 +133,12 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         (
             "retries",
             json!({"perPair": 0}),
-            json!({"perPair": 0, "infrastructure": 2}),
+            json!({"perPair": 0, "infrastructure": 2, "onRepeatedInfrastructure": "Forgive"}),
         ),
         (
             "retries",
             json!({"infrastructure": 0}),
-            json!({"perPair": 3, "infrastructure": 0}),
+            json!({"perPair": 3, "infrastructure": 0, "onRepeatedInfrastructure": "Forgive"}),
         ),
         (
             "deadlines",
