@@ -139,7 +139,8 @@ def ensure_started(settings: Settings, part: Component) -> bool:
         if holder is not None:
             variable = next(name for name, number in settings.ports.items() if number == port).upper()
             raise LabError(
-                f"{part.name} needs {address}:{port}, which {holder} uses: end that, or set LEADERBOARD_LAB_PORT_{variable} to a free port"
+                f"{part.name} needs {address}:{port}, which {holder.text} uses: {ending(holder.pid)}, or set "
+                f"LEADERBOARD_LAB_PORT_{variable} to a free port"
             )
     for file, text in part.files.items():
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -151,6 +152,19 @@ def ensure_started(settings: Settings, part: Component) -> bool:
     log = settings.logs / f"{part.name}.log"
     process.start(part.name, part.argv, env=env, pidfile=pidfile, log=log, digest=digest)
     return True
+
+
+def ending(pid: int | None) -> str:
+    """How to end a process that is in the way: of the cluster of another folder, by `down` there."""
+    try:
+        environment = (Path("/proc") / str(pid) / "environ").read_bytes().split(b"\0") if pid else []
+    except OSError:
+        environment = []
+    mark = f"{OWNER_VARIABLE}=".encode()
+    states = [
+        os.fsdecode(entry.removeprefix(mark)).rpartition(":")[0] for entry in environment if entry.startswith(mark)
+    ]
+    return f"run `LEADERBOARD_LAB_STATE={states[0]} local/lab down`" if states else "end that"
 
 
 def authority(settings: Settings) -> str:

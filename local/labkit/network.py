@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import LabError
@@ -144,7 +145,16 @@ def jump_arguments(line: str) -> list[str]:
     return words[2:]
 
 
-def holder_of(address: str, port: int) -> str | None:
+@dataclass(frozen=True)
+class Holder:
+    """Who listens at a port."""
+
+    text: str
+    # None: the kernel does not show whose it is.
+    pid: int | None = None
+
+
+def holder_of(address: str, port: int) -> Holder | None:
     """Who listens at a port so that `address`:`port` can't be had: `program (pid N)`; None if it is free."""
     listing = run("ss", "-Hlntp", "sport", "=", f":{port}").stdout
     for line in listing.splitlines():
@@ -152,5 +162,7 @@ def holder_of(address: str, port: int) -> str | None:
         local = fields[3].rpartition(":")[0].strip("[]") if len(fields) > 3 else ""
         if local in (address, "0.0.0.0", "*", "::"):
             match = re.search(r'\("([^"]+)",pid=(\d+)', line)
-            return f"{match.group(1)} (pid {match.group(2)})" if match else "another process"
+            if match:
+                return Holder(f"{match.group(1)} (pid {match.group(2)})", int(match.group(2)))
+            return Holder("another process")
     return None

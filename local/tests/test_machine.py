@@ -1,12 +1,14 @@
 """What the lab reads from the machine: mounts, address translation rules, libraries, settings, failures of registries."""
 
 import json
+import os
 import struct
+import subprocess
 import tempfile
 import unittest
 from pathlib import Path
 
-from labkit import components, console, elf, files, image, leftovers, network, pki, settings
+from labkit import cluster, components, console, elf, files, image, leftovers, network, pki, settings
 from labkit.errors import LabError
 
 MOUNTS = """22 1 254:0 / / rw - ext4 /dev/vda rw
@@ -52,6 +54,24 @@ class Leftovers(unittest.TestCase):
         self.assertEqual(network.our_veths(""), [])
         self.assertEqual(network.our_veths("not json"), [])
         self.assertEqual(network.our_veths('[{"ifname": "veth1"}, {}]'), ["veth1"])
+
+
+class Holders(unittest.TestCase):
+    def test_a_process_of_another_cluster_is_ended_by_its_own_down(self) -> None:
+        def ending(**env: str) -> str:
+            argv = ["sh", "-c", "echo; read _"]
+            with subprocess.Popen(argv, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+                process.stdout.readline()
+                found = cluster.ending(process.pid)
+                process.stdin.close()
+            return found
+
+        self.assertEqual(
+            ending(LEADERBOARD_LAB_OWNER="/srv/b/.local:etcd"),
+            "run `LEADERBOARD_LAB_STATE=/srv/b/.local local/lab down`",
+        )
+        self.assertEqual(ending(PATH=os.environ["PATH"]), "end that")
+        self.assertEqual(cluster.ending(None), "end that")
 
 
 class Libraries(unittest.TestCase):
