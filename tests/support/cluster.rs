@@ -208,7 +208,7 @@ impl Scene {
             "podIdentity": {"secretName": "aws"},
             // Nothing enforces policies here; only the test of that waits the minute until it is certain.
             "network": {
-                "dns": false,
+                "dns": "None",
                 "egress": [{"cidr": format!("{}/32", self.lab.host)}],
                 "enforcement": "Off",
             },

@@ -60,7 +60,7 @@ fn listening(table: &str, port: u16) -> impl Iterator<Item = String> {
     })
 }
 
-/// All descendants. Orphans among them are this process's children, since it is their subreaper.
+/// All descendants that live. Orphans among them are this process's children, since it is their subreaper.
 fn descendants() -> Vec<u32> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     let all: Vec<(u32, u32)> = entries
@@ -77,10 +77,18 @@ fn descendants() -> Vec<u32> {
 }
 
 fn parent(pid: u32) -> Option<u32> {
-    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    parent_of_living(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
+}
+
+/// The parent in a process's `stat`. None of one that has ended and is not reaped yet: it has no file open, and yet the kernel hides its
+/// files from all but root, as those of one that might have the socket.
+fn parent_of_living(stat: &str) -> Option<u32> {
     // The name stands in brackets and may hold any character.
     let (_, rest) = stat.rsplit_once(')')?;
-    rest.split_whitespace().nth(1)?.parse().ok()
+    let mut fields = rest.split_whitespace();
+    let state = fields.next()?;
+    let parent = fields.next()?.parse().ok()?;
+    (!matches!(state, "Z" | "X" | "x")).then_some(parent)
 }
 
 /// Whether a process has one of the sockets open. One whose files are hidden (it has changed its user) may have.
@@ -163,6 +171,14 @@ mod tests {
         assert_eq!(listener(port), Listener::Foreign);
         drop(socket);
         assert_eq!(listener(port), Listener::Nobody);
+    }
+
+    #[test]
+    fn a_process_that_has_ended_and_is_not_reaped_listens_nowhere() {
+        assert_eq!(parent_of_living("7 (a) Z 3 7 7"), None);
+        assert_eq!(parent_of_living("7 (a) X 3 7 7"), None);
+        assert_eq!(parent_of_living("7 (Z) Z 1) S 3 7 7"), Some(3));
+        assert_eq!(parent_of_living("7 (a) R 3 7 7"), Some(3));
     }
 
     #[test]
