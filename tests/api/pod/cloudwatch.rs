@@ -2,8 +2,8 @@
 
 use super::*;
 
-#[tokio::test]
-async fn each_line_arrives_once_and_in_order() {
+/// A Pod whose logs go to a group of its own, and the group's name.
+async fn pod_with_logs() -> (Pod, String) {
     let group = format!("group-{}", fastrand::u64(..));
     let mut pod = Pod::new().await;
     pod.setting.run.log_group = Some(LogGroup {
@@ -13,28 +13,24 @@ async fn each_line_arrives_once_and_in_order() {
     });
     let logs = pod.aws.logs(None, None);
     logs.create_log_group().log_group_name(&group).send().await.unwrap();
+    (pod, group)
+}
+
+/// The sender of a logcopy that has just started.
+fn shipper(pod: &Pod, a_day: u64) -> ship::Shipper {
     let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group.as_ref().unwrap());
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let shipper = || {
-        let memory = pod.uploader().memory().clone();
-        ship::Shipper::new(
-            client.clone(),
-            Arc::clone(&tree),
-            &"77".parse().unwrap(),
-            2,
-            &memory,
-            ship::STREAM_A_DAY,
-        )
-    };
+    let memory = pod.uploader().memory().clone();
+    ship::Shipper::new(client, tree, &"77".parse().unwrap(), 2, &memory, a_day)
+}
+
+#[tokio::test]
+async fn each_line_arrives_once_and_in_order() {
+    let (pod, group) = pod_with_logs().await;
+    let logs = pod.aws.logs(None, None);
+    let shipper = || shipper(&pod, ship::STREAM_A_DAY);
     let lines = |from: usize, to: usize| {
-        let lines: Vec<String> = (from..to)
-            .map(|i| {
-                format!(
-                    "line {i}
-"
-                )
-            })
-            .collect();
+        let lines: Vec<String> = (from..to).map(|i| format!("line {i}\n")).collect();
         lines.concat()
     };
     let log = "agent/agent2/leaderboard.log";
@@ -58,15 +54,8 @@ async fn each_line_arrives_once_and_in_order() {
 
 #[tokio::test]
 async fn logcopy_sends_the_logs_of_its_run() {
-    let mut pod = Pod::new().await;
-    let group = format!("group-{}", fastrand::u64(..));
-    pod.setting.run.log_group = Some(LogGroup {
-        name: group.clone(),
-        region: None,
-        endpoint: None,
-    });
+    let (pod, group) = pod_with_logs().await;
     let logs = pod.aws.logs(None, None);
-    logs.create_log_group().log_group_name(&group).send().await.unwrap();
     pod.prepare().await.unwrap();
     pod.append("agent/agent1/leaderboard.log", b"first\n");
     let logcopy = pod.logcopy();
@@ -81,28 +70,9 @@ async fn logcopy_sends_the_logs_of_its_run() {
 #[tokio::test]
 async fn a_log_that_is_replaced_all_the_time_ends_its_stream_for_the_day_also_after_a_restart() {
     const A_DAY: u64 = 3000;
-    let group = format!("group-{}", fastrand::u64(..));
-    let mut pod = Pod::new().await;
-    pod.setting.run.log_group = Some(LogGroup {
-        name: group.clone(),
-        region: None,
-        endpoint: None,
-    });
+    let (pod, group) = pod_with_logs().await;
     let logs = pod.aws.logs(None, None);
-    logs.create_log_group().log_group_name(&group).send().await.unwrap();
-    let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group.as_ref().unwrap());
-    let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let shipper = || {
-        let memory = pod.uploader().memory().clone();
-        ship::Shipper::new(
-            client.clone(),
-            Arc::clone(&tree),
-            &"77".parse().unwrap(),
-            2,
-            &memory,
-            A_DAY,
-        )
-    };
+    let shipper = || shipper(&pod, A_DAY);
     let replace = |round: usize| {
         pod.put(
             "agent/agent1/next",
