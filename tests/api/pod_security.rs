@@ -226,50 +226,38 @@ fn weakened(template: &Value, pointer: &str, patch: &Value) -> Value {
     changed
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn what_is_noted_as_weaker_than_baseline_is_what_the_api_server_refuses() {
-    const POD: &str = "/spec";
-    const CONTAINER: &str = "/spec/containers/1";
-    const INIT: &str = "/spec/initContainers/0";
-    let world = World::new().await;
-    let baseline = enforcing(&world.client, "baseline").await;
-    let template = world.template("one", &json!({})).await;
-    let volumes = |volume: Value| {
-        let mut all = template["spec"]["volumes"].as_array().unwrap().clone();
-        all.push(volume);
-        json!({ "volumes": all })
-    };
-    let context = |context: Value| json!({ "securityContext": context });
+const POD: &str = "/spec";
+const CONTAINER: &str = "/spec/containers/1";
+const INIT: &str = "/spec/initContainers/0";
+
+/// Whether `baseline` allows it, where it is changed, and how.
+type Change = (bool, &'static str, Value);
+
+fn context(context: &Value) -> Value {
+    json!({ "securityContext": context })
+}
+
+fn label(field: &str, label: &str) -> Value {
+    context(&json!({"seLinuxOptions": {field: label}}))
+}
+
+fn changes_of_containers() -> Vec<Change> {
     let probe = |host: &str| json!({"readinessProbe": {"httpGet": {"port": 80, "host": host}}});
     let hook = |host: &str| json!({"lifecycle": {"preStop": {"tcpSocket": {"port": 80, "host": host}}}});
-    let annotation = |profile: &str| {
-        let key = "container.apparmor.security.beta.kubernetes.io/simulator-1";
-        json!({"annotations": {key: profile}})
-    };
-    let sysctl = |name: &str| context(json!({"sysctls": [{"name": name, "value": "1"}]}));
-    let label = |field: &str, label: &str| context(json!({"seLinuxOptions": {field: label}}));
-    let capability = |name: &str| context(json!({"capabilities": {"drop": ["ALL"], "add": [name]}}));
-    let privileged = context(json!({"privileged": true, "allowPrivilegeEscalation": null}));
-    let host_path = json!({"name": "h", "hostPath": {"path": "/tmp"}});
-    let cases = [
-        (true, POD, json!({})),
+    let capability = |name: &str| context(&json!({"capabilities": {"drop": ["ALL"], "add": [name]}}));
+    let privileged = context(&json!({"privileged": true, "allowPrivilegeEscalation": null}));
+    vec![
         (false, CONTAINER, privileged.clone()),
         (false, INIT, privileged),
         (
             true,
             CONTAINER,
-            context(json!({"allowPrivilegeEscalation": true, "capabilities": null})),
+            context(&json!({"allowPrivilegeEscalation": true, "capabilities": null})),
         ),
         (true, CONTAINER, capability("KILL")),
         (true, CONTAINER, capability("SETFCAP")),
         (false, CONTAINER, capability("SYS_ADMIN")),
         (false, CONTAINER, capability("NET_RAW")),
-        (false, POD, volumes(host_path)),
-        (
-            true,
-            POD,
-            volumes(json!({"name": "m", "emptyDir": {"medium": "Memory"}})),
-        ),
         (
             false,
             CONTAINER,
@@ -279,36 +267,67 @@ async fn what_is_noted_as_weaker_than_baseline_is_what_the_api_server_refuses() 
         (
             false,
             CONTAINER,
-            context(json!({"seccompProfile": {"type": "Unconfined"}})),
+            context(&json!({"seccompProfile": {"type": "Unconfined"}})),
         ),
-        (false, POD, context(json!({"seccompProfile": {"type": "Unconfined"}}))),
-        (true, CONTAINER, context(json!({"seccompProfile": null}))),
+        (true, CONTAINER, context(&json!({"seccompProfile": null}))),
         (
             false,
             CONTAINER,
-            context(json!({"appArmorProfile": {"type": "Unconfined"}})),
+            context(&json!({"appArmorProfile": {"type": "Unconfined"}})),
         ),
-        (false, POD, context(json!({"appArmorProfile": {"type": "Unconfined"}}))),
+        (false, CONTAINER, label("type", "spc_t")),
+        (true, CONTAINER, label("type", "container_t")),
+        (false, CONTAINER, probe("192.0.2.1")),
+        (true, CONTAINER, probe("")),
+        (false, CONTAINER, hook("192.0.2.1")),
+    ]
+}
+
+fn changes_of_pods(template: &Value) -> Vec<Change> {
+    let volumes = |volume: Value| {
+        let mut all = template["spec"]["volumes"].as_array().unwrap().clone();
+        all.push(volume);
+        json!({ "volumes": all })
+    };
+    let annotation = |profile: &str| {
+        let key = "container.apparmor.security.beta.kubernetes.io/simulator-1";
+        json!({"annotations": {key: profile}})
+    };
+    let sysctl = |name: &str| context(&json!({"sysctls": [{"name": name, "value": "1"}]}));
+    let host_path = json!({"name": "h", "hostPath": {"path": "/tmp"}});
+    vec![
+        (true, POD, json!({})),
+        (false, POD, volumes(host_path)),
         (
             true,
             POD,
-            context(json!({"appArmorProfile": {"type": "RuntimeDefault"}})),
+            volumes(json!({"name": "m", "emptyDir": {"medium": "Memory"}})),
+        ),
+        (false, POD, context(&json!({"seccompProfile": {"type": "Unconfined"}}))),
+        (false, POD, context(&json!({"appArmorProfile": {"type": "Unconfined"}}))),
+        (
+            true,
+            POD,
+            context(&json!({"appArmorProfile": {"type": "RuntimeDefault"}})),
         ),
         (false, "/metadata", annotation("unconfined")),
         (true, "/metadata", annotation("runtime/default")),
-        (false, CONTAINER, label("type", "spc_t")),
-        (true, CONTAINER, label("type", "container_t")),
         (false, POD, label("user", "system_u")),
         (false, POD, label("role", "system_r")),
         (true, POD, label("level", "s0:c1,c2")),
         (false, POD, sysctl("kernel.msgmax")),
         (true, POD, sysctl("net.ipv4.tcp_syncookies")),
-        (false, CONTAINER, probe("192.0.2.1")),
-        (true, CONTAINER, probe("")),
-        (false, CONTAINER, hook("192.0.2.1")),
         (true, POD, json!({"hostUsers": false})),
-    ];
-    for (allowed, pointer, patch) in cases {
+    ]
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_noted_as_weaker_than_baseline_is_what_the_api_server_refuses() {
+    let world = World::new().await;
+    let baseline = enforcing(&world.client, "baseline").await;
+    let template = world.template("one", &json!({})).await;
+    let changes = changes_of_containers().into_iter().chain(changes_of_pods(&template));
+    for (allowed, pointer, patch) in changes {
         let changed = weakened(&template, pointer, &patch);
         let answer = pod(&world.client, &baseline, &changed).await;
         assert_eq!(answer.is_ok(), allowed, "{pointer} {patch}: {answer:?}");

@@ -1,7 +1,6 @@
 //! One container's life: looks at the world, asks `decide`, does what it says. Called by `main`.
 //!
-//! All waiting is one `poll` over signals, changed folders and the command's output; a look once a second stands behind it. No
-//! policy here: what follows from what is `decide`'s.
+//! All waiting is one `poll` over signals, folders and output; a look once a second stands behind it. Policy is `decide`'s.
 
 use std::io;
 use std::os::fd::AsFd;

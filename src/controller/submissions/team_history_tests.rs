@@ -76,47 +76,60 @@ fn is_blamed(before: &[Run]) -> bool {
     of(&all, &own, at(20)).blames_agent(Some("n9"), 2)
 }
 
+type Case = (&'static str, bool, Vec<Run>);
+
+/// Two failures of a team in a row on two nodes, and what else has run.
+fn twice_and(more: Vec<Run>) -> Vec<Run> {
+    let mut runs = vec![run("a", Failed(1), 10, "n1"), run("a", Failed(1), 12, "n2")];
+    runs.extend(more);
+    runs
+}
+
+fn check(cases: Vec<Case>) {
+    for (what, expected, before) in cases {
+        assert_eq!(is_blamed(&before), expected, "{what}");
+    }
+}
+
 #[test]
 fn only_a_row_of_failures_between_other_teams_finishes_blames_the_agent() {
-    let twice = || vec![run("a", Failed(1), 10, "n1"), run("a", Failed(1), 12, "n2")];
-    let with = |mut runs: Vec<Run>, more: Vec<Run>| {
-        runs.extend(more);
-        runs
-    };
     let other_simulator = Run {
         simulator: "carla:2",
         ..run("b", Finished, 15, "n3")
     };
-    let cases = [
+    check(vec![
         (
             "others finish meanwhile",
             true,
-            with(twice(), vec![run("b", Finished, 15, "n3")]),
+            twice_and(vec![run("b", Finished, 15, "n3")]),
         ),
-        ("nobody else runs", false, twice()),
+        ("nobody else runs", false, twice_and(Vec::new())),
         (
             "others finished before",
             false,
-            with(twice(), vec![run("b", Finished, 9, "n3")]),
+            twice_and(vec![run("b", Finished, 9, "n3")]),
         ),
         (
             "others finish with another simulator",
             false,
-            with(twice(), vec![other_simulator]),
+            twice_and(vec![other_simulator]),
         ),
         (
             "its simulator fails for others as well",
             false,
-            with(
-                twice(),
-                vec![run("b", Finished, 15, "n3"), run("c", Failed(1), 16, "n4")],
-            ),
+            twice_and(vec![run("b", Finished, 15, "n3"), run("c", Failed(1), 16, "n4")]),
         ),
         (
             "only its own runs finish",
             false,
-            with(twice(), vec![run("a", Finished, 9, "n3")]),
+            twice_and(vec![run("a", Finished, 9, "n3")]),
         ),
+    ]);
+}
+
+#[test]
+fn neither_a_node_nor_a_finish_between_nor_a_like_name_makes_a_row() {
+    check(vec![
         (
             "one failure only",
             false,
@@ -125,10 +138,7 @@ fn only_a_row_of_failures_between_other_teams_finishes_blames_the_agent() {
         (
             "a run of its own finished between",
             false,
-            with(
-                twice(),
-                vec![run("a", Finished, 11, "n1"), run("b", Finished, 15, "n3")],
-            ),
+            twice_and(vec![run("a", Finished, 11, "n1"), run("b", Finished, 15, "n3")]),
         ),
         (
             "each failure was resumed by the team itself",
@@ -165,10 +175,7 @@ fn only_a_row_of_failures_between_other_teams_finishes_blames_the_agent() {
                 run("b", Finished, 15, "n4"),
             ],
         ),
-    ];
-    for (what, expected, before) in cases {
-        assert_eq!(is_blamed(&before), expected, "{what}");
-    }
+    ]);
 }
 
 #[test]
