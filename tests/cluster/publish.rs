@@ -45,13 +45,9 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
         assert_published(scene, &evalai, pk).await;
         assert_requests(&evalai.requests());
         assert_partials(&evalai.requests());
-        for status in ["queued", "running"] {
-            assert_eq!(
-                evalai.updates("PATCH", status),
-                1,
-                "each PATCH starts EvalAI's clock again: {status}"
-            );
-        }
+        // Each PATCH starts EvalAI's clock again. `queued` is left out if the agents run before it was sent.
+        assert!(evalai.updates("PATCH", "queued") <= 1);
+        assert_eq!(evalai.updates("PATCH", "running"), 1);
         assert_eq!(evalai.updates("PUT", "finished"), 1);
 
         let row = scene.cloud.row(&scene.cloud.table).await;

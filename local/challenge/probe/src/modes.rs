@@ -4,6 +4,7 @@ use std::convert::Infallible;
 use std::env;
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write as _};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::os::unix::fs::PermissionsExt as _;
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
@@ -58,7 +59,12 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
                 thread::park();
             }
         }
-        "own-crash" => mark("crash0"),
+        "own-crash" => {
+            mark("crash0")?;
+            // An honest agent that is faster than its simulator's look would end well, and the mark mean nothing.
+            await_simulators_end();
+            Ok(())
+        }
         "many-crashes" => (0..CRASHES).try_for_each(|number| mark(&format!("crash{number}"))),
         "own-done" => {
             mark("done")?;
@@ -100,6 +106,15 @@ pub fn honest(arguments: &[String], knobs: &str) -> io::Result<Infallible> {
 
 fn status(mark: &str) -> String {
     format!("/tmp/status/agent-{0}/agent-{0}.{mark}", pair())
+}
+
+/// Until nothing listens on the port of its simulator any more.
+fn await_simulators_end() {
+    let address = SocketAddr::from((Ipv4Addr::LOCALHOST, FIRST_PORT + PORT_STEP * (pair() - 1)));
+    let begun = Instant::now();
+    while TcpStream::connect(address).is_ok() && begun.elapsed() < LIFE {
+        thread::sleep(Duration::from_millis(20));
+    }
 }
 
 fn mark(name: &str) -> io::Result<()> {
