@@ -20,10 +20,13 @@ use crate::record::Figures;
 #[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Case {
     /// 300 submissions at once, until each has its Job.
+    #[value(name = "intake-300")]
     Intake300,
     /// The same with `concurrency.total`.
+    #[value(name = "intake-300-limited")]
     Intake300Limited,
     /// 1,000 at once.
+    #[value(name = "intake-1000")]
     Intake1000,
     /// 200 whole lives at once, with Pods of 5 s.
     Lifecycles,
