@@ -137,6 +137,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "list", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
         *may(controller, "list watch create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may(controller, "get list create patch delete", "resource.k8s.io/resourceclaimtemplates", namespace),
         *may(controller, "get", "coordination.k8s.io/leases", namespace, "another"),
         *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
     ]
@@ -152,6 +153,7 @@ def outside(controller: str, bridge: str, namespace: str) -> list[Access]:
         *may_not(controller, "get", "pods:log", namespace),
         *may_not(controller, "get", "secrets", namespace, "evalai"),
         *may_not(controller, "create patch", "networking.k8s.io/networkpolicies", namespace),
+        *may_not(controller, "get list create patch delete", "resource.k8s.io/resourceclaimtemplates", namespace),
         *may_not(bridge, "get list watch", f"{OWN}/leaderboards", namespace),
         *may_not(bridge, "get create patch", f"{OWN}/submissions", namespace),
     ]

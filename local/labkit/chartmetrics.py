@@ -6,12 +6,15 @@ from pathlib import Path
 
 from .errors import LabError
 
+# The folder whose files register all metrics.
+FOLDER = Path("src/observability/metrics")
 # What Prometheus adds to every sample of a target.
 TARGET_LABELS = frozenset({"namespace", "job", "pod", "container", "instance", "endpoint"})
 SUFFIXES = {
     "Counter": ("_total",),
     "Histogram": ("_bucket", "_sum", "_count"),
     "Gauge": ("",),
+    "FloatCounter": ("_total",),
     "FloatGauge": ("",),
     "Info": ("_info",),
 }
@@ -20,8 +23,11 @@ FIELD = re.compile(r"^\s+(?:pub )?(\w+): (.+),$", re.MULTILINE)
 IMPLEMENTATION = re.compile(r"^impl (\w+) \{(.*?)^\}", re.DOTALL | re.MULTILINE)
 REGISTRATION = re.compile(r"(\w+): (?:zero|add)\(\s*r,\s*\"(\w+)\"")
 INFO = re.compile(r"\.register\(\s*\"(\w+)\",\s*\"[^\"]*\",\s*Info::new\((\w+)\)")
-NAME = re.compile(r"\bleaderboard_\w+")
-SELECTED = re.compile(r"\b(leaderboard_\w+)\{([^}]*)\}")
+PREFIX = re.compile(r"= [\w.:]*with_prefix\(\"(\w+)\"\)")
+OTHER_PREFIX = re.compile(r"(\w+)::new\(\w+\.sub_registry_with_prefix\(\"(\w+)\"\)\)")
+PROGRAM = re.compile(r"(\w+)::new\((controller|bridge)\)")
+NAME = re.compile(r"\b(?:leaderboard|process)_\w+")
+SELECTED = re.compile(r"\b((?:leaderboard|process)_\w+)\{([^}]*)\}")
 MATCHER = re.compile(r"(\w+)\s*(?:=~|!~|!=|=)\s*\"([^\"]*)\"")
 GROUPED = re.compile(r"\b(?:by|on|without|ignoring)\s*\(([^)]*)\)")
 LITERAL = re.compile(r"\"([A-Za-z][A-Za-z_]*)\"")
@@ -29,11 +35,16 @@ LITERAL = re.compile(r"\"([A-Za-z][A-Za-z_]*)\"")
 Exported = Mapping[str, frozenset[str]]
 
 
+def source_of(repository: Path) -> str:
+    """The text of all files that register metrics, without their tests."""
+    files = sorted(file for file in (repository / FOLDER).glob("*.rs") if file.name != "tests.rs")
+    return "\n".join(file.read_text().partition("\n#[cfg(test)]")[0] for file in files)
+
+
 def exported(source: str) -> Exported:
     """The names that /metrics shows, with the labels of each."""
-    source = source.partition("\n#[cfg(test)]")[0]
     structs = {name: dict(FIELD.findall(body)) for name, body in STRUCT.findall(source)}
-    prefix = re.search(r"with_prefix\(\"(\w+)\"\)", source)
+    prefix, others = PREFIX.search(source), dict(OTHER_PREFIX.findall(source))
     if prefix is None:
         raise LabError("the source of the metrics names no prefix: chartmetrics.py must follow it")
     found: dict[str, frozenset[str]] = {}
@@ -42,11 +53,22 @@ def exported(source: str) -> Exported:
             kind, labels = shape(structs[owner][field], structs)
             for suffix in SUFFIXES[kind]:
                 more = {"le"} if suffix == "_bucket" else set()
-                found[f"{prefix[1]}_{name}{suffix}"] = frozenset(labels | more)
+                found[f"{others.get(owner, prefix[1])}_{name}{suffix}"] = frozenset(labels | more)
     for name, variable in INFO.findall(source):
         labels = structs[variable.capitalize()]
         found[f"{prefix[1]}_{name}_info"] = frozenset(labels)
     return found
+
+
+def programs(source: str) -> dict[str, str]:
+    """The one program that exports a family, by the family's name; those of both are left out."""
+    of_owner = dict(PROGRAM.findall(source))
+    return {
+        name: of_owner[owner]
+        for owner, body in IMPLEMENTATION.findall(source)
+        if owner in of_owner
+        for _, name in REGISTRATION.findall(body)
+    }
 
 
 def shape(written: str, structs: Mapping[str, Mapping[str, str]]) -> tuple[str, set[str]]:
@@ -80,7 +102,7 @@ def of_repository(repository: Path) -> tuple[Exported, frozenset[str]]:
     """The metrics of the operator, and every string that may be the value of a label."""
     sources = [*(repository / "src").rglob("*.rs"), *(repository / "crates" / "api" / "src").rglob("*.rs")]
     texts = "\n".join(file.read_text() for file in sources)
-    metrics = exported((repository / "src" / "observability" / "metrics.rs").read_text())
+    metrics = exported(source_of(repository))
     if not metrics:
         raise LabError("the source of the metrics registers none that chartmetrics.py could read")
     return metrics, frozenset(LITERAL.findall(texts))

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import apiserver, chartcases, chartdocs, chartrender, doccheck, release, schemas, tools
+from . import apiserver, chartalerts, chartcases, chartdocs, chartrender, doccheck, metricdocs, release, schemas, tools
 from .chartcases import RELEASE, SYSTEM, Access
 from .chartrender import documents
 from .console import say, seconds
@@ -30,13 +30,15 @@ def run(settings: Settings, update: bool) -> None:
     generated, copied = settings.repository / "crds", chart / "files" / "crds"
     if update:
         copy_definitions(generated, copied)
-    folder = tools.ensure(settings, apiserver.TOOLS)
+    folder = tools.ensure(settings, [*apiserver.TOOLS, chartalerts.TOOL])
     check("the chart's copy of crds/", lambda: same_definitions(generated, copied))
     check("a reason above every rule", lambda: rules_have_reasons(chart))
     check("values.yaml and the README's table", lambda: chartdocs.same_table(chart))
     check("values.yaml and its schema", lambda: chartdocs.same_schema(chart))
+    check("metrics and their page", lambda: metricdocs.same(settings.repository))
     check("one version", lambda: release.version(settings.repository))
     check("a runbook for each alert", lambda: doccheck.runbooks(settings.repository))
+    check("when each alert fires", lambda: chartalerts.fire(settings.repository, folder))
     started = time.monotonic()
     with apiserver.running(settings, folder) as kube:
         say(f"an API server of its own is ready ({seconds(time.monotonic() - started)})")
@@ -53,6 +55,7 @@ def run(settings: Settings, update: bool) -> None:
         check("install, rights in one leaderboard's namespace", lambda: installed(kube, chart))
         check("rights of people", lambda: people(kube))
         check("examples of Chart.yaml", lambda: examples(kube, chart))
+        check("values of examples/aws", lambda: aws_values(kube, chart, settings.repository / "examples" / "aws"))
         check("the demo's manifests", lambda: demo_manifests(kube, settings.repository / "examples" / "demo"))
         before = identities(kube)
         check("upgrade with roles, several leaderboards", lambda: upgraded(kube, chart))
@@ -125,6 +128,21 @@ def lint(kube: Kube, chart: Path) -> str:
         if done.returncode != 0:
             raise LabError(f"{file or 'values.yaml'}: {done.stdout.strip()[-600:]}")
     return f"{len(values_files(chart))} sets of values"
+
+
+def aws_values(kube: Kube, chart: Path, examples: Path) -> str:
+    """The file is for people to copy; with their names in it the chart takes it."""
+    text = (examples / "values.yaml").read_text()
+    for placeholder, value in (("<ACCOUNT_ID>", "123456789012"), ("<REGION>", "us-east-1"), ("<TAG>", "1.0.0")):
+        text = text.replace(placeholder, value)
+    argv = ["template", RELEASE, str(chart), f"--namespace={SYSTEM}", "--values=-"]
+    found = chartrender.objects(kube, kube.run("helm", *argv, given=text))
+    for program in ("controller", "bridge"):
+        account = found[f"ServiceAccount/{RELEASE}-{program}"]["metadata"]["annotations"]
+        role = account["eks.amazonaws.com/role-arn"]
+        if role != f"arn:aws:iam::123456789012:role/leaderboard-{program}":
+            raise LabError(f"the account of the {program} has the role {role}")
+    return f"{len(found)} objects"
 
 
 def refused_values(kube: Kube, chart: Path) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from . import (
     aws,
+    build,
     chartdocs,
     chartrender,
     charttest,
@@ -17,6 +18,7 @@ from . import (
     demo,
     image,
     kube,
+    metricdocs,
     pythonenv,
     release,
     testrun,
@@ -27,7 +29,10 @@ from .errors import LabError
 from .settings import API_SERVICE_ADDRESS, HOST_ADDRESS, PORTS, Settings, client_environment, load
 from .toolsets import SETS
 
-ALL_TOOLS = [name for tool_set in SETS.values() for name in tool_set.tools if name != "pause"]
+# containerd is built for those who ask for it by a setting.
+ALL_TOOLS = [
+    name for tool_set in SETS.values() for name in tool_set.tools if name != "pause" and tool_set.name != "containerd"
+]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -65,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     )
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
-    commands.add_parser("chart-docs", help="write the table of values in the chart's README")
+    commands.add_parser("chart-docs", help="write the tables of the chart's values and of the metrics")
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
@@ -113,6 +118,7 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             charttest.run(settings, arguments.update)
         case "chart-docs":
             chartdocs.update(chartrender.folder(settings.repository))
+            metricdocs.update(settings.repository)
         case "install-yaml":
             helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")
@@ -128,13 +134,14 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
 
 
 def print_environment(settings: Settings) -> None:
-    """Shell lines that make kubectl, helm and every AWS client speak to the lab."""
+    """Shell lines that make kubectl, helm and every AWS client speak to the lab, and give kubectl the plugin as cargo builds it."""
     for name, value in client_environment(settings).items():
         print(f"export {name}={shlex.quote(value)}")
     for name in ("NO_PROXY", "no_proxy"):
         print(f'export {name}="{HOST_ADDRESS},{API_SERVICE_ADDRESS}${{{name}:+,${name}}}"')
     folder = tools.gather(settings, {})
-    print(f'export PATH={shlex.quote(str(folder))}:"$PATH"')
+    built = image.target_folder(settings.repository, os.environ) / build.PROFILE
+    print(f'export PATH={shlex.quote(str(folder))}:"$PATH":{shlex.quote(str(built))}')
 
 
 def main(repository: Path, argv: Sequence[str]) -> int:

@@ -41,7 +41,7 @@ NAMES = (
     "kube-proxy",
 )
 # Started by commands of their own, ended by `down` with the rest.
-GUESTS = ("evalai",)
+GUESTS = ("evalai", "gpus")
 OWNER_VARIABLE = "LEADERBOARD_LAB_OWNER"
 
 
@@ -52,7 +52,7 @@ def up(settings: Settings) -> None:
     with exclusively(settings):
         tools.check_space(settings.state)
         packages.ensure(settings)
-        folder = tools.ensure(settings, CLUSTER_TOOLS)
+        folder = tools.ensure(settings, tools_of(settings))
         python = pythonenv.ensure(settings) / "python"
         pki.ensure(settings)
         network.up(settings)
@@ -63,9 +63,17 @@ def up(settings: Settings) -> None:
     say(f"the cluster is up ({took}; {news})")
 
 
+def tools_of(settings: Settings) -> tuple[str, ...]:
+    """The tools that this cluster runs on."""
+    return (*CLUSTER_TOOLS, "containerd", "containerd-shim-runc-v2") if settings.builds_containerd else CLUSTER_TOOLS
+
+
 def parts_of(settings: Settings, folder: Path, python: Path) -> list[Component]:
     """Every part as this machine runs it, with the tools in `folder`."""
-    containerd = shutil.which("containerd") or "containerd"
+    if settings.builds_containerd:
+        containerd = str(folder / "containerd")
+    else:
+        containerd = shutil.which("containerd", path=components.PATH) or "containerd"
     return components.all_components(settings, folder, python, containerd, str(packages.cni_folder()))
 
 

@@ -184,7 +184,9 @@ def scheduler(settings: Settings, tools: Path) -> Component:
 
 def containerd(settings: Settings, program: str) -> Component:
     argv = [program, f"--config={settings.config}/containerd.toml"]
-    return Component("containerd", argv, lambda: accepts(settings.containerd_socket))
+    # Its shim is looked up there: the one of the same version comes first.
+    env = {"PATH": f"{Path(program).parent}:{PATH}"}
+    return Component("containerd", argv, lambda: accepts(settings.containerd_socket), env=env)
 
 
 def kubelet(settings: Settings, tools: Path) -> Component:

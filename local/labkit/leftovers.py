@@ -16,6 +16,10 @@ from .settings import CGROUP, Settings
 
 CGROUPS = Path("/sys/fs/cgroup")
 CONTAINER_LOGS = Path("/var/log/containers")
+# Each kubelet of a machine has its plugins' sockets here, whatever its own root folder is.
+DEVICE_PLUGIN = Path("/var/lib/kubelet/device-plugins/fake-gpu.sock")
+# Where container engines read which devices a name stands for.
+CDI = Path("/var/run/cdi")
 
 
 def cgroup_roots() -> list[Path]:
@@ -161,12 +165,23 @@ def remove_traces(settings: Settings, sockets: Iterable[Path]) -> None:
         for link in CONTAINER_LOGS.iterdir():
             if link.is_symlink() and os.readlink(link).startswith(f"{settings.pod_logs}/"):
                 link.unlink(missing_ok=True)
+    remove_gpus()
     for root in cgroup_roots():
         for folder, _, _ in os.walk(root / CGROUP, topdown=False):
             try:
                 os.rmdir(folder)
             except OSError:
                 continue
+
+
+def remove_gpus() -> None:
+    """Removes what the stand-in of GPUs has left: the next cluster's node has none."""
+    if DEVICE_PLUGIN.is_socket():
+        DEVICE_PLUGIN.unlink(missing_ok=True)
+        # The kubelet remembers there which resources its node had.
+        (DEVICE_PLUGIN.parent / "kubelet_internal_checkpoint").unlink(missing_ok=True)
+    for file in CDI.glob("fake-gpu-*.json"):
+        file.unlink(missing_ok=True)
 
 
 def age_of(pid: int) -> float:

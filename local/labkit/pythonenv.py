@@ -1,4 +1,4 @@
-"""Owns the virtual environment with the AWS stand-in and its client; it lives in the tool cache, keyed by its requirements."""
+"""Owns the virtual environment with the AWS stand-in, its client and cfn-lint; it lives in the tool cache, keyed by its requirements."""
 
 import hashlib
 import os
@@ -30,7 +30,7 @@ def ensure(settings: Settings) -> Path:
 
 
 def build(folder: Path, requirements: Path, settings: Settings) -> None:
-    say("installing the AWS stand-in (ministack) and boto3, usually 15 s")
+    say("installing the AWS stand-in (ministack), boto3 and cfn-lint, usually 40 s")
     shutil.rmtree(folder, ignore_errors=True)
     made = subprocess.run([sys.executable, "-m", "venv", str(folder)], capture_output=True, text=True, check=False)
     if made.returncode != 0:

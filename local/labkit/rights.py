@@ -53,6 +53,12 @@ RARE: Mapping[Right, str] = {
     Right(
         "controller", "delete", "submissions", GROUP
     ): "only with retention.finishedSeconds, as tests/api/retention.rs has it",
+    **{
+        Right(
+            "controller", verb, "resourceclaimtemplates", "resource.k8s.io"
+        ): "only with gpu.mode Claim, as tests/api/claims.rs has it"
+        for verb in ("get", "list", "create", "patch", "delete")
+    },
     Right("controller", "create", "submissions", GROUP): "only for a submission whose message was lost",
     Right("controller", "get", "submissions", GROUP): "only for a submission whose message was lost",
 }

@@ -45,6 +45,8 @@ class Settings:
     cache: Path
     ports: Mapping[str, int]
     internet: bool
+    # A newer containerd than Debian's, built from source: it knows CDI devices.
+    builds_containerd: bool
 
     @property
     def local(self) -> Path:
@@ -114,6 +116,7 @@ def load(repository: Path, env: Mapping[str, str] | None = None) -> Settings:
         cache=Path(values.get("LEADERBOARD_TOOLS") or caches / "leaderboard-operator" / "tools").absolute(),
         ports={name: port(values, name, default) for name, default in PORTS.items()},
         internet=values.get("LEADERBOARD_LAB_INTERNET", "") == "1",
+        builds_containerd=values.get("LEADERBOARD_LAB_CONTAINERD", "") == "built",
     )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from . import build, charttest, cluster, demo, kube, pythonenv, rights, tools
+from . import build, charttest, cluster, demo, gpus, kube, pythonenv, rights, tools
 from .console import say, seconds
 from .errors import LabError
 from .failures import Failure, Reader, Summary, failed_cases
@@ -158,8 +158,9 @@ def in_cluster(plan: Plan) -> None:
     """The real thing: the node, the images and the AWS stand-in; EvalAI's runs inside of the tests."""
     require_target(plan.settings, "cluster")
     cluster.check_machine(plan.settings)
-    folder = tools.ensure(plan.settings, [*cluster.CLUSTER_TOOLS, "helm"])
+    folder = tools.ensure(plan.settings, [*cluster.CLUSTER_TOOLS, "helm", gpus.TOOL])
     cluster.up(plan.settings)
+    gpus.ensure(plan.settings, folder)
     demo.take_away(kube.of_lab(plan.settings, folder))
     images = demo.make_images(plan.settings)
     env = {

@@ -25,6 +25,8 @@ class ToolSet:
     name: str
     ldflags: str
     tools: Mapping[str, Tool]
+    # Build tags, between commas.
+    tags: str = ""
 
 
 def kubernetes_ldflags(version: str) -> str:
@@ -42,6 +44,10 @@ def kubernetes_ldflags(version: str) -> str:
 
 def kubernetes(program: str, seconds: int) -> Tool:
     return Tool(f"k8s.io/kubernetes/cmd/{program}", seconds)
+
+
+def containerd(program: str, seconds: int) -> Tool:
+    return Tool(f"github.com/containerd/containerd/v2/cmd/{program}", seconds)
 
 
 SETS: dict[str, ToolSet] = {
@@ -71,6 +77,22 @@ SETS: dict[str, ToolSet] = {
             },
         ),
         ToolSet("pause", "-s -w", {"pause": Tool(".", 2)}),
+        # Without what finds the targets of each cloud, which the rules' tests do not need.
+        ToolSet(
+            "prometheus",
+            "-s -w",
+            {"promtool": Tool("github.com/prometheus/prometheus/cmd/promtool", 120)},
+            tags="remove_all_sd",
+        ),
+        ToolSet("gpu", "-s -w", {"fake-gpu": Tool(".", 30)}),
+        ToolSet(
+            "containerd",
+            "-s -w",
+            {
+                "containerd": containerd("containerd", 110),
+                "containerd-shim-runc-v2": containerd("containerd-shim-runc-v2", 5),
+            },
+        ),
     )
 }
 
@@ -95,7 +117,8 @@ def in_build_order(names: Iterable[str]) -> list[tuple[ToolSet, str]]:
 
 def build_flags(tool_set: ToolSet) -> list[str]:
     """The arguments of `go build` besides output and package."""
-    return ["-trimpath", "-buildvcs=false", "-mod=readonly", "-ldflags", tool_set.ldflags]
+    tags = ["-tags", tool_set.tags] if tool_set.tags else []
+    return ["-trimpath", "-buildvcs=false", "-mod=readonly", *tags, "-ldflags", tool_set.ldflags]
 
 
 def cache_key(module: Path, flags: Iterable[str], platform: str) -> str:
