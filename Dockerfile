@@ -8,7 +8,7 @@ ARG BASE_IMAGE=gcr.io/distroless/cc-debian12:nonroot
 
 FROM ${BUILD_IMAGE} AS build
 WORKDIR /src
-# The commit, for the first line of the log: --build-arg REVISION="$(git rev-parse --short HEAD)"
+# The commit, for the first line of the log and for leaderboard_build_info: --build-arg REVISION="$(git rev-parse --short HEAD)"
 ARG REVISION=""
 COPY . .
 # Two builds, as the runner is static and small: it is copied into every Pod and runs inside any image.

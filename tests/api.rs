@@ -14,6 +14,7 @@ mod api {
     mod boards;
     mod bridge;
     mod charging;
+    mod claims;
     mod columns;
     mod counts;
     mod definitions;
@@ -22,9 +23,13 @@ mod api {
     mod examples;
     mod failures;
     mod images;
+    mod import;
+    mod import_readers;
+    mod inbox;
     mod intake;
     mod isolation;
     mod leader;
+    mod log_groups;
     mod memory;
     mod objects;
     mod operator;
@@ -37,7 +42,9 @@ mod api {
     mod rule_cases;
     mod rules;
     mod scale;
+    mod shared_queue;
     mod slots;
+    mod switch;
     mod table;
     mod token;
     mod two_operators;

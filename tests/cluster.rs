@@ -17,6 +17,8 @@ mod aws;
 mod evalai;
 #[path = "support/gate.rs"]
 mod gate;
+#[path = "support/old_pipeline.rs"]
+mod old_pipeline;
 #[path = "support/operator.rs"]
 mod operator;
 #[path = "support/processes.rs"]
@@ -30,12 +32,17 @@ mod cluster {
     mod abrupt;
     mod abuse;
     mod audit;
+    mod both_versions;
     mod bridge;
     mod bucket;
+    mod checks;
     mod crashes;
+    mod cutover;
     mod edits;
     mod expected;
     mod failures;
+    mod gpus;
+    mod import;
     mod isolation;
     mod losses;
     mod matrix;

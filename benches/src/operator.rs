@@ -85,7 +85,7 @@ impl Operator {
     /// Reconciles of Submissions since its start.
     pub async fn reconciles(&self) -> Outcome<f64> {
         let text = self.get("/metrics").await?;
-        Ok(sum(&text, "leaderboard_reconciles_total{", "kind=\"submission\""))
+        Ok(sum(&text, "leaderboard_reconciles_total{", "kind=\"Submission\""))
     }
 
     pub fn pid(&self) -> Outcome<u32> {

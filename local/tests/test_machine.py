@@ -8,7 +8,7 @@ import tempfile
 import unittest
 from pathlib import Path
 
-from labkit import cluster, components, console, elf, files, image, leftovers, network, pki, settings
+from labkit import cluster, components, console, elf, files, gpus, image, leftovers, network, pki, settings
 from labkit.errors import LabError
 
 MOUNTS = """22 1 254:0 / / rw - ext4 /dev/vda rw
@@ -158,6 +158,19 @@ class Configuration(unittest.TestCase):
     def test_pods_reach_the_internet_only_on_request(self) -> None:
         self.assertFalse(json.loads(files.cni(lab()))["plugins"][0]["ipMasq"])
         self.assertTrue(json.loads(files.cni(lab(LEADERBOARD_LAB_INTERNET="1")))["plugins"][0]["ipMasq"])
+
+    def test_a_built_containerd_takes_the_place_of_the_systems_with_its_own_shim(self) -> None:
+        with_system, with_built = lab(), lab(LEADERBOARD_LAB_CONTAINERD="built")
+        self.assertNotIn("containerd", cluster.tools_of(with_system))
+        for tool in ("containerd", "containerd-shim-runc-v2"):
+            self.assertIn(tool, cluster.tools_of(with_built))
+        made = components.containerd(with_built, "/tools/containerd")
+        self.assertEqual(made.env["PATH"].split(":")[0], "/tools")
+
+    def test_the_stand_in_of_gpus_has_the_rights_of_the_node(self) -> None:
+        made = gpus.component(lab(), Path("/tools"))
+        self.assertIn("-kubeconfig=/srv/repo/.local/pki/node.kubeconfig", made.argv)
+        self.assertIn("gpus", cluster.GUESTS)
 
     def test_the_stand_in_serves_nothing_that_runs_code(self) -> None:
         served = self.parts()["aws"].env["SERVICES"].split(",")

@@ -254,6 +254,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
             image: incoming.image.clone(),
             evalai: Some(incoming.reference()),
             track: None,
+            check: false,
             team: None,
             priority: 0,
             attempt: 1,

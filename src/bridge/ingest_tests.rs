@@ -94,6 +94,7 @@ fn the_first_message_makes_the_object_with_everything_it_needs() {
     let record: Value = serde_json::from_str(&made.metadata.annotations.unwrap()[names::ANNOTATION_INGESTED]).unwrap();
     assert_eq!(record, json!({"message": "a", "sent": 100, "attempt": 1}));
     let spec = made.spec;
+    assert!(!spec.check, "no message makes a check");
     assert_eq!(
         (spec.leaderboard_name.as_str(), spec.attempt, spec.cancel),
         (BOARD, 1, false)

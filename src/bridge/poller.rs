@@ -146,12 +146,13 @@ impl Poller {
         let outcomes = self.outcomes(&reader, &received, &readers).await;
         let count = u32::try_from(received.len()).unwrap_or(1);
         self.each = (self.each * 3 + begun.elapsed() / count) / 4;
-        let mut deletes = Vec::new();
+        let (mut deletes, mut held_back) = (Vec::new(), 0_u32);
         for (message, mut outcome) in received.iter().zip(outcomes) {
             if let MessageOutcome::Dead(reason) = &outcome {
                 outcome = self.dead_letter(&reader, message, reason, &readers).await;
             }
             self.shared.telemetry.metrics.sqs_message(outcome.as_str());
+            held_back = held_back.saturating_add(u32::from(outcome.is_held_back()));
             match outcome {
                 MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message.receipt.as_str()),
                 MessageOutcome::Later { seconds, .. } => report(reader.hold(&[&message.receipt], seconds).await),
@@ -159,6 +160,11 @@ impl Poller {
             }
         }
         report(reader.delete(&deletes).await);
+        if held_back > 0 {
+            // The controller does not take what is in flight for another reader's then.
+            let note = format!("{held_back} messages of the queue cannot be used yet and are received again later.");
+            self.publish(&readers, reasons::MESSAGES_HELD_BACK, &note).await;
+        }
         self.reader = Some((reader, since));
     }
 

@@ -110,6 +110,15 @@ pub enum Done {
 }
 
 impl MessageOutcome {
+    /// Whether a message stays in flight that nobody works on, and that no other reader is left.
+    pub fn is_held_back(&self) -> bool {
+        match self {
+            Self::Lapse => true,
+            Self::Later { why, .. } => *why != Later::Foreign,
+            Self::Ingest { .. } | Self::Dead(_) | Self::Delete(_) => false,
+        }
+    }
+
     /// The value of the metric's label.
     pub fn as_str(&self) -> &'static str {
         match self {
@@ -163,11 +172,21 @@ pub fn rules(readers: &[Arc<Leaderboard>]) -> Rules {
 
 /// Finds the Leaderboard of a message. `readers` are the queue's, the oldest first; `is_complete`: none can be missing.
 pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, is_complete: bool) -> MessageOutcome {
+    route_by(&rules(readers), envelope, readers, now_ms, is_complete)
+}
+
+/// The same for a queue with these rules.
+pub fn route_by(
+    rules: &Rules,
+    envelope: &Envelope,
+    readers: &[Arc<Leaderboard>],
+    now_ms: i64,
+    is_complete: bool,
+) -> MessageOutcome {
     // The last Leaderboard of the queue is being deleted: the next reader decides.
     if readers.is_empty() {
         return MessageOutcome::Lapse;
     }
-    let rules = rules(readers);
     let message = match &envelope.content {
         Ok(message) => message,
         Err(Malformed::StaticDataset) if rules.leaves_foreign => {
@@ -184,7 +203,7 @@ pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, is_
     if rules.leaves_foreign {
         return later(envelope.receives, SHORT_WAIT, Later::Foreign);
     }
-    if !is_complete || !is_overdue(envelope, &rules, now_ms) {
+    if !is_complete || !is_overdue(envelope, rules, now_ms) {
         return later(envelope.receives, LONGEST_WAIT, Later::Unknown);
     }
     MessageOutcome::Dead(DeadReason::Unknown(format!(

@@ -9,6 +9,7 @@ use tower_test::mock::{Handle, pair};
 
 use super::*;
 use crate::bridge::route::tests::{board, with_queue};
+use crate::observability::metrics::Program;
 use crate::observability::shutdown::Stop;
 
 type Server = Handle<Request<Body>, Response<Body>>;
@@ -34,7 +35,7 @@ fn everything() -> Scope {
 
 fn telemetry() -> (Observability, watch::Sender<bool>) {
     let (stop, signal) = Stop::new();
-    (Observability::new(signal), stop)
+    (Observability::of(Program::Bridge, signal), stop)
 }
 
 /// Whether a request is the check that the API server answers.

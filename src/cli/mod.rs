@@ -2,6 +2,8 @@
 //!
 //! Called by the binary alone. Every flag of a server can be given as an environment variable, as the chart does.
 
+mod import;
+mod labels;
 mod offline;
 mod serve;
 
@@ -35,6 +37,11 @@ enum Command {
     /// Merge and render checkpoint files without a cluster.
     #[command(after_help = offline::EXIT_CODES)]
     Results(offline::Results),
+    /// Print manifests for a pipeline that this operator takes over, or make Submissions from its table.
+    #[command(after_help = import::EXIT_CODES)]
+    Import(Box<import::Import>),
+    /// Print the schema of a phase's leaderboard in EvalAI.
+    Labels(labels::Labels),
 }
 
 /// What the servers have in common.
@@ -102,6 +109,8 @@ pub fn run() -> ExitCode {
     match cli.command {
         Command::Crd => offline::print_crds(),
         Command::Results(results) => results.run(),
+        Command::Import(import) => import.run(),
+        Command::Labels(labels) => labels.run(),
         Command::Controller(options) => serve::controller(options),
         Command::Bridge(options) => serve::bridge(options),
         Command::Workspace(options) => serve::workspace(&options),

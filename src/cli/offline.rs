@@ -34,9 +34,18 @@ pub(super) fn print_crds() -> ExitCode {
 }
 
 #[derive(ValueEnum, Clone, Copy, Debug)]
-enum FormatName {
+pub(super) enum FormatName {
     V1,
     V2,
+}
+
+impl From<FormatName> for Format {
+    fn from(name: FormatName) -> Self {
+        match name {
+            FormatName::V1 => Self::V1,
+            FormatName::V2 => Self::V2,
+        }
+    }
 }
 
 #[derive(ValueEnum, Clone, Copy, Debug)]
@@ -136,10 +145,7 @@ impl Results {
     }
 
     fn plan(&self) -> Result<Plan, Failure> {
-        let format = match self.format {
-            FormatName::V1 => Format::V1,
-            FormatName::V2 => Format::V2,
-        };
+        let format = Format::from(self.format);
         let verify = match self.verify {
             VerifyName::Off => Verify::Off,
             VerifyName::Warn => Verify::Warn,

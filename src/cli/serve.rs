@@ -14,18 +14,17 @@ use crate::controller::runtime as run;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::controller::settings::Settings;
 use crate::kubernetes::{Clients, Namespaces, watch_client};
-use crate::observability::Observability;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
+use crate::observability::metrics::Program;
 use crate::observability::shutdown::on_signals;
+use crate::observability::{Observability, REVISION};
 use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 
-/// The commit that was built, where the build was given one.
-const REVISION: Option<&str> = option_env!("LEADERBOARD_REVISION");
 /// Environment variable with the log filter.
 const ENV_LOG: &str = "RUST_LOG";
 
@@ -38,7 +37,7 @@ pub(super) fn bridge(options: Server) -> ExitCode {
 }
 
 pub(super) fn workspace(options: &InPod) -> ExitCode {
-    ownlog::start(None);
+    ownlog::start(&Places::below(&options.root).logs, ownlog::WORKSPACE_LOG);
     start_logged("workspace", || async {
         let setting = setting(options)?;
         workspace_program::main(setting).await.map_err(|e| e.to_string())
@@ -47,7 +46,7 @@ pub(super) fn workspace(options: &InPod) -> ExitCode {
 
 pub(super) fn logcopy(options: &InPod) -> ExitCode {
     // Its log is one of the results as well.
-    ownlog::start(Some(&Places::below(&options.root).logs));
+    ownlog::start(&Places::below(&options.root).logs, ownlog::OWN_LOG);
     start_logged("logcopy", || async {
         let setting = setting(options)?;
         let stop = on_signals().map_err(|e| e.to_string())?;
@@ -78,10 +77,8 @@ fn start_logged<W>(program: &'static str, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
 {
-    let (version, revision) = (
-        env!("CARGO_PKG_VERSION"),
-        REVISION.filter(|revision| !revision.is_empty()),
-    );
+    let version = env!("CARGO_PKG_VERSION");
+    let revision = Some(REVISION).filter(|revision| !revision.is_empty());
     tracing::info!(program, version, revision, "starting");
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
@@ -134,7 +131,7 @@ async fn lead(options: Controller) -> Result<(), String> {
 }
 
 async fn serve_bridge(options: Server) -> Result<(), String> {
-    let telemetry = Observability::new(on_signals().map_err(|e| e.to_string())?);
+    let telemetry = Observability::of(Program::Bridge, on_signals().map_err(|e| e.to_string())?);
     let server = HealthServer::start(options.http, telemetry.clone())
         .await
         .map_err(|e| e.to_string())?;
@@ -149,7 +146,7 @@ async fn serve_bridge(options: Server) -> Result<(), String> {
 }
 
 /// How the cluster is reached. Its audit log then names the program.
-async fn cluster(program: &str) -> Result<Config, String> {
+pub(super) async fn cluster(program: &str) -> Result<Config, String> {
     let mut config = Config::infer().await.map_err(|e| {
         format!("no cluster is configured: {e}; set KUBECONFIG, or run inside a Pod with a service account")
     })?;

@@ -66,6 +66,7 @@ fn job(number: usize) -> Value {
         plan,
         number: JobNumber::first(1),
         settings: &settings(),
+        without_gpu: &[],
         now: jiff::Timestamp::now(),
     }));
     object["status"] = json!({"active": 1, "ready": 1, "startTime": "2026-01-01T00:00:00Z"});

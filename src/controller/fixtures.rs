@@ -27,6 +27,7 @@ use crate::controller::settings::Settings;
 use crate::controller::stores::{Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
@@ -109,11 +110,13 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), noting(&answering)),
         lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
         images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
+        foreign_runs: ForeignRuns::start(&aws, &tasks, noting(&answering)),
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),
         external: external(&aws, &tasks),
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
+        metrics: Arc::default(),
         wake: noting(&waking),
         client,
         aws,
@@ -171,6 +174,7 @@ fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
         not_before: Instant::now(),
         changed: mpsc::unbounded_channel().0,
         sweep: mpsc::unbounded_channel().0,
+        arrived: mpsc::unbounded_channel().0,
         timing: Timing::default(),
         timeouts: Timeouts::default(),
         meter: Meter::default(),

@@ -7,6 +7,7 @@
 mod cache_tests;
 #[cfg(test)]
 pub(crate) mod fixtures;
+pub mod gpu_claims;
 pub mod leaderboards;
 pub mod network_policy;
 pub mod objects;

@@ -14,10 +14,16 @@ pub mod tasks;
 use std::sync::Arc;
 
 use liveness::Liveness;
-use metrics::Metrics;
+use metrics::{Metrics, Program};
 use readiness::Readiness;
 use shutdown::Stop;
 use tasks::Tasks;
+
+/// The commit that was built; empty where the build was given none.
+pub const REVISION: &str = match option_env!("LEADERBOARD_REVISION") {
+    Some(revision) => revision,
+    None => "",
+};
 
 /// What every part of a process is handed: where it counts, where it reports what it misses, and when it has to end.
 #[derive(Clone, Debug)]
@@ -30,10 +36,15 @@ pub struct Observability {
 }
 
 impl Observability {
-    /// Empty registries around a process's stop signal.
+    /// Of a controller: empty registries around a process's stop signal.
     pub fn new(stop: Stop) -> Self {
+        Self::of(Program::Controller, stop)
+    }
+
+    /// The same of any program.
+    pub fn of(program: Program, stop: Stop) -> Self {
         Self {
-            metrics: Arc::new(Metrics::new()),
+            metrics: Arc::new(Metrics::new(program)),
             liveness: Liveness::default(),
             readiness: Readiness::default(),
             tasks: Tasks::new(stop.clone()),

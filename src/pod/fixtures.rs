@@ -31,6 +31,8 @@ pub(crate) fn run() -> Run {
                 region: None,
                 endpoint: None,
                 size_limit: ByteQuantity::gibibytes(1),
+                kms_key_arn: None,
+                storage_class: None,
             },
             image: "image".to_owned(),
             contents_image: "contents".to_owned(),

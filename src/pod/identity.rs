@@ -108,6 +108,13 @@ fn session_policy(run: &Run, partition: &str) -> String {
             "Resource": bucket,
             "Condition": {"StringLike": {"s3:prefix": format!("{prefix}*")}},
         }),
+        // S3 asks KMS with the caller's rights, and a bucket may have a key that the Leaderboard does not name.
+        serde_json::json!({
+            "Effect": "Allow",
+            "Action": ["kms:Decrypt", "kms:GenerateDataKey"],
+            "Resource": run.plan.storage.kms_key_arn.as_deref().unwrap_or("*"),
+            "Condition": {"StringLike": {"kms:ViaService": "s3.*"}},
+        }),
     ];
     if let Some(group) = &run.log_group {
         statements.push(serde_json::json!({
@@ -121,6 +128,8 @@ fn session_policy(run: &Run, partition: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
     use crate::pod::fixtures;
 
@@ -137,12 +146,31 @@ mod tests {
     }
 
     #[test]
+    fn the_session_may_use_the_key_of_its_objects_and_only_through_s3() {
+        let key = "arn:aws:kms:us-east-1:123456789012:key/0a1b";
+        let mut run = fixtures::run();
+        for (named, resource) in [(None, "*"), (Some(key), key)] {
+            run.plan.storage.kms_key_arn = named.map(str::to_owned);
+            let policy: serde_json::Value = serde_json::from_str(&session_policy(&run, "aws")).unwrap();
+            let statement = &policy["Statement"][2];
+            assert_eq!(
+                statement["Action"],
+                serde_json::json!(["kms:Decrypt", "kms:GenerateDataKey"])
+            );
+            assert_eq!(statement["Resource"], resource);
+            assert_eq!(statement["Condition"]["StringLike"]["kms:ViaService"], "s3.*");
+        }
+    }
+
+    #[test]
     fn a_log_group_adds_this_runs_streams() {
         let mut run = fixtures::run();
         run.log_group = Some(leaderboard_api::LogGroup {
             name: "leaderboard-20".to_owned(),
             region: None,
             endpoint: None,
+            retention_days: None,
+            tags: BTreeMap::new(),
         });
         let policy = session_policy(&run, partition("nonsense"));
         assert!(

@@ -1,5 +1,5 @@
-//! logcopy's own log: JSON lines on standard output and, up to a size, in `logcopy/logcopy.log`, which is stored like any
-//! other log of the run.
+//! The logs of our own programs in the Pod: JSON lines on standard output and, up to a size, in a file of the `logs` volume.
+//! logcopy sends both files to CloudWatch, and stores its own like any other log of the run.
 //!
 //! Called by the entry points of the programs in the Pod, once, before anything else.
 
@@ -11,8 +11,10 @@ use std::sync::Mutex;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::writer::MakeWriterExt;
 
-/// Below the root of the `logs` volume.
+/// logcopy's, below the root of the `logs` volume.
 pub const OWN_LOG: &str = "logcopy/logcopy.log";
+/// workspace's.
+pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
 /// Bytes it may have.
 const LIMIT: u64 = 16 << 20;
 /// The last line: there is more than this file holds.
@@ -59,23 +61,22 @@ impl Write for Limited {
     }
 }
 
-/// Starts logging of this process: standard output, and the file if the volume's root is given. `RUST_LOG` chooses what.
-pub fn start(logs: Option<&Path>) {
+/// Starts logging of this process: standard output, and the file `name` below the volume's root. `RUST_LOG` chooses what.
+pub fn start(logs: &Path, name: &str) {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     let json = tracing_subscriber::fmt()
         .json()
         .flatten_event(true)
         .with_env_filter(filter);
-    let file = logs.map(|logs| Limited::open(&logs.join(OWN_LOG), LIMIT));
+    let file = Limited::open(&logs.join(name), LIMIT);
     // A second call in one process changes nothing, and logging is no reason to fail.
     let _ = match file {
-        Some(Ok(file)) => json.with_writer(io::stdout.and(Mutex::new(file))).try_init(),
-        Some(Err(error)) => {
+        Ok(file) => json.with_writer(io::stdout.and(Mutex::new(file))).try_init(),
+        Err(error) => {
             let started = json.try_init();
-            tracing::warn!("{OWN_LOG} can't be written, standard output has everything: {error}");
+            tracing::warn!("{name} can't be written, standard output has everything: {error}");
             started
         }
-        None => json.try_init(),
     };
 }
 

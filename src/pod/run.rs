@@ -115,6 +115,8 @@ pub enum Stop {
     Retries,
     /// `deadlines.runSeconds` is over.
     RunDeadline,
+    /// Its node is about to be taken away.
+    Interruption,
 }
 
 impl Stop {
@@ -124,12 +126,13 @@ impl Stop {
             Self::Cancel => "Cancel",
             Self::Retries => "Retries",
             Self::RunDeadline => "RunDeadline",
+            Self::Interruption => "Interruption",
         }
     }
 
     /// Reads the annotation's value; unknown text is nothing.
     pub fn parse(text: &str) -> Option<Self> {
-        [Self::Cancel, Self::Retries, Self::RunDeadline]
+        [Self::Cancel, Self::Retries, Self::RunDeadline, Self::Interruption]
             .into_iter()
             .find(|s| s.as_str() == text.trim())
     }

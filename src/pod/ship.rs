@@ -14,10 +14,11 @@ use tokio::sync::watch;
 use super::blocking;
 use super::daily::{Daily, Spent, today};
 use super::keys::agent_log;
-use super::ownlog::OWN_LOG;
+use super::ownlog::{OWN_LOG, WORKSPACE_LOG};
 use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
+use crate::backoff::Backoff;
 use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, OVERHEAD, cut};
 use leaderboard_api::RunId;
 
@@ -32,6 +33,8 @@ const NOTE_LIMIT: u64 = 1 << 20;
 /// Bytes that one stream gets on a day, as CloudWatch bills them: an agent that rewrites its log all the time ends its stream
 /// for that day. S3 has the log all the same.
 pub const STREAM_A_DAY: u64 = 512 << 20;
+/// Pauses of the last round after failures.
+const AGAIN: Backoff = Backoff::new(Duration::from_millis(500), Duration::from_secs(4));
 /// Time the last round may take.
 const LAST_ROUND: Duration = Duration::from_secs(20);
 
@@ -89,7 +92,10 @@ impl Shipper {
         let simulators = (1..=pairs).map(|n| (console(n), format!("{run_id}/simulator-{n}")));
         let streams: BTreeMap<String, String> = agents
             .chain(simulators)
-            .chain([(OWN_LOG.to_owned(), format!("{run_id}/logcopy"))])
+            .chain([
+                (OWN_LOG.to_owned(), format!("{run_id}/logcopy")),
+                (WORKSPACE_LOG.to_owned(), format!("{run_id}/workspace")),
+            ])
             .collect();
         let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();
         let noted = note.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());
@@ -138,10 +144,23 @@ impl Shipper {
                 break;
             }
         }
-        match tokio::time::timeout(LAST_ROUND, self.pass(true)).await {
+        match tokio::time::timeout(LAST_ROUND, self.last()).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::warn!("{error}"),
             Err(_) => tracing::warn!("the last lines are not in CloudWatch Logs: it took too long"),
+        }
+    }
+
+    /// Sends what is left, also of lines without an end, as often as it takes: no round follows.
+    async fn last(&mut self) -> Result<(), LogsError> {
+        let mut failures: u32 = 0;
+        loop {
+            match self.pass(true).await {
+                Err(error) if error.is_transient() => tracing::warn!("{error}"),
+                ended => return ended,
+            }
+            failures = failures.saturating_add(1);
+            tokio::time::sleep(AGAIN.after(failures)).await;
         }
     }
 
@@ -228,7 +247,7 @@ impl Shipper {
             self.made.insert(stream.to_owned());
         }
         let result = self.client.put(stream, events).await;
-        if !matches!(result, Err(LogsError::Refused { .. })) {
+        if !matches!(result, Err(LogsError::Refused { .. } | LogsError::Throttled { .. })) {
             let cost = Spent {
                 requests: 1,
                 bytes: billed(events),

@@ -4,18 +4,15 @@
 //! is stored when, and what the documents say, is for its callers.
 
 mod error;
+mod keeping;
+mod listing;
 mod parts;
-
-use std::fs::File;
-use std::os::unix::fs::FileExt;
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+mod upload;
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
-use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPart, Delete, ObjectIdentifier};
+use aws_sdk_s3::types::{Delete, ObjectIdentifier};
 use hyper::body::Bytes;
-use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use tokio::io::AsyncWriteExt;
 
 use crate::services::aws::Aws;
@@ -23,22 +20,16 @@ use crate::services::meter::Meter;
 use leaderboard_api::{RunId, Storage, effective};
 
 pub use error::{ArchiveError, Cause};
+pub use listing::{Listed, Listing};
 pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};
+pub(crate) use upload::read_range;
+
+use keeping::Keeping;
 
 /// Keys one DeleteObjects takes.
 const DELETE_PAGE: usize = 1000;
-/// Time S3 may take for copying a part or joining them.
-const LONG_TRY: Duration = Duration::from_mins(5);
 /// Times that an object is sent which another one gets ahead of.
 const REPLACE_TRIES: u32 = 5;
-/// What stays as it is in `x-amz-copy-source`.
-const PLAIN: &AsciiSet = &NON_ALPHANUMERIC
-    .remove(b'-')
-    .remove(b'_')
-    .remove(b'.')
-    .remove(b'~')
-    .remove(b'/');
-
 type HttpResponse = aws_sdk_s3::config::http::HttpResponse;
 
 /// One run's prefix in its bucket. Cheap to clone.
@@ -48,6 +39,7 @@ pub struct Archive {
     bucket: String,
     prefix: String,
     meter: Meter,
+    keeping: Keeping,
 }
 
 /// An object with its content.
@@ -68,26 +60,6 @@ pub enum Fetched {
     Absent,
     /// Another one.
     Found(Object),
-}
-
-/// An object as the list shows it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Listed {
-    /// Its key below the prefix.
-    pub key: String,
-    /// Its bytes.
-    pub size: u64,
-    /// Its entity tag.
-    pub etag: Option<String>,
-}
-
-/// What lies below a prefix.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Listing {
-    /// In the order of their keys.
-    pub objects: Vec<Listed>,
-    /// False if there are more than were asked for.
-    pub complete: bool,
 }
 
 /// What has to be there for an object to be stored in its place.
@@ -118,6 +90,7 @@ impl Archive {
             bucket: bucket.into(),
             prefix: prefix.into(),
             meter: Meter::default(),
+            keeping: Keeping::default(),
         }
     }
 
@@ -131,6 +104,7 @@ impl Archive {
         let client = aws.s3(storage.region.as_deref(), storage.endpoint.as_deref());
         Self {
             meter: aws.meter().clone(),
+            keeping: Keeping::of(storage),
             ..Self::new(client, &storage.bucket, storage.prefix.as_deref().unwrap_or_default())
         }
     }
@@ -232,7 +206,7 @@ impl Archive {
     /// Stores an object that fits into memory. Returns its entity tag.
     pub async fn put(&self, key: &str, bytes: impl Into<ByteStream>) -> Result<Option<String>, ArchiveError> {
         let request = self.client.put_object().bucket(&self.bucket).key(self.full(key));
-        let request = request.body(bytes.into()).send();
+        let request = self.keeping.of_object(request).body(bytes.into()).send();
         let output = self.meter.aws("s3", "PutObject", request).await;
         Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
     }
@@ -245,7 +219,7 @@ impl Archive {
         let mut tries: u32 = 0;
         loop {
             let request = self.client.put_object().bucket(&self.bucket).key(self.full(key));
-            let request = request.body(ByteStream::from(bytes.clone()));
+            let request = self.keeping.of_object(request).body(ByteStream::from(bytes.clone()));
             let request = match &before {
                 Before::Nothing => request.if_none_match("*"),
                 Before::Tagged(etag) => request.if_match(etag),
@@ -289,6 +263,7 @@ impl Archive {
                     key: object.key?.strip_prefix(&self.prefix)?.to_owned(),
                     size: object.size.and_then(|size| u64::try_from(size).ok()).unwrap_or(0),
                     etag: object.e_tag,
+                    stored: object.last_modified.as_ref().and_then(listing::moment),
                 })
             }));
             next = output.next_continuation_token;
@@ -328,112 +303,6 @@ impl Archive {
         Ok(())
     }
 
-    /// Stores the first `size` bytes of a file in parts; what is stored of it already is copied inside S3. At most one part
-    /// is in memory. What is not done at `cut_at` is aborted. Returns the new object's entity tag.
-    pub async fn upload(
-        &self,
-        key: &str,
-        file: &Arc<File>,
-        kept: Option<Kept<'_>>,
-        size: u64,
-        cut_at: Option<Instant>,
-    ) -> Result<Option<String>, ArchiveError> {
-        const OP: &str = "storing";
-        let parts = parts::plan(kept.map_or(0, |kept| kept.size), size);
-        let parts = parts.map_err(|e| self.error(OP, key, e.into()))?;
-        let request = self.client.create_multipart_upload().bucket(&self.bucket);
-        // The SDK adds a checksum to each part, which S3 takes only if the upload announced it.
-        let request = request.key(self.full(key)).checksum_algorithm(ChecksumAlgorithm::Crc32);
-        let output = request.send().await.map_err(|e| self.failed(OP, key, &e))?;
-        let Some(id) = output.upload_id else {
-            return Err(self.error(OP, key, Cause::Refused("no upload id in the answer".to_owned())));
-        };
-        let sending = self.send_parts(key, &id, file, kept, &parts);
-        let stored = match cut_at {
-            Some(cut_at) => tokio::time::timeout_at(cut_at.into(), sending)
-                .await
-                .unwrap_or_else(|_| Err(self.error(OP, key, Cause::Slow))),
-            None => sending.await,
-        };
-        if stored.is_err() {
-            let abort = self.client.abort_multipart_upload().bucket(&self.bucket);
-            // What is left over costs storage only; the bucket's lifecycle rule ends it.
-            let _ = abort.key(self.full(key)).upload_id(&id).send().await;
-        }
-        stored
-    }
-
-    async fn send_parts(
-        &self,
-        key: &str,
-        id: &str,
-        file: &Arc<File>,
-        kept: Option<Kept<'_>>,
-        parts: &[Part],
-    ) -> Result<Option<String>, ArchiveError> {
-        let mut done = Vec::with_capacity(parts.len());
-        for (number, part) in (1..).zip(parts) {
-            let completed = match *part {
-                Part::Copy { from, len } => {
-                    let etag = kept.map_or("", |kept| kept.etag);
-                    self.copy_part(key, id, number, etag, from..from + len).await?
-                }
-                Part::Send { from, len } => self.send_part(key, id, number, file, from..from + len).await?,
-            };
-            done.push(completed.part_number(number).build());
-        }
-        let upload = CompletedMultipartUpload::builder().set_parts(Some(done)).build();
-        let request = self.client.complete_multipart_upload().bucket(&self.bucket);
-        let request = request.key(self.full(key)).upload_id(id).multipart_upload(upload);
-        let output = request.customize().config_override(patient()).send().await;
-        Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
-    }
-
-    async fn send_part(
-        &self,
-        key: &str,
-        id: &str,
-        number: i32,
-        file: &Arc<File>,
-        range: std::ops::Range<u64>,
-    ) -> Result<aws_sdk_s3::types::builders::CompletedPartBuilder, ArchiveError> {
-        const OP: &str = "storing a part of";
-        let bytes = read_range(file, range)
-            .await
-            .map_err(|e| self.error(OP, key, e.into()))?;
-        let request = self.client.upload_part().bucket(&self.bucket).key(self.full(key));
-        let request = request.upload_id(id).part_number(number);
-        let request = request.checksum_algorithm(ChecksumAlgorithm::Crc32);
-        let output = request.body(ByteStream::from(bytes)).send().await;
-        let output = output.map_err(|e| self.failed(OP, key, &e))?;
-        let part = CompletedPart::builder().set_e_tag(output.e_tag);
-        Ok(part.set_checksum_crc32(output.checksum_crc32))
-    }
-
-    async fn copy_part(
-        &self,
-        key: &str,
-        id: &str,
-        number: i32,
-        etag: &str,
-        range: std::ops::Range<u64>,
-    ) -> Result<aws_sdk_s3::types::builders::CompletedPartBuilder, ArchiveError> {
-        const OP: &str = "copying a part of";
-        let source = format!("{}/{}", self.bucket, self.full(key));
-        let source = utf8_percent_encode(&source, PLAIN).to_string();
-        let request = self.client.upload_part_copy().bucket(&self.bucket).key(self.full(key));
-        let request = request.upload_id(id).part_number(number).copy_source(source);
-        let request = request.copy_source_if_match(etag);
-        let request = request.copy_source_range(format!("bytes={}-{}", range.start, range.end - 1));
-        let output = request.customize().config_override(patient()).send().await;
-        let result = output.map_err(|e| self.failed(OP, key, &e))?.copy_part_result;
-        let part = CompletedPart::builder();
-        Ok(match result {
-            Some(result) => part.set_e_tag(result.e_tag).set_checksum_crc32(result.checksum_crc32),
-            None => part,
-        })
-    }
-
     /// S3 says 403 for a missing object to whom may list one prefix only. The list of that prefix tells the two apart.
     async fn is_unlisted(&self, key: &str) -> bool {
         let listing = self.list(key, 1).await;
@@ -471,25 +340,4 @@ fn is_absent<E: ProvideErrorMetadata>(error: &SdkError<E, HttpResponse>) -> bool
 /// Some stores refuse a request with a condition that they can't check.
 fn knows_no_conditions<E: ProvideErrorMetadata>(error: &SdkError<E, HttpResponse>) -> bool {
     error::status(error) == Some(501) || error.code() == Some("NotImplemented")
-}
-
-/// Copying and joining large objects takes S3 longer than an ordinary answer.
-fn patient() -> aws_sdk_s3::config::Builder {
-    let timeouts = aws_config::timeout::TimeoutConfig::builder()
-        .connect_timeout(Duration::from_secs(5))
-        .operation_attempt_timeout(LONG_TRY)
-        .operation_timeout(LONG_TRY * 2)
-        .build();
-    aws_sdk_s3::config::Builder::new().timeout_config(timeouts)
-}
-
-/// Reads a part of a file, on a thread that may block.
-pub(crate) async fn read_range(file: &Arc<File>, range: std::ops::Range<u64>) -> std::io::Result<Vec<u8>> {
-    let file = Arc::clone(file);
-    let read = tokio::task::spawn_blocking(move || {
-        let mut bytes = vec![0; usize::try_from(range.end - range.start).map_err(std::io::Error::other)?];
-        file.read_exact_at(&mut bytes, range.start)?;
-        Ok(bytes)
-    });
-    read.await.map_err(std::io::Error::other)?
 }

@@ -8,6 +8,7 @@ use aws_sdk_cloudwatchlogs::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_cloudwatchlogs::types::InputLogEvent;
 
 use crate::services::aws::Aws;
+use crate::services::fault::{self, Fault};
 use leaderboard_api::LogGroup;
 
 /// Events of one request.
@@ -52,6 +53,18 @@ pub enum LogsError {
         /// Whether the stream does not exist.
         missing: bool,
     },
+    /// It takes no more requests for now: nothing of this one is stored.
+    #[error("{op} {group}/{stream} in CloudWatch Logs: too many requests ({why}). It is tried again.")]
+    Throttled {
+        /// What was done.
+        op: &'static str,
+        /// The group.
+        group: String,
+        /// The stream.
+        stream: String,
+        /// Its message.
+        why: String,
+    },
     /// It did not answer: the events may be there or not.
     #[error("{op} {group}/{stream} in CloudWatch Logs: no answer ({why}). {HINT}")]
     Unanswered {
@@ -66,8 +79,16 @@ pub enum LogsError {
     },
 }
 
-const HINT: &str = "Check logGroup of the leaderboard, and logs:CreateLogStream, logs:PutLogEvents and \
-                    logs:GetLogEvents of the Pod's identity; results do not depend on it.";
+const HINT: &str = "Check that logGroup of the leaderboard exists (the controller makes it where logGroup.retentionDays \
+                    is set), and logs:CreateLogStream, logs:PutLogEvents and logs:GetLogEvents of the Pod's identity; \
+                    results do not depend on it.";
+
+impl LogsError {
+    /// Whether the same request may succeed in a moment.
+    pub fn is_transient(&self) -> bool {
+        !matches!(self, Self::Refused { .. })
+    }
+}
 
 impl LogClient {
     /// The group of a Leaderboard.
@@ -140,7 +161,7 @@ impl LogClient {
         error: &SdkError<E, aws_sdk_cloudwatchlogs::config::http::HttpResponse>,
     ) -> LogsError
     where
-        E: ProvideErrorMetadata,
+        E: ProvideErrorMetadata + std::error::Error + 'static,
     {
         let answered = error.raw_response().is_some_and(|raw| raw.status().as_u16() < 500);
         let why = match (error.code(), error.message()) {
@@ -148,6 +169,14 @@ impl LogClient {
             (Some(code), None) => code.to_owned(),
             (None, _) => short(error).to_owned(),
         };
+        if fault::of(error) == Fault::Throttled {
+            return LogsError::Throttled {
+                op,
+                group: self.group.clone(),
+                stream: stream.to_owned(),
+                why,
+            };
+        }
         if answered {
             let missing = error.code() == Some("ResourceNotFoundException");
             return self.refused(op, stream, why, missing);

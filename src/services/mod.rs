@@ -4,8 +4,10 @@
 pub mod archive;
 pub mod aws;
 pub mod evalai;
+pub mod event_sources;
 pub mod fault;
 pub mod held_text;
+pub mod log_groups;
 pub mod logs;
 pub mod meter;
 pub mod public;

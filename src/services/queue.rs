@@ -1,4 +1,8 @@
-//! Whether an SQS queue exists. Called by the controller's checks of a Leaderboard; messages are the bridge's alone.
+//! Whether an SQS queue exists, and how much of it is in flight. Called by the controller's checks of a Leaderboard; messages are the
+//! bridge's alone.
+
+use std::collections::HashMap;
+use std::time::Duration;
 
 use aws_sdk_sqs::types::QueueAttributeName;
 
@@ -33,13 +37,46 @@ impl QueueError {
     }
 }
 
+/// What SQS shows of a queue. Its numbers are approximate, and up to a minute old.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Reading {
+    pub arn: Option<String>,
+    /// Messages that a receive would get.
+    pub visible: u64,
+    /// Messages that were received, and are neither deleted nor visible again.
+    pub in_flight: u64,
+    /// How long a received message stays invisible by itself.
+    pub visibility: Duration,
+}
+
+impl Reading {
+    const ATTRIBUTES: [QueueAttributeName; 4] = [
+        QueueAttributeName::QueueArn,
+        QueueAttributeName::VisibilityTimeout,
+        QueueAttributeName::ApproximateNumberOfMessages,
+        QueueAttributeName::ApproximateNumberOfMessagesNotVisible,
+    ];
+
+    fn of(attributes: Option<&HashMap<QueueAttributeName, String>>) -> Self {
+        let text = |name| attributes.and_then(|all| all.get(&name)).cloned();
+        let number = |name| text(name).and_then(|text| text.parse().ok()).unwrap_or_default();
+        Self {
+            arn: text(QueueAttributeName::QueueArn),
+            visible: number(QueueAttributeName::ApproximateNumberOfMessages),
+            in_flight: number(QueueAttributeName::ApproximateNumberOfMessagesNotVisible),
+            visibility: Duration::from_secs(number(QueueAttributeName::VisibilityTimeout)),
+        }
+    }
+}
+
 /// Checks whether a queue answers: the one that is read, or its dead-letter queue.
-pub async fn check(aws: &Aws, queue: &api::Queue, url: &str) -> Result<(), QueueError> {
+pub async fn check(aws: &Aws, queue: &api::Queue, url: &str) -> Result<Reading, QueueError> {
     let client = aws.sqs(queue.region.as_deref(), queue.endpoint.as_deref());
     let request = client.get_queue_attributes().queue_url(url);
-    let request = request.attribute_names(QueueAttributeName::QueueArn).send();
+    let request = request.set_attribute_names(Some(Reading::ATTRIBUTES.to_vec())).send();
     let answer = aws.meter().aws("sqs", "GetQueueAttributes", request).await;
-    answer.map(|_| ()).map_err(|error| QueueError {
+    let answer = answer.map(|output| Reading::of(output.attributes()));
+    answer.map_err(|error| QueueError {
         url: url.to_owned(),
         fault: fault::of(&error),
         text: fault::sentence(&error),

@@ -4,7 +4,10 @@
 //! column holds is the caller's.
 
 mod ledger;
+mod read;
 mod recorder;
+mod rows;
+mod trial;
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -18,8 +21,10 @@ use aws_sdk_dynamodb::types::{
 };
 use thiserror::Error;
 
-pub use ledger::RowState;
+pub use ledger::{RowState, TableId};
+pub use read::ObservedRow;
 pub use recorder::Recorder;
+pub use rows::StoredRow;
 
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
@@ -71,6 +76,8 @@ pub struct Row {
     pub progress: String,
     /// Name of the Submission that a host made of it by a re-run in EvalAI.
     pub rerun_as: String,
+    /// Nothing is written: DynamoDB is only asked whether it would take a row.
+    pub is_trial: bool,
     /// Metric columns and their values; none removes the column: only a finished submission has metrics.
     pub metrics: Vec<(String, Option<String>)>,
 }
@@ -220,6 +227,9 @@ impl Table {
 
     /// Writes a row, unless the table holds a later one. Safe twice.
     pub async fn write(&self, row: &Row) -> Result<Written, TableError> {
+        if row.is_trial {
+            return self.try_write(row).await;
+        }
         let columns = self.columns(row);
         let request = set_columns(self.request(row)?, row, &columns).send();
         match self.meter.aws("dynamodb", "UpdateItem", request).await {

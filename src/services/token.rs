@@ -81,14 +81,9 @@ impl TokenSource {
                 region,
                 endpoint,
             } => {
-                let client = aws.secrets(region.as_deref(), endpoint.as_deref());
-                let request = client.get_secret_value().secret_id(id).send();
-                let answer = aws.meter().aws("secretsmanager", "GetSecretValue", request).await;
-                let answer = answer.map_err(|e| TokenError::Unreadable {
-                    id: id.clone(),
-                    why: reason(&e),
-                })?;
-                Token::parse(&entry(id, key, answer.secret_string().unwrap_or_default())?)
+                let text = secret_text(aws, id, region.as_deref(), endpoint.as_deref()).await;
+                let text = text.map_err(|why| TokenError::Unreadable { id: id.clone(), why })?;
+                Token::parse(&entry(id, key, &text)?)
             }
         }
     }
@@ -101,6 +96,14 @@ impl fmt::Debug for TokenSource {
             Self::SecretsManager { id, key, .. } => write!(f, "SecretsManager({id}, {key})"),
         }
     }
+}
+
+/// The text of an entry of Secrets Manager; an error shows what the service has answered.
+pub async fn secret_text(aws: &Aws, id: &str, region: Option<&str>, endpoint: Option<&str>) -> Result<String, String> {
+    let request = aws.secrets(region, endpoint).get_secret_value().secret_id(id).send();
+    let answer = aws.meter().aws("secretsmanager", "GetSecretValue", request).await;
+    let answer = answer.map_err(|error| reason(&error))?;
+    Ok(answer.secret_string().unwrap_or_default().to_owned())
 }
 
 /// The service's own message where it gave one: its answers hold no secret, unlike a `Debug` of the whole.

@@ -9,8 +9,9 @@ use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use evalai_stand_in::{Config, Handle};
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::scheduling::v1::PriorityClass;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
-use kube::api::{Api, Patch, PatchParams};
+use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_api::{Leaderboard, conditions, reasons};
 use serde_json::{Value, json};
@@ -221,20 +222,14 @@ async fn what_is_missing_is_named_until_it_is_there() {
         "leaderboard_cloud_calls_total{service=\"secretsmanager\",op=\"GetSecretValue\",outcome=\"ok\"}",
         "leaderboard_evalai_requests_total{op=\"get_phases\",outcome=\"ok\"}",
         "leaderboard_evalai_requests_total{op=\"sweep_submitted\",outcome=\"ok\"}",
-        "leaderboard_evalai_request_seconds_count{service=\"evalai\",op=\"get_splits\"}",
+        "leaderboard_evalai_request_duration_seconds_count{op=\"get_splits\"}",
         "leaderboard_submissions{state=\"Running\"} 0",
+        &format!("leaderboard_ready{{leaderboard=\"{}/{NAME}\"}} 1", world.namespace),
     ] {
         world.counted(line).await;
     }
     let text = world.operator.metrics();
-    for private in [
-        world.token.as_str(),
-        &world.token[..20],
-        &world.namespace,
-        NAME,
-        &world.bucket(),
-        "127.0.0.1",
-    ] {
+    for private in [world.token.as_str(), &world.token[..20], &world.bucket(), "127.0.0.1"] {
         assert!(!text.contains(private), "{private} is in the metrics:\n{text}");
     }
     world.operator.end().await;
@@ -306,5 +301,34 @@ async fn a_missing_table_stops_no_submission() {
     let made = await_condition(jobs, "one-1", |job: Option<&Job>| job.is_some());
     timeout(LIMIT, made).await.expect("its Job is made").unwrap();
     world.says("False", reasons::TABLE_UNREACHABLE).await;
+    world.operator.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_priority_class_of_a_track_has_to_be_there_and_must_not_preempt() {
+    let world = World::new().await;
+    world.make_bucket().await;
+    let class = |name: &str| format!("{}-{name}", world.namespace);
+    let tracks = |class: String| json!([{"name": "sensors", "codename": "SENSORS", "priorityClassName": class}]);
+    let storage = json!({"bucket": world.bucket(), "endpoint": world.aws.endpoint});
+    let spec = json!({"spec": {"tracks": tracks(class("waits")), "storage": storage}});
+    world.apply(&spec).await;
+    let said = world.says("False", reasons::INVALID_POD).await;
+    let expected = format!("PriorityClass {} of the track sensors does not exist.", class("waits"));
+    assert!(said.message.starts_with(&expected), "{}", said.message);
+
+    let classes: Api<PriorityClass> = Api::all(server().await.client());
+    for (name, policy) in [("waits", "Never"), ("preempts", "PreemptLowerPriority")] {
+        let class = json!({"metadata": {"name": class(name)}, "value": 1, "preemptionPolicy": policy});
+        let class: PriorityClass = serde_json::from_value(class).unwrap();
+        classes.create(&PostParams::default(), &class).await.unwrap();
+    }
+    // Nobody edits anything: it is asked again by itself.
+    world.says("True", reasons::READY).await;
+    let patch = Patch::Merge(json!({"spec": {"tracks": tracks(class("preempts"))}}));
+    let boards = world.boards().await;
+    boards.patch(NAME, &PatchParams::default(), &patch).await.unwrap();
+    let said = world.says("False", reasons::INVALID_POD).await;
+    assert!(said.message.contains("preemptionPolicy: Never"), "{}", said.message);
     world.operator.end().await;
 }

@@ -20,6 +20,7 @@ use leaderboard_operator::bridge;
 use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
 use leaderboard_operator::kubernetes::{Clients, Namespaces};
 use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::metrics::Program;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::TaskFailed;
 use leaderboard_operator::services::aws::Aws;
@@ -129,7 +130,7 @@ impl StandIn {
     }
 }
 
-async fn eventually(what: &str, mut holds: impl AsyncFnMut() -> bool) {
+pub(super) async fn eventually(what: &str, mut holds: impl AsyncFnMut() -> bool) {
     let wait = async {
         while !holds().await {
             tokio::time::sleep(POLL).await;
@@ -139,16 +140,16 @@ async fn eventually(what: &str, mut holds: impl AsyncFnMut() -> bool) {
 }
 
 /// A bridge of one namespace that runs until it is dropped.
-struct Bridge {
+pub(super) struct Bridge {
     telemetry: Observability,
     stop: watch::Sender<bool>,
     task: tokio::task::JoinHandle<Result<(), TaskFailed>>,
 }
 
 impl Bridge {
-    fn start(clients: Clients, stand_in: &StandIn, namespace: &str) -> Self {
+    pub(super) fn start(clients: Clients, stand_in: &StandIn, namespace: &str) -> Self {
         let (stop, stopped) = Stop::new();
-        let telemetry = Observability::new(stopped);
+        let telemetry = Observability::of(Program::Bridge, stopped);
         let aws = stand_in.aws.clone();
         let scope = bridge::Scope {
             namespaces: Namespaces::of([namespace.to_owned()]),
@@ -163,7 +164,7 @@ impl Bridge {
     }
 
     /// So many messages had this outcome.
-    fn count(&self, outcome: &str) -> u64 {
+    pub(super) fn count(&self, outcome: &str) -> u64 {
         let sample = format!("leaderboard_sqs_messages_total{{outcome=\"{outcome}\"}} ");
         let text = self.telemetry.metrics.text().unwrap();
         let value = text.lines().find_map(|line| line.strip_prefix(&sample));
@@ -175,7 +176,7 @@ impl Bridge {
         self.telemetry.readiness.missing().join("; ")
     }
 
-    async fn stop(self) {
+    pub(super) async fn stop(self) {
         self.stop.send_replace(true);
         tokio::time::timeout(LIMIT, self.task)
             .await
@@ -296,7 +297,7 @@ async fn two_bridges_make_each_submission_once() {
     for bridge in bridges {
         assert_eq!(bridge.missing(), "");
         let metrics = bridge.telemetry.metrics.text().unwrap();
-        let receives = "leaderboard_cloud_call_seconds_sum{service=\"sqs\",op=\"ReceiveMessage\"} ";
+        let receives = "leaderboard_cloud_call_duration_seconds_sum{service=\"sqs\",op=\"ReceiveMessage\"} ";
         let seconds = metrics.lines().find_map(|line| line.strip_prefix(receives));
         assert!(
             seconds.unwrap().parse::<f64>().unwrap() > 0.0,

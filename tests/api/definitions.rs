@@ -70,13 +70,14 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "tracks": [{"name": "sensors", "codename": "SENSORS"}],
         "leaderboardVersion": "V2",
         "contents": {"image": "contents:1"},
-        "simulator": {"image": "simulator:1"},
+        "simulator": {"image": "simulator:1", "display": "Offscreen"},
         "agent": {"logSizeLimit": "2Gi", "imageSizeLimit": "60Gi"},
         "pairs": 4,
         "routes": 20,
         "retries": {"perPair": 3, "infrastructure": 2, "onRepeatedInfrastructure": "Forgive"},
         "deadlines": {
             "scheduleSeconds": 0,
+            "pullSeconds": 5400,
             "startSeconds": 1800,
             "readySeconds": 3600,
             "idleSeconds": 800,
@@ -145,6 +146,7 @@ fn half_filled_runs() -> Vec<HalfFilled> {
             json!({"startSeconds": 5, "runSeconds": 7200}),
             json!({
                 "scheduleSeconds": 0,
+                "pullSeconds": 5400,
                 "startSeconds": 5,
                 "readySeconds": 3600,
                 "idleSeconds": 800,
@@ -178,6 +180,16 @@ fn half_filled_runs() -> Vec<HalfFilled> {
                     "deadlines": {"runSeconds": 0}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
         ),
         ("concurrency", json!({"total": 3}), json!({"total": 3})),
+        (
+            "simulator",
+            json!({"image": "simulator:1", "display": "X11Socket", "x11": {}}),
+            json!({"image": "simulator:1", "display": "X11Socket", "x11": {"display": ":0"}}),
+        ),
+        (
+            "gpu",
+            json!({"resourceName": "nvidia.com/gpu"}),
+            json!({"resourceName": "nvidia.com/gpu"}),
+        ),
     ]
 }
 
@@ -191,22 +203,35 @@ fn half_filled_services() -> Vec<HalfFilled> {
             "requestsPerMinute": 54,
             "sweepSeconds": 60,
             "logTail": log_tail,
+            "mode": "Publish",
         })
     };
     let sent = |token: Value| json!({"apiServer": "https://eval.ai", "challenge": 1, "token": token});
     let secret = json!({"secretKeyRef": {"name": "evalai", "key": "token"}});
     let in_manager = |manager: Value| json!({ "secretsManager": manager });
+    let with_queue = |mut evalai: Value, queue: Value| {
+        evalai["queue"] = queue;
+        evalai
+    };
     vec![
         (
             "storage",
             json!({"bucket": "results", "prefix": "a/"}),
             json!({"bucket": "results", "prefix": "a/", "sizeLimit": "20Gi"}),
         ),
-        ("evalai", sent(secret.clone()), evalai(secret, "Hosts")),
+        ("evalai", sent(secret.clone()), evalai(secret.clone(), "Hosts")),
         (
             "evalai",
             sent(in_manager(json!({"id": "evalai"}))),
             evalai(in_manager(json!({"id": "evalai", "key": "auth_token"})), "Hosts"),
+        ),
+        (
+            "evalai",
+            with_queue(sent(secret.clone()), json!({"name": "carla-1"})),
+            with_queue(
+                evalai(secret, "Hosts"),
+                json!({"name": "carla-1", "unknownAfterSeconds": 900}),
+            ),
         ),
         (
             "queue",
@@ -273,7 +298,10 @@ async fn a_null_is_as_good_as_a_field_left_out() {
                 "name": "sensors", "codename": "SENSORS", "phase": null, "pairs": null, "routeSubsets": null,
                 "routesFile": null,
             }],
-            "storage": {"bucket": "results", "prefix": null, "region": null, "endpoint": null, "sizeLimit": null},
+            "storage": {
+                "bucket": "results", "prefix": null, "region": null, "endpoint": null, "sizeLimit": null, "kmsKeyARN": null,
+                "storageClass": null,
+            },
             "deadlines": {"runSeconds": null},
             "concurrency": {"total": null, "perTeam": null},
             "agent": {"command": null, "args": null, "resources": null, "logSizeLimit": null, "images": null, "imageSizeLimit": null},

@@ -22,8 +22,8 @@ use jiff::{SignedDuration, Timestamp};
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::evalai::{
-    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Payload, Progress, Run, Status,
-    Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
+    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Payload, Progress, Publisher, Run,
+    Status, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
 };
 use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
@@ -71,6 +71,8 @@ fn target(api_server: &str, token: &str) -> Target {
         period: Duration::from_millis(200),
         phases: [1, 2].into(),
         labels: seed.challenges[0].phases[0].splits[0].schema.labels.clone().into(),
+        inbox: None,
+        is_observed: false,
         since: Timestamp::now() - SignedDuration::from_hours(1),
     }
 }
@@ -102,6 +104,7 @@ impl World {
             not_before,
             changed: wake,
             sweep: found,
+            arrived: mpsc::unbounded_channel().0,
             timing,
             timeouts,
             meter: Meter::default(),
@@ -184,7 +187,8 @@ impl World {
     }
 
     fn update(&self, pk: i64, update: DesiredUpdate) {
-        self.hub.update(&self.subject(pk), update).unwrap();
+        let publisher = Publisher::of(self.subject(pk)).unwrap();
+        self.hub.update(&publisher, update).unwrap();
     }
 
     fn fail(&self, method: &str, part: &str, answer: Failure, when: When) {

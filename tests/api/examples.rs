@@ -1,11 +1,15 @@
 //! The manifests in `examples/` and the files in `crds/`, as a person applies them.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use leaderboard_api::{Leaderboard, Submission, effective};
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use leaderboard_api::{GpuSource, Leaderboard, Submission, effective};
 
 use crate::support::apiserver::{ApiServer, server};
+
+type Quantities = BTreeMap<String, Quantity>;
 
 fn folder(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name)
@@ -115,5 +119,43 @@ fn examples_run_what_their_comments_say() {
             "{}",
             file.display()
         );
+    }
+}
+
+/// Cores and GiB of a quantity as the examples write it.
+fn number(quantities: Option<&Quantities>, name: &str) -> f64 {
+    let text = &quantities.unwrap()[name].0;
+    text.trim_end_matches("Gi").parse().unwrap()
+}
+
+/// What is left for Pods on a g5.12xlarge: 47.8 CPUs, some 180 GiB, and 4 GPUs that are shown as 8.
+#[test]
+fn a_run_of_the_examples_takes_the_gpus_of_one_node_and_fits_it() {
+    for name in [
+        "leaderboard-20.yaml",
+        "leaderboard-10.yaml",
+        "leaderboard-restricted.yaml",
+    ] {
+        let text = std::fs::read_to_string(folder("examples").join(name)).unwrap();
+        let spec = serde_saphyr::from_str::<Leaderboard>(&text).unwrap().spec;
+        let sides = [&spec.simulator.resources, &spec.agent.resources].map(|side| side.as_ref().unwrap());
+        let sum = |what: &str| -> f64 { sides.iter().map(|side| number(side.requests.as_ref(), what)).sum() };
+        let limit: f64 = sides.iter().map(|side| number(side.limits.as_ref(), "memory")).sum();
+        let pairs = f64::from(spec.pairs);
+        assert!(pairs * sum("cpu") + 1.0 <= 47.8, "{name}");
+        assert!(pairs * sum("memory") < 170.0 && pairs * limit < 170.0, "{name}");
+        assert!(pairs * sum("ephemeral-storage") < 100.0, "{name}");
+        let gpu = spec.gpu.as_ref().unwrap();
+        assert_eq!(
+            (gpu.source(), 2 * spec.pairs),
+            (GpuSource::PerContainer("nvidia.com/gpu"), 8)
+        );
+        for track in &spec.tracks {
+            let mut keys = track
+                .tolerations
+                .iter()
+                .filter_map(|toleration| toleration.key.as_deref());
+            assert!(keys.any(|key| key == "nvidia.com/gpu"), "{name}");
+        }
     }
 }

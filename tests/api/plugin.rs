@@ -2,6 +2,8 @@
 //! rights it needs. No controller runs; the test writes the status.
 #![cfg(test)]
 
+mod checks;
+mod daily;
 mod rights;
 mod terminal;
 

@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{LeaderboardVersion, LogGroup, RouteSlice, RunPlan, Storage, Verify};
+use leaderboard_api::{LeaderboardVersion, LogGroup, RouteSlice, RunPlan, Storage, StorageClass, Verify};
 use leaderboard_operator::pod::logcopy::{self, LogcopyError};
 use leaderboard_operator::pod::places::{Pace, Places, Setting};
 use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
@@ -258,6 +258,8 @@ fn run(bucket: &str) -> Run {
                 region: None,
                 endpoint: None,
                 size_limit: LIMIT.to_string().parse().unwrap(),
+                kms_key_arn: None,
+                storage_class: None,
             },
             image: "image".to_owned(),
             contents_image: "contents".to_owned(),

@@ -200,17 +200,15 @@ async fn a_leaderboard_is_ready_and_names_what_its_pods_give_to_strangers() {
         .leaderboard("quiet", &example("leaderboard-restricted.yaml"))
         .await;
     assert_eq!(world.ready("quiet").await, "");
-    let socket = json!({"name": "x11", "hostPath": {"path": "/tmp/.X11-unix"}});
     let key = json!({"name": "KEY", "valueFrom": {"secretKeyRef": {"name": "weights", "key": "k"}}});
     let more = json!({
-        "simulator": {"image": "simulator:1", "securityContext": {"privileged": true}},
+        "simulator": {"image": "simulator:1", "securityContext": {"privileged": true}, "display": "X11Socket"},
         "agent": {"env": [key]},
-        "podOverrides": {"spec": {"volumes": [socket]}},
     });
     world.leaderboard("weak", &more).await;
     let message = world.ready("weak").await;
     for part in [
-        "Weaker than Pod Security baseline: Pod: hostPath /tmp/.X11-unix, simulators: privileged.",
+        "Weaker than Pod Security baseline: Pod: hostPath /tmp/.X11-unix, simulators: privileged. The namespace has to allow the level privileged",
         "Agents can read Secret weights:",
         "Unbounded: agents of the track sensors have no memory limit",
     ] {

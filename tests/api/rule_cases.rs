@@ -1,5 +1,8 @@
 //! For each rule of the API a mistake that a person can make, and its neighbor that is no mistake.
 
+mod gpu;
+mod submissions;
+
 use serde_json::{Value, json};
 
 use super::objects::Kind::{self, Leaderboard, Submission};
@@ -63,8 +66,8 @@ pub fn all() -> Vec<Case> {
         server(),
         queue(),
         pods_and_tables(),
-        submissions(),
-        attempts(),
+        gpu::all(),
+        submissions::all(),
     ]
     .into_iter()
     .flatten()
@@ -275,7 +278,21 @@ fn server() -> Vec<Case> {
     let nowhere = json!({"evalai": {"token": {"secretKeyRef": null}}});
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let one_place = "exactly one of secretKeyRef and secretsManager";
+    let mode = |mode: &str| served(&json!({"evalai": {"mode": mode}, "storage": {"prefix": "observe/"}}));
+    let observe = mode("Observe");
+    let only_observed = "evalai.mode Observe needs a storage.prefix";
+    let queue = json!({"queue": {"url": "https://sqs.example.org/1/a"}});
     vec![
+        case(only_observed, &observe, &queue),
+        case(only_observed, &observe, &json!({"table": {"name": "rows"}})),
+        case(only_observed, &observe, &json!({"storage": {"prefix": null}})),
+        update(
+            Leaderboard,
+            "evalai.mode is immutable",
+            &mode("Publish"),
+            &json!({"evalai": {"mode": "Observe"}}),
+            &json!({"paused": true}),
+        ),
         case("without /api", &root, &at("https://eval.ai/api")),
         case("without /api", &under_path, &at("https://eval.ai/api/")),
         case("without /api", &root, &at("https://eval.ai/evalai/api/jobs")),
@@ -302,8 +319,10 @@ fn queue() -> Vec<Case> {
     };
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let alone = json!({"queue": {"url": "https://sqs.example.org/1/a"}});
+    let inbox = json!({"evalai": {"queue": {"name": "carla-1"}}});
     vec![
         case("queue needs evalai", &json!({}), &alone),
+        case("two ways to the challenge's messages", &served(&inbox), &alone),
         case("is the queue itself", &served(&queue("a", "b")), &queue("a", "a")),
         case(
             "needs a FIFO dead-letter queue",
@@ -365,6 +384,21 @@ fn pods_and_tables() -> Vec<Case> {
             &json!({"storage": {"sizeLimit": "16M"}}),
         ),
         case(
+            "agent.shmSize must be",
+            &json!({"agent": {"shmSize": "1Mi"}}),
+            &json!({"agent": {"shmSize": "1M"}}),
+        ),
+        case(
+            "logGroup.retentionDays must be",
+            &json!({"logGroup": {"name": "logs", "retentionDays": 30}}),
+            &json!({"logGroup": {"name": "logs", "retentionDays": 31}}),
+        ),
+        case(
+            "logGroup.tags are for",
+            &json!({"logGroup": {"name": "logs", "retentionDays": 30, "tags": {"team": "challenge"}}}),
+            &json!({"logGroup": {"name": "logs", "retentionDays": null, "tags": {"team": "challenge"}}}),
+        ),
+        case(
             "agent.logSizeLimit must be",
             &json!({"agent": {"logSizeLimit": "1Mi"}}),
             &json!({"agent": {"logSizeLimit": "1M"}}),
@@ -391,88 +425,4 @@ fn pods_and_tables() -> Vec<Case> {
 
 fn images(pattern: &str) -> Value {
     json!({"agent": {"images": [pattern]}})
-}
-
-fn submissions() -> Vec<Case> {
-    let ids = |submission: i64| json!({"challenge": 1, "phase": 7, "submission": submission});
-    let theirs = json!({"track": null, "image": null, "evalai": ids(42)});
-    let first = json!({"priority": 5});
-    let keeps = |message, from: &Value, bad: &Value| update(Submission, message, from, bad, &first);
-    vec![
-        keeps(
-            "leaderboardName is immutable",
-            &json!({}),
-            &json!({"leaderboardName": "other"}),
-        ),
-        keeps("image is immutable", &json!({}), &json!({"image": "agent:2"})),
-        keeps("image is immutable", &theirs, &json!({"image": "agent:2"})),
-        keeps("evalai is immutable", &theirs, &json!({"evalai": ids(43)})),
-        keeps("track is immutable", &json!({}), &json!({"track": "map"})),
-        create(
-            Submission,
-            "not both and not neither",
-            &json!({}),
-            &json!({"track": null}),
-        ),
-        create(
-            Submission,
-            "not both and not neither",
-            &theirs,
-            &json!({"track": "sensors"}),
-        ),
-        create(
-            Submission,
-            "without evalai needs an image",
-            &json!({}),
-            &json!({"image": null}),
-        ),
-        create(
-            Submission,
-            "team needs an id or a name",
-            &json!({"team": {"name": "a"}}),
-            &json!({"team": {"name": null}}),
-        ),
-    ]
-}
-
-fn attempts() -> Vec<Case> {
-    let second = json!({"attempt": 2, "cancel": false});
-    let ended = |state, message, bad: &Value, good: &Value| {
-        let mut case = update(Submission, message, &json!({}), bad, good);
-        if let Step::Update { state: slot, .. } = &mut case.step {
-            *slot = Some(state);
-        }
-        case
-    };
-    let again = "a finished submission is not resumed";
-    vec![
-        update(
-            Submission,
-            "attempt may only grow",
-            &json!({"attempt": 2}),
-            &json!({"attempt": 1}),
-            &json!({"attempt": 4}),
-        ),
-        update(
-            Submission,
-            "to resume, set cancel to false",
-            &json!({"cancel": true}),
-            &json!({"attempt": 2}),
-            &second,
-        ),
-        update(
-            Submission,
-            "undone only by a higher attempt",
-            &json!({"cancel": true}),
-            &json!({"cancel": false}),
-            &second,
-        ),
-        ended("Finished", again, &json!({"attempt": 2}), &json!({"priority": 5})),
-        ended(
-            "Failed",
-            "to resume, set cancel to false",
-            &json!({"attempt": 2, "cancel": true}),
-            &second,
-        ),
-    ]
 }

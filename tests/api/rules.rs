@@ -174,7 +174,8 @@ async fn the_api_server_refuses_each_mistake_with_its_message_and_nothing_else()
     let mut wrong = Vec::new();
     for (number, case) in rule_cases::all().iter().enumerate() {
         let api = case.kind.api(&client, &namespace);
-        if let Err(why) = try_case(&api, case, &format!("case-{number}")).await {
+        // A name that a check may have, too.
+        if let Err(why) = try_case(&api, case, &format!("check-case-{number}")).await {
             wrong.push(format!("{} {:?}: {why}", case.kind.name(), case.message));
         }
     }

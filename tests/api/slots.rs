@@ -5,7 +5,7 @@ use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::api::{Api, DeleteParams, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Leaderboard, Submission, reasons};
+use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
 use serde_json::json;
 use tokio::time::timeout;
 
@@ -44,6 +44,14 @@ impl World {
     async fn submit(&self, name: &str) {
         let api = Kind::Submission.api(&server().await.client(), &self.namespace);
         let patch = json!({"spec": {"leaderboardName": NAME}});
+        create(&api, Kind::Submission.object(name, &[&patch]), false)
+            .await
+            .unwrap();
+    }
+
+    async fn check(&self, name: &str) {
+        let api = Kind::Submission.api(&server().await.client(), &self.namespace);
+        let patch = json!({"spec": {"leaderboardName": NAME, "check": true}});
         create(&api, Kind::Submission.object(name, &[&patch]), false)
             .await
             .unwrap();
@@ -101,6 +109,56 @@ async fn one_slot_is_one_job_also_after_a_takeover() {
     world.shows("third", reasons::WAITING_FOR_SLOT, 1).await;
     world.edit(json!({"concurrency": null})).await;
     world.has_job("third").await;
+    operator.end().await;
+}
+
+/// A host checks a Leaderboard before it serves: while it is paused, and before all that wait.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_check_starts_while_the_leaderboard_is_paused_and_others_wait() {
+    let world = World::new().await;
+    world.edit(json!({"paused": true})).await;
+    let operator = world.operator().await;
+    world.submit("first").await;
+    world.shows("first", reasons::PAUSED, 1).await;
+    world.check("check-one").await;
+    world.has_job("check-one").await;
+    world.check("check-two").await;
+    // The only slot is taken, also for a check.
+    world.shows("check-two", reasons::WAITING_FOR_SLOT, 1).await;
+    let api: Api<Submission> = Api::namespaced(server().await.client(), &world.namespace);
+    let status = api.get("check-one").await.unwrap().status.unwrap();
+    let plan = status.plan.unwrap();
+    assert_eq!((plan.slices.len(), plan.routes, plan.repetitions), (1, 1, 1));
+    assert!(status.checked_generation.is_some());
+    assert_eq!(api.get("check-one").await.unwrap().finalizers().len(), 0);
+
+    let boards: Api<Leaderboard> = Api::namespaced(server().await.client(), &world.namespace);
+    let checked = |object: Option<&Leaderboard>| {
+        let status = object.and_then(|board| board.status.as_ref());
+        let found = status.and_then(|status| conditions::get(&status.conditions, conditions::CHECKED));
+        found.is_some_and(|c| (c.status.as_str(), c.reason.as_str()) == ("False", reasons::CHECK_FAILED))
+    };
+    // One without a Job ends at once.
+    api.patch(
+        "check-two",
+        &PatchParams::default(),
+        &Patch::Merge(json!({"spec": {"cancel": true}})),
+    )
+    .await
+    .unwrap();
+    let noted = Box::pin(await_condition(boards.clone(), NAME, checked));
+    timeout(LIMIT, noted)
+        .await
+        .expect("the Leaderboard notes the check")
+        .unwrap();
+    let status = boards.get(NAME).await.unwrap().status.unwrap();
+    let last = status.last_check.unwrap();
+    assert_eq!(
+        (last.submission_name.as_str(), last.reason.as_str()),
+        ("check-two", reasons::CANCELLED)
+    );
+    let counts = status.counts.unwrap();
+    assert_eq!((counts.pending, counts.cancelled), (1, 0), "a check is in no count");
     operator.end().await;
 }
 

@@ -17,6 +17,7 @@ use serde_json::json;
 use tokio::sync::mpsc;
 
 use super::bridge::{LIMIT, StandIn};
+use crate::support::throttle::Throttle;
 
 fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
     stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))
@@ -27,7 +28,7 @@ fn named(stand_in: &StandIn, name: &str) -> api::Table {
 }
 
 /// A new table with these keys, and its description.
-async fn table(stand_in: &StandIn, name: &str, keys: &[(&str, ScalarAttributeType)]) -> api::Table {
+pub(super) async fn table(stand_in: &StandIn, name: &str, keys: &[(&str, ScalarAttributeType)]) -> api::Table {
     let mut request = client(stand_in)
         .create_table()
         .table_name(stand_in.name(name))
@@ -86,6 +87,35 @@ fn row(attempt: i64, status: &str) -> Row {
         progress: format!("{attempt}/9"),
         ..Row::default()
     }
+}
+
+/// A check asks so whether the table would take a row.
+#[tokio::test]
+async fn a_trial_is_answered_and_writes_nothing() {
+    let stand_in = StandIn::start().await;
+    let trial = Row {
+        is_trial: true,
+        ..row(1, "FINISHED")
+    };
+    let (spec, table) = usual(&stand_in).await;
+    assert_eq!(table.write(&trial).await, Ok(Written::Stored));
+    assert_eq!(rows(&stand_in, &spec.name).await.len(), 0);
+    assert_eq!(table.write(&row(1, "FINISHED")).await, Ok(Written::Stored));
+    let before = rows(&stand_in, &spec.name).await;
+    assert_eq!(table.write(&trial).await, Ok(Written::Stored));
+    assert_eq!(
+        rows(&stand_in, &spec.name).await,
+        before,
+        "a row of these keys is left as it is"
+    );
+    client(&stand_in)
+        .delete_table()
+        .table_name(&spec.name)
+        .send()
+        .await
+        .unwrap();
+    let refused = table.write(&trial).await.unwrap_err();
+    assert!(refused.to_string().contains("does not exist"), "{refused}");
 }
 
 #[tokio::test]
@@ -370,5 +400,40 @@ async fn the_recorder_writes_in_the_background_only_while_it_may() {
     let missing = format!("table {} does not exist", stand_in.name("nowhere"));
     assert!(!view.end_written && view.error.unwrap().starts_with(&missing));
     assert_eq!(rows(&stand_in, &spec.name).await.len(), 1);
+    stop.send_replace(true);
+}
+
+#[tokio::test]
+async fn a_row_that_dynamodb_throttles_is_written_at_last_and_an_older_state_is_not() {
+    let stand_in = StandIn::start().await;
+    let (mut spec, _) = usual(&stand_in).await;
+    let throttle = Throttle::start(&stand_in.endpoint, "ProvisionedThroughputExceededException").await;
+    spec.endpoint = Some(throttle.endpoint().to_owned());
+    let (wake, mut woken) = mpsc::unbounded_channel();
+    let (stop, stopped) = Stop::new();
+    let recorder = Recorder::new(stand_in.aws.clone(), || true, wake, Tasks::new(stopped));
+    let key = ObjectKey {
+        namespace: "ns".into(),
+        name: "a".into(),
+        uid: "u".into(),
+    };
+    // The SDK sends each call three times: so the first call fails, and part of the second.
+    throttle.refuse(5);
+    recorder.record(&spec, &key, row(1, "RUNNING"), false);
+    tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap();
+    let view = recorder.view(&key).unwrap();
+    let why = view.error.unwrap();
+    assert!(
+        why.contains("ProvisionedThroughputExceededException") && why.contains("it is retried"),
+        "{why}"
+    );
+    recorder.record(&spec, &key, row(1, "FINISHED"), true);
+    while !recorder.view(&key).unwrap().end_written {
+        tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap();
+    }
+    assert_eq!(recorder.view(&key).unwrap().error, None);
+    assert_eq!(throttle.refused(), 5);
+    let stored = rows(&stand_in, &spec.name).await;
+    assert_eq!((stored.len(), stored[0]["submission_status"].as_str()), (1, "FINISHED"));
     stop.send_replace(true);
 }

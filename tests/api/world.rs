@@ -2,9 +2,11 @@
 //! logcopy.
 #![cfg(test)]
 
+use std::sync::Arc;
+
 use evalai_stand_in::model::{FileState, User};
 use evalai_stand_in::submissions::{NewSubmission, create, rerun};
-use evalai_stand_in::{Config, Handle};
+use evalai_stand_in::{Config, Handle, MemoryQueues};
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Pod, Secret};
@@ -43,7 +45,9 @@ pub(super) struct World {
     pub(super) namespace: String,
     pub(super) aws: StandIn,
     pub(super) bucket: String,
-    pub(super) evalai: Handle,
+    pub(super) evalai: Arc<Handle>,
+    /// The queues of EvalAI's challenges.
+    pub(super) queues: Arc<MemoryQueues>,
     pub(super) http: reqwest::Client,
 }
 
@@ -56,7 +60,7 @@ impl World {
         let bucket = aws.name("failure-log");
         let s3 = aws.aws.s3(None, Some(&aws.endpoint));
         s3.create_bucket().bucket(&bucket).send().await.unwrap();
-        let (config, _) = Config::in_memory().unwrap();
+        let (config, queues) = Config::in_memory().unwrap();
         let config = Config { throttle: 0, ..config };
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let world = Self {
@@ -64,13 +68,34 @@ impl World {
             namespace: server.namespace("failure-log").await,
             aws,
             bucket,
-            evalai: evalai_stand_in::serve(config, vec![listener]),
+            evalai: Arc::new(evalai_stand_in::serve(config, vec![listener])),
+            queues,
             http: reqwest::Client::builder().no_proxy().build().unwrap(),
         };
+        world.token().await;
+        world
+    }
+
+    /// Another namespace, for another operator, with the same EvalAI and the same AWS.
+    pub(super) async fn neighbor(&self) -> Self {
+        let world = Self {
+            client: self.client.clone(),
+            namespace: apiserver::server().await.namespace("neighbor").await,
+            aws: StandIn::start().await,
+            bucket: self.bucket.clone(),
+            evalai: Arc::clone(&self.evalai),
+            queues: Arc::clone(&self.queues),
+            http: self.http.clone(),
+        };
+        world.token().await;
+        world
+    }
+
+    /// Stores EvalAI's token.
+    async fn token(&self) {
         let secret = json!({"metadata": {"name": "evalai"}, "stringData": {"token": HOST}});
         let secret: Secret = serde_json::from_value(secret).unwrap();
-        world.api().create(&PostParams::default(), &secret).await.unwrap();
-        world
+        self.api().create(&PostParams::default(), &secret).await.unwrap();
     }
 
     pub(super) fn api<K>(&self) -> Api<K>
@@ -153,18 +178,22 @@ impl World {
         uploaded: &Value,
         image: &Value,
     ) -> (u64, String) {
+        let pk = self.push(phase, uploaded);
+        let name = self.object(leaderboard, phase, pk, image).await;
+        (pk, name)
+    }
+
+    /// Team a pushes this image to a phase, and no message comes of it; hands back EvalAI's key.
+    pub(super) fn push(&self, phase: u64, image: &Value) -> u64 {
         let new = NewSubmission {
             team: 1,
             phase,
             user: 11,
-            input: json!({ "submitted_image_uri": uploaded }).to_string().into_bytes(),
+            input: json!({ "submitted_image_uri": image }).to_string().into_bytes(),
             fields: Map::new(),
         };
-        let pk = self
-            .evalai
-            .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()));
-        let name = self.object(leaderboard, phase, pk, image).await;
-        (pk, name)
+        self.evalai
+            .with_state(|state| create(state, new, FileState::Stored, Timestamp::now()))
     }
 
     /// A host re-runs a submission; hands back the new key and the new object's name.

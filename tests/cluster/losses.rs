@@ -6,7 +6,7 @@ use std::time::Duration;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use kube::api::DeleteParams;
+use kube::api::{DeleteParams, EvictParams};
 use leaderboard_api::{State, Submission};
 use serde_json::{Value, json};
 
@@ -27,9 +27,11 @@ fn slow() -> Value {
     })
 }
 
-/// Starts a run and waits until it is half-way.
-async fn half_way(scene: &Scene, name: &str) {
-    scene.leaderboard("lb", slow()).await;
+/// Starts a run and waits until it is half-way. No failure of the infrastructure is retried if `retries` is 0.
+pub(super) async fn half_way(scene: &Scene, name: &str, retries: i32) {
+    let mut spec = slow();
+    spec["retries"] = json!({"infrastructure": retries});
+    scene.leaderboard("lb", spec).await;
     scene.submit(name, "agent:standard").await;
     let half = |s: &Submission| done(s) >= 2;
     scene
@@ -55,7 +57,7 @@ async fn begun(scene: &Scene, run: &str) -> Vec<BTreeMap<String, u32>> {
     pairs
 }
 
-async fn assert_finished(case: &mut Case, scene: &Scene, name: &str) {
+pub(super) async fn assert_finished(case: &mut Case, scene: &Scene, name: &str) {
     let submission = case.ends(scene, name, Duration::from_mins(5)).await;
     assert_eq!(
         (state(&submission), score(&submission)),
@@ -76,7 +78,7 @@ async fn assert_finished(case: &mut Case, scene: &Scene, name: &str) {
 async fn a_pod_deleted_by_hand_costs_one_route_of_each_pair() {
     scenario("pod-deleted", async |scene: &Scene| {
         let _controller = controller(scene);
-        half_way(scene, "lost").await;
+        half_way(scene, "lost", 2).await;
         let pod = scene.pod("lost").await;
         scene
             .api::<Pod>()
@@ -91,11 +93,37 @@ async fn a_pod_deleted_by_hand_costs_one_route_of_each_pair() {
     .await;
 }
 
+/// What a run shows whose one Pod was taken away, where no failure of the infrastructure is retried.
+pub(super) async fn assert_interrupted_once(scene: &Scene, name: &str) {
+    let status = scene.api::<Submission>().get(name).await.unwrap().status.unwrap();
+    assert_eq!((status.attempt, status.retry, status.failure), (Some(1), 1, None));
+    assert_eq!(status.interruptions.unwrap().number, 1);
+    assert!(status.pairs.iter().all(|pair| pair.crashes == 0), "{:?}", status.pairs);
+    assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-1-r1")]);
+}
+
+#[tokio::test]
+async fn an_evicted_pod_costs_one_route_of_each_pair_and_no_retry() {
+    scenario("pod-evicted", async |scene: &Scene| {
+        let _controller = controller(scene);
+        half_way(scene, "lost", 0).await;
+        let pod = scene.pod("lost").await;
+        // As a drain does it, and what takes Spot instances away.
+        let evicted = scene.api::<Pod>().evict(&pod.name_any(), &EvictParams::default()).await;
+        evicted.unwrap();
+        let mut case = Case::open("Pod evicted", REPEATED);
+        assert_finished(&mut case, scene, "lost").await;
+        assert_interrupted_once(scene, "lost").await;
+        case.close();
+    })
+    .await;
+}
+
 #[tokio::test]
 async fn a_job_deleted_by_hand_is_made_again() {
     scenario("job-deleted", async |scene: &Scene| {
         let _controller = controller(scene);
-        half_way(scene, "lost").await;
+        half_way(scene, "lost", 2).await;
         let old = scene.api::<Job>().get("lost-1").await.unwrap().uid();
         scene
             .api::<Job>()

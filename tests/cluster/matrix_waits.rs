@@ -81,7 +81,7 @@ async fn finishes(case: &mut Case, scene: &Scene, name: &str) {
 /// A start that can't succeed is given no more time.
 async fn give_up(scene: &Scene, board: &str) {
     scene
-        .change_leaderboard(board, &json!({"deadlines": {"startSeconds": 1}}))
+        .change_leaderboard(board, &json!({"deadlines": {"pullSeconds": 1, "startSeconds": 1}}))
         .await;
 }
 
@@ -419,7 +419,7 @@ async fn label_node(nodes: &Api<Node>, name: &str, value: Value) {
 fn fake_node(label: &str) -> Node {
     let capacity = json!({"cpu": "4", "memory": "8Gi", "pods": "10", "ephemeral-storage": "10Gi"});
     let node = json!({
-        "metadata": {"name": label, "labels": {NODE_LABEL: label}},
+        "metadata": {"name": label, "labels": {NODE_LABEL: label, "kubernetes.io/arch": "amd64"}},
         // Nobody else's Pod may come here.
         "spec": {"taints": [{"key": NODE_LABEL, "effect": "NoSchedule"}]},
         "status": {

@@ -6,8 +6,9 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use challenge_probe::objects::{Check, OBJECTS};
+use challenge_probe::probe::Probe;
 use challenge_probe::seen::{self, Seen};
-use challenge_probe::table::{self, Probe};
+use challenge_probe::table;
 use futures::future::join_all;
 use k8s_openapi::api::core::v1::{Node, Pod, Service};
 use k8s_openapi::api::networking::v1::{NetworkPolicy, NetworkPolicySpec};

@@ -1,6 +1,9 @@
-//! The matrix: a part of the cluster dies while a submission runs, and comes back: the run does not notice.
+//! The matrix: a part of the cluster dies while a submission runs, and comes back: the run does not notice. In `interruption` the
+//! node is about to go, and comes back; in the mode NodeIndex a submission wants the node to itself.
 //!
 //! All other tests would. So these run alone and only when they are named, as `make test` does after the others.
+
+mod interruption;
 
 use std::path::Path;
 use std::process::Stdio;
@@ -14,6 +17,7 @@ use tokio::process::Command;
 use tokio::select;
 
 use super::abrupt::assert_untouched;
+use super::gpus;
 use super::matrix::Case;
 use crate::evalai::Evalai;
 use crate::operator::{bridge_process, controller_process, kept};
@@ -27,6 +31,12 @@ const ROUTE_MS: &str = "4000";
 /// A Lease runs out (15 s), EvalAI is left alone (75 s), and the machine is slow.
 const LIMIT: Duration = Duration::from_mins(4);
 const PAIRS: usize = 4;
+
+#[tokio::test]
+#[ignore = "it disturbs all other tests: make test runs it after them"]
+async fn both_containers_of_a_pair_have_the_index_of_its_gpu_on_a_node_of_their_own() {
+    gpus::both_containers_have_the_index_of_their_gpu().await;
+}
 
 #[tokio::test]
 #[ignore = "it disturbs all other tests: make test runs it after them"]

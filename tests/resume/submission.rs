@@ -222,6 +222,8 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
                 region: None,
                 endpoint: Some(endpoint.to_owned()),
                 size_limit: ByteQuantity::gibibytes(1),
+                kms_key_arn: None,
+                storage_class: None,
             },
             image: "image".to_owned(),
             contents_image: "contents".to_owned(),

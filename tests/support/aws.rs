@@ -18,6 +18,7 @@ pub const BUCKET: &str = "leaderboard-tests";
 const ASK_EVERY: Duration = Duration::from_millis(250);
 
 /// One test's own things in AWS.
+#[derive(Clone)]
 pub struct Cloud {
     /// The stand-in's address, for everybody.
     pub endpoint: String,
@@ -33,9 +34,9 @@ pub struct Cloud {
     pub hyphen_table: String,
     /// Prefix of all keys, with the final slash.
     pub prefix: String,
-    sqs: aws_sdk_sqs::Client,
-    s3: aws_sdk_s3::Client,
-    dynamodb: aws_sdk_dynamodb::Client,
+    pub sqs: aws_sdk_sqs::Client,
+    pub s3: aws_sdk_s3::Client,
+    pub dynamodb: aws_sdk_dynamodb::Client,
 }
 
 /// A message in the dead-letter queue.
@@ -130,7 +131,12 @@ impl Cloud {
 
     /// Messages in the queue: those that wait, and those that somebody has received.
     pub async fn messages(&self) -> [u32; 2] {
-        let request = self.sqs.get_queue_attributes().queue_url(&self.queue_url);
+        self.depth(&self.queue_url).await
+    }
+
+    /// The same of any queue.
+    pub async fn depth(&self, url: &str) -> [u32; 2] {
+        let request = self.sqs.get_queue_attributes().queue_url(url);
         let answer = request.attribute_names(QueueAttributeName::All).send().await.unwrap();
         let attributes = answer.attributes.unwrap_or_default();
         let names = [
@@ -206,6 +212,30 @@ impl Cloud {
         let object = self.s3.get_object().bucket(BUCKET).key(&key).send().await;
         let object = object.unwrap_or_else(|error| panic!("{key} is not in S3: {error:?}"));
         String::from_utf8(object.body.collect().await.unwrap().to_vec()).unwrap()
+    }
+
+    /// The texts of all objects of a run, by their keys without its prefix.
+    pub async fn texts(&self, run: &str) -> BTreeMap<String, String> {
+        let mut texts = BTreeMap::new();
+        for key in self.keys(run).await.into_keys() {
+            let text = self.text(run, &key).await;
+            texts.insert(key, text);
+        }
+        texts
+    }
+
+    /// The row of a submission.
+    pub async fn row_of(&self, table: &str, submission: u64) -> BTreeMap<String, String> {
+        let id = submission.to_string();
+        let is_its = |row: &BTreeMap<String, String>| {
+            let key = row.get("submission_id").or_else(|| row.get("submission-id"));
+            key == Some(&id)
+        };
+        let rows: Vec<_> = self.rows(table).await.into_iter().filter(is_its).collect();
+        let [row] = rows.as_slice() else {
+            panic!("submission {id} has one row in {table}: {rows:?}")
+        };
+        row.clone()
     }
 
     /// All rows of a table, each as texts.

@@ -68,6 +68,15 @@ impl Evalai {
         Self::serve(scene, seed, 0).await
     }
 
+    /// Starts one whose challenge 1 has the four phases of the original: 1 and 2 of Leaderboard 2.0, 3 and 4 of 1.0. It serves
+    /// everybody at once.
+    pub async fn start_as_the_original(scene: &Scene) -> Self {
+        let mut seed = Seed::built_in().unwrap();
+        let phases = std::mem::take(&mut seed.challenges[1].phases);
+        seed.challenges[0].phases.extend(phases);
+        Self::serve(scene, seed, 0).await
+    }
+
     async fn serve(scene: &Scene, mut seed: Seed, throttle: usize) -> Self {
         seed.set_queue(&scene.cloud.queue);
         let config = Config {

@@ -4,3 +4,4 @@
 pub mod apiserver;
 pub mod images;
 pub mod ministack;
+pub mod throttle;

@@ -62,6 +62,17 @@ pub fn controller(scene: &Scene) -> Kept {
     Start::controller(scene).keep(scene)
 }
 
+/// Starts a controller that watches the cluster's nodes, and keeps it running.
+pub fn controller_with_nodes(scene: &Scene) -> Kept {
+    let mut start = Start::controller(scene);
+    let rights = start
+        .arguments
+        .iter()
+        .position(|argument| argument == "--cluster-rights");
+    "true".clone_into(&mut start.arguments[rights.unwrap() + 1]);
+    start.keep(scene)
+}
+
 /// Starts `leaderboard-operator bridge`, and keeps it running.
 pub fn bridge(scene: &Scene) -> Kept {
     Start::bridge(scene).keep(scene)

@@ -15,6 +15,8 @@ pub const ARCHIVED: &str = "Archived";
 pub const RECORDED: &str = "Recorded";
 /// The end is in EvalAI.
 pub const PUBLISHED: &str = "Published";
+/// The end is the one that EvalAI shows of another program's run; only there where nothing is published.
+pub const COMPARED: &str = "Compared";
 /// Nothing moves, although it should.
 pub const STALLED: &str = "Stalled";
 /// The scores follow from the infractions; only there once they did not.
@@ -25,6 +27,8 @@ pub const FINISHED: &str = "Finished";
 pub const READY: &str = "Ready";
 /// The Pods of a Leaderboard reach nothing that its policy forbids: measured, not assumed.
 pub const ISOLATED: &str = "Isolated";
+/// The last check of a Leaderboard passed, and its spec has not changed since.
+pub const CHECKED: &str = "Checked";
 /// A Leaderboard that is being deleted waits for its submissions.
 pub const TERMINATING: &str = "Terminating";
 

@@ -63,6 +63,7 @@ pub fn slices(routes: usize, pairs: usize) -> Vec<RouteSlice> {
 pub fn deadlines(spec: &LeaderboardSpec, track: Option<&Track>) -> Deadlines {
     let own = track.and_then(|track| track.deadlines).unwrap_or_default();
     Deadlines {
+        pull_seconds: own.pull_seconds.unwrap_or(spec.deadlines.pull_seconds),
         start_seconds: own.start_seconds.unwrap_or(spec.deadlines.start_seconds),
         run_seconds: own.run_seconds.unwrap_or(spec.deadlines.run_seconds),
         ..spec.deadlines

@@ -10,13 +10,16 @@ use kube::KubeSchema;
 use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
+use super::check::{CheckImage, LastCheck};
+use super::evalai_mode::EvalaiMode;
 use super::infrastructure_failures::{MAX_TEAMS, TeamFailures};
 use super::leaderboard_parts::{
-    AgentContainer, Concurrency, ContentsContainer, Deadlines, Evalai, LogGroup, Network, PodIdentity, Queue, Retries,
-    SimulatorContainer, Storage, Table, Track,
+    AgentContainer, Concurrency, ContentsContainer, Deadlines, Evalai, Gpu, LogGroup, Network, PodIdentity, Queue,
+    Retries, SimulatorContainer, Storage, Table, Track,
 };
 use super::leaderboard_parts::{LeaderboardVersion, Verify};
 use super::retention::Retention;
+use super::submission_use::{MAX_USING_TEAMS, TeamUse};
 
 /// One leaderboard version: its tracks, the images that run it, and the services its results go to.
 #[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
@@ -50,16 +53,26 @@ use super::retention::Retention;
     validation = Rule::new("has(self.storage.prefix) == has(oldSelf.storage.prefix) && (!has(self.storage.prefix) || self.storage.prefix == oldSelf.storage.prefix)").message("storage.prefix is immutable: finished results would no longer be found; make a new Leaderboard"),
     validation = Rule::new("!has(oldSelf.evalai) || has(self.evalai)").message("evalai cannot be removed: its submissions would never be published; make a new Leaderboard"),
     validation = Rule::new("!has(oldSelf.evalai) || !has(self.evalai) || self.evalai.challenge == oldSelf.evalai.challenge").message("evalai.challenge is immutable: its submissions belong to that challenge; make a new Leaderboard"),
+    validation = Rule::new("!has(oldSelf.evalai) || !has(self.evalai) || self.evalai.mode == oldSelf.evalai.mode").message("evalai.mode is immutable: what was only observed would be published; make a new Leaderboard"),
+    validation = Rule::new("!has(self.evalai) || self.evalai.mode != 'Observe' || (!has(self.queue) && !has(self.table) && has(self.storage.prefix))").message("evalai.mode Observe needs a storage.prefix of its own, no queue and no table: those are the other program's"),
     validation = Rule::new("self.tracks.filter(t, has(t.phase)).all(t, self.tracks.exists_one(u, has(u.phase) && u.phase == t.phase))").message("two tracks have the same phase: a message could not be told which one it is for"),
     validation = Rule::new("!has(self.evalai) || self.tracks.exists(t, has(t.phase))").message("evalai is set but no track has a phase: no submission of the challenge could be served; give a track the id of its phase"),
     validation = Rule::new("has(self.evalai) || !self.tracks.exists(t, has(t.phase))").message("a track has a phase but evalai is missing: set evalai, or leave the phase out for a local leaderboard"),
     validation = Rule::new("!has(self.queue) || has(self.evalai)").message("queue needs evalai: its messages name a challenge and a phase of it"),
+    validation = Rule::new("!has(self.queue) || !has(self.evalai) || !has(self.evalai.queue)").message("queue and evalai.queue are two ways to the challenge's messages: set queue if it is your own in SQS, evalai.queue if it is EvalAI's"),
     validation = Rule::new("self.tracks.all(t, (has(t.pairs) ? t.pairs : self.pairs) <= (has(t.routes) ? t.routes : self.routes))").message("a track has more pairs than routes, so a pair would have nothing to drive; lower pairs, or set the track's own"),
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || size(t.routeSubsets) == (has(t.pairs) ? t.pairs : self.pairs))").message("a track's routeSubsets must have one entry for each of its pairs"),
     validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || t.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.routes) ? t.routes : self.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
     validation = Rule::new("self.leaderboardVersion == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
     validation = Rule::new("self.tracks.all(t, !has(t.deadlines) || !has(t.deadlines.runSeconds) || t.deadlines.runSeconds == 0 || (self.deadlines.idleSeconds < t.deadlines.runSeconds && self.deadlines.readySeconds < t.deadlines.runSeconds))").message("a track's deadlines.runSeconds must be longer than deadlines.idleSeconds and deadlines.readySeconds: the run would end before they could be reached"),
     validation = Rule::new("self.retention.finishedSeconds == 0 || self.retention.finishedSeconds >= self.ttlSecondsAfterFinished").message("retention.finishedSeconds must be 0 or at least ttlSecondsAfterFinished: the Job would be removed with its Submission before its own time; raise one or lower the other"),
+    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !(has(self.simulator.resources) && ((has(self.simulator.resources.limits) && self.gpu.resourceName in self.simulator.resources.limits) || (has(self.simulator.resources.requests) && self.gpu.resourceName in self.simulator.resources.requests)))").message("simulator.resources names gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
+    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !self.tracks.exists(t, (has(t.simulator) && (has(t.simulator.resources) && ((has(t.simulator.resources.limits) && self.gpu.resourceName in t.simulator.resources.limits) || (has(t.simulator.resources.requests) && self.gpu.resourceName in t.simulator.resources.requests)))))").message("the simulator.resources of a track name gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
+    validation = Rule::new("has(self.gpu) || !(has(self.simulator.resources) && ((has(self.simulator.resources.limits) && 'nvidia.com/gpu' in self.simulator.resources.limits) || (has(self.simulator.resources.requests) && 'nvidia.com/gpu' in self.simulator.resources.requests)))").message("simulator.resources names nvidia.com/gpu and gpu is missing, so the other container of a pair would have no GPU; write gpu.resourceName: nvidia.com/gpu in place of it, or gpu.mode: None if that is meant"),
+    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !(has(self.agent.resources) && ((has(self.agent.resources.limits) && self.gpu.resourceName in self.agent.resources.limits) || (has(self.agent.resources.requests) && self.gpu.resourceName in self.agent.resources.requests)))").message("agent.resources names gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
+    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !self.tracks.exists(t, (has(t.agent) && (has(t.agent.resources) && ((has(t.agent.resources.limits) && self.gpu.resourceName in t.agent.resources.limits) || (has(t.agent.resources.requests) && self.gpu.resourceName in t.agent.resources.requests)))))").message("the agent.resources of a track name gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
+    validation = Rule::new("has(self.gpu) || !(has(self.agent.resources) && ((has(self.agent.resources.limits) && 'nvidia.com/gpu' in self.agent.resources.limits) || (has(self.agent.resources.requests) && 'nvidia.com/gpu' in self.agent.resources.requests)))").message("agent.resources names nvidia.com/gpu and gpu is missing, so the other container of a pair would have no GPU; write gpu.resourceName: nvidia.com/gpu in place of it, or gpu.mode: None if that is meant"),
+    validation = Rule::new("self.leaderboardVersion == 'V2' || !has(self.simulator.graphicsAdapter)").message("simulator.graphicsAdapter is for V2: the simulator of V1 draws with OpenGL, which takes no adapter; leave it out"),
     validation = Rule::new("self.deadlines.idleSeconds > self.syncPeriodSeconds").message("deadlines.idleSeconds must be longer than syncPeriodSeconds: an agent would be stopped before its first report")
 )]
 pub struct LeaderboardSpec {
@@ -79,6 +92,12 @@ pub struct LeaderboardSpec {
     /// How the submitted image is run.
     #[serde(default)]
     pub agent: AgentContainer,
+    /// Which container gets which GPU. Absent: none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<Gpu>,
+    /// What `kubectl leaderboard check` runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub check: Option<CheckImage>,
     /// Simulator-agent pairs that share out the routes.
     #[serde(default = "defaults::pairs")]
     #[schemars(range(min = 1, max = 16))]
@@ -149,6 +168,13 @@ pub struct LeaderboardSpec {
 pub const JOB_SECONDS: i32 = 7 * 86_400;
 
 impl LeaderboardSpec {
+    /// Whether nothing of it is written to EvalAI.
+    pub fn observes(&self) -> bool {
+        self.evalai
+            .as_ref()
+            .is_some_and(|evalai| evalai.mode == EvalaiMode::Observe)
+    }
+
     /// How long Kubernetes keeps a finished Job. A shorter time of the host's is carried out by the controller.
     pub fn job_seconds(&self) -> i32 {
         self.ttl_seconds_after_finished.max(JOB_SECONDS)
@@ -192,12 +218,20 @@ pub struct LeaderboardStatus {
     #[x_kube(merge_strategy = ListMerge::Map(vec!["team".into()]))]
     #[schemars(length(max = MAX_TEAMS))]
     pub infrastructure_failures: Vec<TeamFailures>,
+    /// Teams whose submissions have used the most GPU seconds; the most come first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["team".into()]))]
+    #[schemars(length(max = MAX_USING_TEAMS))]
+    pub gpu_use: Vec<TeamUse>,
     /// What each track effectively runs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     #[schemars(length(max = 32))]
     pub tracks: Vec<TrackStatus>,
-    /// `Ready`, `Isolated`, `Terminating`.
+    /// The check that ended last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub last_check: Option<LastCheck>,
+    /// `Ready`, `Isolated`, `Checked`, `Terminating`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]
     pub conditions: Vec<Condition>,

@@ -16,6 +16,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
+pub use super::gpu::*;
 use super::image_pattern::ImagePattern;
 use super::infrastructure_failures::OnRepeatedInfrastructure;
 pub use super::leaderboard_network::*;
@@ -99,13 +100,21 @@ pub struct Track {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(length(max = 32))]
     pub tolerations: Vec<Toleration>,
+    /// PriorityClass of its Pods. The class needs `preemptionPolicy: Never`: a run that preempts another one costs it the route that it drives.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = 253), regex(pattern = r"^[a-z0-9]([-.a-z0-9]*[a-z0-9])?$"))]
+    pub priority_class_name: Option<String>,
 }
 
 /// Deadlines of one track's runs in place of the Leaderboard's.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct TrackDeadlines {
-    /// From the Pod's scheduling to its first agent.
+    /// For the pulls of all images of a Pod.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub pull_seconds: Option<i64>,
+    /// From the Pod's scheduling, or from the end of its last pull, to its first agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: Option<i64>,
@@ -152,7 +161,11 @@ pub struct ContentsContainer {
 /// The simulator container of each pair.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
-#[x_kube(validation = Rule::new("!has(self.args) || has(self.command)").message("simulator.args without simulator.command would be added to the default command; write the command too"))]
+#[x_kube(
+    validation = Rule::new("!has(self.args) || has(self.command)").message("simulator.args without simulator.command would be added to the default command; write the command too"),
+    validation = Rule::new("!has(self.x11) || self.display == 'X11Socket'").message("simulator.x11 is for simulator.display X11Socket; set that display, or leave x11 out"),
+    validation = Rule::new("!has(self.graphicsAdapter) || !has(self.command)").message("simulator.graphicsAdapter is a flag of the default command; write it into simulator.command")
+)]
 pub struct SimulatorContainer {
     /// Image of the simulator.
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
@@ -167,12 +180,22 @@ pub struct SimulatorContainer {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub env: Vec<EnvVar>,
-    /// Requests and limits, for example one `nvidia.com/gpu`.
+    /// Requests and limits; GPUs are requested by the field `gpu` of the Leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resources: Option<ResourceRequirements>,
     /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security_context: Option<SecurityContext>,
+    /// `Offscreen`: on no screen; SDL_VIDEODRIVER is `offscreen` in V1 and `dummy` in V2, and the simulator has no DISPLAY and no XAUTHORITY of its image. `X11Socket`: on the node's X server, by its socket in /tmp/.X11-unix; the namespace then needs Pod Security `privileged`. What `env` sets takes precedence.
+    #[serde(default)]
+    pub display: Display,
+    /// The node's X server, for `X11Socket`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub x11: Option<X11>,
+    /// The graphics adapter of every simulator, for nodes where Vulkan counts otherwise than the devices. Default: the one GPU that a simulator sees; if it sees several, that of its pair. V2 only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0, max = 255))]
+    pub graphics_adapter: Option<i32>,
 }
 
 /// How the submitted image is run in each pair.
@@ -181,6 +204,7 @@ pub struct SimulatorContainer {
 #[x_kube(
     validation = Rule::new("!has(self.logSizeLimit) || (quantity(self.logSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.logSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.logSizeLimit must be 1Mi to 1Ti"),
     validation = Rule::new("!has(self.imageSizeLimit) || (quantity(self.imageSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.imageSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.imageSizeLimit must be 1Mi to 1Ti"),
+    validation = Rule::new("!has(self.shmSize) || (quantity(self.shmSize).compareTo(quantity('1Mi')) >= 0 && quantity(self.shmSize).compareTo(quantity('1Ti')) <= 0)").message("agent.shmSize must be 1Mi to 1Ti"),
     validation = Rule::new("!has(self.images) || self.images.all(p, !p.matches('[a-z0-9*}][{]team[}]|[{]team[}][a-z0-9*{]'))").message("an entry of agent.images has a letter, a digit or * next to {team}: team 7 would get the images of team 17; put -, _, . or / between"),
     validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too")
 )]
@@ -204,6 +228,9 @@ pub struct AgentContainer {
     /// Size of `leaderboard.log` at which it is no longer written: `1Mi` to `1Ti`.
     #[serde(default = "defaults::log_size_limit")]
     pub log_size_limit: ByteQuantity,
+    /// Size of each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. What lies there counts to the agent's memory limit. Absent: 64 MiB, as the container runtime makes it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shm_size: Option<ByteQuantity>,
     /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Their registries are asked for size and digest before a Job is made. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image, and no registry is asked. The images of contents and simulator are never among them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 32))]
@@ -248,7 +275,11 @@ pub struct Deadlines {
     #[serde(default = "defaults::schedule_seconds")]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub schedule_seconds: i64,
-    /// From the Pod's scheduling to its first agent.
+    /// For the pulls of all images of a Pod. While a container waits for its image, `startSeconds` does not count.
+    #[serde(default = "defaults::pull_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub pull_seconds: i64,
+    /// From the Pod's scheduling, or from the end of its last pull, to its first agent.
     #[serde(default = "defaults::start_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: i64,
@@ -324,6 +355,7 @@ impl Default for AgentContainer {
             resources: None,
             security_context: None,
             log_size_limit: defaults::log_size_limit(),
+            shm_size: None,
             images: None,
             image_size_limit: defaults::image_size_limit(),
         }
@@ -344,6 +376,7 @@ impl Default for Deadlines {
     fn default() -> Self {
         Self {
             schedule_seconds: defaults::schedule_seconds(),
+            pull_seconds: defaults::pull_seconds(),
             start_seconds: defaults::start_seconds(),
             ready_seconds: defaults::ready_seconds(),
             idle_seconds: defaults::idle_seconds(),
@@ -377,6 +410,9 @@ mod defaults {
     }
     pub(super) fn schedule_seconds() -> i64 {
         0
+    }
+    pub(super) fn pull_seconds() -> i64 {
+        5400
     }
     pub(super) fn start_seconds() -> i64 {
         1800

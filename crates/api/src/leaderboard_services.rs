@@ -3,11 +3,16 @@
 //!
 //! Owned by `api`; `leaderboard_parts` hands them on.
 
+use std::collections::BTreeMap;
+
 use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::byte_quantity::ByteQuantity;
+use super::evalai_mode::EvalaiMode;
+use super::evalai_queue::EvalaiQueue;
+use super::keeping::StorageClass;
 
 /// Who may read the tail of a failed submission's log in EvalAI.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -50,6 +55,12 @@ pub struct Evalai {
     /// Who may read the tail of a failed submission's log.
     #[serde(default)]
     pub log_tail: LogTail,
+    /// The challenge's queue, if it is in EvalAI's account; a queue in SQS is `spec.queue`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub queue: Option<EvalaiQueue>,
+    /// Whether results go to EvalAI, or the submissions of another program are only run once more and compared.
+    #[serde(default)]
+    pub mode: EvalaiMode,
 }
 
 impl Evalai {
@@ -171,6 +182,23 @@ pub struct Storage {
     /// What one run may store, `16Mi` to `1Ti`; what is beyond it is left out, and logcopy's log says so. A file counts at least 4 KiB.
     #[serde(default = "defaults::size_limit")]
     pub size_limit: ByteQuantity,
+    /// Key of KMS that S3 encrypts each object with (SSE-KMS); default: what the bucket says.
+    #[serde(rename = "kmsKeyARN", default, skip_serializing_if = "Option::is_none")]
+    #[schemars(
+        length(max = 256),
+        regex(pattern = r"^arn:[a-z-]+:kms:[a-z0-9-]+:[0-9]{12}:key/[A-Za-z0-9-]+$")
+    )]
+    pub kms_key_arn: Option<String>,
+    /// Storage class of each object: `STANDARD`, `INTELLIGENT_TIERING`, `STANDARD_IA`, `ONEZONE_IA` or `GLACIER_IR`; default: S3's
+    /// `STANDARD`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    // An enum of the schema refuses null, which is as good as a field left out.
+    #[schemars(
+        with = "Option<String>",
+        length(max = 32),
+        regex(pattern = r"^(STANDARD|INTELLIGENT_TIERING|STANDARD_IA|ONEZONE_IA|GLACIER_IR)$")
+    )]
+    pub storage_class: Option<StorageClass>,
 }
 
 /// The DynamoDB table of submissions.
@@ -203,8 +231,12 @@ pub struct Table {
 }
 
 /// The CloudWatch log group of container logs.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("!has(self.retentionDays) || self.retentionDays in [1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653]").message("logGroup.retentionDays must be a number of days that CloudWatch Logs knows: 1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288 or 3653"),
+    validation = Rule::new("!has(self.tags) || has(self.retentionDays)").message("logGroup.tags are for a group that the controller makes: set logGroup.retentionDays too, or tag the group yourself")
+)]
 pub struct LogGroup {
     /// Name of the log group.
     #[schemars(length(min = 1, max = 512))]
@@ -217,6 +249,14 @@ pub struct LogGroup {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub endpoint: Option<String>,
+    /// Days that lines are kept. With it the controller makes the group if it is missing, and keeps its retention so; without it
+    /// the group must exist, and stays as it is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retention_days: Option<i32>,
+    /// Tags of the group, given when the controller makes it.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[schemars(extend("maxProperties" = 50))]
+    pub tags: BTreeMap<String, String>,
 }
 
 mod defaults {

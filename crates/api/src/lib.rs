@@ -3,15 +3,21 @@
 //! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
 
 pub mod byte_quantity;
+pub mod check;
 #[cfg(feature = "client-errors")]
 pub mod client_errors;
 pub mod conditions;
 pub mod effective;
+mod evalai_mode;
+mod evalai_queue;
+pub mod gpu;
 pub mod image;
 pub mod image_pattern;
+mod imported;
 pub mod infrastructure_failures;
 pub mod ingested;
 mod job_number;
+pub mod keeping;
 pub mod leaderboard;
 pub mod leaderboard_network;
 pub mod leaderboard_parts;
@@ -28,15 +34,21 @@ mod run_id;
 mod state;
 pub mod submission;
 pub mod submission_status;
+mod submission_use;
 mod team;
 pub mod text;
 mod waiting;
 
+pub use check::{CheckEnd, CheckImage, CheckResult, LastCheck};
+pub use evalai_mode::EvalaiMode;
+pub use evalai_queue::EvalaiQueue;
 pub use image::{ImageReference, NotAnImage};
 pub use image_pattern::{ImagePattern, Repository};
+pub use imported::{ImportedEnd, ImportedState};
 pub use infrastructure_failures::{InfrastructureFailures, OnRepeatedInfrastructure, TeamFailures};
 pub use ingested::{Ingested, RefusedAttempt};
 pub use job_number::JobNumber;
+pub use keeping::StorageClass;
 pub use leaderboard::{
     EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,
 };
@@ -48,6 +60,7 @@ pub use route_slice::{NotASlice, RouteSlice};
 pub use run_id::{NotARunId, RunId};
 pub use submission::{EvalaiRef, Submission, SubmissionSpec};
 pub use submission_status::*;
+pub use submission_use::{Interruptions, MAX_INTERRUPTED_NODES, MAX_USING_TEAMS, TeamUse, Use};
 pub use team::{Team, TeamStatus};
 pub use waiting::{Eta, Waiting};
 

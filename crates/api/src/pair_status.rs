@@ -69,6 +69,10 @@ pub enum EndReason {
     SimulatorSilent,
     /// The kubelet could not start the simulator's container.
     SimulatorNotStarted,
+    /// The simulator was to have a GPU and saw none.
+    NoGPU,
+    /// The simulator's node has no driver for what it draws with.
+    GraphicsDriverMissing,
     /// An end that this operator does not know, of another version.
     #[serde(other)]
     Unknown,

@@ -26,6 +26,7 @@ use super::team::Team;
     selectable = ".spec.evalai.submission",
     selectable = ".status.state",
     validation = Rule::new("size(self.metadata.name) <= 52").message("metadata.name may have at most 52 characters: Jobs and Pods add the attempt to it"),
+    validation = Rule::new("!has(self.spec.check) || !self.spec.check || self.metadata.name.startsWith('check-')").message("the name of a check begins with check-: its results then have a prefix that is no submission's"),
     validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes the name of a Job and a label"),
     validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.state) || oldSelf.status.state != 'Finished' || self.spec.attempt == oldSelf.spec.attempt").message("a finished submission is not resumed; submit it again"),
     printcolumn = r#"{"name":"Leaderboard","type":"string","jsonPath":".spec.leaderboardName"}"#,
@@ -50,6 +51,8 @@ use super::team::Team;
     validation = Rule::new("has(self.image) == has(oldSelf.image) && (!has(self.image) || self.image == oldSelf.image)").message("image is immutable; apply a new Submission"),
     validation = Rule::new("has(self.evalai) == has(oldSelf.evalai) && (!has(self.evalai) || self.evalai == oldSelf.evalai)").message("evalai is immutable; apply a new Submission"),
     validation = Rule::new("has(self.track) == has(oldSelf.track) && (!has(self.track) || self.track == oldSelf.track)").message("track is immutable; apply a new Submission"),
+    validation = Rule::new("(has(self.check) && self.check) == (has(oldSelf.check) && oldSelf.check)").message("check is immutable; run another check"),
+    validation = Rule::new("!has(self.check) || !self.check || !has(self.evalai)").message("a check has no evalai: nothing of it is published"),
     validation = Rule::new("has(self.evalai) != has(self.track)").message("a Submission has either evalai (its phase tells the track) or a track, not both and not neither"),
     validation = Rule::new("has(self.evalai) || has(self.image)").message("a Submission without evalai needs an image"),
     validation = Rule::new("self.attempt >= oldSelf.attempt").message("attempt may only grow"),
@@ -71,6 +74,10 @@ pub struct SubmissionSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 32))]
     pub track: Option<String>,
+    /// A check of the Leaderboard: it drives one route with one pair, goes first in line, starts while the Leaderboard is paused, and
+    /// is published and recorded nowhere. Its name begins with `check-`.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub check: bool,
     /// Who submitted; asked from EvalAI when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub team: Option<Team>,
@@ -113,4 +120,9 @@ pub struct EvalaiRef {
 
 fn first_attempt() -> i64 {
     1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]
+fn is_false(value: &bool) -> bool {
+    !*value
 }

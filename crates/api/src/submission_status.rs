@@ -7,12 +7,14 @@ use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::gpu::{MAX_NODES_WITHOUT_GPU, NodeWithoutGpu};
 use super::infrastructure_failures::InfrastructureFailures;
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::pair_status::PairStatus;
 use super::progress::{Progress, Score};
 use super::route_slice::RouteSlice;
 use super::run_id::RunId;
+use super::submission_use::{Interruptions, Use};
 use super::team::TeamStatus;
 use super::waiting::Waiting;
 
@@ -63,9 +65,12 @@ pub struct SubmissionStatus {
     /// Attempt that this status speaks of.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attempt: Option<i64>,
-    /// Jobs of this attempt that infrastructure failures ended.
+    /// Jobs of this attempt that infrastructure failures ended, `interruptions` among them.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub retry: i32,
+    /// Those of them whose node was taken away, which use up no retry.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub interruptions: Option<Interruptions>,
     /// Times the Job of this attempt had to be created again after somebody deleted it.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub recreated: i32,
@@ -93,6 +98,9 @@ pub struct SubmissionStatus {
     /// What is run, pinned at acceptance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<RunPlan>,
+    /// Of a check: generation of the Leaderboard that it runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub checked_generation: Option<i64>,
     /// What the participant's image was when its registry was asked; absent where none was, or none answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<PinnedImage>,
@@ -125,6 +133,11 @@ pub struct SubmissionStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 253))]
     pub node_name: Option<String>,
+    /// Nodes that gave a simulator of this attempt no GPU. One that did so twice gets no further Job of the attempt.
+    #[serde(rename = "nodesWithoutGPU", default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["nodeName".into()]))]
+    #[schemars(length(max = MAX_NODES_WITHOUT_GPU))]
+    pub nodes_without_gpu: Vec<NodeWithoutGpu>,
     /// The submission that this one re-runs: EvalAI made a new row for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rerun_of: Option<Rerun>,
@@ -142,6 +155,9 @@ pub struct SubmissionStatus {
     /// keeps them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub infrastructure_failures: Option<InfrastructureFailures>,
+    /// What its Jobs have used. A resume keeps it.
+    #[serde(rename = "use", default, skip_serializing_if = "Option::is_none")]
+    pub usage: Option<Use>,
     /// `Accepted`, `Running`, `Archived`, `Recorded`, `Published`, `Stalled`, `Finished`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]
@@ -276,6 +292,16 @@ impl Times {
 pub enum FailureClass {
     Participant,
     Infrastructure,
+}
+
+impl FailureClass {
+    /// As in the status.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Participant => "Participant",
+            Self::Infrastructure => "Infrastructure",
+        }
+    }
 }
 
 /// What went wrong.

@@ -2,13 +2,16 @@
 //!
 //! Called by `main`; decides nothing.
 
+use std::collections::BTreeMap;
 use std::future::Future;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
 use futures::{Stream, StreamExt};
-use kube::api::{ListParams, PartialObjectMeta, Patch, PatchParams};
+use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::api::events::v1::Event;
+use kube::api::{DeleteParams, ListParams, LogParams, PartialObjectMeta, Patch, PatchParams, PostParams};
 use kube::config::{KubeConfigOptions, Kubeconfig, KubeconfigError};
 use kube::runtime::WatchStreamExt;
 use kube::runtime::watcher::{self, watch_object};
@@ -19,6 +22,7 @@ use serde_json::Value;
 use super::board::Observed;
 use super::error::{Error, of_kubeconfig};
 use super::near;
+use leaderboard_api::names::LABEL_SUBMISSION;
 use leaderboard_api::{Leaderboard, Submission};
 
 /// Field manager of what people change.
@@ -29,7 +33,7 @@ const PAGE: u32 = 500;
 const LIMIT: Duration = Duration::from_secs(30);
 
 /// Which cluster and namespace: the same flags as kubectl's.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 pub struct Target {
     /// Kubeconfig file [default: $KUBECONFIG, else ~/.kube/config].
     #[arg(long, global = true, value_name = "FILE")]
@@ -40,6 +44,17 @@ pub struct Target {
     /// Namespace [default: the context's].
     #[arg(short, long, global = true)]
     namespace: Option<String>,
+}
+
+/// Which submissions of which namespaces.
+#[derive(Args, Clone, Debug, Default)]
+pub struct Scope {
+    /// All namespaces.
+    #[arg(short = 'A', long)]
+    pub all_namespaces: bool,
+    /// Only objects with these labels, such as `leaderboard.carla.org/phase=7`.
+    #[arg(short = 'l', long, value_name = "LABELS")]
+    pub selector: Option<String>,
 }
 
 /// A namespace of a cluster.
@@ -86,9 +101,56 @@ impl Cluster {
         }
     }
 
-    /// All submissions.
-    pub async fn submissions(&self) -> Result<Vec<Submission>, Error> {
-        list(self, &self.api()).await
+    /// All submissions of a scope.
+    pub async fn submissions(&self, scope: &Scope) -> Result<Vec<Submission>, Error> {
+        list(self, &self.api_of(scope), scope.selector.as_deref()).await
+    }
+
+    /// Namespaces with submissions, and how many; none if this person may not list them.
+    pub async fn elsewhere(&self) -> Vec<(String, usize)> {
+        let api: Api<PartialObjectMeta<Submission>> = Api::all(self.client.clone());
+        let all = list(self, &api, None).await.unwrap_or_default();
+        let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+        for one in all {
+            *counts.entry(one.namespace().unwrap_or_default()).or_default() += 1;
+        }
+        counts.into_iter().collect()
+    }
+
+    /// All Pods that the operator has made.
+    pub async fn pods(&self) -> Result<Vec<Pod>, Error> {
+        list(self, &self.api::<Pod>(), Some(LABEL_SUBMISSION)).await
+    }
+
+    /// All events.
+    pub async fn events(&self) -> Result<Vec<Event>, Error> {
+        list(self, &self.api::<Event>(), None).await
+    }
+
+    /// The newest Pod of a submission.
+    pub async fn pod(&self, submission: &str) -> Result<Option<Pod>, Error> {
+        let selector = format!("{LABEL_SUBMISSION}={submission}");
+        let pods = list(self, &self.api::<Pod>(), Some(&selector)).await?;
+        Ok(pods
+            .into_iter()
+            .max_by_key(|pod| pod.creation_timestamp().map(|time| time.0)))
+    }
+
+    /// The log of a container, line by line.
+    pub async fn log(
+        &self,
+        pod: &str,
+        container: &str,
+        follow: bool,
+    ) -> Result<impl Stream<Item = std::io::Result<String>> + use<>, Error> {
+        let params = LogParams {
+            container: Some(container.to_owned()),
+            follow,
+            ..LogParams::default()
+        };
+        let api = self.api::<Pod>();
+        let reader = self.in_time(api.log_stream(pod, &params)).await??;
+        Ok(futures::io::AsyncBufReadExt::lines(Box::pin(reader)))
     }
 
     /// A Leaderboard by its name.
@@ -101,9 +163,9 @@ impl Cluster {
         }
     }
 
-    /// All Leaderboards; none if this person has no right to read them.
-    pub async fn leaderboards(&self) -> Result<Option<Vec<Leaderboard>>, Error> {
-        match list(self, &self.api()).await {
+    /// All Leaderboards of a scope; none if this person has no right to read them.
+    pub async fn leaderboards(&self, scope: &Scope) -> Result<Option<Vec<Leaderboard>>, Error> {
+        match list(self, &self.api_of(scope), None).await {
             Ok(found) => Ok(Some(found)),
             Err(Error::Forbidden(_)) => Ok(None),
             Err(error) => Err(error),
@@ -120,9 +182,56 @@ impl Cluster {
         self.in_time(api.patch(name, &params, &Patch::Merge(patch))).await
     }
 
+    /// Creates a submission.
+    pub async fn create(&self, submission: &Value) -> Result<Submission, Error> {
+        let object = serde_json::from_value(submission.clone()).map_err(|error| Error::Malformed(error.to_string()))?;
+        let params = PostParams {
+            field_manager: Some(MANAGER.to_owned()),
+            ..PostParams::default()
+        };
+        Ok(self
+            .in_time(self.api::<Submission>().create(&params, &object))
+            .await??)
+    }
+
+    /// Deletes a submission. One that is gone is no error.
+    pub async fn delete(&self, name: &str) -> Result<(), Error> {
+        let api = self.api::<Submission>();
+        match self.in_time(api.delete(name, &DeleteParams::default())).await? {
+            Err(kube::Error::Api(status)) if status.is_not_found() => Ok(()),
+            answer => Ok(answer.map(|_| ())?),
+        }
+    }
+
+    /// Waits until a Leaderboard fulfils a condition, for this time at most.
+    pub async fn await_leaderboard(&self, name: &str, limit: Duration, fulfils: impl Fn(&Leaderboard) -> bool) {
+        let mut changes = watch_object(self.api::<Leaderboard>(), name).default_backoff().boxed();
+        let fulfilled = async {
+            while let Some(change) = changes.next().await {
+                if matches!(&change, Ok(Some(leaderboard)) if fulfils(leaderboard)) {
+                    return;
+                }
+            }
+        };
+        // What is not there in time is not shown.
+        let _ = tokio::time::timeout(limit, fulfilled).await;
+    }
+
     /// A submission each time it changes; none once it is gone.
     pub fn changes(&self, name: &str) -> impl Stream<Item = Result<Option<Submission>, watcher::Error>> + use<> {
         watch_object(self.api::<Submission>(), name).default_backoff().boxed()
+    }
+
+    fn api_of<K>(&self, scope: &Scope) -> Api<K>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
+        K::DynamicType: Default,
+    {
+        if scope.all_namespaces {
+            Api::all(self.client.clone())
+        } else {
+            self.api()
+        }
     }
 
     fn api<K>(&self) -> Api<K>
@@ -135,7 +244,7 @@ impl Cluster {
 
     /// The error for an unknown name, with the names that the person may have meant.
     async fn unknown(&self, name: &str) -> Result<Error, Error> {
-        let all = list(self, &self.api::<PartialObjectMeta<Submission>>()).await;
+        let all = list(self, &self.api::<PartialObjectMeta<Submission>>(), None).await;
         let known: Vec<String> = match all {
             Ok(found) => found.iter().map(ResourceExt::name_any).collect(),
             // The right to read an object by its name does not include the right to list them.
@@ -144,7 +253,10 @@ impl Cluster {
         };
         let near = near::names(name, &known);
         let namespace = self.namespace.clone();
-        let next = if near.is_empty() {
+        let elsewhere = self.namespaces_of(name).await;
+        let next = if let Some(other) = elsewhere.first() {
+            format!("There is one in namespace {}: use -n {other}", elsewhere.join(", "))
+        } else if near.is_empty() {
             format!("`kubectl get submissions -n {namespace}` lists all; use -n for another namespace")
         } else {
             format!("Did you mean {}?", near.join(", "))
@@ -154,6 +266,17 @@ impl Cluster {
             namespace,
             next,
         })
+    }
+
+    /// Namespaces that have a submission of this name; none if this person may not look.
+    async fn namespaces_of(&self, name: &str) -> Vec<String> {
+        let api: Api<PartialObjectMeta<Submission>> = Api::all(self.client.clone());
+        let params = ListParams::default().fields(&format!("metadata.name={name}"));
+        let found = match self.in_time(api.list(&params)).await {
+            Ok(Ok(found)) => found.items,
+            _ => Vec::new(),
+        };
+        found.iter().filter_map(ResourceExt::namespace).collect()
     }
 
     async fn in_time<T>(&self, request: impl Future<Output = T>) -> Result<T, Error> {
@@ -180,12 +303,15 @@ async fn config(target: &Target) -> Result<Config, Error> {
 }
 
 /// All objects of a kind, in pages.
-async fn list<K>(cluster: &Cluster, api: &Api<K>) -> Result<Vec<K>, Error>
+async fn list<K>(cluster: &Cluster, api: &Api<K>, selector: Option<&str>) -> Result<Vec<K>, Error>
 where
     K: Clone + DeserializeOwned + std::fmt::Debug,
 {
     let mut found = Vec::new();
-    let mut params = ListParams::default().limit(PAGE);
+    let mut params = ListParams {
+        label_selector: selector.map(str::to_owned),
+        ..ListParams::default().limit(PAGE)
+    };
     loop {
         let page = cluster.in_time(api.list(&params)).await??;
         found.extend(page.items);

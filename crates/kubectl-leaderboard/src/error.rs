@@ -63,6 +63,12 @@ pub enum Error {
         "{0} was deleted in the meantime. Its results are kept; apply it again with a higher attempt to continue from them"
     )]
     Gone(String),
+    /// A file cannot be written.
+    #[error("cannot write {0}: {1}. Name another file")]
+    File(String, std::io::Error),
+    /// The person ended the command.
+    #[error("interrupted. Run it again")]
+    Interrupted,
     /// The API server does not answer.
     #[error("the API server did not answer within {0} s. Check that `kubectl get submissions` works")]
     Silent(u64),

@@ -27,27 +27,69 @@ struct Row {
     why: String,
 }
 
-/// The lines of a namespace. No Leaderboards: this person has no right to read them.
+/// Where submissions were listed.
+#[derive(Clone, Copy, Debug)]
+pub struct Place<'a> {
+    pub namespace: &'a str,
+    /// All namespaces.
+    pub is_all: bool,
+}
+
+impl Place<'_> {
+    /// The name of an object, with its namespace where there are several.
+    fn name_of(self, object: &impl ResourceExt) -> String {
+        match object.namespace().filter(|_| self.is_all) {
+            Some(namespace) => format!("{namespace}/{}", object.name_any()),
+            None => object.name_any(),
+        }
+    }
+}
+
+/// What is printed where there is no submission. `elsewhere` are the namespaces that have some, with their number.
+pub fn nothing(namespace: &str, selector: Option<&str>, elsewhere: &[(String, usize)]) -> Vec<String> {
+    let mut page = Page::default();
+    if let Some(selector) = selector {
+        page.paragraph(&format!("No submission has the labels {selector}."));
+        return page.into_lines();
+    }
+    let others: Vec<String> = elsewhere
+        .iter()
+        .map(|(name, count)| format!("{name} ({count})"))
+        .collect();
+    page.paragraph(&if others.is_empty() {
+        format!("Namespace {namespace} has no submissions. `kubectl get submissions -A` lists those of all namespaces.")
+    } else {
+        format!(
+            "Namespace {namespace} has no submissions. There are some in {}: use -n NAMESPACE, or -A.",
+            others.join(", ")
+        )
+    });
+    page.into_lines()
+}
+
+/// The lines of a namespace, or of all. No Leaderboards: this person has no right to read them.
 pub fn lines(
-    namespace: &str,
+    place: Place<'_>,
     submissions: &[Submission],
     leaderboards: Option<&[Leaderboard]>,
     now: Timestamp,
 ) -> Vec<String> {
     let mut page = Page::default();
-    for text in of_leaderboards(submissions, leaderboards) {
+    for text in of_leaderboards(place, submissions, leaderboards) {
         page.paragraph(&text);
     }
     page.gap();
-    let mut rows: Vec<Row> = submissions.iter().filter_map(|s| row(s, now)).collect();
+    let mut rows: Vec<Row> = submissions.iter().filter_map(|s| row(place, s, now)).collect();
     rows.sort_by(|a, b| a.order.cmp(&b.order).then_with(|| a.name.cmp(&b.name)));
     if rows.is_empty() {
+        let here = if place.is_all {
+            "The cluster".to_owned()
+        } else {
+            format!("Namespace {}", place.namespace)
+        };
         page.paragraph(&match submissions.len() {
-            0 => format!(
-                "Namespace {namespace} has no submissions. `kubectl get submissions -A` lists those of all namespaces."
-            ),
-            1 => format!("Namespace {namespace} has 1 submission. It is not waiting, failed or stuck."),
-            count => format!("Namespace {namespace} has {count} submissions. None is waiting, failed or stuck."),
+            1 => format!("{here} has 1 submission. It is not waiting, failed or stuck."),
+            count => format!("{here} has {count} submissions. None is waiting, failed or stuck."),
         });
         return page.into_lines();
     }
@@ -59,20 +101,24 @@ pub fn lines(
 }
 
 /// What is wrong with the existing Leaderboards, and with those that submissions name.
-fn of_leaderboards(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> Vec<String> {
+fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> Vec<String> {
     let Some(leaderboards) = leaderboards else {
         return vec!["You have no right to read Leaderboards; one may be paused or not Ready.".to_owned()];
     };
     let mut observed: BTreeMap<String, Observed<'_>> = BTreeMap::new();
     let live = submissions.iter().filter(|s| !why::has_ended(s));
-    observed.extend(live.map(|s| (s.spec.leaderboard_name.clone(), Observed::Missing)));
-    observed.extend(leaderboards.iter().map(|l| (l.name_any(), Observed::Found(l))));
+    let board_of = |s: &Submission| match s.namespace().filter(|_| place.is_all) {
+        Some(namespace) => format!("{namespace}/{}", s.spec.leaderboard_name),
+        None => s.spec.leaderboard_name.clone(),
+    };
+    observed.extend(live.map(|s| (board_of(s), Observed::Missing)));
+    observed.extend(leaderboards.iter().map(|l| (place.name_of(l), Observed::Found(l))));
     let problems = observed.iter().flat_map(|(name, board)| board::problems(name, *board));
     problems.map(|problem| problem.text).collect()
 }
 
 /// The line of a submission, unless it has no problem.
-fn row(submission: &Submission, now: Timestamp) -> Option<Row> {
+fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row> {
     let empty = SubmissionStatus::default();
     let status = submission.status.as_ref().unwrap_or(&empty);
     let others = other_systems(status, now);
@@ -86,14 +132,14 @@ fn row(submission: &Submission, now: Timestamp) -> Option<Row> {
     let doubt = doubt.map(|c| format!("{}.", c.reason)).unwrap_or_default();
     let since = why::since(submission);
     let age = since.map_or(0, |at| now.duration_since(at).as_secs());
-    let place = status.waiting.as_ref().map(|w| i64::from(w.position));
+    let position = status.waiting.as_ref().map(|w| i64::from(w.position));
     Some(Row {
         order: match why::state(status) {
             Some(State::Running | State::Resumed) => (0, age),
-            None | Some(State::Pending) => (1, place.unwrap_or(0)),
+            None | Some(State::Pending) => (1, position.unwrap_or(0)),
             Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
         },
-        name: clean(&submission.name_any()),
+        name: clean(&place.name_of(submission)),
         state: why::state(status).map_or("(new)", State::as_str),
         since: since.map(|_| span(age)).unwrap_or_default(),
         why: join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),

@@ -6,8 +6,10 @@
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use kube::ResourceExt;
+use serde_json::{Value, json};
 
 use super::board::{self, Observed};
+use super::bucket;
 use super::text::{Page, join, span, when};
 use leaderboard_api::conditions;
 use leaderboard_api::names::FAILURE_LOG_KEY;
@@ -24,6 +26,25 @@ struct Explanation<'a> {
     leaderboard: Observed<'a>,
     now: Timestamp,
     page: Page,
+}
+
+/// The same for programs.
+pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
+    let empty = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&empty);
+    let problems = board::problems(&submission.spec.leaderboard_name, leaderboard);
+    json!({
+        "name": submission.name_any(),
+        "namespace": submission.namespace(),
+        "state": state(status),
+        "reason": status.reason,
+        "meaning": status.reason.as_deref().map(meaning),
+        "message": status.message,
+        "failure": status.failure,
+        "waiting": status.waiting,
+        "leaderboardProblems": problems.iter().map(|problem| problem.text.as_str()).collect::<Vec<_>>(),
+        "nextSteps": next_steps(submission, status, leaderboard),
+    })
 }
 
 /// All that is known of a submission.
@@ -80,6 +101,49 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     found.or_else(|| submission.creation_timestamp().map(|t| t.0))
 }
 
+/// The state of a submission in a sentence.
+pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
+    let name = submission.name_any();
+    let since = since(submission).map(|at| when(at, now));
+    match (submission.status.as_ref().and_then(state), since) {
+        (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
+        (Some(state), None) => format!("{name} is {}.", state.as_str()),
+        (None, _) => {
+            let made = submission.creation_timestamp().map(|made| when(made.0, now));
+            let made = made.map(|made| format!(", created {made}")).unwrap_or_default();
+            format!("{name} is new{made}: the operator has not processed it yet.")
+        }
+    }
+}
+
+/// Name of the team, else its id.
+pub(super) fn team(submission: &Submission) -> Option<String> {
+    let given = submission.spec.team.clone().map(TeamStatus::from);
+    let accepted = submission.status.as_ref().and_then(|status| status.team.as_ref());
+    let team = accepted.or(given.as_ref())?;
+    team.name.clone().or_else(|| team.id.clone())
+}
+
+/// Track, Leaderboard, team and submission in EvalAI.
+pub(super) fn track(submission: &Submission) -> String {
+    let spec = &submission.spec;
+    let found = submission.status.as_ref().and_then(|status| status.track.as_deref());
+    let mut text = match found.or(spec.track.as_deref()) {
+        Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
+        None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
+    };
+    if let Some(team) = team(submission) {
+        text = format!("{text}, by {team}");
+    }
+    if let Some(evalai) = spec.evalai {
+        text = format!(
+            "{text}; EvalAI submission {}, phase {}",
+            evalai.submission, evalai.phase
+        );
+    }
+    text
+}
+
 /// Whether the attempt has ended and no higher one is requested.
 pub(super) fn has_ended(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
@@ -109,18 +173,7 @@ pub(super) fn class(class: FailureClass) -> &'static str {
 
 impl Explanation<'_> {
     fn headline(&mut self) {
-        let name = self.submission.name_any();
-        let since = since(self.submission).map(|at| when(at, self.now));
-        let made = self.submission.creation_timestamp().map(|t| when(t.0, self.now));
-        let text = match (state(self.status), since) {
-            (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
-            (Some(state), None) => format!("{name} is {}.", state.as_str()),
-            (None, _) => {
-                let made = made.map(|made| format!(", created {made}")).unwrap_or_default();
-                format!("{name} is new{made}: the operator has not processed it yet.")
-            }
-        };
-        self.page.paragraph(&text);
+        self.page.paragraph(&headline(self.submission, self.now));
         if let Some(at) = &self.submission.metadata.deletion_timestamp {
             let asked = when(at.0, self.now);
             self.page.paragraph(&format!(
@@ -133,25 +186,7 @@ impl Explanation<'_> {
     }
 
     fn belongs_to(&mut self) {
-        let spec = &self.submission.spec;
-        let track = self.status.track.as_deref().or(spec.track.as_deref());
-        let given = spec.team.clone().map(TeamStatus::from);
-        let team = self.status.team.as_ref().or(given.as_ref());
-        let team = team.and_then(|team| team.name.as_deref().or(team.id.as_deref()));
-        let mut text = match track {
-            Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
-            None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
-        };
-        if let Some(team) = team {
-            text = format!("{text}, by {team}");
-        }
-        if let Some(evalai) = spec.evalai {
-            text = format!(
-                "{text}; EvalAI submission {}, phase {}",
-                evalai.submission, evalai.phase
-            );
-        }
-        self.page.row("Track", &text);
+        self.page.row("Track", &track(self.submission));
     }
 
     fn reason(&mut self) {
@@ -344,10 +379,7 @@ impl Explanation<'_> {
         let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private routes.");
         self.page.row("Log", &text);
         let storage = self.status.plan.as_ref().map(|plan| &plan.storage);
-        let flag = |name: &str, value: Option<&String>| value.map(|v| format!(" {name} {v}")).unwrap_or_default();
-        let region = flag("--region", storage.and_then(|s| s.region.as_ref()));
-        let endpoint = flag("--endpoint-url", storage.and_then(|s| s.endpoint.as_ref()));
-        let command = format!("aws s3 cp {results}/{FAILURE_LOG_KEY} -{region}{endpoint}");
+        let command = bucket::print(&format!("{results}/{FAILURE_LOG_KEY}"), storage);
         self.page.whole("", &command);
     }
 
@@ -364,7 +396,7 @@ impl Explanation<'_> {
     }
 }
 
-fn meaning(reason: &str) -> String {
+pub(super) fn meaning(reason: &str) -> String {
     reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.meaning))
 }
 

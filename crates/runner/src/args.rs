@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use crate::graphics::Needs;
 use crate::protocol::{Member, Pair, Side};
 use thiserror::Error;
 
@@ -26,6 +27,9 @@ simulator:  --flush-seconds 1800   how long to hold the exit until the results a
             --cancel-seconds 120   the same after a cancel
             --answer-seconds 10    how long a server may take to answer when its agent has crashed
             --log FILE             where output is kept, too
+            --gpu any|vulkan|opengl  the server needs a GPU, and the driver for what it draws with
+            --unset A,B            variables that the server does not get
+            --root /               where devices and drivers are looked for
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
             --python-path A:B:C    put in front of the image's own PYTHONPATH
@@ -64,6 +68,12 @@ pub enum Role {
         cancel: Duration,
         answer: Duration,
         log: Option<PathBuf>,
+        /// What the server draws with, if it is to have a GPU.
+        gpu: Option<Needs>,
+        /// Variables that the server does not get.
+        unset: Vec<OsString>,
+        /// Where devices and drivers are looked for.
+        root: PathBuf,
     },
     Agent {
         work: PathBuf,
@@ -163,6 +173,9 @@ fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
                 .take("--log")?
                 .filter(|path| !path.is_empty())
                 .map(PathBuf::from),
+            gpu: options.optional("--gpu", "any, vulkan or opengl")?,
+            unset: options.list("--unset")?,
+            root: options.take("--root")?.map_or_else(|| "/".into(), PathBuf::from),
         },
         Side::Agent => Role::Agent {
             work: options.take("--work")?.map_or_else(|| WORK.into(), PathBuf::from),
@@ -241,6 +254,16 @@ impl Options {
         Ok(value.into())
     }
 
+    /// The parts of a value between commas.
+    fn list(&mut self, option: &'static str) -> Result<Vec<OsString>, UsageError> {
+        let value = self.take(option)?.unwrap_or_default();
+        let parts = value
+            .as_bytes()
+            .split(|byte| *byte == b',')
+            .filter(|part| !part.is_empty());
+        Ok(parts.map(|part| OsStr::from_bytes(part).to_owned()).collect())
+    }
+
     fn seconds(&mut self, option: &'static str, default: u32) -> Result<Duration, UsageError> {
         let seconds = self.optional::<u32>(option, "a number of seconds")?.unwrap_or(default);
         Ok(Duration::from_secs(seconds.into()))
@@ -282,6 +305,9 @@ mod tests {
                 cancel: Duration::from_mins(2),
                 answer: Duration::from_secs(10),
                 log: None,
+                gpu: None,
+                unset: Vec::new(),
+                root: "/".into(),
             }
         );
         assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
@@ -291,6 +317,16 @@ mod tests {
             [3600, 20, 600]
         );
         assert_eq!(job.command, ["./server", "--pair", "9", "--", "x"]);
+    }
+
+    #[test]
+    fn a_simulator_has_a_gpu_and_loses_variables() {
+        let line = "simulator --pair 1 --status /s --port 1 --gpu=vulkan --unset=DISPLAY,XAUTHORITY --root /r -- a";
+        let Role::Simulator { gpu, unset, root, .. } = job(line).role else {
+            panic!("a simulator's line");
+        };
+        assert_eq!((gpu, root), (Some(Needs::Vulkan), "/r".into()));
+        assert_eq!(unset, ["DISPLAY", "XAUTHORITY"]);
     }
 
     #[test]
@@ -346,6 +382,10 @@ mod tests {
             (
                 "simulator --pair 1 --status /s --port 1 --inotify off -- a",
                 "--inotify: \"off\" is not true or false",
+            ),
+            (
+                "simulator --pair 1 --status /s --port 1 --gpu directx -- a",
+                "--gpu: \"directx\" is not any, vulkan or opengl",
             ),
             (
                 "simulator --pair 1 --status /s --port 1",

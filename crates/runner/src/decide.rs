@@ -76,6 +76,10 @@ pub(crate) enum Cause {
     ServerSilent,
     /// The server failed while another process of the Pod listened on its port.
     PortTaken,
+    /// The server was to have a GPU and there is none.
+    NoGpu,
+    /// There is a GPU, and no driver for what the server draws with.
+    GraphicsDriverMissing,
     /// With the exit code of a shell that cannot start a command.
     CannotStart(i32),
     /// The status folder cannot be written, so nothing can be agreed.
@@ -209,6 +213,8 @@ pub(crate) struct Conclusion {
 
 /// Exit code after a SIGTERM from outside, as a shell reports it.
 pub(crate) const CODE_TERMINATED: i32 = 143;
+/// Exit code when there is nothing to draw with (EX_UNAVAILABLE).
+pub(crate) const CODE_NO_GRAPHICS: i32 = 69;
 /// Exit code when the status folder cannot be written (EX_IOERR).
 pub(crate) const CODE_MUTE: i32 = 74;
 
@@ -228,6 +234,12 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
         Cause::AlreadyDone => silent(hold(Hold::Flush), 0),
         Cause::Cancelled => silent(hold(Hold::Cancel), 0),
         Cause::PeerDone => SIMULATOR_DONE,
+        // The agent's image may take an hour to come, and nothing that it does helps.
+        Cause::NoGpu | Cause::GraphicsDriverMissing => Conclusion {
+            mark: Some(EndMark::Crash),
+            hold: Hold::Free,
+            code: CODE_NO_GRAPHICS,
+        },
         Cause::PeerCrashed
         | Cause::ChildEnded
         | Cause::Idle

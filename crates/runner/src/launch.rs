@@ -8,19 +8,46 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use crate::checkpoint;
-use crate::group::{self, Group};
+use crate::decide::Cause;
+use crate::group::{self, Group, spawn_code};
 use crate::tee::Tee;
 use leaderboard_runner::args::{Job, Role};
 use leaderboard_runner::expand::expand;
+use leaderboard_runner::graphics::{self, NoGraphics};
+use thiserror::Error;
+
+/// Why no command runs.
+#[derive(Debug, Error)]
+pub(crate) enum CannotLaunch {
+    /// The kernel refuses it.
+    #[error("{program} cannot be started: {source}", program = program.to_string_lossy())]
+    Spawn { program: OsString, source: io::Error },
+    /// A server that has nothing to draw with.
+    #[error(transparent)]
+    NoGraphics(#[from] NoGraphics),
+}
+
+impl CannotLaunch {
+    /// The end that follows.
+    pub(crate) fn cause(&self) -> Cause {
+        match self {
+            Self::Spawn { source, .. } => Cause::CannotStart(spawn_code(source)),
+            Self::NoGraphics(NoGraphics::NoGpu) => Cause::NoGpu,
+            Self::NoGraphics(NoGraphics::DriverMissing) => Cause::GraphicsDriverMissing,
+        }
+    }
+}
 
 /// Starts the command, with the tee of its output if that is kept. `round`: crashes so far.
-pub(crate) fn launch(job: &Job, round: u32) -> io::Result<(Group, Option<Tee>)> {
-    match &job.role {
-        Role::Simulator { log: None, .. } => {
-            let mut command = group::command(&job.command, &[]);
-            Ok((Group::spawn(command.stdin(no_input()))?, None))
+pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), CannotLaunch> {
+    let started = match &job.role {
+        Role::Simulator { log, .. } => {
+            let mut command = server(job)?;
+            match log {
+                None => Group::spawn(command.stdin(no_input())).map(|group| (group, None)),
+                Some(log) => teed(command, log.clone(), job.log_limit),
+            }
         }
-        Role::Simulator { log: Some(log), .. } => teed(group::command(&job.command, &[]), log.clone(), job.log_limit),
         Role::Agent {
             work,
             checkpoint,
@@ -37,7 +64,34 @@ pub(crate) fn launch(job: &Job, round: u32) -> io::Result<(Group, Option<Tee>)> 
             let log = work.join("leaderboard.log");
             teed(group::command(&words, &environment), log, job.log_limit)
         }
+    };
+    started.map_err(|source| CannotLaunch::Spawn {
+        program: program(job).to_owned(),
+        source,
+    })
+}
+
+/// The command of a simulator's server, on its own GPU and without the screen of its image.
+fn server(job: &Job) -> Result<Command, NoGraphics> {
+    let Role::Simulator { gpu, unset, root, .. } = &job.role else {
+        return Ok(group::command(&job.command, &[]));
+    };
+    let mut command = match gpu {
+        None => group::command(&job.command, &[]),
+        Some(needs) => {
+            let adapter = graphics::adapter(root, *needs, |name| env::var_os(name))?;
+            let words: Vec<OsString> = job
+                .command
+                .iter()
+                .map(|word| graphics::with_adapter(word, adapter))
+                .collect();
+            group::command(&words, &[(graphics::ADAPTER, adapter.to_string().into())])
+        }
+    };
+    for name in unset {
+        command.env_remove(name);
     }
+    Ok(command)
 }
 
 fn teed(mut command: Command, log: PathBuf, limit: u64) -> io::Result<(Group, Option<Tee>)> {
@@ -78,7 +132,7 @@ fn expand_all(words: &[OsString], environment: &[(&str, OsString)]) -> Vec<OsStr
 }
 
 /// The program's name, for messages.
-pub(crate) fn program(job: &Job) -> &OsStr {
+fn program(job: &Job) -> &OsStr {
     job.command
         .first()
         .map_or(OsStr::new(""), |program| Path::new(program).as_os_str())

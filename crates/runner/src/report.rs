@@ -1,8 +1,7 @@
 //! The verdict: its sentence, and writing it where the kubelet finds it. Called by `run`.
 
-use std::ffi::OsStr;
 use std::fs::OpenOptions;
-use std::io::{self, ErrorKind, Write};
+use std::io::{ErrorKind, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
@@ -62,6 +61,8 @@ const fn what(end: &End<'_>) -> What {
         Cause::NotReady => What::NotReady,
         Cause::ServerSilent => What::ServerSilent,
         Cause::PortTaken => What::PortTaken,
+        Cause::NoGpu => What::NoGpu,
+        Cause::GraphicsDriverMissing => What::GraphicsDriverMissing,
         Cause::CannotStart(_) | Cause::Mute => What::CannotStart,
         Cause::ChildEnded => match end.status {
             Some(Status::Exited(_)) => What::Exited,
@@ -88,7 +89,9 @@ fn reason(end: &End<'_>) -> String {
         ),
         Cause::ServerSilent => "the agent crashed, and the server does not answer any more".to_owned(),
         Cause::PortTaken => "another process of the Pod listens on the server's port".to_owned(),
-        Cause::CannotStart(_) | Cause::Mute => end.detail.unwrap_or("the command could not be started").to_owned(),
+        Cause::CannotStart(_) | Cause::Mute | Cause::NoGpu | Cause::GraphicsDriverMissing => {
+            end.detail.unwrap_or("the command could not be started").to_owned()
+        }
         Cause::ChildEnded => match end.status {
             Some(Status::Exited(code)) => format!("the command exited with code {code}"),
             Some(Status::Killed(Some(signal))) => format!("the command died of signal {signal}"),
@@ -121,11 +124,6 @@ pub(crate) fn write(path: &Path, verdict: &Verdict) {
     {
         crate::say(format_args!("the termination message cannot be written: {error}"));
     }
-}
-
-/// Why a command could not be started.
-pub(crate) fn cannot_start(program: &OsStr, error: &io::Error) -> String {
-    format!("{} cannot be started: {error}", program.to_string_lossy())
 }
 
 #[cfg(test)]

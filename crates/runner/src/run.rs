@@ -13,7 +13,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
 
 use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Phase, Seen, Skip};
-use crate::group::{self, Group, spawn_code};
+use crate::group::{self, Group};
 use crate::keep::Keeper;
 use crate::launch;
 use crate::server::{self, Listener, Question};
@@ -283,8 +283,8 @@ impl Runner {
                 Ok(())
             }
             Err(error) => {
-                self.detail = Some(report::cannot_start(launch::program(&self.job), &error));
-                Err(Cause::CannotStart(spawn_code(&error)))
+                self.detail = Some(error.to_string());
+                Err(error.cause())
             }
         }
     }

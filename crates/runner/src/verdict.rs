@@ -39,6 +39,10 @@ pub enum What {
     ServerSilent,
     /// Another process of the Pod listens on the port of the simulator's server.
     PortTaken,
+    /// The simulator was to have a GPU and sees none.
+    NoGpu,
+    /// The simulator sees a GPU, and no driver for what its server draws with.
+    GraphicsDriverMissing,
     /// The command could not be started, or the status folder could not be written.
     CannotStart,
     /// Written first and replaced at the end: it stays when the runner is killed.

@@ -6,6 +6,8 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
+use super::check;
+use super::claims::Claims;
 use super::isolation;
 use super::probe::EvalaiStanding;
 use super::reach::Unreachable;
@@ -13,13 +15,19 @@ use super::refusal::Refusal;
 use super::state::Policy;
 use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
-use crate::services::evalai::Usage;
+use crate::services::evalai::{InboxTrouble, Usage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TeamFailures, Track, TrackStatus, effective,
-    names, reasons,
+    CheckEnd, Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TeamFailures, TeamUse, Track,
+    TrackStatus, effective, names, reasons,
 };
+
+const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
+                                 Update the cluster, or choose another gpu.mode.";
+/// What the host of a Leaderboard that only observes is to know.
+const OBSERVES: &str = "evalai.mode is Observe: nothing is written to EvalAI; the condition Compared of each submission shows whether \
+                        the ends agree.";
 
 /// What one reconcile has read of a Leaderboard.
 #[derive(Clone, Debug)]
@@ -29,8 +37,12 @@ pub struct LeaderboardView {
     /// All Leaderboards that the operator watches, this one included.
     pub all: Vec<Arc<Leaderboard>>,
     pub counts: Counts,
+    /// The check that ended last, as far as its Submission was seen.
+    pub check: Option<CheckEnd>,
     /// Teams with failures in a row that an agent can cause.
     pub teams: Vec<TeamFailures>,
+    /// Its teams that have used the most.
+    pub gpu_use: Vec<TeamUse>,
     /// Submissions that are live or not yet published and recorded.
     pub in_use: usize,
     /// Its Pods that have not ended, counted while it is being deleted.
@@ -45,8 +57,14 @@ pub struct LeaderboardView {
     pub invalid_pod: Option<String>,
     /// What its host should know of its Pods all the same.
     pub pod_notes: Vec<String>,
+    /// How the template of its claims stands.
+    pub claims: Claims,
     /// What of its bucket, table and queues cannot be reached.
     pub unreachable: Option<Unreachable>,
+    /// What its host should know of places that it can do without.
+    pub place_notes: Vec<String>,
+    /// The note about another reader of its queue.
+    pub shared_queue: Option<String>,
     pub evalai: EvalaiStanding,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
@@ -70,12 +88,20 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.observed_generation = generation;
     status.counts = Some(view.counts);
     status.infrastructure_failures.clone_from(&view.teams);
+    status.gpu_use.clone_from(&view.gpu_use);
     status.evalai = view.usage.map(evalai_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
     let ready = with_notes(view, ready(view));
-    for (type_, (truth, reason, message)) in [(conditions::READY, ready), (conditions::ISOLATED, isolated)] {
+    let fault = Some(ready.1).filter(|_| ready.0 != Truth::True);
+    status.last_check = check::last(status.last_check.take(), view.check.as_ref(), fault, generation);
+    let checked = check::condition(leaderboard, status.last_check.as_ref());
+    for (type_, (truth, reason, message)) in [
+        (conditions::READY, ready),
+        (conditions::ISOLATED, isolated),
+        (conditions::CHECKED, checked),
+    ] {
         conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
     }
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
@@ -135,6 +161,10 @@ fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
     if let Some(wrong) = of_spec(view) {
         return wrong;
     }
+    // Before all that the sweep goes on with: the sweep reads it here.
+    if let Some(message) = &view.shared_queue {
+        return (Truth::False, reasons::QUEUE_SHARED, message.clone());
+    }
     if let Some(found) = unreachable(Truth::False) {
         return (Truth::False, found.reason, found.message.clone());
     }
@@ -153,9 +183,14 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
     }
     let spec = &view.leaderboard.spec;
     let delay = view.evalai_writes_from.filter(|_| spec.evalai.is_some());
-    let notes = [delay.map(previous_controller), without_limit(&view.leaderboard)];
+    let observes = spec.observes().then(|| OBSERVES.to_owned());
+    let notes = [
+        observes,
+        delay.map(previous_controller),
+        without_limit(&view.leaderboard),
+    ];
     let texts = [Some(message)].into_iter().chain(notes).flatten();
-    let texts = texts.chain(view.pod_notes.iter().cloned());
+    let texts = texts.chain(view.pod_notes.iter().chain(&view.place_notes).cloned());
     let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
     (truth, reason, texts.join(" "))
 }
@@ -183,6 +218,11 @@ fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     if let Some(why) = &view.invalid_pod {
         return no(reasons::INVALID_POD, why.clone());
     }
+    match &view.claims {
+        Claims::NotServed => return no(reasons::CLAIMS_NOT_SERVED, CLAIMS_NOT_SERVED.to_owned()),
+        Claims::Missing(why) => return no(reasons::CLAIM_TEMPLATE_MISSING, why.clone()),
+        Claims::NotRequired | Claims::InPlace => {}
+    }
     match &view.policy {
         Policy::Refused(why) | Policy::NotApplied(why) => no(reasons::NOT_ISOLATED, why.clone()),
         Policy::InPlace | Policy::External => None,
@@ -194,6 +234,13 @@ fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
     match standing {
         EvalaiStanding::NoToken(why) => no(reasons::TOKEN_MISSING, why.clone()),
         EvalaiStanding::TokenRefused(why) => no(reasons::TOKEN_REFUSED, why.clone()),
+        EvalaiStanding::QueueUnread(InboxTrouble { is_refused: true, why }) => {
+            no(reasons::QUEUE_UNREACHABLE, why.clone())
+        }
+        EvalaiStanding::QueueUnread(InboxTrouble { why, .. }) => {
+            let message = format!("EvalAI's queue has not been read for minutes: {why}. It is retried each minute.");
+            (Truth::Unknown, reasons::QUEUE_UNREACHABLE, message)
+        }
         EvalaiStanding::Misfit(why) => no(reasons::LABELS_DIFFER, why.clone()),
         EvalaiStanding::Unchecked(why) => {
             let why = why

@@ -46,7 +46,9 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         leaderboard: Arc::clone(mine),
         all: all.to_vec(),
         counts: Counts::default(),
+        check: None,
         teams: Vec::new(),
+        gpu_use: Vec::new(),
         in_use: 0,
         pods: 0,
         policy: Policy::InPlace,
@@ -54,7 +56,10 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         refusal: None,
         invalid_pod: None,
         pod_notes: Vec::new(),
+        claims: Claims::NotRequired,
         unreachable: None,
+        place_notes: Vec::new(),
+        shared_queue: None,
         evalai: EvalaiStanding::Fits { note: None },
         evalai_writes_from: None,
         usage: Some(USAGE),
@@ -79,6 +84,22 @@ fn of_two_with_the_same_phase_the_older_serves() {
         reason(&decide(&view(&new, &all))),
         ("False".into(), reasons::PHASE_CONFLICT.into())
     );
+}
+
+#[test]
+fn another_reader_of_the_queue_hides_behind_no_fault_with_which_submissions_start() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let mut seen = view(&one, &[]);
+    seen.shared_queue = Some("The queue has another reader.".into());
+    let shared = ("False".to_owned(), reasons::QUEUE_SHARED.to_owned());
+    assert_eq!(reason(&decide(&seen)), shared);
+    seen.evalai = EvalaiStanding::TokenRefused("no".into());
+    seen.unreachable = Some(Unreachable {
+        truth: Truth::False,
+        reason: reasons::BUCKET_UNREACHABLE,
+        message: "It does not exist.".into(),
+    });
+    assert_eq!(reason(&decide(&seen)), shared);
 }
 
 #[test]
@@ -170,6 +191,40 @@ fn what_is_surely_wrong_comes_before_what_nobody_knows() {
 }
 
 #[test]
+fn no_leaderboard_is_ready_whose_claims_cannot_be_made() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    for (claims, expected, begin) in [
+        (
+            Claims::NotServed,
+            reasons::CLAIMS_NOT_SERVED,
+            "gpu.mode is Claim, and the API server does not serve",
+        ),
+        (
+            Claims::Missing("No template.".into()),
+            reasons::CLAIM_TEMPLATE_MISSING,
+            "No template.",
+        ),
+    ] {
+        let seen = LeaderboardView {
+            claims,
+            ..view(&one, &[])
+        };
+        let plan = decide(&seen);
+        assert_eq!(reason(&plan), ("False".to_owned(), expected.to_owned()));
+        let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+        assert!(ready.message.starts_with(begin), "{}", ready.message);
+    }
+    for claims in [Claims::NotRequired, Claims::InPlace] {
+        let seen = LeaderboardView {
+            claims,
+            evalai: EvalaiStanding::NotRequired,
+            ..view(&one, &[])
+        };
+        assert_eq!(reason(&decide(&seen)).0, "True");
+    }
+}
+
+#[test]
 fn a_leaderboard_says_until_when_nothing_is_written_to_evalai() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
     let note = || Some("EvalAI's token ends on 2026-12-01.".to_owned());
@@ -216,7 +271,7 @@ fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
     );
     Arc::make_mut(&mut one).spec.tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
         run_seconds: Some(7200),
-        start_seconds: None,
+        ..Default::default()
     });
     let plan = decide(&view(&one, &[]));
     assert_eq!(
@@ -235,13 +290,14 @@ fn a_leaderboard_that_is_ready_shows_what_its_pods_give_to_strangers() {
         (
             EvalaiStanding::NotRequired,
             "True",
-            "Unbounded: x. Agents can read Secret y.",
+            "Unbounded: x. Agents can read Secret y. Log group z.",
         ),
         (EvalaiStanding::NoToken("No token.".into()), "False", "No token."),
     ] {
         let seen = LeaderboardView {
             evalai,
             pod_notes: pod_notes.clone(),
+            place_notes: vec!["Log group z.".to_owned()],
             ..view(&one, &[])
         };
         let plan = decide(&seen);
@@ -277,6 +333,12 @@ fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
 #[test]
 fn what_is_wrong_with_evalai_is_said() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let unread = |is_refused| {
+        EvalaiStanding::QueueUnread(InboxTrouble {
+            is_refused,
+            why: "x".into(),
+        })
+    };
     let cases = [
         (EvalaiStanding::NoToken("x".into()), "False", reasons::TOKEN_MISSING),
         (
@@ -285,6 +347,8 @@ fn what_is_wrong_with_evalai_is_said() {
             reasons::TOKEN_REFUSED,
         ),
         (EvalaiStanding::Misfit("x".into()), "False", reasons::LABELS_DIFFER),
+        (unread(true), "False", reasons::QUEUE_UNREACHABLE),
+        (unread(false), "Unknown", reasons::QUEUE_UNREACHABLE),
         (EvalaiStanding::Unchecked(None), "Unknown", reasons::ASKING_EVALAI),
         (EvalaiStanding::NotRequired, "True", reasons::READY),
     ];

@@ -4,15 +4,20 @@
 //! Job is made without it. Reads the token (every five minutes, or when EvalAI refuses it), checks whether bucket, table and queues
 //! answer, and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
 
+mod check;
+pub mod claims;
 pub mod decide;
 mod foreign;
 pub mod isolation;
 pub mod operator;
 mod places;
 mod pod_notes;
+mod priority;
 pub mod probe;
+mod queue_readers;
 mod reach;
 mod refusal;
+pub mod shared_queue;
 pub mod state;
 
 use std::sync::Arc;
@@ -27,7 +32,7 @@ use super::slots::SlotAllocator;
 use super::writes::{apply_status, set_finalizer};
 use crate::controller::stores::Stores;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::team_history;
+use crate::controller::submissions::{team_history, team_use};
 use crate::kubernetes::CallError;
 use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
@@ -126,12 +131,15 @@ fn observe(
     let (counts, in_use) = uses.slots.census(leaderboard);
     let (stores, hub) = (uses.policies.stores, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
+    let ended = ended(stores, leaderboard);
     LeaderboardView {
         now,
         leaderboard: Arc::clone(leaderboard),
         all: stores.leaderboards.state(),
         counts,
-        teams: team_history::teams(&ended(stores, leaderboard)),
+        check: uses.slots.last_check(leaderboard),
+        teams: team_history::teams(&ended),
+        gpu_use: team_use::teams(&ended),
         in_use,
         pods: isolation::pods_left(stores, leaderboard),
         policy,
@@ -139,14 +147,17 @@ fn observe(
         refusal: None,
         invalid_pod: probe.invalid_pod(),
         pod_notes: probe.pod_notes(),
+        claims: probe.claims(),
         unreachable: probe.unreachable(now),
+        place_notes: probe.place_notes(now),
+        shared_queue: probe.shared_queue(),
         evalai: probe.evalai_standing(hub, leaderboard, &key, now),
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),
     }
 }
 
-/// Its Submissions that have an end of some attempt.
+/// Its Submissions that have an end of some attempt, or of a Job.
 fn ended(stores: &Stores, leaderboard: &Leaderboard) -> Vec<Arc<Submission>> {
     let namespace = leaderboard.metadata.namespace.as_deref().unwrap_or_default();
     let name = leaderboard.metadata.name.as_deref().unwrap_or_default();
@@ -168,6 +179,7 @@ async fn write_status(
     let only_numbers = leaderboard_api::LeaderboardStatus {
         counts: old.counts,
         evalai: old.evalai.clone(),
+        gpu_use: old.gpu_use.clone(),
         ..plan.status.clone()
     } == old;
     let uid = uid_of(leaderboard);

@@ -12,7 +12,8 @@ use crate::controller::objects::key_of;
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
 use crate::services::fault::Fault;
-use crate::services::queue::{self, QueueError};
+use crate::services::log_groups::{self, LogGroupError};
+use crate::services::queue::{self, QueueError, Reading};
 use crate::services::table::{Table, TableError};
 use leaderboard_api::Leaderboard;
 
@@ -21,31 +22,40 @@ const LIMIT: Duration = Duration::from_secs(10);
 /// A run that nobody has: the list below it is empty, and costs nothing.
 const NO_RUN: &str = "none/";
 
-/// Asks what is due.
-pub(super) async fn look(aws: &Aws, leaderboard: &Leaderboard, mut reach: Reach, now: Timestamp) -> Reach {
+/// Asks what is due; the queue also if it is in question. Hands back what was read of the queue, if it was asked.
+pub(super) async fn look(
+    aws: &Aws,
+    leaderboard: &Leaderboard,
+    mut reach: Reach,
+    is_queue_due: bool,
+    now: Timestamp,
+) -> (Reach, Option<Reading>) {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
     let named = named(leaderboard);
     let places: Vec<Place> = named.iter().map(|(place, _)| *place).collect();
     reach.retain(&places);
-    let due = named
-        .into_iter()
-        .filter(|(place, address)| reach.is_due(*place, address, generation, now));
+    let due = named.into_iter().filter(|(place, address)| {
+        let is_in_question = *place == Place::Queue && is_queue_due;
+        is_in_question || reach.is_due(*place, address, generation, now)
+    });
     let asked = due.map(|(place, address)| {
         let question = ask(aws, leaderboard, place);
         async move {
             let answer = tokio::time::timeout(LIMIT, question).await;
             let silent = || Finding::Silent(format!("{address} did not answer within {} s", LIMIT.as_secs()));
-            let found = answer.unwrap_or_else(|_| silent());
-            (place, address, found)
+            let (found, read) = answer.unwrap_or_else(|_| (silent(), None));
+            (place, address, found, read)
         }
     });
-    for (place, address, found) in join_all(asked).await {
+    let mut reading = None;
+    for (place, address, found, read) in join_all(asked).await {
+        reading = reading.or(read.filter(|_| place == Place::Queue));
         if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
-            tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table or queue cannot be reached");
+            tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table, queue or log group cannot be reached");
         }
         reach.take(place, &address, generation, found, now);
     }
-    reach
+    (reach, reading)
 }
 
 /// What a Leaderboard names, each with its address in words.
@@ -70,19 +80,27 @@ fn named(leaderboard: &Leaderboard) -> Vec<(Place, String)> {
         let dead = queue.dead_letter_url.as_ref();
         places.extend(dead.map(|url| (Place::DeadLetterQueue, format!("the dead-letter queue {url}{at}"))));
     }
+    if let Some(group) = spec.log_group.as_ref().filter(|group| group.retention_days.is_some()) {
+        let at = at(&group.region, &group.endpoint);
+        places.push((Place::LogGroup, format!("the log group {}{at}", group.name)));
+    }
     places
 }
 
-fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFuture<'a, Finding> {
+fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFuture<'a, (Finding, Option<Reading>)> {
     let spec = &leaderboard.spec;
+    if let (Place::LogGroup, Some(group)) = (place, &spec.log_group) {
+        let days = group.retention_days.unwrap_or_default();
+        return async move { (of_log_group(log_groups::keep(aws, group, days).await), None) }.boxed();
+    }
     match (place, &spec.table, &spec.queue) {
         (Place::Bucket, ..) => {
             let prefix = format!("{}{NO_RUN}", spec.storage.prefix.as_deref().unwrap_or_default());
             let archive = Archive::of_storage(aws, &spec.storage).at_prefix(prefix);
-            async move { of_bucket(archive.prefix_is_empty().await.map(|_| ())) }.boxed()
+            async move { (of_bucket(archive.prefix_is_empty().await.map(|_| ())), None) }.boxed()
         }
         (Place::Table, Some(table), _) => {
-            async move { of_table(Table::describe(aws, table).await.map(|_| ())) }.boxed()
+            async move { (of_table(Table::describe(aws, table).await.map(|_| ())), None) }.boxed()
         }
         (Place::Queue, _, Some(queue)) => async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed(),
         (Place::DeadLetterQueue, _, Some(queue)) => {
@@ -90,7 +108,7 @@ fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFutur
             async move { of_queue(queue::check(aws, queue, url).await) }.boxed()
         }
         // It is named by nobody.
-        _ => async { Finding::Good }.boxed(),
+        _ => async { (Finding::Good, None) }.boxed(),
     }
 }
 
@@ -111,13 +129,25 @@ fn of_table(answer: Result<(), TableError>) -> Finding {
 }
 
 /// The bridge reads the queue, with rights of its own.
-fn of_queue(answer: Result<(), QueueError>) -> Finding {
+fn of_queue(answer: Result<Reading, QueueError>) -> (Finding, Option<Reading>) {
+    let error = match answer {
+        Ok(reading) => return (Finding::Good, Some(reading)),
+        Err(error) => error,
+    };
+    let found = match error.fault {
+        Fault::Denied => Finding::Hidden(error.to_string()),
+        Fault::Throttled | Fault::Unavailable | Fault::Conflict => Finding::Silent(error.to_string()),
+        Fault::Missing | Fault::Refused => Finding::Bad(error.to_string()),
+    };
+    (found, None)
+}
+
+fn of_log_group(answer: Result<(), LogGroupError>) -> Finding {
     match answer {
         Ok(()) => Finding::Good,
         Err(error) => match error.fault {
-            Fault::Denied => Finding::Hidden(error.to_string()),
             Fault::Throttled | Fault::Unavailable | Fault::Conflict => Finding::Silent(error.to_string()),
-            Fault::Missing | Fault::Refused => Finding::Bad(error.to_string()),
+            Fault::Denied | Fault::Missing | Fault::Refused => Finding::Bad(error.to_string()),
         },
     }
 }
@@ -139,6 +169,12 @@ mod tests {
         let table = || "table".to_owned();
         let queue = |fault| QueueError {
             url: "https://sqs/one".into(),
+            fault,
+            text: "words".into(),
+        };
+        let group = |fault| LogGroupError {
+            name: "group".to_owned(),
+            action: "CreateLogGroup",
             fault,
             text: "words".into(),
         };
@@ -167,9 +203,11 @@ mod tests {
                 })),
                 silent,
             ),
-            (of_queue(Err(queue(Fault::Missing))), bad),
-            (of_queue(Err(queue(Fault::Denied))), hidden),
-            (of_queue(Err(queue(Fault::Throttled))), silent),
+            (of_queue(Err(queue(Fault::Missing))).0, bad),
+            (of_queue(Err(queue(Fault::Denied))).0, hidden),
+            (of_queue(Err(queue(Fault::Throttled))).0, silent),
+            (of_log_group(Err(group(Fault::Denied))), bad),
+            (of_log_group(Err(group(Fault::Throttled))), silent),
         ];
         for (found, kind) in cases {
             assert_eq!(discriminant(&found), kind, "{found:?}");
@@ -201,5 +239,10 @@ mod tests {
             "the dead-letter queue https://sqs/dead",
         ];
         assert_eq!(places(&spec), all);
+        // A group that is the host's own is left alone.
+        spec["logGroup"] = json!({"name": "logs"});
+        assert_eq!(places(&spec), all);
+        spec["logGroup"] = json!({"name": "logs", "retentionDays": 30});
+        assert_eq!(places(&spec).last().unwrap(), "the log group logs");
     }
 }

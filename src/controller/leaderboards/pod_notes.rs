@@ -29,8 +29,8 @@ fn weak(tracks: &[TrackPods]) -> Option<String> {
         .collect();
     (!found.is_empty()).then(|| {
         format!(
-            "Weaker than Pod Security baseline: {}. What breaks out of such a container is on the node; remove it, or keep \
-             nodes for these Pods alone.",
+            "Weaker than Pod Security baseline: {}. The namespace has to allow the level privileged, and what breaks out of such a \
+             container is on the node; remove it, or keep nodes for these Pods alone.",
             listed(found)
         )
     })

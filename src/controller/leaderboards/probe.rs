@@ -1,5 +1,6 @@
 //! What is tried for a Leaderboard from time to time: its token, its places in AWS, its Pod.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,9 +11,13 @@ use kube::{Api, Client, ResourceExt};
 use leaderboard_results::metrics;
 
 use super::Uses;
+use super::claims::{self, Claims};
 use super::places;
 use super::pod_notes::{TrackPods, notes};
+use super::priority::{self, Asked};
+use super::queue_readers;
 use super::reach::{Reach, Unreachable, sentence};
+use super::shared_queue::SharedQueue;
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::controller::submissions::job_spec::{self, JobInput};
@@ -21,9 +26,10 @@ use crate::kubernetes::call;
 use crate::pod::run::results_format;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Hub, Labels, Target};
+use crate::services::evalai::{Hub, InboxTrouble, Labels, Target};
+use crate::services::queue::Reading;
 use crate::services::token::{Token, TokenSource};
-use leaderboard_api::{Evalai, JobNumber, Leaderboard, Submission, Token as TokenPlace, Track, effective};
+use leaderboard_api::{Evalai, EvalaiMode, JobNumber, Leaderboard, Submission, Token as TokenPlace, Track, effective};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -36,10 +42,16 @@ pub(super) struct Probe {
     token: Option<Result<Arc<Token>, String>>,
     token_at: Option<Timestamp>,
     reach: Reach,
+    /// Whether somebody else reads its queue.
+    queue: Option<SharedQueue>,
     /// The way to EvalAI that follows.
     target: Option<Arc<Target>>,
     /// Generation whose Pods were tried, and what was found.
     pod: Option<(i64, TriedPods)>,
+    priority: priority::Problems,
+    priority_at: Option<Timestamp>,
+    /// Generation whose claims were looked after, when, and how they stand.
+    claims: Option<(i64, Timestamp, Claims)>,
 }
 
 /// What was found of a Leaderboard's Pods.
@@ -49,6 +61,8 @@ struct TriedPods {
     refused: Option<String>,
     /// What their host should know all the same.
     notes: Vec<String>,
+    /// Their PriorityClasses.
+    classes: BTreeMap<String, Asked>,
 }
 
 /// How a Leaderboard stands with EvalAI.
@@ -57,6 +71,8 @@ pub enum EvalaiStanding {
     NotRequired,
     NoToken(String),
     TokenRefused(String),
+    /// Its queue in EvalAI is not read.
+    QueueUnread(InboxTrouble),
     /// Its phases or labels do not fit the challenge.
     Misfit(String),
     /// Not checked yet, or EvalAI does not answer.
@@ -75,12 +91,77 @@ impl Probe {
         if self.pod.as_ref().is_none_or(|(tried, _)| *tried != generation) {
             let tried = try_pods(client, uses.settings, leaderboard).await;
             self.pod = Some((generation, tried));
+            self.priority_at = None;
         }
+        self.refresh_priority(client, now).await;
+        self.refresh_claims(client, leaderboard, generation, now).await;
         let reach = std::mem::take(&mut self.reach);
         // A bucket that hangs must not keep EvalAI waiting.
-        let places = places::look(uses.aws, leaderboard, reach, now);
-        (self.reach, ()) = tokio::join!(places, self.refresh_token(uses, leaderboard, now));
+        let is_queue_due = self.queue.as_ref().is_some_and(|queue| queue.is_due(now));
+        let places = places::look(uses.aws, leaderboard, reach, is_queue_due, now);
+        let reading;
+        ((self.reach, reading), ()) = tokio::join!(places, self.refresh_token(uses, leaderboard, now));
+        self.refresh_queue(uses, leaderboard, reading, now).await;
         self
+    }
+
+    async fn refresh_priority(&mut self, client: &Client, now: Timestamp) {
+        let classes = self.pod.as_ref().map(|(_, tried)| &tried.classes);
+        let Some(classes) = classes.filter(|classes| !classes.is_empty()) else {
+            self.priority = priority::Problems::default();
+            return;
+        };
+        if due(self.priority_at, self.priority.refused.is_none(), now) {
+            self.priority = priority::look(client, classes).await;
+            self.priority_at = Some(now);
+        }
+    }
+
+    async fn refresh_claims(&mut self, client: &Client, leaderboard: &Leaderboard, generation: i64, now: Timestamp) {
+        let of_spec = self.claims.as_ref().filter(|(of, _, _)| *of == generation);
+        let is_due = match of_spec {
+            None => true,
+            Some((_, _, Claims::NotRequired)) => false,
+            Some((_, at, found)) => due(Some(*at), *found == Claims::InPlace, now),
+        };
+        if !is_due {
+            return;
+        }
+        let is_known = of_spec.is_some();
+        let found = claims::keep(client, leaderboard).await;
+        if is_known
+            && found == Claims::InPlace
+            && let Err(error) = claims::remove_others(client, leaderboard).await
+        {
+            tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
+        }
+        self.claims = Some((generation, now, found));
+    }
+
+    async fn refresh_queue(
+        &mut self,
+        uses: Uses<'_>,
+        leaderboard: &Leaderboard,
+        reading: Option<Reading>,
+        now: Timestamp,
+    ) {
+        let before = self.queue.take();
+        let Some(queue) = &leaderboard.spec.queue else { return };
+        let (client, stores) = (uses.policies.client, uses.policies.stores);
+        let known = before.unwrap_or_else(|| SharedQueue::of_status(leaderboard));
+        let mut known = known.of_queue(&queue.url);
+        if queue_readers::is_on_purpose(stores, queue) {
+            known = SharedQueue::default().of_queue(&queue.url);
+        } else if let Some(reading) = reading {
+            let sign = queue_readers::sign(client, stores, queue, &reading, now).await;
+            known.take(&reading, sign, now);
+        }
+        self.queue = Some(known);
+    }
+
+    /// The note about another reader of its queue.
+    pub(super) fn shared_queue(&self) -> Option<String> {
+        self.queue.as_ref()?.message()
     }
 
     async fn refresh_token(&mut self, uses: Uses<'_>, leaderboard: &Leaderboard, now: Timestamp) {
@@ -102,12 +183,23 @@ impl Probe {
     }
 
     pub(super) fn invalid_pod(&self) -> Option<String> {
-        self.pod.as_ref().and_then(|(_, tried)| tried.refused.clone())
+        let of_pod = self.pod.as_ref().and_then(|(_, tried)| tried.refused.clone());
+        of_pod.or_else(|| self.priority.refused.clone())
     }
 
     pub(super) fn pod_notes(&self) -> Vec<String> {
         let tried = self.pod.as_ref();
-        tried.map(|(_, tried)| tried.notes.clone()).unwrap_or_default()
+        let of_pods = tried.map(|(_, tried)| tried.notes.clone()).unwrap_or_default();
+        of_pods.into_iter().chain(self.priority.notes.clone()).collect()
+    }
+
+    pub(super) fn claims(&self) -> Claims {
+        let found = self.claims.as_ref();
+        found.map(|(_, _, found)| found.clone()).unwrap_or_default()
+    }
+
+    pub(super) fn place_notes(&self, now: Timestamp) -> Vec<String> {
+        self.reach.notes(now)
     }
 
     pub(super) fn unreachable(&self, now: Timestamp) -> Option<Unreachable> {
@@ -118,7 +210,18 @@ impl Probe {
     pub(super) fn next(&self, now: Timestamp) -> Option<Timestamp> {
         let waits = self.token.as_ref().is_some_and(Result::is_err);
         let token = self.token_at.filter(|_| waits).and_then(|at| at.checked_add(SOON).ok());
-        [self.reach.next(now), token].into_iter().flatten().min()
+        let has_bad_class = self.priority.refused.is_some();
+        let priority = self
+            .priority_at
+            .filter(|_| has_bad_class)
+            .and_then(|at| at.checked_add(SOON).ok());
+        let claims = self.claims.as_ref().filter(|(_, _, found)| is_wrong(found));
+        let claims = claims.and_then(|(_, at, _)| at.checked_add(SOON).ok());
+        let queue = self.queue.as_ref().and_then(SharedQueue::next);
+        [self.reach.next(now), token, claims, priority, queue]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     pub(super) fn evalai_standing(
@@ -139,6 +242,13 @@ impl Probe {
         if let Some(why) = hub.token_refused(key) {
             return EvalaiStanding::TokenRefused(why);
         }
+        match hub.inbox_trouble(key) {
+            Some(trouble) if trouble.is_refused => return EvalaiStanding::QueueUnread(trouble),
+            Some(trouble) if hub.labels(key).0.is_none_or(|labels| labels.ok()) => {
+                return EvalaiStanding::QueueUnread(trouble);
+            }
+            _ => {}
+        }
         match hub.labels(key) {
             (None, why) => EvalaiStanding::Unchecked(why),
             (Some(labels), _) if !labels.ok() => {
@@ -150,6 +260,10 @@ impl Probe {
             },
         }
     }
+}
+
+fn is_wrong(claims: &Claims) -> bool {
+    matches!(claims, Claims::NotServed | Claims::Missing(_))
 }
 
 /// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
@@ -220,6 +334,8 @@ fn serve(hub: &Hub, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Toke
         period: Duration::from_secs(leaderboard.spec.sync_period_seconds.unsigned_abs()),
         phases: leaderboard.spec.tracks.iter().filter_map(|t| t.phase).collect(),
         labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
+        inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
+        is_observed: evalai.mode == EvalaiMode::Observe,
         since: leaderboard
             .metadata
             .creation_timestamp
@@ -238,7 +354,7 @@ async fn try_pods(client: &Client, settings: &Settings, leaderboard: &Leaderboar
     if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
         return TriedPods {
             refused: Some(error.to_string()),
-            notes: Vec::new(),
+            ..TriedPods::default()
         };
     }
     let tracks = leaderboard.spec.tracks.iter();
@@ -250,11 +366,16 @@ async fn try_pods(client: &Client, settings: &Settings, leaderboard: &Leaderboar
         track: track.name.clone(),
         template: template(job),
     });
+    let pods: Vec<TrackPods> = pods.collect();
+    let mut templates = jobs.iter().map(|(_, job)| template(job));
+    let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
     TriedPods {
-        notes: notes(&pods.collect::<Vec<_>>()),
-        refused: match jobs.first() {
-            Some((_, job)) => refused_job(client, leaderboard, job).await,
-            None => None,
+        notes: notes(&pods),
+        classes: priority::asked(&leaderboard.spec.tracks, &pods),
+        refused: match (unclear, jobs.first()) {
+            (Some(unclear), _) => Some(unclear),
+            (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
+            (None, None) => None,
         },
     }
 }
@@ -296,6 +417,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         plan: &plan,
         number: JobNumber::first(1),
         settings,
+        without_gpu: &[],
         now: Timestamp::now(),
     }))
 }

@@ -1,4 +1,4 @@
-//! Whether a Leaderboard's bucket, table and queues can be reached: when each is asked again, and what is said of it.
+//! Whether a Leaderboard's bucket, table, queues and log group can be reached: when each is asked again, and what is reported.
 //!
 //! Pure: `places` asks, `decide` turns what is said into the condition `Ready`. An answer counts at once. Silence counts
 //! when it has lasted for [`PATIENCE`], and then as `Unknown`: a service that is away for a minute makes nothing flap, and
@@ -27,15 +27,19 @@ pub enum Place {
     Table,
     Queue,
     DeadLetterQueue,
+    LogGroup,
 }
 
 impl Place {
-    fn reason(self) -> &'static str {
+    /// The reason of a Leaderboard that cannot do without it.
+    fn reason(self) -> Option<&'static str> {
         match self {
-            Self::Bucket => reasons::BUCKET_UNREACHABLE,
-            Self::Table => reasons::TABLE_UNREACHABLE,
-            Self::Queue => reasons::QUEUE_UNREACHABLE,
-            Self::DeadLetterQueue => reasons::DEAD_LETTER_QUEUE_UNREACHABLE,
+            Self::Bucket => Some(reasons::BUCKET_UNREACHABLE),
+            Self::Table => Some(reasons::TABLE_UNREACHABLE),
+            Self::Queue => Some(reasons::QUEUE_UNREACHABLE),
+            Self::DeadLetterQueue => Some(reasons::DEAD_LETTER_QUEUE_UNREACHABLE),
+            // No result depends on lines in CloudWatch.
+            Self::LogGroup => None,
         }
     }
 }
@@ -136,20 +140,28 @@ impl Reach {
         let mut said: Vec<_> = self
             .0
             .iter()
-            .filter_map(|(place, known)| known.said(now).map(|(truth, why)| (*place, truth, why)))
+            .filter_map(|(place, known)| Some((place.reason()?, known)))
+            .filter_map(|(reason, known)| known.said(now).map(|(truth, why)| (reason, truth, why)))
             .collect();
-        // What is surely wrong comes before what nobody knows.
-        said.sort_by_key(|(place, truth, _)| (*truth != Truth::False, *place));
-        let (place, truth, _) = said.first()?;
+        // What is surely wrong comes before what nobody knows; among equals the gravest is first already.
+        said.sort_by_key(|(_, truth, _)| *truth != Truth::False);
+        let (reason, truth, _) = said.first()?;
         Some(Unreachable {
             truth: *truth,
-            reason: place.reason(),
+            reason,
             message: said
                 .iter()
                 .map(|(_, _, why)| sentence(why))
                 .collect::<Vec<_>>()
                 .join(" "),
         })
+    }
+
+    /// What a host should know of places that a Leaderboard can do without.
+    pub fn notes(&self, now: Timestamp) -> Vec<String> {
+        let optional = self.0.iter().filter(|(place, _)| place.reason().is_none());
+        let said = optional.filter_map(|(_, known)| known.said(now));
+        said.map(|(_, why)| sentence(why)).collect()
     }
 }
 
@@ -190,6 +202,18 @@ pub(super) fn sentence(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_log_group_that_cannot_be_made_is_a_note_and_holds_nothing_up() {
+        let mut reach = Reach::default();
+        reach.take(Place::LogGroup, "the log group logs", 1, bad(), at(0));
+        assert_eq!(reach.unreachable(at(0)), None);
+        assert_eq!(reach.notes(at(0)), ["It does not exist; create it."]);
+        reach.take(Place::Table, "the table rows", 1, bad(), at(0));
+        assert_eq!(reach.unreachable(at(0)).unwrap().reason, reasons::TABLE_UNREACHABLE);
+        reach.take(Place::LogGroup, "the log group logs", 1, Finding::Good, at(5));
+        assert_eq!(reach.notes(at(5)), Vec::<String>::new());
+    }
 
     fn at(second: i64) -> Timestamp {
         Timestamp::from_second(1_800_000_000 + second).unwrap()

@@ -14,11 +14,13 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::{act, observe};
+use crate::observability::metrics::Metrics;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
@@ -32,12 +34,14 @@ pub struct Context {
     pub archive: ArchiveWorkers,
     pub lookups: Lookups,
     pub images: Images,
+    pub foreign_runs: ForeignRuns,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
     pub external: ExternalSystems,
     pub aws: Aws,
     pub recorder: Recorder,
+    pub metrics: Arc<Metrics>,
     pub wake: Wake<Leaderboard>,
 }
 
@@ -50,6 +54,7 @@ impl Context {
             archive: &self.archive,
             lookups: &self.lookups,
             images: &self.images,
+            foreign_runs: &self.foreign_runs,
             reruns: &self.reruns,
             external: &self.external,
         }
@@ -65,7 +70,9 @@ impl Context {
             slots: &self.slots,
             archive: &self.archive,
             images: &self.images,
+            foreign_runs: &self.foreign_runs,
             external: &self.external,
+            metrics: &self.metrics,
         }
     }
 
@@ -95,6 +102,7 @@ impl Context {
         self.memory.forget(&key.uid);
         self.archive.forget(&key.uid);
         self.images.forget(&key.uid);
+        self.foreign_runs.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
         self.external.gone(key);
     }

@@ -7,6 +7,7 @@ pub mod backoff;
 pub mod context;
 mod counts;
 mod events;
+mod inbox;
 pub mod leader;
 mod needs;
 mod queue;
@@ -32,6 +33,7 @@ use super::settings::Settings;
 use super::stores::{Nodes, Stores, owner_uid};
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
@@ -40,12 +42,12 @@ use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history;
 use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::preflight::{self, await_kinds, watch_access};
-use crate::kubernetes::{Namespaces, Shape, Store, Watch, Watchable, spawn_watch};
+use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
+use crate::services::evalai::{Arrived, Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::meter::Meter;
 use crate::services::table::Recorder;
 use backoff::BackoffMap;
@@ -277,7 +279,13 @@ impl Parts {
         rows: mpsc::UnboundedSender<ObjectKey>,
     ) -> ExternalSystems {
         let (watches, telemetry) = (&self.watches, &self.telemetry);
-        let hub = hub(fence, evalai, &self.client, &watches.leaderboards.store, telemetry);
+        let intake = inbox::Intake {
+            client: self.client.clone(),
+            leaderboards: watches.leaderboards.clone(),
+            operator: self.settings.operator.clone(),
+            recorder: events(&self.client),
+        };
+        let hub = hub(fence, evalai, intake, telemetry);
         let fence = fence.clone();
         let recorder = Recorder::new(
             self.aws.clone(),
@@ -289,6 +297,7 @@ impl Parts {
             hub.clone(),
             watches.leaderboards.store.clone(),
             watches.submissions.store.clone(),
+            self.settings.operator.clone(),
             telemetry.clone(),
         );
         telemetry.tasks.stay("gauges", gauges);
@@ -308,12 +317,14 @@ impl Parts {
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered()),
             lookups: Lookups::start(client.clone(), tasks, answered()),
             images: Images::start(aws, client.clone(), tasks, answered()),
+            foreign_runs: ForeignRuns::start(aws, tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),
             external,
             aws: aws.clone(),
             recorder: events(client),
+            metrics: Arc::clone(&self.telemetry.metrics),
             wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
         };
         context.stores.fill(&context.slots);
@@ -389,19 +400,25 @@ async fn lost(leadership: &mut tokio::sync::watch::Receiver<Leadership>) -> Stri
     }
 }
 
+/// Runs a task that the stop ends.
+fn until_stop(telemetry: &Observability, name: &'static str, work: impl Future<Output = ()> + Send + 'static) {
+    let stop = telemetry.stop.clone();
+    telemetry.tasks.stay(name, async move {
+        tokio::select! { () = stop.wait() => {}, () = work => {} }
+    });
+}
+
 fn hub(
     fence: &leader::Fence,
     changed: mpsc::UnboundedSender<Changed>,
-    client: &Client,
-    leaderboards: &Store<Leaderboard>,
+    intake: inbox::Intake,
     telemetry: &Observability,
 ) -> Hub {
     let (sweep, rows) = mpsc::unbounded_channel::<SweepRow>();
-    let sweeping = sweep::into_cluster(client.clone(), leaderboards.clone(), rows);
-    let stop = telemetry.stop.clone();
-    telemetry.tasks.stay("sweep", async move {
-        tokio::select! { () = stop.wait() => {}, () = sweeping => {} }
-    });
+    let (arrived, messages) = mpsc::unbounded_channel::<Arrived>();
+    let (client, leaderboards) = (intake.client.clone(), intake.leaderboards.store.clone());
+    until_stop(telemetry, "sweep", sweep::into_cluster(client, leaderboards, rows));
+    until_stop(telemetry, "inbox", intake.into_cluster(messages));
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
@@ -409,6 +426,7 @@ fn hub(
         not_before,
         changed,
         sweep,
+        arrived,
         timing: Timing::default(),
         timeouts: Timeouts::default(),
         meter: Meter::for_metrics(&telemetry.metrics),

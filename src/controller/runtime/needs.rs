@@ -12,7 +12,7 @@ use leaderboard_api::GROUP;
 type Right = (&'static str, &'static str, &'static [&'static str]);
 
 /// In the namespaces of the Leaderboards.
-const OF_RUNS: [Right; 13] = [
+const OF_RUNS: [Right; 14] = [
     (GROUP, "leaderboards", &["list", "watch", "patch"]),
     (
         GROUP,
@@ -33,10 +33,19 @@ const OF_RUNS: [Right; 13] = [
         "networkpolicies",
         &["list", "watch", "create", "patch"],
     ),
+    (
+        "resource.k8s.io",
+        "resourceclaimtemplates",
+        &["get", "list", "create", "patch", "delete"],
+    ),
     (LEASES.0, LEASES.1, &["get"]),
 ];
 /// In the whole cluster: a lost node, and whether another installation still holds its Lease, wherever it is installed.
-const OF_THE_CLUSTER: [Right; 2] = [("", "nodes", &["get", "list", "watch"]), (LEASES.0, LEASES.1, &["get"])];
+const OF_THE_CLUSTER: [Right; 3] = [
+    ("", "nodes", &["get", "list", "watch"]),
+    ("scheduling.k8s.io", "priorityclasses", &["get"]),
+    (LEASES.0, LEASES.1, &["get"]),
+];
 const LEASES: (&str, &str) = ("coordination.k8s.io", "leases");
 
 /// Everything, for the namespaces that are served, with the rights of the whole cluster or without.

@@ -28,6 +28,9 @@ use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 
+/// The kinds as their watches call them, for metrics.
+const SUBMISSION: &str = "Submission";
+const LEADERBOARD: &str = "Leaderboard";
 /// A reconcile takes at most this long.
 const TIME_LIMIT: Duration = Duration::from_secs(90);
 /// An object without any other cause is reconciled this often.
@@ -56,8 +59,8 @@ impl Queues {
             Queue::new(limits, metrics.queue(kind, Class::ALL.map(Class::as_str)))
         };
         Self {
-            submissions: queue("submission", concurrency.into()),
-            leaderboards: queue("leaderboard", LEADERBOARDS),
+            submissions: queue(SUBMISSION, concurrency.into()),
+            leaderboards: queue(LEADERBOARD, LEADERBOARDS),
         }
     }
 }
@@ -130,7 +133,7 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
     let board = context.stores.leaderboards.get(&board);
     if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
         let metrics = &shared.telemetry.metrics;
-        metrics.reconciled("submission", OTHER_OPERATOR, started.elapsed());
+        metrics.reconciled(SUBMISSION, OTHER_OPERATOR, started.elapsed());
         return After::In(jittered(wait, 0.2), Class::Refresh);
     }
     let work = async {
@@ -157,7 +160,7 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
         return After::WithPermit;
     };
     let result = result.map_err(|error| (error, urgency::of_submission(&submission)));
-    finish("submission", &turn, submission.as_ref(), started, &shared, result)
+    finish(SUBMISSION, &turn, submission.as_ref(), started, &shared, result)
 }
 
 /// A reconcile within its limit of time; a panic of it is its own error.
@@ -193,13 +196,13 @@ async fn reconcile_leaderboard(turn: Turn, shared: Arc<Shared>) -> After {
     let result = match limited(work.map(|result| result.map_err(ReconcileError::from))).await {
         Ok(Reconciled::LeftAlone(wait)) => {
             let metrics = &shared.telemetry.metrics;
-            metrics.reconciled("leaderboard", OTHER_OPERATOR, started.elapsed());
+            metrics.reconciled(LEADERBOARD, OTHER_OPERATOR, started.elapsed());
             return After::In(wait, Class::Refresh);
         }
         Ok(Reconciled::Done(wait)) => Ok((Some(wait), Class::Refresh)),
         Err(error) => Err((error, Class::Refresh)),
     };
-    finish("leaderboard", &turn, leaderboard.as_ref(), started, &shared, result)
+    finish(LEADERBOARD, &turn, leaderboard.as_ref(), started, &shared, result)
 }
 
 fn finish(

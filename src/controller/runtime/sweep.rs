@@ -8,6 +8,7 @@ use kube::{Api, Client, ResourceExt};
 use tokio::sync::mpsc;
 
 use crate::bridge::ingest::{self, Incoming, Outcome, Source};
+use crate::controller::leaderboards::shared_queue::is_shown;
 use crate::kubernetes::Store;
 use crate::services::evalai::SweepRow;
 use leaderboard_api::{Evalai, Leaderboard, Submission, names};
@@ -21,6 +22,16 @@ pub(super) async fn into_cluster(
     while let Some(row) = rows.recv().await {
         let all = leaderboards.state();
         let Some(board) = serving(&all, &row) else { continue };
+        if let Some(queue) = shared_queue(&all, board) {
+            let (server, submission) = (&row.server, row.submission);
+            tracing::warn!(
+                server,
+                submission,
+                queue,
+                "EvalAI waits for a submission, and another reader of the queue may have its message"
+            );
+            continue;
+        }
         take(&client, board, &row).await;
     }
 }
@@ -59,6 +70,15 @@ fn serving<'a>(all: &'a [Arc<Leaderboard>], row: &SweepRow) -> Option<&'a Arc<Le
         is_of_server && l.serves(row.challenge, row.phase) && l.metadata.deletion_timestamp.is_none()
     };
     all.iter().filter(serves).min_by_key(|l| l.seniority())
+}
+
+/// The queue of a Leaderboard, while one of those that read it shows that somebody else does too. The row is found again
+/// ten minutes later.
+fn shared_queue<'a>(all: &[Arc<Leaderboard>], board: &'a Leaderboard) -> Option<&'a str> {
+    let url = &board.spec.queue.as_ref()?.url;
+    let is_of_queue = |other: &Leaderboard| other.spec.queue.as_ref().is_some_and(|queue| queue.url == *url);
+    let is_shared = all.iter().any(|other| is_of_queue(other) && is_shown(other));
+    is_shared.then_some(url)
 }
 
 #[cfg(test)]
@@ -118,6 +138,33 @@ mod tests {
         }
     }
 
+    #[test]
+    fn nothing_is_swept_up_while_a_leaderboard_of_the_queue_shows_another_reader() {
+        let with_queue = |name: &str, url: &str, reason: &str| {
+            let mut board = board(name, 1, "https://eval.ai");
+            board.spec.queue = serde_json::from_value(json!({"url": url})).unwrap();
+            let ready = json!([{"type": "Ready", "status": "False", "reason": reason, "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"}]);
+            board.status.get_or_insert_default().conditions = serde_json::from_value(ready).unwrap();
+            Arc::new(board)
+        };
+        let (mine, quiet) = (
+            with_queue("a", "https://q", "Ready"),
+            with_queue("b", "https://q", "BucketUnreachable"),
+        );
+        let shared = |other: Arc<Leaderboard>| shared_queue(&[Arc::clone(&mine), other], &mine).map(str::to_owned);
+        assert_eq!(shared(quiet), None);
+        assert_eq!(
+            shared(with_queue("b", "https://q", "QueueShared")).as_deref(),
+            Some("https://q")
+        );
+        assert_eq!(shared(with_queue("b", "https://other", "QueueShared")), None);
+        let without = Arc::new(board("c", 1, "https://eval.ai"));
+        assert_eq!(
+            shared_queue(&[with_queue("b", "https://q", "QueueShared")], &without),
+            None
+        );
+    }
+
     /// Answers with what was sent, and hands back each path.
     fn cluster() -> (Client, mpsc::UnboundedReceiver<(String, Value)>) {
         let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
@@ -131,6 +178,27 @@ mod tests {
             }
         });
         (Client::new(service, "default"), asked)
+    }
+
+    #[tokio::test]
+    async fn what_another_reader_may_have_is_not_made() {
+        let mut shared = board("real", 1, "http://one");
+        shared.spec.queue = serde_json::from_value(json!({"url": "https://q"})).unwrap();
+        let ready = json!([{"type": "Ready", "status": "False", "reason": "QueueShared", "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"}]);
+        shared.status.get_or_insert_default().conditions = serde_json::from_value(ready).unwrap();
+        let (client, mut asked) = cluster();
+        let (sender, rows) = mpsc::unbounded_channel();
+        sender.send(row("http://one", 2)).unwrap();
+        sender.send(row("http://two", 2)).unwrap();
+        drop(sender);
+        into_cluster(
+            client,
+            Store::of([shared, board("quiet", 1, "http://two")], |_| None),
+            rows,
+        )
+        .await;
+        let (line, _) = asked.recv().await.unwrap();
+        assert!(line.ends_with("/namespaces/quiet/submissions"), "{line}");
     }
 
     #[tokio::test]

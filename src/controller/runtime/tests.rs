@@ -14,9 +14,11 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 15] = [
+const TASKS: [&str; 17] = [
+    "foreign runs",
     "gauges",
     "images",
+    "inbox",
     "lease",
     "lookups",
     "nodes",

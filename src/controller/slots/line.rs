@@ -3,10 +3,10 @@
 use std::collections::{HashMap, HashSet};
 use std::mem::discriminant;
 
-use super::member::{Member, Stand};
+use super::member::{Kind, Member, Stand};
 use crate::controller::slots::turns::{InLine, Limits, Past, RUNS, Turn, turns};
-use leaderboard_api::State;
 use leaderboard_api::leaderboard::Counts;
+use leaderboard_api::{CheckEnd, State};
 
 #[cfg(test)]
 mod histories;
@@ -29,6 +29,8 @@ pub(super) struct Line {
     is_past_stale: bool,
     counts: Counts,
     in_use: usize,
+    /// The check that ended last, also when its Submission is gone.
+    pub(super) last_check: Option<CheckEnd>,
     /// Something has changed since slots were allocated last.
     pub(super) is_dirty: bool,
 }
@@ -77,9 +79,10 @@ impl Line {
         self.place(owner);
     }
 
-    /// Takes in a Submission, or none if it is gone. Returns whether the counts have changed.
+    /// Takes in a Submission, or none if it is gone. Returns whether the counts or the last check have changed.
     pub(super) fn member(&mut self, uid: &str, new: Option<Member>) -> bool {
         let before = (self.counts, self.in_use);
+        let is_checked = new.as_ref().is_some_and(|new| self.note_check(new));
         let old = match new {
             Some(new) => self.shown(uid, new),
             None => self.gone(uid),
@@ -88,7 +91,20 @@ impl Line {
             self.count(old, -1);
         }
         self.place(uid);
-        before != (self.counts, self.in_use)
+        is_checked || before != (self.counts, self.in_use)
+    }
+
+    /// Returns whether it is the check that ended last.
+    fn note_check(&mut self, new: &Member) -> bool {
+        let Kind::Check(Some(end)) = &new.kind else {
+            return false;
+        };
+        let known = self.last_check.as_ref();
+        let is_new = known.is_none_or(|known| end.time >= known.time && end != known);
+        if is_new {
+            self.last_check = Some(end.clone());
+        }
+        is_new
     }
 
     fn shown(&mut self, uid: &str, new: Member) -> Option<Member> {
@@ -121,7 +137,8 @@ impl Line {
         let holds = |reserved: &Reserved| {
             reserved.waiting.attempt == attempt && (reserved.is_started || reserved.limits == limits)
         };
-        if self.reserved.get(uid).is_some_and(holds) || (!limits.paused && self.has_slot(uid, attempt)) {
+        let is_held = limits.paused && !self.members.get(uid).is_some_and(Member::is_check);
+        if self.reserved.get(uid).is_some_and(holds) || (!is_held && self.has_slot(uid, attempt)) {
             return Turn::Go;
         }
         let waiting = self.waiting.get(uid).and_then(|waiting| waiting.turn.clone());
@@ -299,6 +316,12 @@ impl Line {
     }
 
     fn count(&mut self, member: &Member, by: i32) {
+        if member.needs_leaderboard {
+            self.in_use = self.in_use.saturating_add_signed(if by > 0 { 1 } else { -1 });
+        }
+        if member.is_check() {
+            return;
+        }
         let counts = &mut self.counts;
         let count = match member.state {
             State::Pending => &mut counts.pending,
@@ -308,9 +331,6 @@ impl Line {
             State::Cancelled => &mut counts.cancelled,
         };
         *count += by;
-        if member.needs_leaderboard {
-            self.in_use = self.in_use.saturating_add_signed(if by > 0 { 1 } else { -1 });
-        }
     }
 
     fn recount_past(&mut self) {

@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 
-use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{CheckEnd, JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
 
 pub(super) struct Member {
     pub(super) name: String,
@@ -24,6 +24,20 @@ pub(super) struct Member {
     pub(super) state: State,
     /// It is live, or its end is not yet published and recorded.
     pub(super) needs_leaderboard: bool,
+    /// Whether it is a check of the Leaderboard.
+    pub(super) kind: Kind,
+}
+
+/// Whose run it is.
+pub(super) enum Kind {
+    OfTeam,
+    /// A check: in no count and no estimate. Its end, once it has nothing left to do.
+    Check(Option<CheckEnd>),
+}
+
+/// The team as which a check stands in line: its own, so that no limit of a team holds it up.
+pub fn check_team(name: &str) -> String {
+    format!("check/{name}")
 }
 
 /// What its status says of it.
@@ -58,8 +72,9 @@ impl Member {
         // What never ran says nothing of how long a run takes.
         let ended = times.started.as_ref().and(times.finished.as_ref());
         let is_deleting = submission.metadata.deletion_timestamp.is_some();
+        let own = spec.check.then(|| check_team(&name));
         Self {
-            team: submission.team().unwrap_or_default().to_owned(),
+            team: own.unwrap_or_else(|| submission.team().unwrap_or_default().to_owned()),
             track: status.track.clone().or(spec.track.clone()).unwrap_or_default(),
             attempt: number.attempt,
             job: names::job(&name, number),
@@ -72,11 +87,20 @@ impl Member {
             },
             is_leaving: is_over || spec.cancel || is_deleting,
             is_pending: !is_over && waits_for_leaderboard(status),
-            began: began.map(|time| time.0),
-            ended: ended.map(|time| time.0),
+            began: began.filter(|_| !spec.check).map(|time| time.0),
+            ended: ended.filter(|_| !spec.check).map(|time| time.0),
             state: status.state_of_conditions(),
             needs_leaderboard: needs_leaderboard(status),
+            kind: if spec.check {
+                Kind::Check(submission.check_end())
+            } else {
+                Kind::OfTeam
+            },
         }
+    }
+
+    pub(super) fn is_check(&self) -> bool {
+        matches!(self.kind, Kind::Check(_))
     }
 
     /// Whether what is known of past runs stays right by adding what is new here.

@@ -83,6 +83,7 @@ impl World {
             track: "sensors".into(),
             priority: submission.spec.priority,
             submitted: created.0,
+            is_check: submission.spec.check,
         };
         self.slots.join(submission, place);
     }

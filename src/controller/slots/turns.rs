@@ -3,7 +3,8 @@
 //! Pure; called by `slots`. Fair between teams: each pick goes to the team that has the least running
 //! and picked so far, and among these to the one whose last run began longest ago. So a team with a hundred submissions
 //! does not hold up another's first, even where only one runs at a time. Within a team the higher priority goes first,
-//! then the older; those of one second stand in the order of their names.
+//! then the older; those of one second stand in the order of their names. A check of the Leaderboard goes before all teams, and
+//! starts while the Leaderboard is paused; it takes a slot as any other.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
@@ -50,6 +51,8 @@ pub struct InLine {
     pub track: String,
     pub priority: i32,
     pub submitted: Timestamp,
+    /// A check of the Leaderboard, which stands in line as a team of its own.
+    pub is_check: bool,
 }
 
 /// How many may run.
@@ -71,8 +74,8 @@ pub struct Past {
     pub runs: HashMap<String, Vec<(Timestamp, i64)>>,
 }
 
-/// What decides between teams, the least first: running and picked, the number of the last pick, the last start.
-type Rank<'a> = (usize, usize, Option<Timestamp>, Timestamp, &'a str);
+/// What decides between teams, the least first: no check, running and picked, the number of the last pick, the last start.
+type Rank<'a> = (bool, usize, usize, Option<Timestamp>, Timestamp, &'a str);
 
 /// The teams in line.
 struct Teams<'a> {
@@ -98,12 +101,13 @@ pub fn turns<'a>(line: impl IntoIterator<Item = &'a InLine>, past: &'a Past, lim
     let mut position = 0;
     while let Some((pick, running)) = teams.pick() {
         let full = limits.per_team.is_some_and(|limit| running >= limit);
-        let turn = if !limits.paused && !full && free > 0 {
+        let is_held = limits.paused && !pick.is_check;
+        let turn = if !is_held && !full && free > 0 {
             free -= 1;
             Turn::Go
         } else {
             position += 1;
-            if limits.paused {
+            if is_held {
                 Turn::Paused { position }
             } else {
                 let slots = limits.total.and_then(|n| i64::try_from(n).ok());
@@ -167,11 +171,13 @@ impl<'a> Teams<'a> {
     fn rank(&self, team: &'a str, line: &VecDeque<&InLine>) -> Option<Rank<'a>> {
         let load = self.load.get(team).copied().unwrap_or(0);
         let picked = self.picked.get(team).copied().unwrap_or(0);
+        let first = line.front()?;
         Some((
+            !first.is_check,
             load,
             picked,
             self.served.get(team).copied(),
-            line.front()?.submitted,
+            first.submitted,
             team,
         ))
     }
@@ -226,6 +232,14 @@ mod tests {
             track: "sensors".into(),
             priority: 0,
             submitted,
+            is_check: false,
+        }
+    }
+
+    fn check(uid: &str, second: i64) -> InLine {
+        InLine {
+            is_check: true,
+            ..waiting(uid, &format!("check/{uid}"), second)
         }
     }
 
@@ -280,6 +294,46 @@ mod tests {
         assert_eq!(all["late"], Turn::Go);
         assert_eq!(all["other"], Turn::Go);
         assert_eq!(all["early"], wait(1));
+    }
+
+    #[test]
+    fn a_check_goes_first_and_takes_a_slot_as_any_other() {
+        let mut line: Vec<_> = (0..200)
+            .map(|n| waiting(&format!("x{n:03}"), &format!("t{n}"), n))
+            .collect();
+        line[7].priority = 1000;
+        line.push(check("check-lb-1", 5000));
+        line.push(check("check-lb-2", 6000));
+        let all = turns(&line, &occupied(&["y"]), limits(1));
+        assert_eq!((&all["check-lb-1"], &all["check-lb-2"]), (&wait(1), &wait(2)));
+        assert_eq!(all["x000"], wait(3));
+        let limits = Limits {
+            total: Some(2),
+            per_team: Some(1),
+            paused: false,
+        };
+        let all = turns(&line, &occupied(&["y"]), limits);
+        assert_eq!((&all["check-lb-1"], &all["check-lb-2"]), (&Turn::Go, &wait(1)));
+    }
+
+    #[test]
+    fn a_check_starts_while_the_leaderboard_is_paused() {
+        let limits = Limits {
+            total: Some(1),
+            per_team: None,
+            paused: true,
+        };
+        let line = [waiting("a", "x", 1), check("check-lb-1", 9)];
+        let all = turns(&line, &occupied(&[]), limits);
+        assert_eq!(
+            (&all["check-lb-1"], &all["a"]),
+            (&Turn::Go, &Turn::Paused { position: 1 })
+        );
+        let all = turns(&line, &occupied(&["y"]), limits);
+        assert_eq!(
+            (&all["check-lb-1"], &all["a"]),
+            (&wait(1), &Turn::Paused { position: 2 })
+        );
     }
 
     #[test]

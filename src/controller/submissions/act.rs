@@ -15,6 +15,7 @@ use super::archive::ArchiveWorkers;
 use super::decide::{Action, Event, Plan, pinned};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
+use super::foreign_runs::ForeignRuns;
 use super::images::Images;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
@@ -27,8 +28,9 @@ use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
+use crate::observability::metrics::{FailedAttempt, Metrics};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{JobNumber, RunPlan, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, conditions, names, reasons};
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
@@ -44,7 +46,9 @@ pub struct Uses<'a> {
     pub slots: &'a SlotAllocator,
     pub archive: &'a ArchiveWorkers,
     pub images: &'a Images,
+    pub foreign_runs: &'a ForeignRuns,
     pub external: &'a ExternalSystems,
+    pub metrics: &'a Metrics,
 }
 
 /// A create that an admission webhook holds up keeps a permit that others wait for.
@@ -89,14 +93,14 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for action in &plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
-    if view.texts != ObservedTexts::NotRead && !needs_texts(&plan.status) {
+    if view.texts != ObservedTexts::NotRead && !awaits_publication(&plan.status) {
         uses.archive.drop_texts(&view.submission, &plan.status);
     }
     Ok(held_back)
 }
 
-/// Whether texts that were read are still to be sent with an end. Those of a live run are with EvalAI's side already.
-fn needs_texts(status: &SubmissionStatus) -> bool {
+/// Whether an end is still to be sent to EvalAI, with the texts that were read. Those of a live run are with EvalAI's side already.
+pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     let published = conditions::get(&status.conditions, conditions::PUBLISHED);
     let is_open =
         |c: &Condition| c.status == "False" && ![reasons::NOT_REQUIRED, reasons::REFUSED].contains(&c.reason.as_str());
@@ -150,6 +154,7 @@ impl Actor<'_> {
         match action {
             Action::JoinLine(place) => uses.slots.join(submission, place.clone()),
             Action::LookUpImage(question) => uses.images.want(submission, question.clone()),
+            Action::LookForForeignRun(question) => uses.foreign_runs.want(submission, (**question).clone()),
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
@@ -208,6 +213,8 @@ impl Actor<'_> {
         let version = apply_status(self.uses.client, self.submission(), status).await?;
         self.uses.memory.wrote(self.submission(), status, &version);
         self.log_transition(status);
+        self.count_use(&old, status);
+        self.count_failure(&old, status);
         Ok(None)
     }
 
@@ -231,6 +238,35 @@ impl Actor<'_> {
         );
     }
 
+    /// Once it is stored, so that a write that fails counts nothing twice.
+    fn count_use(&self, old: &SubmissionStatus, new: &SubmissionStatus) {
+        let seconds = |status: &SubmissionStatus| status.usage.map_or(0, |usage| usage.gpu_seconds);
+        let more = u64::try_from(seconds(new).saturating_sub(seconds(old))).unwrap_or(0);
+        if more > 0 {
+            let track = new.track.clone().unwrap_or_default();
+            self.uses.metrics.gpus_used(self.leaderboard(), track, more);
+        }
+    }
+
+    /// Each failed attempt once, when its end is stored.
+    fn count_failure(&self, old: &SubmissionStatus, new: &SubmissionStatus) {
+        let failed = |status: &SubmissionStatus| status.state_of_conditions() == State::Failed;
+        let is_known = failed(old) && old.attempt == new.attempt;
+        if let Some(failure) = new.failure.as_ref().filter(|_| failed(new) && !is_known) {
+            self.uses.metrics.attempt_failed(FailedAttempt {
+                leaderboard: self.leaderboard(),
+                class: failure.class.as_str(),
+                reason: reasons::of(&failure.reason).map_or("Other", |reason| reason.name),
+                is_charged: failure.charged,
+            });
+        }
+    }
+
+    /// As metrics name it.
+    fn leaderboard(&self) -> String {
+        format!("{}/{}", self.namespace, self.submission().spec.leaderboard_name)
+    }
+
     async fn create_job(&self, status: &SubmissionStatus, number: JobNumber) -> Result<(), ActError> {
         let (Some(plan), Some(leaderboard)) = (&status.plan, &self.view.leaderboard) else {
             return Err(ActError::NoPlan { object: self.name() });
@@ -245,6 +281,7 @@ impl Actor<'_> {
             plan: &plan,
             number,
             settings: self.uses.settings,
+            without_gpu: &status.nodes_without_gpu,
             now: self.view.now,
         });
         let name = names::job(&self.name(), number);

@@ -88,3 +88,75 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         assert_eq!(line[field], value, "{field} of {text}");
     }
 }
+
+#[tokio::test(start_paused = true)]
+async fn gpu_seconds_are_counted_when_they_are_stored_and_once() {
+    let (around, view) = bench().await;
+    let mut view = view;
+    let old = view.submission.status.clone().unwrap();
+    for (gpu_seconds, sum) in [(400, "400"), (400, "400"), (1000, "1000")] {
+        let status = SubmissionStatus {
+            usage: Some(leaderboard_api::Use { gpus: 4, gpu_seconds }),
+            track: Some("sensors".into()),
+            ..old.clone()
+        };
+        let plan = Plan {
+            status: status.clone(),
+            actions: Vec::new(),
+            events: Vec::new(),
+            report: None,
+            requeue: None,
+        };
+        act(around.context.for_act(), &view, plan).await.unwrap();
+        Arc::make_mut(&mut view.submission).status = Some(status);
+        let text = around.context.metrics.text().unwrap();
+        let line = format!("leaderboard_gpu_seconds_total{{leaderboard=\"one/board\",track=\"sensors\"}} {sum}");
+        assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_failed_attempt_is_counted_once_when_it_is_stored() {
+    let (around, mut view) = bench().await;
+    let old = view.submission.status.clone().unwrap();
+    let finished = json!({"type": "Finished", "status": "True", "reason": "AgentCrashed", "message": "",
+                          "lastTransitionTime": "2026-01-01T00:00:00Z"});
+    let failure = json!({"class": "Participant", "charged": true, "reason": "AgentCrashed", "message": "It crashed."});
+    let failed = SubmissionStatus {
+        conditions: vec![serde_json::from_value(finished).unwrap()],
+        failure: Some(serde_json::from_value(failure).unwrap()),
+        ..old.clone()
+    };
+    let published = SubmissionStatus {
+        message: Some("It is published.".into()),
+        ..failed.clone()
+    };
+    let resumed = SubmissionStatus {
+        attempt: old.attempt.map(|attempt| attempt + 1),
+        ..failed.clone()
+    };
+    let family = "leaderboard_submission_failures_total{";
+    for (status, count) in [
+        (old, None),
+        (failed, Some("1")),
+        (published, Some("1")),
+        (resumed, Some("2")),
+    ] {
+        let plan = Plan {
+            status: status.clone(),
+            actions: Vec::new(),
+            events: Vec::new(),
+            report: None,
+            requeue: None,
+        };
+        act(around.context.for_act(), &view, plan).await.unwrap();
+        Arc::make_mut(&mut view.submission).status = Some(status);
+        let text = around.context.metrics.text().unwrap();
+        let labels = "leaderboard=\"one/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"";
+        let found = text.lines().find(|line| line.starts_with(family));
+        assert_eq!(
+            found,
+            count.map(|count| format!("{family}{labels}}} {count}")).as_deref()
+        );
+    }
+}

@@ -16,7 +16,7 @@ use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View}
 use crate::controller::objects::{key_of, uid_of};
 use crate::services::ObjectKey;
 use crate::services::evalai::{
-    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Run, Status, Subject, SubmissionState, Target,
+    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Publisher, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, JobNumber, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
@@ -75,7 +75,8 @@ impl ExternalSystems {
         let may_note = status.is_none_or(|s| s.rerun_of.is_none() && s.job_name.is_none());
         let row = seen.row.as_ref().filter(|_| may_note);
         let rerun_of = row.and_then(|row| reruns::original(row, submission, others));
-        Some(map_view(&seen, submission, rerun_of))
+        let observes = leaderboard.is_some_and(|board| board.spec.observes());
+        Some(map_view(&as_observed(seen, observes), submission, rerun_of))
     }
 
     /// What is known of a submission's row. None without a table.
@@ -118,6 +119,12 @@ impl ExternalSystems {
         update: EvalaiUpdate,
     ) {
         let Some(subject) = self.subject(view) else { return };
+        if matches!(update, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
+            self.follow(view, status);
+        }
+        let Some(publisher) = Publisher::of(subject) else {
+            return;
+        };
         let with_end = |outcome| Some(final_update(archive, view, status, outcome));
         let desired = match update {
             EvalaiUpdate::Queued => Some(DesiredUpdate::Queued),
@@ -127,11 +134,8 @@ impl ExternalSystems {
             EvalaiUpdate::Failed => with_end(Outcome::Failed),
             EvalaiUpdate::Cancelled => with_end(Outcome::Cancelled),
         };
-        if matches!(update, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
-            self.follow(view, status);
-        }
         if let Some(desired) = desired {
-            log_refused(&view.submission, self.hub.update(&subject, desired));
+            log_refused(&view.submission, self.hub.update(&publisher, desired));
         }
     }
 
@@ -159,6 +163,14 @@ impl ExternalSystems {
     pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
+        if view.submission.spec.check {
+            // Before its end there is nothing to learn.
+            if end {
+                let row = result_texts::trial(status);
+                self.recorder.record(table, &key_of(view.submission.as_ref()), row, end);
+            }
+            return;
+        }
         if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
             self.recorder.record(table, &key_of(view.submission.as_ref()), row, end);
         }
@@ -212,6 +224,15 @@ fn wants_image(submission: &Submission) -> bool {
     submission.spec.image.is_none() && !has_ended
 }
 
+/// Where a Leaderboard only observes, the other program's end is no end of its own run; a cancel is one of both.
+fn as_observed(seen: SubmissionState, observes: bool) -> SubmissionState {
+    let is_others = |status: &Status| observes && matches!(status, Status::Finished | Status::Failed);
+    SubmissionState {
+        ended: seen.ended.filter(|status| !is_others(status)),
+        ..seen
+    }
+}
+
 fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
     let attempt = submission.spec.attempt;
     // An image that was asked for is waited for; why there is none is an answer too.
@@ -240,6 +261,7 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
                 team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
                 team_name: row.team_name.clone(),
                 submitted_at: row.submitted_at,
+                resumed_at: row.resumed_at,
                 rerun_of,
                 last_attempt: reruns::last_attempt(row),
                 image,
@@ -273,7 +295,7 @@ fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
     }
 }
 
-fn log_refused(submission: &Submission, result: Result<(), evalai::client::ClientError>) {
+fn log_refused(submission: &Submission, result: Result<(), evalai::ClientError>) {
     if let Err(error) = result {
         tracing::error!(submission = %submission.name_any(), %error, "cannot create EvalAI client");
     }

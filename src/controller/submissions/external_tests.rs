@@ -14,7 +14,8 @@ use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Turn,
+    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts,
+    ObservedTraces, Turn,
 };
 use leaderboard_api::State;
 
@@ -100,10 +101,12 @@ async fn bench(state: State) -> Bench {
         leaderboard: Some(Arc::new(board)),
         is_policy_in_place: true,
         image: ObservedImage::NotAsked,
+        traces: ObservedTraces::NotAsked,
         turn: Turn::Go,
         job: ObservedJob::Absent,
         evalai_waited: std::time::Duration::ZERO,
         pod: None,
+        leaving: None,
         node: ObservedNode::Unknown,
         report: ObservedReport::NotRead,
         report_stage: None,

@@ -1,30 +1,18 @@
-//! What registries tell of submitted images. A task of its own asks, one question for each attempt before its first Job, and an answer
-//! wakes its submission. No reconcile waits for a registry.
+//! What registries know of submitted images: one question for each attempt, before its first Job.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
-use futures::stream::FuturesUnordered;
-use futures::{FutureExt, StreamExt};
 use k8s_openapi::api::core::v1::Secret;
-use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client};
-use tokio::sync::Notify;
-use tokio::time::Instant;
 
-use super::view::ObservedImage;
-use crate::controller::objects::{Wake, uid_of};
+use super::questions::{self, Observed, Questions};
+use crate::controller::objects::Wake;
 use crate::kubernetes::CALL_TIMEOUT;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::registry::{Credentials, Facts, Fault, Image, Registries};
 use leaderboard_api::Submission;
-
-/// How many registries are asked at once. Each answer is at most a few MiB.
-const AT_ONCE: usize = 4;
-/// How long an answer is kept that nobody has taken: it is in the status long before.
-const KEPT: Duration = Duration::from_mins(10);
 
 /// What is asked of a registry.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -36,132 +24,36 @@ pub struct Question {
     pub secrets: Vec<String>,
 }
 
-struct Entry {
-    question: Question,
-    by: ObjectRef<Submission>,
-    asked: Instant,
-    is_under_way: bool,
-    answer: Option<Arc<Result<Facts, Fault>>>,
-}
+impl questions::Question for Question {
+    type Answer = Result<Facts, Fault>;
+    /// Each answer is at most a few MiB.
+    const AT_ONCE: usize = 4;
+    /// One answer serves the whole attempt.
+    const GOOD_FOR: Duration = Duration::MAX;
 
-#[derive(Default)]
-struct Shared {
-    /// By the UID of the submission.
-    entries: Mutex<HashMap<String, Entry>>,
-    notify: Notify,
+    fn attempt(&self) -> i64 {
+        self.attempt
+    }
 }
 
 /// The questions and their answers.
-#[derive(Clone)]
-pub struct Images(Arc<Shared>);
+pub type Images = Questions<Question>;
+
+/// What a registry has answered about the image.
+pub type ObservedImage = Observed<Result<Facts, Fault>>;
 
 impl Images {
     /// Starts the task that asks.
     pub fn start(aws: &Aws, client: Client, tasks: &Tasks, wake: Wake<Submission>) -> Self {
-        let shared = Arc::new(Shared::default());
-        let stop = tasks.stop().clone();
-        let asking = ask(Registries::new(aws), client, Arc::clone(&shared), wake);
-        tasks.stay("images", async move {
-            tokio::select! { () = stop.wait() => {}, () = asking => {} }
-        });
-        Self(shared)
-    }
-
-    /// Asks, unless that is asked already.
-    pub fn want(&self, submission: &Submission, question: Question) {
-        self.0
-            .want(uid_of(submission), ObjectRef::from_obj(submission), question);
-    }
-
-    /// What is known for the submission's present attempt.
-    pub fn observe(&self, submission: &Submission) -> ObservedImage {
-        let attempt = submission.status.as_ref().and_then(|status| status.attempt);
-        self.0.observe(&uid_of(submission), attempt.unwrap_or(1))
-    }
-
-    /// Drops what is known for an object that is gone.
-    pub fn forget(&self, uid: &str) {
-        self.0.lock().remove(uid);
-    }
-}
-
-impl Shared {
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn want(&self, uid: String, by: ObjectRef<Submission>, question: Question) {
-        let now = Instant::now();
-        let mut entries = self.lock();
-        let is_waited_for = |entry: &Entry| entry.answer.is_none() || now.saturating_duration_since(entry.asked) < KEPT;
-        entries.retain(|_, entry| is_waited_for(entry));
-        if entries.get(&uid).is_some_and(|entry| entry.question == question) {
-            return;
-        }
-        let entry = Entry {
-            question,
-            by,
-            asked: now,
-            is_under_way: false,
-            answer: None,
-        };
-        entries.insert(uid, entry);
-        self.notify.notify_one();
-    }
-
-    fn observe(&self, uid: &str, attempt: i64) -> ObservedImage {
-        let entries = self.lock();
-        let Some(entry) = entries.get(uid).filter(|entry| entry.question.attempt == attempt) else {
-            return ObservedImage::NotAsked;
-        };
-        match &entry.answer {
-            Some(answer) => ObservedImage::Answered(Arc::clone(answer)),
-            None => ObservedImage::Asked(entry.asked.elapsed()),
-        }
-    }
-
-    /// The question that has waited longest.
-    fn next(&self) -> Option<(String, Question, String)> {
-        let mut entries = self.lock();
-        let waiting = entries
-            .iter_mut()
-            .filter(|(_, entry)| !entry.is_under_way && entry.answer.is_none());
-        let (uid, entry) = waiting.min_by_key(|(_, entry)| entry.asked)?;
-        entry.is_under_way = true;
-        let namespace = entry.by.namespace.clone().unwrap_or_default();
-        Some((uid.clone(), entry.question.clone(), namespace))
-    }
-
-    /// Takes an answer in. Returns whom it is for.
-    fn done(&self, uid: &str, question: &Question, answer: Result<Facts, Fault>) -> Option<ObjectRef<Submission>> {
-        let mut entries = self.lock();
-        let entry = entries.get_mut(uid).filter(|entry| entry.question == *question)?;
-        entry.is_under_way = false;
-        entry.answer = Some(Arc::new(answer));
-        Some(entry.by.clone())
-    }
-}
-
-async fn ask(registries: Registries, client: Client, shared: Arc<Shared>, wake: Wake<Submission>) {
-    let mut under_way = FuturesUnordered::new();
-    loop {
-        while under_way.len() < AT_ONCE
-            && let Some((uid, question, namespace)) = shared.next()
-        {
-            let (client, registries) = (&client, &registries);
-            let asking = async move {
-                let credentials = credentials(client, &namespace, &question).await;
-                let answer = registries.look_up(&question.image, credentials).await;
-                (uid, question, answer)
-            };
-            under_way.push(asking.boxed());
-        }
-        tokio::select! {
-            Some((uid, question, answer)) = under_way.next() => {
-                shared.done(&uid, &question, answer).into_iter().for_each(&wake);
+        let registries = Arc::new(Registries::new(aws));
+        let ask = move |question: Question, namespace: String| {
+            let (client, registries) = (client.clone(), Arc::clone(&registries));
+            async move {
+                let credentials = credentials(&client, &namespace, &question).await;
+                registries.look_up(&question.image, credentials).await
             }
-            () = shared.notify.notified() => {}
-        }
+        };
+        Self::answered_by(ask, "images", tasks, wake)
     }
 }
 
@@ -189,6 +81,9 @@ async fn credentials(client: &Client, namespace: &str, question: &Question) -> O
 
 #[cfg(test)]
 mod tests {
+    use kube::runtime::reflector::ObjectRef;
+
+    use super::super::questions::{KEPT, Shared};
     use super::*;
 
     fn question(attempt: i64, reference: &str) -> Question {

@@ -19,6 +19,10 @@ pub(super) const LOGS_VOLUME: &str = "logs";
 pub(super) const TOOLS_VOLUME: &str = "tools";
 pub(super) const PODINFO_VOLUME: &str = "podinfo";
 pub(super) const IDENTITY_VOLUME: &str = "identity";
+/// Shared memory of an agent; the number of its pair follows.
+pub(super) const SHM_VOLUME: &str = "shm-agent-";
+/// Where programs look for it.
+pub(super) const SHM: &str = "/dev/shm";
 
 /// Status files, in simulators and agents.
 pub(super) const STATUS: &str = "/tmp/status";

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
 
+use super::team_use;
 use leaderboard_api::infrastructure_failures::MAX_TEAMS;
 use leaderboard_api::{InfrastructureFailures, Submission, TeamFailures, conditions, reasons};
 
@@ -123,9 +124,10 @@ pub fn teams(all: &[Arc<Submission>]) -> Vec<TeamFailures> {
     teams
 }
 
-/// By what the cache finds the Submissions of a Leaderboard that have an end of some attempt.
+/// By what the cache finds the Submissions of a Leaderboard that have an end of some attempt, or of a Job that had a GPU.
 pub fn index(submission: &Submission) -> Option<String> {
-    let has_end = finish(submission).is_some() || failures(submission).is_some();
+    let has_end =
+        finish(submission).is_some() || failures(submission).is_some() || team_use::gpu_seconds(submission) > 0;
     has_end.then(|| key(submission))
 }
 

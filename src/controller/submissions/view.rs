@@ -6,12 +6,13 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
+pub use super::foreign_runs::ObservedTraces;
+pub use super::images::ObservedImage;
 use super::report_digest::{ReportDigest, ReportId};
 use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
-use crate::services::registry::{Facts, Fault};
 use leaderboard_api::{JobNumber, Leaderboard, Rerun, Submission};
 
 /// Everything a decision may depend on.
@@ -24,11 +25,15 @@ pub struct View {
     pub is_policy_in_place: bool,
     /// What its registry has told of its image.
     pub image: ObservedImage,
+    /// What another program has left of it.
+    pub traces: ObservedTraces,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
     pub pod: Option<PodView>,
     pub node: ObservedNode,
+    /// The taint that announces that the node is about to be taken away.
+    pub leaving: Option<String>,
     pub report: ObservedReport,
     /// What was known of the run when the answer in `report` was asked for; None: nothing was read for this Job.
     pub report_stage: Option<Stage>,
@@ -51,15 +56,6 @@ pub struct View {
     pub team: TeamHistory,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
-}
-
-/// What a registry has told of the image, in the present attempt.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ObservedImage {
-    NotAsked,
-    /// It was asked this long ago.
-    Asked(Duration),
-    Answered(Arc<Result<Facts, Fault>>),
 }
 
 /// The Job that the present attempt should have.
@@ -126,6 +122,8 @@ pub struct PodView {
     pub scheduled: Option<Timestamp>,
     /// The scheduler's words, while no node fits.
     pub unschedulable: Option<String>,
+    /// What an autoscaler reports of that.
+    pub scale_up: Option<ScaleUp>,
     /// When it has to be gone, once it is being deleted (its grace included).
     pub delete_by: Option<Timestamp>,
     /// When its deletion was asked for.
@@ -138,6 +136,8 @@ pub struct PodView {
     pub containers: Vec<ContainerView>,
     /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
     pub ended_by_node: Option<(String, String)>,
+    /// Who takes it away: the reason of its condition `DisruptionTarget`.
+    pub disruption: Option<String>,
     pub stop: Option<Stop>,
 }
 
@@ -155,12 +155,31 @@ pub enum ObservedNode {
     Gone,
 }
 
+/// A node, as far as it matters to a run on it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct NodeView {
+    pub state: ObservedNode,
+    /// The taint that announces its end.
+    pub leaving: Option<String>,
+}
+
+/// What an autoscaler has reported of a Pod that no node accepts.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ScaleUp {
+    /// A node was asked for.
+    Coming(String),
+    /// None will be.
+    Refused(String),
+}
+
 /// One container of the Pod.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ContainerView {
     pub name: String,
     pub restarts: i32,
     pub running: bool,
+    /// When its present life began, while it runs.
+    pub began: Option<Timestamp>,
     /// Reason and message, while it waits.
     pub waiting: Option<(String, String)>,
     pub last: Option<EndView>,
@@ -346,6 +365,8 @@ pub struct EvalaiInfo {
     pub team_id: String,
     pub team_name: Option<String>,
     pub submitted_at: Option<Timestamp>,
+    /// When it was last re-run or resumed there.
+    pub resumed_at: Option<Timestamp>,
     /// The submission that this one re-runs.
     pub rerun_of: Option<Rerun>,
     /// The highest attempt whose Job its row names; 0 for none.

@@ -12,9 +12,10 @@ mod texts;
 
 pub use job::{Job, JobCondition, JobStatus};
 pub use meta::{Annotations, Labels, Meta, Owner};
-pub use node::{Node, NodeCondition, NodeStatus};
+pub use node::{Node, NodeCondition, NodeSpec, NodeStatus, Taint};
 pub use pod::{
-    Condition, ContainerName, ContainerState, ContainerStatus, Ended, Pod, PodSpec, PodStatus, Running, Waiting,
+    Condition, Conditions, ContainerName, ContainerState, ContainerStatus, Ended, Pod, PodSpec, PodStatus, Running,
+    Waiting,
 };
 pub use texts::{Text, Texts};
 

@@ -1,4 +1,4 @@
-//! A node as it is cached: its name, and whether its kubelet reports.
+//! A node as it is cached: its name, its taints, and whether its kubelet reports.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::core::ClusterResourceScope;
@@ -14,7 +14,21 @@ use super::watchable;
 #[serde(default)]
 pub struct Node {
     pub metadata: Meta,
+    pub spec: NodeSpec,
     pub status: NodeStatus,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct NodeSpec {
+    pub taints: Box<[Taint]>,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(default)]
+pub struct Taint {
+    pub key: Text,
+    pub effect: Text,
 }
 
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
@@ -40,6 +54,10 @@ fn ready<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<Nod
 
 impl Node {
     fn share_texts(&mut self, texts: &mut Texts) {
+        for taint in &mut self.spec.taints {
+            texts.share(&mut taint.key);
+            texts.share(&mut taint.effect);
+        }
         if let Some(ready) = &mut self.status.ready {
             texts.share(&mut ready.type_);
             texts.share(&mut ready.status);

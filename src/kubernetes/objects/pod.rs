@@ -37,11 +37,19 @@ pub struct PodStatus {
     pub reason: Option<Text>,
     #[serde(deserialize_with = "cut")]
     pub message: Option<Box<str>>,
-    /// The condition `PodScheduled`.
-    #[serde(rename = "conditions", deserialize_with = "scheduled")]
-    pub scheduled: Option<Box<Condition>>,
+    #[serde(deserialize_with = "conditions")]
+    pub conditions: Conditions,
     pub init_container_statuses: Box<[ContainerStatus]>,
     pub container_statuses: Box<[ContainerStatus]>,
+}
+
+/// What is read of a Pod's conditions.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Conditions {
+    /// `PodScheduled`.
+    pub scheduled: Option<Box<Condition>>,
+    /// The reason of `DisruptionTarget`, where it is True: who takes the Pod away.
+    pub disruption: Option<Text>,
 }
 
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
@@ -50,6 +58,7 @@ pub struct Condition {
     #[serde(rename = "type")]
     type_: Text,
     pub status: Text,
+    reason: Option<Text>,
     pub last_transition_time: Option<Time>,
     #[serde(deserialize_with = "cut")]
     pub message: Option<Box<str>>,
@@ -100,11 +109,17 @@ pub struct Ended {
     pub finished_at: Option<Time>,
 }
 
-fn scheduled<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<Condition>>, D::Error> {
-    let found = of_type(deserializer, |condition: &Condition| {
-        &*condition.type_ == "PodScheduled"
-    })?;
-    Ok(found.map(Box::new))
+fn conditions<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Conditions, D::Error> {
+    let all = Option::<Vec<Condition>>::deserialize(deserializer)?;
+    let mut found = Conditions::default();
+    for condition in all.into_iter().flatten() {
+        match &*condition.type_ {
+            "PodScheduled" => found.scheduled = Some(Box::new(condition)),
+            "DisruptionTarget" if &*condition.status == "True" => found.disruption = condition.reason,
+            _ => {}
+        }
+    }
+    Ok(found)
 }
 
 /// Of all conditions the one that is read.
@@ -143,9 +158,11 @@ impl Pod {
         shared.extend(spec.containers.iter_mut().map(|container| &mut container.name));
         shared.extend(&mut status.phase);
         shared.extend(&mut status.reason);
-        if let Some(scheduled) = &mut status.scheduled {
+        if let Some(scheduled) = &mut status.conditions.scheduled {
             shared.extend([&mut scheduled.type_, &mut scheduled.status]);
+            shared.extend(&mut scheduled.reason);
         }
+        shared.extend(&mut status.conditions.disruption);
         let all = [&mut status.init_container_statuses, &mut status.container_statuses];
         for container in all.into_iter().flat_map(|containers| containers.iter_mut()) {
             shared.push(&mut container.name);

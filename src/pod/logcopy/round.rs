@@ -12,7 +12,7 @@ use leaderboard_runner::protocol::{self, Mark, Side, StatusFile};
 use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
-use super::{LAST_FLUSH, LogcopyError, create};
+use super::{LANDING, LAST_FLUSH, LogcopyError, create};
 use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
@@ -29,6 +29,9 @@ use crate::services::archive::{Archive, ArchiveError, Fetched};
 
 /// Rounds of a container whose status files are stored: far more than retries a host forgives.
 const STATUS_ROUNDS: u32 = 64;
+/// What the last logs get at most if the node is about to be taken away: with the agents' end before it and the simulators' after it,
+/// all is stored before the controller deletes the Pod, 90 s after it has noticed.
+const LAST_LOGS_BEFORE_NODE: Duration = Duration::from_secs(40);
 /// Bytes of the owner that are read.
 const OWNER_BYTES: u64 = 1024;
 
@@ -123,7 +126,11 @@ impl Rounds {
             Why::Period => self.flush(),
             Why::Shutdown => self.flush().min(LAST_FLUSH),
         };
-        longest.checked_div(2).unwrap_or(longest)
+        let longest = longest.checked_div(2).unwrap_or(longest);
+        match *self.stop.borrow() {
+            Some(Stop::Interruption) => longest.min(LAST_LOGS_BEFORE_NODE),
+            _ => longest,
+        }
     }
 
     fn period(&self) -> Duration {
@@ -318,7 +325,11 @@ impl Rounds {
                 cut_at,
                 is_last: false,
             };
-            return self.uploader.sync(&files, window).await.map(drop);
+            return tokio::select! {
+                sent = self.uploader.sync(&files, window) => sent.map(drop),
+                // The results come first then; the last logs read everything once more.
+                () = before_node_goes(self.stop.clone()) => Ok(()),
+            };
         };
         for file in &mut files {
             file.haste = Haste::Now;
@@ -374,6 +385,16 @@ impl Rounds {
     }
 }
 
+/// Ends when a round under way has had its time to land, once the node is known to be taken away. Any other stop leaves a log its
+/// time.
+async fn before_node_goes(mut stop: watch::Receiver<Option<Stop>>) {
+    let is_it = |stop: &Option<Stop>| *stop == Some(Stop::Interruption);
+    if stop.wait_for(is_it).await.is_err() {
+        return std::future::pending().await;
+    }
+    tokio::time::sleep(LANDING).await;
+}
+
 /// An agent can make any number of them.
 fn is_of_first_rounds(file: &StatusFile) -> bool {
     match file {
@@ -389,4 +410,25 @@ fn is_news(name: &OsStr) -> bool {
     let is_mark = [".start", ".crash", ".done"].iter().any(|mark| name.contains(mark));
     let is_folder = ["agent", "simulator-"].iter().any(|start| name.starts_with(start)) && !name.contains('.');
     is_mark || is_folder
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn only_a_node_that_goes_cuts_the_logs_of_a_round_under_way() {
+        let (sender, receiver) = watch::channel(None);
+        for stop in [Stop::Cancel, Stop::Retries, Stop::RunDeadline] {
+            sender.send_replace(Some(stop));
+            let hour = Duration::from_hours(1);
+            let cut = tokio::time::timeout(hour, before_node_goes(receiver.clone())).await;
+            assert!(cut.is_err(), "{stop:?}");
+        }
+        let began = tokio::time::Instant::now();
+        let cut = before_node_goes(receiver);
+        sender.send_replace(Some(Stop::Interruption));
+        cut.await;
+        assert_eq!(began.elapsed(), LANDING, "what is in the air has its time to land");
+    }
 }

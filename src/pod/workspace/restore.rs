@@ -202,6 +202,7 @@ mod tests {
             key: key.to_owned(),
             size,
             etag: None,
+            stored: None,
         }
     }
 

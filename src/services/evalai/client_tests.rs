@@ -4,11 +4,12 @@ use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::task::{Context, Poll};
+use std::task::{Context, Poll, Waker};
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
+use super::super::http::is_canceled;
 use super::super::request::Purpose;
 use super::super::status::{Outcome, Progress};
 use super::super::types::Key;
@@ -108,17 +109,34 @@ async fn a_write_to_a_server_that_is_not_there_was_not_sent() {
     );
 }
 
-/// A connection that the other side has closed.
-struct Closed;
+/// A connection that the other side closes: at once, or when it has read something.
+#[derive(Default)]
+struct Closing {
+    reads_first: bool,
+    has_read: bool,
+    waker: Option<Waker>,
+}
 
-impl hyper::rt::Read for Closed {
-    fn poll_read(self: Pin<&mut Self>, _: &mut Context<'_>, _: hyper::rt::ReadBufCursor<'_>) -> Poll<io::Result<()>> {
-        Poll::Ready(Ok(()))
+impl hyper::rt::Read for Closing {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        _: hyper::rt::ReadBufCursor<'_>,
+    ) -> Poll<io::Result<()>> {
+        if self.has_read || !self.reads_first {
+            return Poll::Ready(Ok(()));
+        }
+        self.waker = Some(context.waker().clone());
+        Poll::Pending
     }
 }
 
-impl hyper::rt::Write for Closed {
-    fn poll_write(self: Pin<&mut Self>, _: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+impl hyper::rt::Write for Closing {
+    fn poll_write(mut self: Pin<&mut Self>, _: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.has_read = true;
+        if let Some(waker) = self.waker.take() {
+            waker.wake();
+        }
         Poll::Ready(Ok(bytes.len()))
     }
 
@@ -137,19 +155,17 @@ async fn a_request_whose_connection_was_closed_before_its_first_byte_was_not_sen
     #[error("it did not work")]
     struct Wrapped(#[source] hyper::Error);
 
-    let handshake = || hyper::client::conn::http1::handshake::<_, String>(Closed);
-    let (mut sender, connection) = handshake().await.unwrap();
-    drop(connection);
-    let unsent = sender
-        .send_request(hyper::Request::new(String::new()))
-        .await
-        .unwrap_err();
-    assert!(is_canceled(&Wrapped(unsent)));
-
-    // This one is sent, and then the answer breaks off.
-    let (mut sender, connection) = handshake().await.unwrap();
-    let sent = sender.send_request(hyper::Request::new(String::new()));
-    let (sent, _) = tokio::join!(sent, connection);
-    println!("{sent:?}");
-    assert!(!is_canceled(&io::Error::other("reset")));
+    let handshake = |reads_first| {
+        let peer = Closing {
+            reads_first,
+            ..Closing::default()
+        };
+        hyper::client::conn::http1::handshake::<_, String>(peer)
+    };
+    for reads_first in [false, true] {
+        let (mut sender, connection) = handshake(reads_first).await.unwrap();
+        let request = sender.send_request(hyper::Request::new(String::new()));
+        let (answer, _) = tokio::join!(request, connection);
+        assert_eq!(is_canceled(&Wrapped(answer.unwrap_err())), !reads_first);
+    }
 }

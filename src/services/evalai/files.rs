@@ -6,11 +6,13 @@ use reqwest::{Response, StatusCode, Url};
 use tokio::time::Instant;
 
 use super::answer::{About, Answer, Refusal};
-use super::client::{ClientError, LARGEST_UPLOAD, Need, Timeouts, builder, made, read, silence};
+use super::http::{ClientError, Need, Timeouts, builder, made, read, silence};
 use super::row::image;
 use super::types::ImageAnswer;
 use crate::services::public::{self, NotPublic, Reach};
 
+/// Largest file that is read, in bytes.
+const LARGEST_UPLOAD: usize = 64 << 10;
 /// How often a file may be somewhere else.
 const REDIRECTS: usize = 5;
 

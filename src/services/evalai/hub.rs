@@ -11,11 +11,15 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use super::client::{Client, ClientError, Timeouts};
+use super::client::Client;
+use super::http::{ClientError, Timeouts};
 use super::labels::Labels;
 use super::queue::{Now, Queue, Timing};
-use super::task::{Outlets, Shared, Task, now, run};
-use super::types::{Changed, DesiredUpdate, Key, Subject, SubmissionState, SweepRow, Target, Usage, WriteGuard};
+use super::task::{Arrived, Outlets, Shared, Task, now, run};
+use super::types::{
+    Changed, DesiredUpdate, InboxTrouble, Key, Load, Publisher, Subject, SubmissionState, SweepRow, Target, Usage,
+    WriteGuard,
+};
 use crate::observability::tasks::Tasks;
 use crate::services::meter::Meter;
 
@@ -28,6 +32,8 @@ pub struct Options {
     pub changed: mpsc::UnboundedSender<Changed>,
     /// Receives submissions whose message was lost.
     pub sweep: mpsc::UnboundedSender<SweepRow>,
+    /// Receives messages of the challenges' queues in EvalAI.
+    pub arrived: mpsc::UnboundedSender<Arrived>,
     pub timing: Timing,
     pub timeouts: Timeouts,
     /// Counts the requests.
@@ -113,6 +119,7 @@ impl Hub {
         let outlets = Outlets {
             changed: options.changed.clone(),
             sweep: options.sweep.clone(),
+            arrived: options.arrived.clone(),
         };
         Self(Arc::new(Inner {
             writes_from: wall(options.not_before),
@@ -156,7 +163,8 @@ impl Hub {
     }
 
     /// Requests an update of EvalAI. May be called in each reconcile: what is already done or requested changes nothing.
-    pub fn update(&self, subject: &Subject, update: DesiredUpdate) -> Result<(), ClientError> {
+    pub fn update(&self, publisher: &Publisher, update: DesiredUpdate) -> Result<(), ClientError> {
+        let subject = publisher.subject();
         self.with_subject(subject, |queue, now| queue.update(subject, update, now))
     }
 
@@ -189,14 +197,10 @@ impl Hub {
         Some(usage)
     }
 
-    /// Requests of the last minute, and updates that wait for one, over all tokens.
-    pub fn load(&self) -> (usize, usize) {
+    /// Over all tokens.
+    pub fn load(&self) -> Load {
         let queues: Vec<_> = self.state().tokens.values().map(|entry| entry.shared.clone()).collect();
-        queues.iter().fold((0, 0), |(used, waiting), shared| {
-            let queue = shared.queue();
-            let sent = queue.requests_of_last_minute(shared.now());
-            (used + sent as usize, waiting + queue.waiting())
-        })
+        queues.iter().map(|shared| shared.queue().load(shared.now())).sum()
     }
 
     /// Why EvalAI refuses a Leaderboard's token, at all or for the challenge; none while it does not.
@@ -205,6 +209,12 @@ impl Hub {
         let queue = shared.queue();
         let refused = queue.token_refused().or_else(|| queue.challenge_refused(leaderboard));
         refused.map(str::to_owned)
+    }
+
+    /// Why the queue of a Leaderboard's challenge is not read; none while it is, or need not be.
+    pub fn inbox_trouble(&self, leaderboard: &Key) -> Option<InboxTrouble> {
+        let shared = self.place(leaderboard)?;
+        shared.queue().inbox_trouble(leaderboard, shared.now())
     }
 
     /// Takes nothing new and waits for what is on its way, at most 70 s. True if every write is answered, so that the next
@@ -348,122 +358,4 @@ fn wall(at: Instant) -> Timestamp {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::observability::shutdown::Stop;
-    use crate::services::evalai::types::Run;
-    use crate::services::token::Token;
-    use futures::FutureExt;
-    use std::time::Duration;
-
-    fn hub(tasks: &Tasks, write_guard: impl WriteGuard) -> Hub {
-        Hub::new(Options {
-            write_guard: Arc::new(write_guard),
-            not_before: Instant::now(),
-            changed: mpsc::unbounded_channel().0,
-            sweep: mpsc::unbounded_channel().0,
-            timing: Timing::default(),
-            timeouts: Timeouts::default(),
-            meter: Meter::default(),
-            tasks: tasks.clone(),
-        })
-    }
-
-    fn target(token: &str) -> Target {
-        Target {
-            api_server: "http://127.0.0.1:9".into(),
-            challenge: 1,
-            split: "leaderboard".into(),
-            token: Arc::new(Token::parse(token).unwrap()),
-            requests_per_minute: 54,
-            sweep: Duration::from_mins(1),
-            period: Duration::from_secs(10),
-            phases: [1].into(),
-            labels: [].into(),
-            since: Timestamp::UNIX_EPOCH,
-        }
-    }
-
-    fn key(name: &str) -> Key {
-        Key {
-            namespace: "ns".into(),
-            name: name.into(),
-            uid: name.into(),
-        }
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn the_task_of_each_token_is_one_of_the_process() {
-        let (_stop, signal) = Stop::new();
-        let tasks = Tasks::new(signal);
-        // Nothing is sent anywhere: the guard's panic stands for any of the task's own.
-        let hub = hub(&tasks, || -> bool { panic!("on purpose") });
-        hub.serve(&key("board"), &target("x")).unwrap();
-        let failed = tokio::time::timeout(Duration::from_mins(1), tasks.failed()).await;
-        let failed = failed.unwrap().to_string();
-        assert!(
-            failed.starts_with("task EvalAI requests of token-") && failed.contains("has panicked: on purpose"),
-            "{failed}"
-        );
-        assert!(!hub.drain().await, "a write of it may have no answer");
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn nothing_is_remembered_of_a_thousand_submissions_that_are_forgotten() {
-        let (_stop, signal) = Stop::new();
-        let hub = hub(&Tasks::new(signal), || true);
-        let target = Arc::new(target("x"));
-        let subject = |pk: i64| Subject {
-            target: target.clone(),
-            key: key(&pk.to_string()),
-            pk,
-            run: Run {
-                attempt: 1,
-                job: format!("submission-{pk}-1"),
-                by_hand: false,
-                has_job: true,
-                ended: None,
-            },
-        };
-        for pk in 0..1000 {
-            hub.live(&subject(pk), Timestamp::UNIX_EPOCH).unwrap();
-        }
-        assert_eq!(hub.state().places.len(), 1000);
-        for pk in 0..1000 {
-            hub.forget(&subject(pk).key);
-        }
-        tokio::time::sleep(Duration::from_mins(2)).await;
-        let state = hub.state();
-        assert_eq!((state.places.len(), state.tokens.len()), (0, 0));
-        drop(state);
-        assert!(hub.view(&key("1")).is_none());
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn the_task_of_a_token_ends_when_nothing_uses_it_and_comes_back_with_the_next_use() {
-        let (_stop, signal) = Stop::new();
-        let tasks = Tasks::new(signal);
-        let hub = hub(&tasks, || true);
-        let running = || tasks.names().len();
-        let settled = async || tokio::time::sleep(Duration::from_mins(2)).await;
-        hub.serve(&key("one"), &target("x")).unwrap();
-        hub.serve(&key("two"), &target("x")).unwrap();
-        hub.serve(&key("three"), &target("y")).unwrap();
-        assert_eq!(running(), 2);
-        hub.retire(&key("one"));
-        hub.retire(&key("three"));
-        settled().await;
-        assert_eq!(running(), 1, "the one that a Leaderboard still uses");
-        assert_eq!(hub.state().tokens.len(), 1);
-        hub.serve(&key("two"), &target("y")).unwrap();
-        settled().await;
-        assert_eq!(running(), 1, "the renewed token's");
-        hub.retire(&key("two"));
-        settled().await;
-        assert_eq!((running(), hub.state().places.len()), (0, 0));
-        hub.serve(&key("two"), &target("x")).unwrap();
-        assert_eq!(running(), 1);
-        assert!(tasks.failed().now_or_never().is_none());
-        assert!(hub.drain().await);
-    }
-}
+mod tests;

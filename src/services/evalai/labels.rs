@@ -139,6 +139,8 @@ mod tests {
             period: Duration::from_secs(10),
             phases: phases.into(),
             labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+            inbox: None,
+            is_observed: false,
             since: Timestamp::UNIX_EPOCH,
         }
     }

@@ -10,6 +10,7 @@ pub mod budget;
 pub mod client;
 mod files;
 pub mod guard;
+mod http;
 pub mod hub;
 pub mod labels;
 mod payload;
@@ -20,13 +21,14 @@ pub mod status;
 mod task;
 pub mod types;
 
-pub use client::Timeouts;
+pub use http::{ClientError, Timeouts};
 pub use hub::{Hub, Options};
 pub use labels::{Labels, Misfit};
 pub use queue::Timing;
 pub use row::Row;
 pub use status::{Outcome, Progress, Status};
+pub use task::Arrived;
 pub use types::{
-    Changed, DesiredUpdate, Ended, ImageAnswer, Key, Payload, Run, Subject, SubmissionState, SweepRow, Swept, Target,
-    Usage, WriteGuard,
+    Arrival, Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Origin, Payload, Publisher, Run, Settled,
+    Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
 };

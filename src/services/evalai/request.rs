@@ -5,7 +5,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 
 use super::answer::Answer;
-use super::row::{DatasetSplit, Phase, Row, Split};
+use super::row::{DatasetSplit, Phase, Received, Row, Split};
 use super::status::{Outcome, Progress, Status};
 use super::types::{ImageAnswer, Key, Payload};
 
@@ -75,6 +75,12 @@ pub enum Request {
     Phases(i64),
     Splits(i64),
     DatasetSplit(i64, i64),
+    /// One message of a challenge's queue, by the queue's name.
+    Receive(String),
+    /// The row of a message's submission.
+    MessageRow(String, i64),
+    /// Deletes a message, by what was received with it.
+    DeleteMessage(String, String),
 }
 
 impl Request {
@@ -96,7 +102,13 @@ impl Request {
             | Self::Progress(subject, ..)
             | Self::Partial(subject, _)
             | Self::Final(subject, ..) => Some(subject),
-            Self::List { .. } | Self::Phases(_) | Self::Splits(_) | Self::DatasetSplit(..) => None,
+            Self::List { .. }
+            | Self::Phases(_)
+            | Self::Splits(_)
+            | Self::DatasetSplit(..)
+            | Self::Receive(_)
+            | Self::MessageRow(..)
+            | Self::DeleteMessage(..) => None,
         }
     }
 
@@ -122,6 +134,9 @@ impl Request {
             Self::Phases(_) => "get_phases",
             Self::Splits(_) => "get_splits",
             Self::DatasetSplit(..) => "get_dataset_split",
+            Self::Receive(_) => "receive_message",
+            Self::MessageRow(..) => "get_message_row",
+            Self::DeleteMessage(..) => "delete_message",
         }
     }
 
@@ -145,6 +160,9 @@ impl Request {
             Self::Phases(_) => "phases",
             Self::Splits(_) => "splits",
             Self::DatasetSplit(..) => "dataset split",
+            Self::Receive(_) => "message",
+            Self::MessageRow(..) => "row of a message",
+            Self::DeleteMessage(..) => "deletion of a message",
         }
     }
 }
@@ -160,6 +178,7 @@ pub enum Reply {
     Phases(Answer<Vec<Phase>>),
     Splits(Answer<Vec<Split>>),
     DatasetSplit(Answer<DatasetSplit>),
+    Message(Answer<Received>),
 }
 
 impl Reply {
@@ -182,6 +201,7 @@ impl Reply {
             Self::Phases(answer) => bare(answer),
             Self::Splits(answer) => bare(answer),
             Self::DatasetSplit(answer) => bare(answer),
+            Self::Message(answer) => bare(answer),
         }
     }
 }

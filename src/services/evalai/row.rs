@@ -152,6 +152,17 @@ pub struct Schema {
     pub labels: Vec<String>,
 }
 
+/// A message of a challenge's queue, or that there is none.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+pub struct Received {
+    /// Its text, as JSON.
+    #[serde(default)]
+    pub body: Value,
+    /// What deletes it.
+    #[serde(default)]
+    pub receipt_handle: Option<String>,
+}
+
 /// A dataset split.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 pub struct DatasetSplit {

@@ -14,7 +14,7 @@ use super::answer::{Answer, Silence};
 use super::client::Client;
 use super::queue::{Next, Now, Queue, Ticket};
 use super::request::Reply;
-use super::types::{Changed, SweepRow, WriteGuard};
+use super::types::{Arrival, Changed, Settled, SweepRow, WriteGuard};
 use crate::services::token::Token;
 
 /// How long answers are waited for at the end: longer than a write may take.
@@ -35,6 +35,25 @@ pub(super) struct Shared {
 pub(super) struct Outlets {
     pub changed: mpsc::UnboundedSender<Changed>,
     pub sweep: mpsc::UnboundedSender<SweepRow>,
+    pub arrived: mpsc::UnboundedSender<Arrived>,
+}
+
+/// A message of a challenge's queue that is to be taken in. One that is dropped without [`Arrived::settle`] comes back.
+pub struct Arrived {
+    pub arrival: Arrival,
+    serial: u64,
+    shared: Arc<Shared>,
+}
+
+impl Arrived {
+    /// Hands back what becomes of it.
+    pub fn settle(self, settled: Settled) {
+        let shared = &self.shared;
+        shared
+            .queue()
+            .settle_message(&self.arrival.queue, self.serial, settled, shared.now());
+        shared.notify.notify_one();
+    }
 }
 
 impl Shared {
@@ -72,10 +91,10 @@ impl Shared {
     }
 
     /// Reports what has changed.
-    pub fn publish(&self, outlets: &Outlets) {
-        let (changes, sweep) = {
+    pub fn publish(self: &Arc<Self>, outlets: &Outlets) {
+        let (changes, sweep, arrivals) = {
             let mut queue = self.queue();
-            (queue.take_changes(), queue.take_sweep())
+            (queue.take_changes(), queue.take_sweep(), queue.take_arrivals())
         };
         // A listener that is gone has no use for it.
         for change in changes {
@@ -83,6 +102,14 @@ impl Shared {
         }
         for row in sweep {
             let _ = outlets.sweep.send(row);
+        }
+        for (serial, arrival) in arrivals {
+            let shared = self.clone();
+            let _ = outlets.arrived.send(Arrived {
+                arrival,
+                serial,
+                shared,
+            });
         }
     }
 }
@@ -161,7 +188,7 @@ async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: 
     (ticket, Some(reply))
 }
 
-fn take(shared: &Shared, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
+fn take(shared: &Arc<Shared>, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
     match reply {
         Some(reply) => shared.queue().answered(ticket, reply, shared.now()),
         None => shared.queue().not_sent(ticket),

@@ -34,6 +34,10 @@ pub struct Target {
     pub phases: Arc<[i64]>,
     /// The metrics that its results hold.
     pub labels: Arc<[String]>,
+    /// Name of the challenge's queue, if it is to be read here.
+    pub inbox: Option<String>,
+    /// Nothing is written there.
+    pub is_observed: bool,
     /// When the Leaderboard was created: the sweep leaves alone what asked to be run before.
     pub since: Timestamp,
 }
@@ -59,6 +63,22 @@ pub struct Subject {
     /// Id of the submission in EvalAI.
     pub pk: i64,
     pub run: Run,
+}
+
+/// A submission whose Leaderboard publishes to EvalAI. Only it can be updated there, so that one which only observes is never
+/// written to.
+#[derive(Clone, Debug)]
+pub struct Publisher(Subject);
+
+impl Publisher {
+    /// None for a submission of a Leaderboard that only observes.
+    pub fn of(subject: Subject) -> Option<Self> {
+        (!subject.target.is_observed).then_some(Self(subject))
+    }
+
+    pub(super) fn subject(&self) -> &Subject {
+        &self.0
+    }
 }
 
 /// One attempt of a submission.
@@ -208,4 +228,67 @@ pub struct SweepRow {
     pub kind: Swept,
     /// When it asked to be run: its re-run or resume, else its submission.
     pub time: Timestamp,
+}
+
+/// A message of a challenge's queue in EvalAI, which shows neither when it was sent nor an id of it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Arrival {
+    /// Root of the server, as in [`Target::api_server`].
+    pub server: String,
+    /// Name of the queue.
+    pub queue: String,
+    /// Its text.
+    pub body: String,
+    /// What EvalAI shows of its submission.
+    pub origin: Origin,
+}
+
+/// What EvalAI shows of a message's submission.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// When its row asked to be run: its re-run or resume, else its submission.
+    Wanted(Timestamp),
+    /// It does not exist.
+    Missing,
+    /// Nothing that helps: the message names none, or one that this token may not read.
+    Hidden,
+}
+
+/// What becomes of a message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Settled {
+    /// It is deleted.
+    Delete,
+    /// It stays, and comes back.
+    Leave,
+}
+
+/// Why a challenge's queue in EvalAI is not read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct InboxTrouble {
+    /// EvalAI refuses it; else it has only failed for a while.
+    pub is_refused: bool,
+    /// EvalAI's answer.
+    pub why: String,
+}
+
+/// How busy a budget is, or several together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Load {
+    /// Requests of the last minute.
+    pub used: usize,
+    /// Requests that are allowed within a minute.
+    pub limit: usize,
+    /// Updates and questions that wait for a request.
+    pub waiting: usize,
+}
+
+impl std::iter::Sum for Load {
+    fn sum<I: Iterator<Item = Self>>(loads: I) -> Self {
+        loads.fold(Self::default(), |sum, load| Self {
+            used: sum.used + load.used,
+            limit: sum.limit + load.limit,
+            waiting: sum.waiting + load.waiting,
+        })
+    }
 }

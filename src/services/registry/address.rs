@@ -3,10 +3,12 @@
 //!
 //! A name is resolved once, and the connection goes to the address that was checked.
 
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use reqwest::Url;
 use reqwest::dns::{Addrs, Name, Resolve, Resolving};
+
+use leaderboard_api::ranges::{self, Range};
 
 /// How far a request may go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,22 +19,16 @@ pub(super) enum Reach {
     Public,
 }
 
-/// Addresses that answer for a machine of a cloud, and are not link-local.
-const OF_CLOUDS: [IpAddr; 3] = [
-    IpAddr::V4(Ipv4Addr::new(168, 63, 129, 16)),
-    IpAddr::V4(Ipv4Addr::new(100, 100, 100, 200)),
-    IpAddr::V6(Ipv6Addr::new(0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254)),
-];
-
 impl Reach {
     /// Whether it may go to this address.
     pub(super) fn allows(self, address: IpAddr) -> bool {
         let address = embedded(address);
         let is_machines = address.is_loopback() || address.is_unspecified() || address.is_multicast();
-        if is_machines || is_link_local(address) || OF_CLOUDS.contains(&address) {
+        let answers_for_machines = |alone| ranges::forbidden().any(|range| range.contains(alone));
+        if is_machines || Range::alone(address).is_none_or(answers_for_machines) {
             return false;
         }
-        self == Self::Registry || is_public(address)
+        self == Self::Registry || ranges::is_public(address)
     }
 }
 
@@ -57,31 +53,6 @@ fn embedded(address: IpAddr) -> IpAddr {
         // The old form `::a.b.c.d`, whose first two addresses are others.
         [0, 0, 0, 0, 0, 0, high, low] if high != 0 => last(high, low),
         _ => address,
-    }
-}
-
-fn is_link_local(address: IpAddr) -> bool {
-    match address {
-        IpAddr::V4(v4) => v4.is_link_local(),
-        IpAddr::V6(v6) => v6.segments()[0] & 0xffc0 == 0xfe80,
-    }
-}
-
-fn is_public(address: IpAddr) -> bool {
-    match address {
-        IpAddr::V4(v4) => {
-            let [a, b, c, _] = v4.octets();
-            let is_shared = a == 100 && (64..128).contains(&b);
-            let is_of_protocols = (a, b, c) == (192, 0, 0);
-            let is_of_benchmarks = a == 198 && (18..20).contains(&b);
-            !(v4.is_private() || v4.is_documentation() || v4.is_broadcast() || a == 0 || a >= 240)
-                && !(is_shared || is_of_protocols || is_of_benchmarks)
-        }
-        // Global unicast, without the part for documentation and Teredo.
-        IpAddr::V6(v6) => {
-            let [first, second, ..] = v6.segments();
-            first & 0xe000 == 0x2000 && !(first == 0x2001 && (second == 0xdb8 || second == 0))
-        }
     }
 }
 

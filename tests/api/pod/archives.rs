@@ -130,3 +130,49 @@ async fn an_s3_that_knows_no_conditions_stores_all_the_same() {
     }
     server.abort();
 }
+
+/// What S3 says of a stored object: how it is encrypted, with which key, and its class.
+async fn kept_as(pod: &Pod, key: &str) -> (String, String, String) {
+    let s3 = pod.aws.s3(None, Some(&server().await.endpoint()));
+    let bucket = &pod.setting.run.plan.storage.bucket;
+    let head = s3
+        .head_object()
+        .bucket(bucket)
+        .key(format!("runs/77/{key}"))
+        .send()
+        .await
+        .unwrap();
+    let text = |value: Option<&str>| value.unwrap_or_default().to_owned();
+    (
+        text(
+            head.server_side_encryption()
+                .map(aws_sdk_s3::types::ServerSideEncryption::as_str),
+        ),
+        text(head.ssekms_key_id()),
+        text(head.storage_class().map(aws_sdk_s3::types::StorageClass::as_str)),
+    )
+}
+
+#[tokio::test]
+async fn every_object_is_kept_as_the_leaderboard_says() {
+    const KEY: &str = "arn:aws:kms:us-east-1:000000000000:key/0a1b";
+    let pod = Pod::new().await;
+    let mut storage = pod.setting.run.plan.storage.clone();
+    storage.endpoint = Some(server().await.endpoint());
+    let run_id = &pod.setting.run.plan.run_id;
+    pod.put("file", &vec![7; 6 * MIB]);
+    let file = Arc::new(File::open(pod.path("file")).unwrap());
+    storage.kms_key_arn = Some(KEY.to_owned());
+    storage.storage_class = Some(StorageClass::StandardIa);
+    let archive = Archive::of_run(&pod.aws, &storage, run_id);
+    archive.put("whole", b"1".to_vec()).await.unwrap();
+    archive.replace("replaced", "1".into(), None).await.unwrap();
+    archive.upload("parts", &file, None, 6 << 20, None).await.unwrap();
+    for key in ["whole", "replaced", "parts"] {
+        let wanted = ["aws:kms", KEY, "STANDARD_IA"].map(str::to_owned).into();
+        assert_eq!(kept_as(&pod, key).await, wanted, "{key}");
+    }
+    // Without a word of the Leaderboard's the bucket decides.
+    pod.archive.put("as the bucket says", b"1".to_vec()).await.unwrap();
+    assert_eq!(kept_as(&pod, "as the bucket says").await.1, "");
+}

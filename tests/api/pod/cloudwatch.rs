@@ -1,6 +1,13 @@
 //! Each line once.
 
+use std::collections::BTreeMap;
+
+use leaderboard_operator::pod::ownlog::WORKSPACE_LOG;
+use leaderboard_operator::services::logs::LogsError;
+use tokio::sync::watch;
+
 use super::*;
+use crate::support::throttle::Throttle;
 
 /// A Pod whose logs go to a group of its own, and the group's name.
 async fn pod_with_logs() -> (Pod, String) {
@@ -10,6 +17,8 @@ async fn pod_with_logs() -> (Pod, String) {
         name: group.clone(),
         region: None,
         endpoint: None,
+        retention_days: None,
+        tags: BTreeMap::new(),
     });
     let logs = pod.aws.logs(None, None);
     logs.create_log_group().log_group_name(&group).send().await.unwrap();
@@ -97,6 +106,42 @@ async fn a_log_that_is_replaced_all_the_time_ends_its_stream_for_the_day_also_af
     restarted.pass(true).await.unwrap();
     assert_eq!(all(&logs, &group, "77/agent-1").await, sent);
     assert_eq!(all(&logs, &group, "77/agent-2").await, ["another agent"]);
+}
+
+#[tokio::test]
+async fn what_cloudwatch_throttles_is_sent_later_and_the_end_waits_for_it() {
+    let (mut pod, group) = pod_with_logs().await;
+    let logs = pod.aws.logs(None, None);
+    let throttle = Throttle::start(&server().await.endpoint(), "ThrottlingException").await;
+    pod.setting.run.log_group.as_mut().unwrap().endpoint = Some(throttle.endpoint().to_owned());
+    pod.append("agent/agent1/leaderboard.log", b"one\n");
+    pod.append("agent/agent2/leaderboard.log", b"of another\n");
+    let mut shipper = shipper(&pod, ship::STREAM_A_DAY);
+    for refused in 1..=2 {
+        throttle.refuse(1);
+        let error = shipper.pass(false).await.unwrap_err();
+        assert!(matches!(error, LogsError::Throttled { .. }), "{error}");
+        assert_eq!(throttle.refused(), refused);
+    }
+    shipper.pass(false).await.unwrap();
+    pod.append("agent/agent1/leaderboard.log", b"two\nno end");
+    throttle.refuse(3);
+    // The run is over: no round follows.
+    let (_sender, is_over) = watch::channel(true);
+    shipper.run(Duration::from_secs(1), is_over).await;
+    assert_eq!(throttle.refused(), 5);
+    assert_eq!(all(&logs, &group, "77/agent-1").await, ["one", "two", "no end"]);
+    assert_eq!(all(&logs, &group, "77/agent-2").await, ["of another"]);
+}
+
+#[tokio::test]
+async fn the_workspaces_log_has_a_stream_of_its_own() {
+    let (pod, group) = pod_with_logs().await;
+    let logs = pod.aws.logs(None, None);
+    pod.append(WORKSPACE_LOG, b"{\"message\":\"restored what was stored\"}\n");
+    shipper(&pod, ship::STREAM_A_DAY).pass(true).await.unwrap();
+    let sent = all(&logs, &group, "77/workspace").await;
+    assert_eq!(sent, ["{\"message\":\"restored what was stored\"}"]);
 }
 
 async fn all(logs: &aws_sdk_cloudwatchlogs::Client, group: &str, stream: &str) -> Vec<String> {

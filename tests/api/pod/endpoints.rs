@@ -16,6 +16,8 @@ async fn objects_and_lines_go_where_the_leaderboard_says() {
         name: group.clone(),
         region: None,
         endpoint: Some(endpoint.clone()),
+        retention_days: None,
+        tags: std::collections::BTreeMap::new(),
     });
     let logs = pod.aws.logs(None, Some(&endpoint));
     logs.create_log_group().log_group_name(&group).send().await.unwrap();

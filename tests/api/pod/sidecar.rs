@@ -166,6 +166,12 @@ async fn the_results_wait_for_s3_to_come_back() {
 
 #[tokio::test]
 async fn a_stop_cancels_stores_what_there_is_and_says_so() {
+    for stop in [Stop::Retries, Stop::Interruption] {
+        is_stopped(stop).await;
+    }
+}
+
+async fn is_stopped(stop: Stop) {
     let pod = Pod::new().await;
     pod.prepare().await.unwrap();
     pod.checkpoint(1, 1);
@@ -173,14 +179,14 @@ async fn a_stop_cancels_stores_what_there_is_and_says_so() {
     let logcopy = pod.logcopy();
     pod.reported(|report| report.done == 1).await;
     // As the kubelet does it: the name never holds half of the text.
-    fs::write(pod.setting.places.podinfo.join("next"), "Retries").unwrap();
+    fs::write(pod.setting.places.podinfo.join("next"), stop.as_str()).unwrap();
     fs::rename(pod.setting.places.podinfo.join("next"), pod.setting.places.stop()).unwrap();
     until_true(|| pod.has(StatusFile::Cancel)).await;
     pod.append("agent/agent1/leaderboard.log", b"stopped\n");
     until_true(|| pod.has(StatusFile::Stored)).await;
     let report = pod.report().await.unwrap();
     assert!(report.is_final && !report.eligible && report.done == 1);
-    assert_eq!(report.stopped, Some(Stop::Retries));
+    assert_eq!(report.stopped, Some(stop));
     assert_eq!(pod.stored("agent/agent1/leaderboard.log").await.unwrap(), b"stopped\n");
     assert!(
         pod.keys()

@@ -59,7 +59,11 @@ fn why_of_all() {
         ),
         named("submission-45", &waiting()),
     ];
-    let lines = overview::lines("carla", &submissions, Some(&[paused]), now());
+    let place = overview::Place {
+        namespace: "carla",
+        is_all: false,
+    };
+    let lines = overview::lines(place, &submissions, Some(&[paused]), now());
     assert_shown(&lines);
 }
 

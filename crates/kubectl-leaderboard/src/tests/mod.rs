@@ -1,6 +1,8 @@
 //! What the plugin prints and decides, as tables: objects in, lines out.
 
 mod change;
+mod check;
+mod daily;
 mod docs;
 mod overview;
 mod why;

@@ -5,11 +5,15 @@ use serde_json::{Value, json};
 use super::{
     assert_width, cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, waiting, with,
 };
-use crate::overview::lines;
+use crate::overview::{Place, lines, nothing};
 use leaderboard_api::{Leaderboard, Submission};
 
 fn printed(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> String {
-    let lines = lines("carla", submissions, leaderboards, now());
+    let place = Place {
+        namespace: "carla",
+        is_all: false,
+    };
+    let lines = lines(place, submissions, leaderboards, now());
     assert_width(&lines);
     lines.join("\n")
 }
@@ -75,7 +79,13 @@ Namespace carla has 1 submission. It is not waiting, failed or stuck."
         !text.contains("There is no Leaderboard"),
         "what has ended needs none: {text}"
     );
-    assert!(printed(&[], Some(&[])).starts_with("Namespace carla has no submissions."));
+    let text = |selector, elsewhere: &[(String, usize)]| nothing("carla", selector, elsewhere).join("\n");
+    assert!(text(None, &[]).starts_with("Namespace carla has no submissions. `kubectl get submissions -A`"));
+    assert_eq!(
+        text(None, &[("carla-20".to_owned(), 12), ("test".to_owned(), 1)]),
+        "Namespace carla has no submissions. There are some in carla-20 (12), test (1): use -n NAMESPACE, or\n-A."
+    );
+    assert_eq!(text(Some("a=b"), &[]), "No submission has the labels a=b.");
     let text = printed(&[], None);
     assert!(text.starts_with("You have no right to read Leaderboards"), "{text}");
 }

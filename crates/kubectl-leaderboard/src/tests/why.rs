@@ -338,7 +338,7 @@ fn the_log_is_read_where_the_run_was_stored() {
 /// Each reason in each state: there is a next step, and no line is too long (but for a command with a name of 52 letters).
 #[test]
 fn every_reason_has_a_next_step_within_the_width() {
-    for reason in reasons::ALL.iter().map(|reason| reason.name) {
+    for reason in reasons::all().map(|reason| reason.name) {
         for status in [waiting(), running(), crashed(), finished(), cancelled()] {
             let long = format!("{} {}", "word ".repeat(80), "x".repeat(300));
             let status = with(

@@ -10,8 +10,8 @@ use nix::libc;
 
 use crate::call::{call, of};
 use crate::modes;
+use crate::probe::{Probe, held, inherent};
 use crate::seen::Seen;
-use crate::table::{Probe, held, inherent};
 
 const READ_ONLY: &str = "mounted read-only";
 /// What every container has in /dev.

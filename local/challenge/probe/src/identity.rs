@@ -4,8 +4,8 @@ use std::env;
 use std::fs;
 use std::path::Path;
 
+use crate::probe::{Probe, held};
 use crate::seen::Seen;
-use crate::table::{Probe, held};
 
 /// Where clouds and Kubernetes put a Pod's tokens.
 const TOKENS: [&str; 4] = [

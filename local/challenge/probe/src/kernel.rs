@@ -9,8 +9,8 @@ use nix::libc::{self, c_long};
 use nix::unistd::getuid;
 
 use crate::call::{call, negative, of};
+use crate::probe::{Probe, by_policy, held};
 use crate::seen::Seen;
-use crate::table::{Probe, by_policy, held};
 
 const DROPPED: &str = "every capability is dropped";
 const FILTERED: &str = "the seccomp profile `RuntimeDefault`";

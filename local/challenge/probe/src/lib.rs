@@ -13,6 +13,7 @@ mod identity;
 mod kernel;
 pub mod modes;
 pub mod objects;
+pub mod probe;
 mod processes;
 pub mod seen;
 pub mod table;

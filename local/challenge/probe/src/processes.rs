@@ -7,8 +7,8 @@ use nix::errno::Errno;
 use nix::libc;
 
 use crate::call::{call, of};
+use crate::probe::{Probe, held, inherent};
 use crate::seen::Seen;
-use crate::table::{Probe, held, inherent};
 
 const RUNNER: usize = 1;
 const NOT_DUMPABLE: &str = "the runner is not dumpable";

@@ -1,6 +1,11 @@
 //! The agent image's program, installed as `/usr/bin/python3`.
 
-use std::{env, process::ExitCode, time::Duration};
+use std::{
+    env,
+    io::{self, Write as _},
+    process::ExitCode,
+    time::Duration,
+};
 
 use challenge_stand_in::{
     evaluator::{self, Ending, Environment},
@@ -11,6 +16,10 @@ use challenge_stand_in::{
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = env::args().skip(1).collect();
+    if env::var_os("CHALLENGE_PRINT_ARGUMENTS").is_some() {
+        // A reader of the log that went away is no reason to end.
+        let _ = writeln!(io::stdout(), "python3 {}", arguments.join(" "));
+    }
     let format = match env::var("CHALLENGE_FORMAT").unwrap_or_default().as_str() {
         "" => None,
         text => match Format::parse(text) {

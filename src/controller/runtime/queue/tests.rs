@@ -35,7 +35,7 @@ struct Running {
 /// A queue whose reconciles take as long as `takes` says for their key. Those that are new create a Job.
 fn start(takes: impl Fn(&Key) -> Duration + Send + Sync + 'static) -> Running {
     let classes = Class::ALL.map(Class::as_str);
-    let queue = Queue::new(LIMITS, Metrics::new().queue("submission", classes));
+    let queue = Queue::new(LIMITS, Metrics::default().queue("Submission", classes));
     let (tell, begun) = mpsc::unbounded_channel();
     let (stop, stopped) = Stop::new();
     let reconciles = Arc::clone(&queue);

@@ -230,6 +230,7 @@ impl World {
                 track: "sensors".into(),
                 priority: object.spec.priority,
                 submitted: object.metadata.creation_timestamp.as_ref().unwrap().0,
+                is_check: false,
             };
             return self.line.join(object.spec.attempt, place);
         }

@@ -8,8 +8,9 @@ use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
-use super::{end, image, isolation};
+use super::{end, foreign, image, isolation};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
+use leaderboard_api::check::first_route;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, effective, reasons};
@@ -38,7 +39,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
             end::cancelled(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(&status));
             return false;
         }
-        Answer::Wanted(info) => Some(info),
+        Answer::Wanted(info) => Some(*info),
     };
     take_team(draft, info.as_ref());
     let Some(track) = find_track(draft, leaderboard) else {
@@ -48,6 +49,10 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     draft.status.track = Some(track.name.clone());
     if let Some(what) = foreign_phase(draft, info.as_ref()) {
         return wait_for_phase(draft, &what);
+    }
+    // Before anything that could end it: an end is written over what the other program writes.
+    if foreign::waits(draft, leaderboard, track, info.as_ref()) {
+        return false;
     }
     let image = match named_image(draft, info.as_ref()) {
         Image::Named(image) => image,
@@ -141,7 +146,13 @@ pub(super) fn no_leaderboard(draft: &PlanBuilder<'_>) -> String {
 fn not_ready(draft: &PlanBuilder<'_>) -> Option<String> {
     let status = draft.view.leaderboard.as_ref()?.status.as_ref()?;
     let ready = conditions::get(&status.conditions, conditions::READY).filter(|c| c.status == "False")?;
-    let blocks = [reasons::INVALID_POD, reasons::PREFIX_CONFLICT].contains(&ready.reason.as_str());
+    let blocks = [
+        reasons::CLAIMS_NOT_SERVED,
+        reasons::CLAIM_TEMPLATE_MISSING,
+        reasons::INVALID_POD,
+        reasons::PREFIX_CONFLICT,
+    ]
+    .contains(&ready.reason.as_str());
     blocks.then(|| {
         format!(
             "Leaderboard {} is not ready ({}): {} Fix it, and the submission goes on.",
@@ -231,7 +242,7 @@ enum Answer {
     NotNeeded,
     Waiting,
     Ended(String),
-    Wanted(EvalaiInfo),
+    Wanted(Box<EvalaiInfo>),
 }
 
 fn ask_evalai(draft: &mut PlanBuilder<'_>) -> Answer {
@@ -241,7 +252,7 @@ fn ask_evalai(draft: &mut PlanBuilder<'_>) -> Answer {
     let view = draft.view.evalai.clone().unwrap_or_default();
     match view.info {
         Some(info) if info.standing == Standing::Ended => Answer::Ended(info.status),
-        Some(info) => Answer::Wanted(info),
+        Some(info) => Answer::Wanted(Box::new(info)),
         None => {
             draft.act(Action::AskEvalai);
             if let Some(left) = SILENCE
@@ -341,14 +352,19 @@ fn pin(
         },
         Some(pinned) => pinned,
         None => {
-            let resume = resumed || draft.spec().attempt > 1;
+            let resume = resumed || draft.spec().attempt > 1 || foreign::is_adopted(draft);
             let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
+            let plan = if draft.spec().check { first_route(plan) } else { plan };
             leaderboard_api::RunPlan {
                 earlier_attempts: earlier_attempts(draft, info),
                 ..plan
             }
         }
     };
+    if draft.spec().check && draft.status.checked_generation.is_none() {
+        let checked = draft.view.leaderboard.as_ref();
+        draft.status.checked_generation = checked.and_then(|leaderboard| leaderboard.metadata.generation);
+    }
     draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
     draft.status.plan = Some(plan);
     if draft.status.times.accepted.is_none() {

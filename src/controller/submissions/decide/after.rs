@@ -8,7 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
-use super::{accept, log, retention, stop};
+use super::{accept, log, observe, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, ObservedJob, ObservedTexts};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -24,6 +24,8 @@ const TOGETHER_SECONDS: i64 = 10;
 const RERUN_SECONDS: i64 = 60;
 /// What EvalAI calls a row that was cancelled.
 const CANCELLED: &str = "cancelled";
+/// What a check finds of the table.
+const TRIED: &str = "The table would take a row; a check writes none.";
 const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
                            the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
                            needed.";
@@ -45,7 +47,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     }
     let is_published = matches!(published, Delivery::Done | Delivery::Answered(_));
     let complete = is_published && recorded && log_left.is_none();
-    if complete && !follow_rerun(draft) {
+    if complete && !follow_rerun(draft) && !observe::awaits_end(draft) {
         draft.act(Action::Forget);
         retention::decide(draft);
     } else {
@@ -211,7 +213,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
-    if !is_ours || (is_evalais && !is_overtaken) {
+    if !is_ours || (is_evalais && !is_overtaken) || draft.observes() {
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
         return Delivery::Done;
     }
@@ -376,13 +378,15 @@ fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
         draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
         return Delivery::Done;
     }
-    if draft.status.team.as_ref().and_then(|t| t.id.as_ref()).is_none() {
+    let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
+    if !has_team && !draft.spec().check {
         let message = "The row needs a team; give spec.team.id to a submission that is not EvalAI's.";
         draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
         return Delivery::Done;
     }
     if view.end_written {
-        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
+        let message = if draft.spec().check { TRIED } else { "" };
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, message);
         return Delivery::Done;
     }
     let mut unread = None;
@@ -406,7 +410,7 @@ fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
 
 /// Whether all that the row shows is there: only that of a finished submission has metrics.
 fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
-    if draft.is_successful() {
+    if draft.is_successful() && !draft.spec().check {
         reading::report_of_end(draft)
     } else {
         Reading::Done

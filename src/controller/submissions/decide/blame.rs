@@ -159,6 +159,8 @@ fn of_simulator(end: &EndView) -> EndReason {
         Some(What::NotReady) => EndReason::SimulatorNotReady,
         Some(What::ServerSilent) => EndReason::SimulatorSilent,
         Some(What::PortTaken) => EndReason::PortTaken,
+        Some(What::NoGpu) => EndReason::NoGPU,
+        Some(What::GraphicsDriverMissing) => EndReason::GraphicsDriverMissing,
         None if is_start_error(end) => EndReason::SimulatorNotStarted,
         _ => EndReason::SimulatorCrashed,
     }
@@ -168,7 +170,14 @@ fn of_simulator(end: &EndView) -> EndReason {
 fn of_agent(end: &EndView) -> EndReason {
     let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
     match what(end) {
-        Some(What::PeerCrashed | What::NotReady | What::ServerSilent | What::PortTaken) => EndReason::BlamesSimulator,
+        Some(
+            What::PeerCrashed
+            | What::NotReady
+            | What::ServerSilent
+            | What::PortTaken
+            | What::NoGpu
+            | What::GraphicsDriverMissing,
+        ) => EndReason::BlamesSimulator,
         Some(What::Idle) => EndReason::Idle,
         Some(What::CannotStart) => EndReason::CannotStart,
         _ if end.reason == "OOMKilled" => EndReason::OutOfMemory,

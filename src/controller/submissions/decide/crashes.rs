@@ -86,7 +86,8 @@ fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
 pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     let limit = draft.retries().per_pair.saturating_add(1);
     let is_too_many =
-        |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair) == Some(EndReason::CannotStart));
+        |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair).is_some_and(is_hopeless));
+    let node = draft.status.node_name.as_deref();
     let mut awaited = None;
     for pair in draft.status.pairs.iter().filter(is_too_many) {
         let Some(cause) = cause(pair) else { continue };
@@ -94,7 +95,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
         let crash = pod.and_then(|pod| last_crash(pod, pair.id, draft.now()));
         // Who goes on to fail while the other side's word is waited for puts its end off no further.
         match crash.filter(|crash| !crash.is_settled && pair.crashes <= limit) {
-            None => return Some(of_pair(pair.id, pair.crashes, cause)),
+            None => return Some(of_pair(pair, cause, node)),
             Some(crash) => awaited = awaited.or(crash.at),
         }
     }
@@ -108,7 +109,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
 pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
     let crashed = status.pairs.iter().filter(|p| p.crashes > 0 && p.last.is_some());
     let pair = crashed.max_by_key(|p| p.crashes)?;
-    Some(of_pair(pair.id, pair.crashes, cause(pair)?))
+    Some(of_pair(pair, cause(pair)?, status.node_name.as_deref()))
 }
 
 /// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
@@ -123,13 +124,23 @@ fn cause(pair: &PairStatus) -> Option<EndReason> {
     pair.last.as_ref().map(|last| last.reason)
 }
 
-fn of_pair(id: i32, crashes: i32, cause: EndReason) -> Failure {
-    let times = if crashes == 1 {
-        "once".to_owned()
-    } else {
-        format!("{crashes} times")
+/// Whether another round in the same Pod would end in the same way.
+fn is_hopeless(cause: EndReason) -> bool {
+    matches!(
+        cause,
+        EndReason::CannotStart | EndReason::NoGPU | EndReason::GraphicsDriverMissing
+    )
+}
+
+fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
+    let id = pair.id;
+    let times = match pair.crashes {
+        1 => "once".to_owned(),
+        crashes => format!("{crashes} times"),
     };
-    let failure = if let Some(what) = of_simulator(cause) {
+    let failure = if let Some((reason, what)) = of_graphics(id, cause, node) {
+        infrastructure(reason, &what)
+    } else if let Some(what) = of_simulator(cause) {
         let what = format!("The simulator of pair {id} failed {times}: {what}.");
         infrastructure(reasons::SIMULATION_CRASHED, &what)
     } else {
@@ -139,6 +150,25 @@ fn of_pair(id: i32, crashes: i32, cause: EndReason) -> Failure {
     Failure {
         pair: Some(id),
         ..failure
+    }
+}
+
+/// What a simulator lacked to draw.
+fn of_graphics(id: i32, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
+    let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
+    match cause {
+        EndReason::NoGPU => Some((
+            reasons::NO_GPU,
+            format!("Simulator {id} saw no GPU on {node}, although the Leaderboard gives it one."),
+        )),
+        EndReason::GraphicsDriverMissing => Some((
+            reasons::GRAPHICS_DRIVER_MISSING,
+            format!(
+                "Simulator {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
+                 (nvidia_icd.json)."
+            ),
+        )),
+        _ => None,
     }
 }
 

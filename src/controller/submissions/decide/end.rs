@@ -6,12 +6,12 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, crashes, failure, reading};
+use super::{allowance, crashes, failure, interruption, reading};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, reasons};
+use leaderboard_api::{Failure, FailureClass, MAX_NODES_WITHOUT_GPU, NodeWithoutGpu, reasons};
 
 /// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
 const NO_ANSWER: &str = "its bucket has not answered yet.";
@@ -100,7 +100,10 @@ pub(super) fn is_verdict(report: &ReportDigest) -> bool {
 
 /// Whether the end still waits until the bucket can be read.
 fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
-    let limit = if draft.is_cancelled() {
+    // A host waits for a check, and an unreadable bucket is what it is to show.
+    let limit = if draft.spec().check {
+        READ_AT_LEAST_SECONDS
+    } else if draft.is_cancelled() {
         draft.deadlines().cancel_seconds.max(READ_AT_LEAST_SECONDS)
     } else {
         READ_SECONDS
@@ -182,7 +185,8 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const FINAL: [&str; 4] = [
+    const FINAL: [&str; 5] = [
+        reasons::GRAPHICS_DRIVER_MISSING,
         reasons::PREFIX_IN_USE,
         reasons::JOB_DELETED,
         reasons::JOB_EXPIRED,
@@ -191,18 +195,32 @@ fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
     let can_recover = !FINAL.contains(&found.reason.as_str());
     // A higher attempt that is already requested takes the place of a retry.
     let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
-    can_recover
-        && is_latest
-        && !allowance::is_used_up(draft, found)
-        && draft.status.retry < draft.retries().infrastructure
+    let is_left = interruption::is_one(found)
+        || (!allowance::is_used_up(draft, found)
+            && interruption::other_failures(&draft.status) < draft.retries().infrastructure);
+    can_recover && is_latest && is_left
 }
 
 fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
-    let delay = RETRY_SECONDS << draft.status.retry.clamp(0, MAX_DOUBLINGS);
+    let failures = interruption::other_failures(&draft.status);
+    let (delay, next) = if interruption::is_one(found) {
+        let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
+        (0, next.to_owned())
+    } else {
+        let delay = RETRY_SECONDS << failures.clamp(0, MAX_DOUBLINGS);
+        (delay, format!("It is tried again in {delay} s; this costs no attempt."))
+    };
     let at = after(draft.now(), delay);
+    count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
+    if interruption::is_one(found) {
+        interruption::note(draft);
+    }
     draft.status.retry += 1;
     draft.status.job_name = None;
-    draft.status.node_name = None;
+    let node = draft.status.node_name.take();
+    if let Some(node) = node.filter(|_| found.reason == reasons::NO_GPU) {
+        note_without_gpu(&mut draft.status.nodes_without_gpu, node);
+    }
     draft.status.failure = None;
     draft.status.recreated = 0;
     draft.status.next_retry_time = Some(Time(at));
@@ -213,11 +231,23 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
         pair.last = None;
     }
     let what = &found.message;
-    let message = format!("{what} It is tried again in {delay} s; this costs no attempt.");
+    let message = format!("{what} {next}");
     draft.moves();
     draft.condition(conditions::RUNNING, Truth::False, &found.reason, what);
     draft.show(reasons::REPLACING, message);
     draft.requeue_at(at);
+}
+
+/// Counts a Job that a node gave no GPU. Of too many nodes the oldest is forgotten.
+pub(super) fn note_without_gpu(nodes: &mut Vec<NodeWithoutGpu>, node_name: String) {
+    if let Some(known) = nodes.iter_mut().find(|known| known.node_name == node_name) {
+        known.jobs = known.jobs.saturating_add(1);
+        return;
+    }
+    if nodes.len() >= MAX_NODES_WITHOUT_GPU {
+        nodes.remove(0);
+    }
+    nodes.push(NodeWithoutGpu { node_name, jobs: 1 });
 }
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
@@ -239,6 +269,9 @@ pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
 fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
+    if !draft.is_finished() {
+        count_use(draft, ended);
+    }
     draft.status.times.finished = Some(Time(ended));
     let started = draft.status.times.started.as_ref();
     draft.status.duration = started.map(|started| duration(ended.duration_since(started.0).as_secs()));
@@ -261,6 +294,16 @@ fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     }
     draft.show(reason, message);
+}
+
+/// Counts what the present Job has used, from its Pod's scheduling until its end.
+pub(super) fn count_use(draft: &mut PlanBuilder<'_>, until: Timestamp) {
+    let Some(scheduled) = draft.status.times.scheduled.as_ref().map(|time| time.0) else {
+        return;
+    };
+    if let Some(usage) = &mut draft.status.usage {
+        usage.add(until.duration_since(scheduled).as_secs());
+    }
 }
 
 /// A time span in its two largest units.

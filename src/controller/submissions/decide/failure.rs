@@ -143,9 +143,9 @@ fn is_agents_disk(message: &str) -> bool {
 
 /// The stop that a failure calls for.
 pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
-    if failure.is_some_and(|f| f.reason == reasons::TIME_LIMIT) {
-        Stop::RunDeadline
-    } else {
-        Stop::Retries
+    match failure.map(|failure| failure.reason.as_str()) {
+        Some(reasons::TIME_LIMIT) => Stop::RunDeadline,
+        Some(reasons::NODE_INTERRUPTED) => Stop::Interruption,
+        _ => Stop::Retries,
     }
 }

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::failure::{charged, infrastructure};
+use super::failure::{charged, infrastructure, participant};
+use super::next_steps::for_both;
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::images::Question;
@@ -44,12 +45,25 @@ pub(super) fn not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec
     let patterns = patterns(draft, leaderboard);
     let is_allowed = patterns
         .as_ref()
-        .is_none_or(|all| all.iter().any(|p| p.allows(&repository, team)));
+        .is_none_or(|all| all.iter().any(|p| p.allows(&repository, team)))
+        || is_check_image(draft, leaderboard, &repository);
     if is_allowed && !is_hosts {
         return None;
     }
+    if draft.spec().check {
+        let what = "The image of the check is neither check.image of the Leaderboard nor allowed by agent.images.";
+        let step = "Name it in check.image of the Leaderboard, and run the check again.";
+        return Some(participant(reasons::IMAGE_NOT_ALLOWED, what, &for_both(step)));
+    }
     let what = "The submitted image is not one that your team may submit to this leaderboard.";
     Some(charged(reasons::IMAGE_NOT_ALLOWED, what))
+}
+
+/// Whether a check runs what its Leaderboard names for that.
+fn is_check_image(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, repository: &Repository<'_>) -> bool {
+    let named = leaderboard.check.as_ref().filter(|_| draft.spec().check);
+    let named = named.and_then(|check| ImageReference::parse(&check.image).ok());
+    named.is_some_and(|named| Repository::of(&named).is_same(repository))
 }
 
 /// What may be submitted; none: everything.
@@ -59,7 +73,9 @@ fn patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Ve
         Some(images) => Some(images.clone()),
         None => {
             let of_evalai = || vec![ImagePattern(image_pattern::OF_EVALAI.to_owned())];
-            draft.spec().evalai.map(|_| of_evalai())
+            // A check proves that the operator can ask a registry as it does for participants.
+            let is_asked = draft.spec().evalai.is_some() || (draft.spec().check && leaderboard.evalai.is_some());
+            is_asked.then(of_evalai)
         }
     }
 }
@@ -104,7 +120,8 @@ fn ask(
             reference: named.to_owned(),
             may_be_local: patterns
                 .iter()
-                .any(|pattern| pattern.names_registry(repository.registry)),
+                .any(|pattern| pattern.names_registry(repository.registry))
+                || is_check_image(draft, leaderboard, &repository),
         },
         secrets: pull_secrets(leaderboard),
     };

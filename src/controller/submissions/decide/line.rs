@@ -4,6 +4,7 @@ use kube::ResourceExt;
 
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
+use crate::controller::slots::check_team;
 use crate::controller::slots::turns::{InLine, Turn};
 use leaderboard_api::{Eta, Waiting, reasons};
 
@@ -52,13 +53,16 @@ fn join(draft: &mut PlanBuilder<'_>) {
     let status = &draft.status;
     let team = status.team.as_ref();
     let team = team.and_then(|team| team.id.clone().or_else(|| team.name.clone()));
+    let is_check = draft.spec().check;
+    let own = is_check.then(|| check_team(&draft.submission().name_any()));
     let place = InLine {
         uid: draft.submission().metadata.uid.clone().unwrap_or_default(),
         name: draft.submission().name_any(),
-        team: team.unwrap_or_default(),
+        team: own.or(team).unwrap_or_default(),
         track: status.track.clone().unwrap_or_default(),
         priority: draft.spec().priority,
         submitted: status.times.submitted.as_ref().map_or(draft.now(), |time| time.0),
+        is_check,
     };
     draft.act(Action::JoinLine(place));
 }

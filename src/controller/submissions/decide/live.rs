@@ -6,7 +6,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate, job_name};
 use super::plan_builder::{PlanBuilder, after};
-use super::{accept, crashes, end, failure, isolation, line, reading, start, stop};
+use super::{accept, crashes, end, failure, interruption, isolation, line, reading, start, stop};
+use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
@@ -133,6 +134,7 @@ fn start_job(draft: &mut PlanBuilder<'_>) {
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
     draft.status.job_name = Some(name);
+    note_gpus(draft);
     draft.act(Action::CreateJob(draft.status.job_number()));
     draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
     if draft.is_running() {
@@ -145,6 +147,18 @@ fn start_job(draft: &mut PlanBuilder<'_>) {
     update_evalai(draft);
     record(draft);
     draft.requeue_in(LOOK);
+}
+
+/// How many GPUs the next Job has: the Leaderboard may be another one when it ends.
+fn note_gpus(draft: &mut PlanBuilder<'_>) {
+    let (Some(spec), Some(plan)) = (draft.leaderboard(), draft.status.plan.as_ref()) else {
+        return;
+    };
+    let track = spec.tracks.iter().find(|track| track.name == plan.track);
+    let gpus = job_spec::gpus(spec, track, plan);
+    if gpus > 0 || draft.status.usage.is_some() {
+        draft.status.usage.get_or_insert_default().gpus = gpus;
+    }
 }
 
 /// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
@@ -186,6 +200,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
             draft.fail(failure::job_deleted());
             return end::decide(draft, None);
         }
+        end::count_use(draft, draft.now());
         draft.status.recreated += 1;
         draft.status.times.scheduled = None;
         draft.event(
@@ -235,6 +250,9 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
     if !draft.is_to_stop() {
         watch_run(draft);
+    }
+    if !draft.is_to_stop() {
+        interruption::notice(draft);
     }
     if !draft.is_to_stop() {
         start::watch(draft, job);
@@ -358,7 +376,7 @@ fn update_evalai(draft: &mut PlanBuilder<'_>) {
 }
 
 fn record(draft: &mut PlanBuilder<'_>) {
-    if draft.view.record.is_some() {
+    if draft.view.record.is_some() && !draft.spec().check {
         draft.act(Action::Record { end: false });
     }
 }

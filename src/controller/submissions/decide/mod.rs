@@ -1,8 +1,8 @@
 //! What is to be done for one submission: a pure function from a `View` to a `Plan`.
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
-//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `blame`
-//! decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `retention` deletes what
+//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `interruption` is a
+//! node that is taken away, `pulls` bounds a start, `blame` decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `retention` deletes what
 //! has ended long ago, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
@@ -12,14 +12,18 @@ mod blame;
 mod crashes;
 mod end;
 mod failure;
+mod foreign;
 mod image;
+mod interruption;
 mod isolation;
 mod line;
 mod live;
 mod log;
 mod next_steps;
+mod observe;
 mod plan;
 mod plan_builder;
+mod pulls;
 mod reading;
 mod retention;
 mod start;
@@ -39,6 +43,11 @@ use plan_builder::PlanBuilder;
 /// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
     let mut draft = PlanBuilder::new(view);
+    if view.submission.awaits_import() {
+        // Its status shows an end, and comes with the next write.
+        draft.keeps_status();
+        return draft.into_plan(None);
+    }
     if draft.begin_attempt() {
         // What was observed is of another attempt.
         after::leave_job(&mut draft);
@@ -64,7 +73,8 @@ fn decide_stage(draft: &mut PlanBuilder<'_>) {
 
 /// A deletion waits only for another system that has heard of the submission, or will, and not of its end.
 fn needs_finalizer(draft: &PlanBuilder<'_>) -> bool {
-    let is_owed = draft.spec().evalai.is_some() || draft.view.record.is_some();
+    let is_recorded = draft.view.record.is_some() && !draft.spec().check;
+    let is_owed = draft.spec().evalai.is_some() || is_recorded;
     let has_begun = draft.status.job_name.is_some() || draft.status.retry > 0;
     let is_told = draft.does(|action| matches!(action, Action::UpdateEvalai(_) | Action::Record { .. }));
     let is_settled = draft.does(|action| *action == Action::Forget);

@@ -59,8 +59,12 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::IMAGE_DENIED => "The submitted image could not be read in its registry.",
         reasons::IMAGE_PULL => "An image could not be pulled.",
         reasons::NODE_LOST => "The machine that ran the submission was lost.",
+        reasons::NODE_INTERRUPTED => "The machine that ran the submission was taken away.",
         reasons::RESULTS_NOT_STORED => "The results could not be stored.",
         reasons::SIMULATION_CRASHED => "The simulator crashed.",
+        reasons::NO_GPU | reasons::GRAPHICS_DRIVER_MISSING => {
+            "The machine that ran the submission could not run the simulator."
+        }
         reasons::START_DEADLINE => "The run could not be started in time.",
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
         reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",

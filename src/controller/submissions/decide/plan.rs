@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
+use crate::controller::submissions::foreign_runs;
 use crate::controller::submissions::images::Question;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
@@ -32,6 +33,8 @@ pub enum Action {
     JoinLine(InLine),
     /// Ask the image's registry.
     LookUpImage(Question),
+    /// Look whether another program runs the submission.
+    LookForForeignRun(Box<foreign_runs::Question>),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

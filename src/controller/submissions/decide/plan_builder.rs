@@ -58,6 +58,11 @@ impl<'a> PlanBuilder<'a> {
         self.view.leaderboard.as_ref().map(|l| &l.spec)
     }
 
+    /// Nothing is written to EvalAI, where another program runs the submission too.
+    pub(super) fn observes(&self) -> bool {
+        self.leaderboard().is_some_and(LeaderboardSpec::observes)
+    }
+
     pub(super) fn deadlines(&self) -> Deadlines {
         let track = self.status.track.as_deref().or(self.spec().track.as_deref());
         let of =
@@ -172,6 +177,7 @@ impl<'a> PlanBuilder<'a> {
             results_url: old.results_url,
             rerun_of: old.rerun_of,
             infrastructure_failures: old.infrastructure_failures,
+            usage: old.usage,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,
                 ..Default::default()

@@ -9,8 +9,9 @@ use jiff::Timestamp;
 use super::failure::{self, infrastructure, participant};
 use super::next_steps::for_both;
 use super::plan_builder::{PlanBuilder, after};
+use super::pulls::{self, Limit};
 use super::trouble::{self, Trouble};
-use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
+use crate::controller::submissions::view::{JobView, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, names, reasons};
@@ -25,6 +26,8 @@ const SILENCE: i64 = 45;
 const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
 /// How long a new Pod may find no node before that is shown: the Pod whose slot it got may still be leaving.
 const SETTLE_SECONDS: i64 = 5;
+/// How long something may keep a check from starting that seldom resolves itself. A host waits for it.
+const CHECK_SECONDS: i64 = 60;
 /// How long a Job may take to make its Pod before that is shown.
 const POD_SECONDS: i64 = 45;
 
@@ -43,32 +46,49 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
         return replacing(draft, &message);
     }
     if let Some(words) = &pod.unschedulable {
-        return unschedulable(draft, job, words);
+        return unschedulable(draft, job, words, pod.scale_up.as_ref());
     }
     let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
+    let found = trouble::of_pod(pod);
+    let stalled = found
+        .as_ref()
+        .map(|found| draft.stalled_since(found.reason).unwrap_or(draft.now()));
     // Until the scheduler has spoken there is no node that could be late.
-    let deadline = pod.scheduled.map(|at| after(at, draft.deadlines().start_seconds));
-    let is_over = deadline.is_some_and(|deadline| draft.now() >= deadline);
+    let limit = pulls::limit(pod, &draft.deadlines(), stalled);
+    let over = limit.filter(|limit| draft.now() >= limit.at);
     let has_started = pod.agent_started.is_some();
-    match trouble::of_pod(pod) {
-        Some(found) if found.is_hopeless || (is_over && found.is_start) => {
-            draft.fail(too_late(&found, draft.deadlines().start_seconds));
+    match (found, over) {
+        (Some(found), _) if found.is_hopeless => draft.fail(too_late(&found, draft.deadlines().start_seconds)),
+        (Some(found), Some(over)) if found.is_start => draft.fail(too_late(&found, over.seconds)),
+        (Some(found), _) if found.is_start && lasts_in_check(draft, found.reason) => {
+            draft.fail(too_late(&found, CHECK_SECONDS));
         }
-        Some(found) => {
+        (Some(found), _) => {
             show_trouble(draft, &found, has_started);
-            if let Some(deadline) = deadline.filter(|_| found.is_start) {
-                draft.requeue_at(deadline);
+            if let Some(limit) = limit.filter(|_| found.is_start) {
+                draft.requeue_at(limit.at);
             }
         }
-        None if has_started => show_running(draft),
-        None if is_over => draft.fail(start_deadline(pod, draft.deadlines().start_seconds)),
-        None => {
+        (None, _) if has_started => show_running(draft),
+        (None, Some(over)) => draft.fail(start_deadline(pod, over)),
+        (None, None) => {
             show_preparing(draft, pod, since);
-            if let Some(deadline) = deadline {
-                draft.requeue_at(deadline);
+            if let Some(limit) = limit {
+                draft.requeue_at(limit.at);
             }
         }
     }
+}
+
+/// Whether a check has been held up by the same thing for too long. If not yet, it is looked at again then.
+fn lasts_in_check(draft: &mut PlanBuilder<'_>, reason: &str) -> bool {
+    if !draft.spec().check {
+        return false;
+    }
+    let since = draft.stalled_since(reason).unwrap_or(draft.now());
+    let until = after(since, CHECK_SECONDS);
+    draft.requeue_at(until);
+    draft.now() >= until
 }
 
 /// The message for a run whose node is away, before Kubernetes has given its Pod up.
@@ -185,12 +205,17 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
     draft.requeue_in(Duration::from_secs(15));
 }
 
-fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str) {
+fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_up: Option<&ScaleUp>) {
     let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
     if let Some(settled) = settled.filter(|at| draft.now() < *at) {
         return draft.requeue_at(settled);
     }
-    wait_for_node(draft, job, reasons::UNSCHEDULABLE, &sentence(words));
+    let of_nodes = match scale_up {
+        Some(ScaleUp::Coming(words)) => format!(" A node is on its way: {}", sentence(words)),
+        Some(ScaleUp::Refused(words)) => format!(" The autoscaler adds no node: {}", sentence(words)),
+        None => String::new(),
+    };
+    wait_for_node(draft, job, reasons::UNSCHEDULABLE, &(sentence(words) + &of_nodes));
 }
 
 /// No node has the Pod: waits as long as `scheduleSeconds` says, and says why.
@@ -201,7 +226,13 @@ fn wait_for_node(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, messa
     } else {
         job.created
     };
-    let limit = draft.deadlines().schedule_seconds;
+    // A node may still come; what refuses the Pod stays.
+    let is_refused = draft.spec().check && reason != reasons::UNSCHEDULABLE;
+    let limit = if is_refused {
+        CHECK_SECONDS
+    } else {
+        draft.deadlines().schedule_seconds
+    };
     if limit > 0 {
         let deadline = after(since.unwrap_or(draft.now()), limit);
         if draft.now() >= deadline {
@@ -247,11 +278,17 @@ fn too_late(found: &Trouble, seconds: i64) -> Failure {
     }
 }
 
-fn start_deadline(pod: &PodView, seconds: i64) -> Failure {
+fn start_deadline(pod: &PodView, over: Limit) -> Failure {
     let node = pod.node.as_deref().unwrap_or("the node");
-    let what = format!(
-        "The Pod did not start within {seconds} s, and {node} reports no reason: {}.",
-        stage(pod)
-    );
+    let seconds = over.seconds;
+    let what = if over.is_of_pulls {
+        let names = pulls::waiting(pod).join(", ");
+        format!("The images of the Pod were not pulled within {seconds} s on {node}; these containers wait: {names}.")
+    } else {
+        format!(
+            "The Pod did not start within {seconds} s, and {node} reports no reason: {}.",
+            stage(pod)
+        )
+    };
     failure::infrastructure(reasons::START_DEADLINE, &what)
 }

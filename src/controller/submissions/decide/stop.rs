@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
-use super::{failure, log, reading, start};
+use super::{failure, interruption, log, reading, start};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::reasons;
@@ -16,6 +16,11 @@ use leaderboard_api::reasons;
 const STOP_MARGIN_SECONDS: i64 = 15;
 /// Grace of a Pod that is deleted because it did not stop by itself.
 pub(super) const DELETE_GRACE_SECONDS: i64 = 60;
+/// How long a Pod whose node is about to go has for all that it stores: of the two minutes of a Spot instance's notice, what is left
+/// when the cluster has passed it on.
+const LEAVING_SECONDS: i64 = 90;
+/// Grace of such a Pod after that: all that takes longer is lost with the node.
+const LEAVING_GRACE_SECONDS: i64 = 5;
 /// How long a Pod may be past its grace before its node is given up, where nobody knows about the node.
 const LOST_MARGIN_SECONDS: i64 = 30;
 /// The same while the kubelet reports: it may still be cleaning up.
@@ -32,28 +37,46 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
     show(draft);
     let log_left = log::keep_while_there(draft);
     let view = draft.view;
+    let is_leaving = is_leaving(draft);
+    let (seconds, grace) = if is_leaving {
+        (LEAVING_SECONDS, LEAVING_GRACE_SECONDS)
+    } else {
+        (
+            draft.deadlines().cancel_seconds + STOP_MARGIN_SECONDS,
+            DELETE_GRACE_SECONDS,
+        )
+    };
     // Without agents there is nothing to store; with them, a logcopy that is being restarted may still do so.
     let listening = view
         .pod
         .as_ref()
         .filter(|p| p.logcopy_running || p.agent_started.is_some());
     let Some(pod) = listening else {
-        return end_job(draft, job, DELETE_GRACE_SECONDS, log_left);
+        return end_job(draft, job, grace, log_left);
     };
-    let delete_at = after(since, draft.deadlines().cancel_seconds + STOP_MARGIN_SECONDS);
-    let force_at = after(delete_at, DELETE_GRACE_SECONDS + STOP_MARGIN_SECONDS);
+    let delete_at = after(since, seconds);
+    let force_at = after(delete_at, grace + STOP_MARGIN_SECONDS);
     if draft.now() >= force_at {
         if log_left.is_none() && force(draft, pod) {
             end_job(draft, job, 0, None);
         }
         draft.requeue_in(SOON);
     } else if draft.now() >= delete_at {
-        end_job(draft, job, DELETE_GRACE_SECONDS, log_left);
+        end_job(draft, job, grace, log_left);
         draft.requeue_at(force_at);
+    } else if is_leaving && pod.delete_by.is_some() {
+        // It stores all by itself; the Job must make no other Pod meanwhile.
+        let left = delete_at.duration_since(draft.now()).as_secs();
+        end_job(draft, job, left.max(grace), log_left);
     } else {
         annotate(draft, pod);
         draft.requeue_at(delete_at);
     }
+}
+
+/// Whether the Job ends because its node is about to go.
+fn is_leaving(draft: &PlanBuilder<'_>) -> bool {
+    !draft.is_cancelled() && draft.status.failure.as_ref().is_some_and(interruption::is_one)
 }
 
 /// Deletes a Job, once the log that goes with its Pod is kept or was waited for long enough.
@@ -78,6 +101,13 @@ fn show(draft: &mut PlanBuilder<'_>) {
     let message = match failure {
         Some(failure) if failure.reason == reasons::NODE_LOST => {
             let what = failure.message.clone();
+            return start::replacing(draft, &what);
+        }
+        Some(failure) if interruption::is_one(failure) => {
+            let what = format!(
+                "{} Its results are being stored; a new Job resumes from them.",
+                failure.message
+            );
             return start::replacing(draft, &what);
         }
         Some(failure) => format!(

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::Duration;
 
-use leaderboard_runner::{args, expand};
+use leaderboard_runner::{args, expand, graphics};
 use serde_json::{Value, json};
 
 use super::commands;
@@ -82,10 +82,12 @@ fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args:
             .collect();
         return (*job, command);
     }
+    // As on a node where the pair sees all GPUs.
+    let index = env.get(graphics::INDEX).map_or(0, |index| index.parse().unwrap());
     let command = job
         .command
         .iter()
-        .map(|word| word.to_str().unwrap().to_owned())
+        .map(|word| graphics::with_adapter(word, index).into_string().unwrap())
         .collect();
     (*job, command)
 }
@@ -213,7 +215,7 @@ fn the_evaluator_gets_the_originals_arguments() {
         let own = [
             ("CARLA_ROOT", "/workspace/CARLA"),
             ("SCENARIO_RUNNER_ROOT", "/workspace/scenario_runner"),
-            ("NVIDIA_VISIBLE_DEVICES", "1"),
+            ("NVIDIA_DRIVER_CAPABILITIES", "all"),
         ];
         for (name, value) in own {
             assert_eq!(env[name], value);
@@ -308,6 +310,9 @@ fn the_runner_is_told_the_deadlines() {
             cancel: seconds(40),
             answer: Duration::from_secs(10),
             log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
+            gpu: Some(graphics::Needs::Vulkan),
+            unset: vec!["DISPLAY".into(), "XAUTHORITY".into()],
+            root: "/".into(),
         }
     );
     assert_eq!(simulator.log_limit, 64 << 20);

@@ -3,12 +3,31 @@
 //! Kubernetes replaces `$(NAME)` in a container's words and variables when it starts; the runner does the same with an
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
-use super::gpu::Gpus;
 use crate::controller::submissions::pod_layout::python_path;
 use leaderboard_api::LeaderboardVersion;
+use leaderboard_runner::graphics;
 
-/// Draws on the pair's own GPU.
-const ADAPTER: &str = "-ini:[/Script/Engine.RendererSettings]:r.GraphicsAdapter=$(NVIDIA_VISIBLE_DEVICES)";
+const ADAPTER: &str = "-ini:[/Script/Engine.RendererSettings]:r.GraphicsAdapter=";
+
+/// Which graphics adapter a simulator draws with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Adapter {
+    /// The engine chooses.
+    Unnamed,
+    Numbered(i32),
+    /// What the runner finds, which sees the devices.
+    Found,
+}
+
+impl Adapter {
+    fn flag(self) -> Option<String> {
+        match self {
+            Self::Unnamed => None,
+            Self::Numbered(number) => Some(format!("{ADAPTER}{number}")),
+            Self::Found => Some(literal(&format!("{ADAPTER}$({})", graphics::ADAPTER))),
+        }
+    }
+}
 
 /// A command with its arguments.
 pub(super) fn words(command: &[String], arguments: Option<&[String]>) -> Vec<String> {
@@ -41,8 +60,8 @@ cp -r ${CARLA_PYTHON_API_ROOT}/* /tmp/CARLA/
     in_bash(script.to_owned())
 }
 
-/// Starts CARLA's server. The values are Kubernetes' to expand.
-pub(super) fn simulator(format: LeaderboardVersion, gpus: Gpus) -> Vec<String> {
+/// Starts CARLA's server. The values are Kubernetes' to expand, but for an adapter that the runner finds.
+pub(super) fn simulator(format: LeaderboardVersion, adapter: Adapter) -> Vec<String> {
     let flags: &[&str] = match format {
         LeaderboardVersion::V1 => &["-carla-rpc-port=$(CARLA_PORT)", "-opengl", "-nosound"],
         LeaderboardVersion::V2 => &[
@@ -52,14 +71,14 @@ pub(super) fn simulator(format: LeaderboardVersion, gpus: Gpus) -> Vec<String> {
             "-nosound",
         ],
     };
-    let adapter = match (format, gpus) {
-        (LeaderboardVersion::V2, Gpus::NodeIndex) => Some(ADAPTER),
-        // OpenGL takes no adapter, and without a GPU there is none to choose.
-        (LeaderboardVersion::V1, _) | (_, Gpus::None) => None,
+    let adapter = match format {
+        // OpenGL takes none.
+        LeaderboardVersion::V1 => None,
+        LeaderboardVersion::V2 => adapter.flag(),
     };
     let words = ["/bin/bash", "/home/carla/CarlaUE4.sh"];
-    let words = words.into_iter().chain(flags.iter().copied()).chain(adapter);
-    words.map(Into::into).collect()
+    let words = words.into_iter().chain(flags.iter().copied()).map(Into::into);
+    words.chain(adapter).collect()
 }
 
 /// Starts the evaluator with the participant's agent.

@@ -27,20 +27,17 @@ fn is_own(container: &Value) -> bool {
 fn the_pairs_share_out_what_the_plan_says() {
     let job = Case::new("V1", json!({"pairs": 3})).json();
     let expected = [
-        ("0-6", "2000", "2010", "0"),
-        ("7-13", "2100", "2110", "1"),
-        ("14-19", "2200", "2210", "2"),
+        ("0-6", "2000", "2010"),
+        ("7-13", "2100", "2110"),
+        ("14-19", "2200", "2210"),
     ];
-    for (pair, (slice, port, traffic, device)) in (1..).zip(expected) {
+    for (pair, (slice, port, traffic)) in (1..).zip(expected) {
         let agent = container(&job, &format!("agent-{pair}"));
         let simulator = container(&job, &format!("simulator-{pair}"));
         assert_eq!(value(agent, "ROUTES_SUBSET"), Some(slice));
         assert_eq!(value(agent, "CARLA_PORT"), Some(port));
         assert_eq!(value(simulator, "CARLA_PORT"), Some(port));
         assert_eq!(value(agent, "CARLA_TM_PORT"), Some(traffic));
-        for container in [agent, simulator] {
-            assert_eq!(value(container, "NVIDIA_VISIBLE_DEVICES"), Some(device));
-        }
         assert!(
             simulator["command"]
                 .as_array()
@@ -67,6 +64,43 @@ fn resume_is_1_or_empty() {
             "{attempt} {taken_up}"
         );
     }
+}
+
+#[test]
+fn the_contents_get_what_the_old_pipelines_had_and_the_hosts_variables_win() {
+    let of = |contents: Value, attempt: i64| {
+        let mut case = Case::new("V2", json!({ "contents": contents }));
+        case.number.attempt = attempt;
+        let run = case.plan.run_id.as_str().to_owned();
+        let bucket = case.plan.storage.bucket.clone();
+        let container = container(&case.json(), "contents").clone();
+        (container, run, bucket)
+    };
+    for (attempt, resume) in [(1, ""), (2, "1")] {
+        let (contents, run, bucket) = of(json!({"image": "c"}), attempt);
+        let expected = [
+            ("SUBMISSION_ID", run.as_str()),
+            ("RESUME", resume),
+            ("S3_BUCKET", bucket.as_str()),
+        ];
+        for (name, text) in expected {
+            assert_eq!(value(&contents, name), Some(text), "{name}");
+        }
+    }
+    let own =
+        json!([{"name": "S3_BUCKET", "value": "mine"}, {"name": "FROM", "value": "$(S3_BUCKET)/$(SUBMISSION_ID)"}]);
+    let (contents, ..) = of(json!({"image": "c", "env": own}), 1);
+    let names: Vec<_> = contents["env"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|v| v["name"].as_str().unwrap())
+        .collect();
+    assert!(
+        names.ends_with(&["SUBMISSION_ID", "RESUME", "S3_BUCKET", "FROM"]),
+        "{names:?}"
+    );
+    assert_eq!(value(&contents, "S3_BUCKET"), Some("mine"));
 }
 
 #[test]
@@ -334,4 +368,50 @@ fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
             assert_eq!(value(container, "AWS_EC2_METADATA_DISABLED"), Some("true"));
         }
     }
+}
+
+#[test]
+fn each_agent_has_shared_memory_of_its_own_and_of_the_size_that_is_asked_for() {
+    let job = Case::new("V2", json!({"pairs": 2, "agent": {"shmSize": "2Gi"}})).json();
+    let volumes = job["spec"]["template"]["spec"]["volumes"].as_array().unwrap();
+    for pair in [1, 2] {
+        let name = format!("shm-agent-{pair}");
+        let volume = volumes.iter().find(|volume| volume["name"] == name).unwrap();
+        let expected = json!({"name": name, "emptyDir": {"medium": "Memory", "sizeLimit": (2_u64 << 30).to_string()}});
+        assert_eq!(*volume, expected);
+        for container in containers(&job) {
+            let mounts = container["volumeMounts"].as_array().unwrap();
+            let mounted: Vec<_> = mounts.iter().filter(|mount| mount["name"] == name).collect();
+            let expected = json!({"name": name, "mountPath": "/dev/shm"});
+            let is_its_own = container["name"] == format!("agent-{pair}");
+            assert_eq!(
+                mounted,
+                if is_its_own { vec![&expected] } else { vec![] },
+                "{}",
+                container["name"]
+            );
+        }
+    }
+    let without = Case::new("V2", json!({})).json();
+    assert!(!without.to_string().contains("shm"));
+}
+
+#[test]
+fn a_track_has_its_priority_and_a_host_may_let_karpenter_disrupt() {
+    let track = json!({"name": "sensors", "codename": "SENSORS", "priorityClassName": "sensors"});
+    let overlay = json!({"metadata": {"annotations": {"karpenter.sh/do-not-disrupt": null}}});
+    let job = Case::new("V2", json!({"tracks": [track], "podOverrides": overlay})).json();
+    let template = &job["spec"]["template"];
+    assert_eq!(template["spec"]["priorityClassName"], "sensors");
+    assert_eq!(
+        template["metadata"]["annotations"].get("karpenter.sh/do-not-disrupt"),
+        None
+    );
+    let job = Case::new("V2", json!({})).json();
+    let template = &job["spec"]["template"];
+    assert_eq!(template["spec"].get("priorityClassName"), None);
+    assert_eq!(
+        template["metadata"]["annotations"]["karpenter.sh/do-not-disrupt"],
+        "true"
+    );
 }

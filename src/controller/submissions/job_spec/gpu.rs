@@ -1,62 +1,110 @@
-//! Which container of a Pod gets which GPU. Pure, and the only place that knows NVIDIA's names.
+//! Which container of a Pod gets which GPU, and from where. Pure, and the only place that knows NVIDIA's names.
 //!
-//! On a node whose default runtime is NVIDIA's, the variable decides, not what was requested: an image that says `all` has every
-//! GPU of the node. So each container has the variable, and `void` is no GPU.
+//! On a node whose default runtime is NVIDIA's, the variable decides, not what was requested: an image that sets `all` has every
+//! GPU of the node. So each container without a GPU has `void`. The kubelet puts the Pod's variables behind those of a device plugin,
+//! and the last one counts: a container that requests a GPU of its own must not have the variable, or it would hide what the plugin
+//! gave.
 
-use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements};
+use std::collections::BTreeMap;
+
+use k8s_openapi::api::core::v1::{EnvVar, PodResourceClaim, ResourceClaim, ResourceRequirements};
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use leaderboard_api::{GpuSource, LeaderboardSpec, NodeWithoutGpu, names};
+use leaderboard_runner::graphics::{INDEX, Needs};
+use leaderboard_runner::protocol::{Member, Side};
 use serde_json::{Value, json};
 
 use super::{JobInput, variable};
-use leaderboard_api::effective;
+use crate::controller::gpu_claims::{source, template_name};
 
 const DEVICES: &str = "NVIDIA_VISIBLE_DEVICES";
 const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";
 const NO_DEVICE: &str = "void";
 /// What the resources of NVIDIA's device plugin begin with: whole GPUs, shared ones, MIG slices.
 const RESOURCES: &str = "nvidia.com/";
+/// Taken as the node's name, which autoscalers understand in an affinity; of a node itself they know no name yet.
+const HOSTNAME: &str = "kubernetes.io/hostname";
+const REQUIRED: &str = "requiredDuringSchedulingIgnoredDuringExecution";
 
-/// How a Pod's pairs get their GPUs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Gpus {
-    /// Nobody requests one.
-    None,
-    /// Simulator and agent of pair n see the node's GPU n-1, as in the original.
-    NodeIndex,
+/// Jobs of an attempt that a node may give no GPU.
+const AVOIDED_AFTER: i32 = 2;
+
+/// The variables of a container of a pair; pairs count from 1.
+pub(super) fn variables(source: GpuSource<'_>, side: Side, pair: usize) -> Vec<EnvVar> {
+    let index = (pair - 1).to_string();
+    let devices = match source {
+        // `hide` decides, by what the finished container requests.
+        GpuSource::None => return Vec::new(),
+        GpuSource::PerContainer(_) => None,
+        GpuSource::NodeIndex(_) => Some(index.as_str()),
+        // The devices come by CDI, past this variable.
+        GpuSource::Claim(_) => Some(NO_DEVICE),
+    };
+    let devices = devices.map(|devices| variable(DEVICES, devices));
+    let index = (side == Side::Simulator).then(|| variable(INDEX, &index));
+    devices
+        .into_iter()
+        .chain([variable(CAPABILITIES, "all")])
+        .chain(index)
+        .collect()
 }
 
-impl Gpus {
-    /// What follows from the resources that the host requests for simulators and agents.
-    pub(super) fn of(input: &JobInput<'_>) -> Self {
-        let (spec, track) = (input.spec(), input.track());
-        let simulators = track.and_then(|track| track.simulator.as_ref());
-        let agents = track.and_then(|track| track.agent.as_ref());
-        let resources = [
-            effective::resources(simulators, spec.simulator.resources.as_ref()),
-            effective::resources(agents, spec.agent.resources.as_ref()),
-        ];
-        let overlay = spec.pod_overrides.as_ref();
-        let overlay = overlay.and_then(|overlay| overlay.pointer("/spec/containers")?.as_array());
-        let asked = resources.iter().flatten().any(requests)
-            || overlay.is_some_and(|containers| containers.iter().any(|one| requests_in(&one["resources"])));
-        if asked { Self::NodeIndex } else { Self::None }
-    }
-
-    /// The variables of both containers of a pair; pairs count from 1.
-    pub(super) fn variables(self, pair: usize) -> Vec<EnvVar> {
-        match self {
-            Self::None => vec![variable(DEVICES, NO_DEVICE)],
-            Self::NodeIndex => vec![
-                variable(DEVICES, &(pair - 1).to_string()),
-                variable(CAPABILITIES, "all"),
-            ],
+/// What a container of a pair requests, with its GPU.
+pub(super) fn resources(
+    source: GpuSource<'_>,
+    side: Side,
+    pair: usize,
+    hosts: Option<ResourceRequirements>,
+) -> Option<ResourceRequirements> {
+    let is_requested = |mut resources: ResourceRequirements, resource: &str| {
+        let limits = resources.limits.get_or_insert_with(BTreeMap::new);
+        limits.insert(resource.to_owned(), Quantity("1".into()));
+        Some(resources)
+    };
+    match (source, side) {
+        (GpuSource::None, _) | (GpuSource::NodeIndex(_), Side::Agent) => hosts,
+        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Simulator) => {
+            is_requested(hosts.unwrap_or_default(), resource)
+        }
+        (GpuSource::Claim(_), _) => {
+            let mut resources = hosts.unwrap_or_default();
+            resources.claims.get_or_insert_with(Vec::new).push(ResourceClaim {
+                name: claim_name(pair),
+                request: None,
+            });
+            Some(resources)
         }
     }
 }
 
+/// One claim for each pair, which its two containers share.
+pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
+    let GpuSource::Claim(claim) = source(input.spec()) else {
+        return None;
+    };
+    let leaderboard = input.leaderboard.metadata.name.as_deref().unwrap_or_default();
+    let template = template_name(leaderboard, claim);
+    let of_pair = |pair| PodResourceClaim {
+        name: claim_name(pair),
+        resource_claim_name: None,
+        resource_claim_template_name: Some(template.clone()),
+    };
+    Some((1..=input.pairs()).map(of_pair).collect())
+}
+
+fn claim_name(pair: usize) -> String {
+    format!("gpu-{pair}")
+}
+
+/// What the runner of a simulator checks before it starts the server: nothing where the operator gives no GPU.
+pub(super) fn check(source: GpuSource<'_>, needs: Needs) -> Option<String> {
+    (source != GpuSource::None).then(|| format!("--gpu={needs}"))
+}
+
 /// Hides the node's GPUs from a container that neither requests one nor has the variable. It comes first, so that the container's
 /// other variables can refer to it.
-pub(super) fn hide(container: &mut Value) {
-    if requests_in(&container["resources"]) {
+pub(super) fn hide(container: &mut Value, source: GpuSource<'_>) {
+    if !requested(container, source).is_empty() {
         return;
     }
     let Some(container) = container.as_object_mut() else {
@@ -70,14 +118,87 @@ pub(super) fn hide(container: &mut Value) {
     }
 }
 
-fn requests(resources: &ResourceRequirements) -> bool {
-    serde_json::to_value(resources).is_ok_and(|resources| requests_in(&resources))
+/// Names of the GPUs that a container requests of a device plugin.
+fn requested<'a>(container: &'a Value, source: GpuSource<'_>) -> Vec<&'a str> {
+    let is_none = |amount: &Value| amount.is_null() || *amount == json!("0") || *amount == json!(0);
+    let lists = ["requests", "limits"].map(|list| container["resources"][list].as_object());
+    let named = lists.into_iter().flatten().flatten();
+    let named = named.filter(|(name, amount)| is_gpu(name, source) && !is_none(amount));
+    named.map(|(name, _)| name.as_str()).collect()
 }
 
-/// Whether a container's resources, as JSON, name a GPU.
-fn requests_in(resources: &Value) -> bool {
-    let is_none = |amount: &Value| amount.is_null() || *amount == json!("0") || *amount == json!(0);
-    let lists = ["requests", "limits"].map(|list| resources[list].as_object());
-    let mut named = lists.into_iter().flatten().flatten();
-    named.any(|(name, amount)| name.starts_with(RESOURCES) && !is_none(amount))
+/// Whether a resource is a GPU.
+pub(super) fn is_gpu(resource: &str, source: GpuSource<'_>) -> bool {
+    let own = match source {
+        GpuSource::PerContainer(own) | GpuSource::NodeIndex(own) => Some(own),
+        GpuSource::None | GpuSource::Claim(_) => None,
+    };
+    resource.starts_with(RESOURCES) || Some(resource) == own
+}
+
+/// Why it is not clear which container of a finished template is meant to have which GPU. A resource that a container of a pair names
+/// is its own alone: without `gpu` the other one would have none, and with a claim the pair would take two.
+pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
+    let source = source(spec);
+    let containers = template["spec"]["containers"].as_array()?;
+    let mut of_pairs = containers.iter().filter(|container| member(container).is_some());
+    let (container, resource) =
+        of_pairs.find_map(|container| Some((container["name"].as_str()?, *requested(container, source).first()?)))?;
+    match (&spec.gpu, source) {
+        (None, _) => Some(format!(
+            "{container} requests {resource} and the Leaderboard has no field gpu, so it is not known what the other container of the \
+             pair is to have. Set gpu.resourceName: {resource} and remove it from resources; or set gpu.mode: None, and only the \
+             containers that request a GPU themselves have one."
+        )),
+        (Some(_), GpuSource::Claim(_)) => Some(format!(
+            "{container} requests {resource} of a device plugin, and gpu.mode is Claim: a pair would take two GPUs. Remove {resource} from \
+             resources and podOverrides."
+        )),
+        (Some(_), GpuSource::None | GpuSource::PerContainer(_) | GpuSource::NodeIndex(_)) => None,
+    }
+}
+
+/// The container of a pair, by its name.
+pub(super) fn member(container: &Value) -> Option<Member> {
+    Member::parse(container["name"].as_str()?)
+}
+
+/// Nodes that a Job must not get: those that gave it no GPU so often that it is not by chance.
+pub(super) fn avoided(nodes: &[NodeWithoutGpu]) -> Vec<&str> {
+    let avoided = nodes.iter().filter(|node| node.jobs >= AVOIDED_AFTER);
+    avoided.map(|node| node.node_name.as_str()).collect()
+}
+
+/// Keeps a Pod whose pairs know their GPU by its index away from nodes with another submission's Pod, whatever its namespace, and
+/// every Pod away from nodes that gave it no GPU. It comes after the overlay, whose lists would take the place of these.
+pub(super) fn place(pod: &mut Value, source: GpuSource<'_>, avoided: &[&str]) {
+    if let GpuSource::NodeIndex(_) = source {
+        let others = json!({
+            "topologyKey": HOSTNAME,
+            "namespaceSelector": {},
+            "labelSelector": {"matchExpressions": [{"key": names::LABEL_SUBMISSION, "operator": "Exists"}]},
+        });
+        let terms = &mut pod["affinity"]["podAntiAffinity"][REQUIRED];
+        match terms.as_array_mut() {
+            Some(terms) => terms.push(others),
+            None => *terms = json!([others]),
+        }
+    }
+    if avoided.is_empty() {
+        return;
+    }
+    let elsewhere = json!({"key": HOSTNAME, "operator": "NotIn", "values": avoided});
+    let terms = &mut pod["affinity"]["nodeAffinity"][REQUIRED]["nodeSelectorTerms"];
+    // One of them has to hold, so each needs it.
+    match terms.as_array_mut().filter(|terms| !terms.is_empty()) {
+        Some(terms) => {
+            for term in terms {
+                match term["matchExpressions"].as_array_mut() {
+                    Some(expressions) => expressions.push(elsewhere.clone()),
+                    None => term["matchExpressions"] = json!([elsewhere]),
+                }
+            }
+        }
+        None => *terms = json!([{"matchExpressions": [elsewhere]}]),
+    }
 }

@@ -1,4 +1,4 @@
-//! What keeps a stranger's container from the node and from its neighbors: security contexts, disk, GPUs, name files.
+//! What keeps a stranger's container from the node and from its neighbors: security contexts, disk, name files.
 
 use serde_json::{Value, json};
 
@@ -6,11 +6,6 @@ use super::tests::{Case, container, containers};
 
 fn is_own(container: &Value) -> bool {
     container["name"] == "workspace" || container["name"] == "logcopy"
-}
-
-fn variable<'a>(container: &'a Value, name: &str) -> Option<&'a str> {
-    let mut env = container["env"].as_array()?.iter();
-    env.find(|variable| variable["name"] == name)?["value"].as_str()
 }
 
 #[test]
@@ -173,62 +168,6 @@ fn a_tracks_own_resources_and_the_overlay_count_for_the_disk_as_well() {
     assert_eq!(disk(&job, "simulator-1"), amounts("", "1Gi"));
     assert_eq!(disk(&job, "logcopy"), amounts("", "90Gi"));
     assert_eq!(container(&job, "logcopy")["resources"]["limits"]["memory"], "1Gi");
-}
-
-const GPU: &str = "nvidia.com/gpu";
-
-#[test]
-fn a_container_without_a_gpu_sees_none_of_its_nodes() {
-    let metrics = json!({"name": "metrics", "image": "m", "restartPolicy": "Always"});
-    let gpu_check = json!({"name": "check", "image": "c", "resources": {"limits": {GPU: "1"}}});
-    let overlay = json!({"spec": {"initContainers": [metrics, gpu_check]}});
-    let contents = json!({"image": "c", "env": [{"name": "A", "value": "b"}]});
-    for requested in [json!({GPU: "1"}), json!({}), json!({GPU: "0"})] {
-        let simulator = json!({"image": "s", "resources": {"limits": requested}});
-        let more = json!({"simulator": simulator, "contents": contents, "podOverrides": overlay});
-        let job = Case::new("V2", more).json();
-        for container in containers(&job) {
-            let name = container["name"].as_str().unwrap();
-            let pair = name.strip_prefix("agent-").or(name.strip_prefix("simulator-"));
-            let index = pair.map(|pair| (pair.parse::<u8>().unwrap() - 1).to_string());
-            let expected = match index.as_deref().filter(|_| requested[GPU] == "1") {
-                // NVIDIA's plugin says what it gets.
-                _ if name == "check" => None,
-                Some(index) => Some(index),
-                None => Some("void"),
-            };
-            assert_eq!(
-                variable(container, "NVIDIA_VISIBLE_DEVICES"),
-                expected,
-                "{name} {requested}"
-            );
-            let capabilities = variable(container, "NVIDIA_DRIVER_CAPABILITIES");
-            assert_eq!(
-                capabilities.is_some(),
-                pair.is_some() && requested[GPU] == "1",
-                "{name}"
-            );
-        }
-        let adapter = container(&job, "simulator-1")["command"]
-            .to_string()
-            .contains("GraphicsAdapter");
-        assert_eq!(adapter, requested[GPU] == "1");
-    }
-}
-
-#[test]
-fn gpus_that_the_overlay_or_a_track_requests_are_seen_by_index() {
-    let limits = json!({"limits": {"nvidia.com/mig-1g.5gb": "1"}});
-    let overlay = json!({"spec": {"containers": [{"name": "agent", "resources": limits}]}});
-    let track = json!({"name": "sensors", "codename": "S", "simulator": {"resources": limits}});
-    for more in [json!({"podOverrides": overlay}), json!({"tracks": [track]})] {
-        let mut more = more;
-        more["simulator"] = json!({"image": "s"});
-        let job = Case::new("V2", more).json();
-        for name in ["agent-2", "simulator-2"] {
-            assert_eq!(variable(container(&job, name), "NVIDIA_VISIBLE_DEVICES"), Some("1"));
-        }
-    }
 }
 
 #[test]

@@ -7,7 +7,7 @@ use k8s_openapi::api::core::v1::{
 };
 
 use super::security::{confined, context, resources};
-use super::{JobInput, commands, run_document, variable, volumes};
+use super::{JobInput, commands, resume, run_document, variable, volumes};
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 use leaderboard_api::names;
 
@@ -27,12 +27,25 @@ pub(super) fn contents(input: &JobInput<'_>) -> Container {
         name: names::CONTAINER_CONTENTS.into(),
         image: Some(input.plan.contents_image.clone()),
         command: Some(host.unwrap_or_else(commands::contents)),
-        env: (!spec.env.is_empty()).then(|| spec.env.clone()),
+        env: Some(contents_env(input)),
         resources: spec.resources.clone(),
         security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_contents()),
         ..Container::default()
     }
+}
+
+/// What the contents of the old pipeline were given; a command of the host's may read it. The host's own variables replace ours of the
+/// same name, and come behind them, so that they can refer to them.
+fn contents_env(input: &JobInput<'_>) -> Vec<EnvVar> {
+    let (plan, hosts) = (input.plan, &input.spec().contents.env);
+    let ours = [
+        variable("SUBMISSION_ID", plan.run_id.as_str()),
+        variable("RESUME", resume(input)),
+        variable("S3_BUCKET", &plan.storage.bucket),
+    ];
+    let is_free = |ours: &EnvVar| hosts.iter().all(|hosts| hosts.name != ours.name);
+    ours.into_iter().filter(is_free).chain(hosts.iter().cloned()).collect()
 }
 
 /// Prepares the volumes and restores what an earlier attempt stored.

@@ -5,7 +5,9 @@
 
 mod commands;
 mod disk;
+mod display;
 mod gpu;
+mod gpu_count;
 mod init;
 mod pairs;
 mod security;
@@ -16,6 +18,8 @@ mod command_tests;
 #[cfg(test)]
 mod container_tests;
 #[cfg(test)]
+mod gpu_tests;
+#[cfg(test)]
 mod hardening_tests;
 #[cfg(test)]
 mod tests;
@@ -23,6 +27,7 @@ mod tests;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+pub use gpu::unclear;
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::{Job, JobSpec};
 use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
@@ -32,12 +37,14 @@ use serde_json::{Value, json};
 
 use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
+use crate::controller::gpu_claims::source;
 use crate::controller::objects::owner_reference;
 use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
+pub use gpu_count::gpus;
 use leaderboard_api::{
-    Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, PolicySource, RunPlan, Submission, Track,
-    conditions, effective, names, reasons,
+    Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan, Submission,
+    Track, conditions, effective, names, reasons,
 };
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
@@ -64,6 +71,8 @@ pub struct JobInput<'a> {
     pub number: JobNumber,
     /// The operator's own image, with `workspace` and `logcopy` in it, and its region.
     pub settings: &'a Settings,
+    /// Nodes that gave it no GPU.
+    pub without_gpu: &'a [NodeWithoutGpu],
     /// When it is made.
     pub now: Timestamp,
 }
@@ -225,6 +234,7 @@ fn active_deadline(deadlines: &Deadlines) -> Option<i64> {
         return None;
     }
     let seconds = [
+        deadlines.pull_seconds,
         deadlines.start_seconds,
         deadlines.run_seconds,
         deadlines.cancel_seconds,
@@ -258,10 +268,6 @@ fn generation(input: &JobInput<'_>) -> i64 {
 fn pod(input: &JobInput<'_>) -> PodSpec {
     let pairs = 1..=input.pairs();
     let identity = input.spec().pod_identity.as_ref();
-    let node_selector = input
-        .track()
-        .map(|track| track.node_selector.clone())
-        .filter(|nodes| !nodes.is_empty());
     PodSpec {
         restart_policy: Some("OnFailure".into()),
         init_containers: Some(vec![
@@ -281,11 +287,25 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
         automount_service_account_token: Some(false),
         enable_service_links: Some(false),
         share_process_namespace: Some(false),
+        priority_class_name: input.track().and_then(|track| track.priority_class_name.clone()),
         runtime_class_name: input.spec().runtime_class_name.clone(),
-        node_selector,
+        resource_claims: gpu::claims(input),
+        node_selector: Some(node_selector(input)),
         tolerations: Some(tolerations(input)),
         ..PodSpec::default()
     }
+}
+
+/// Participants' images, and CARLA's, are for one kind of machine. A track can choose another.
+fn node_selector(input: &JobInput<'_>) -> BTreeMap<String, String> {
+    let mut nodes = BTreeMap::from([("kubernetes.io/arch".into(), "amd64".into())]);
+    nodes.extend(
+        input
+            .track()
+            .map(|track| track.node_selector.clone())
+            .unwrap_or_default(),
+    );
+    nodes
 }
 
 fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
@@ -303,12 +323,15 @@ fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
 /// What depends on all that the host says: filled in where nothing is said, in the containers of the overlay too.
 fn settle(template: &mut Value, input: &JobInput<'_>) {
     let pod = &mut template["spec"];
+    let gpus = source(input.spec());
     for list in ["initContainers", "containers"] {
         for container in pod[list].as_array_mut().into_iter().flatten() {
-            gpu::hide(container);
+            gpu::hide(container, gpus);
+            display::settle(container, input.spec());
             security::settle(container);
         }
     }
+    gpu::place(pod, gpus, &gpu::avoided(input.without_gpu));
     disk::fill(pod, volumes::logs_limit(input));
 }
 
@@ -331,5 +354,14 @@ fn variable(name: &str, value: &str) -> EnvVar {
         name: name.into(),
         value: Some(commands::literal(value)),
         value_from: None,
+    }
+}
+
+/// `RESUME` of a run: the evaluator takes any text for a yes.
+fn resume(input: &JobInput<'_>) -> &'static str {
+    if input.plan.resume || input.number.attempt > 1 {
+        "1"
+    } else {
+        ""
     }
 }

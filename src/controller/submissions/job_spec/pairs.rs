@@ -4,14 +4,17 @@
 
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 
-use super::gpu::Gpus;
+use super::commands::Adapter;
 use super::security::context;
-use super::{JobInput, commands, variable, volumes};
+use super::{JobInput, commands, display, gpu, resume, variable, volumes};
+use crate::controller::gpu_claims::source;
 use crate::controller::submissions::pod_layout::{
     AGENT, CARLA_ROOT, FIXED_ENV, LEADERBOARD_ROOT, SAVED, SCENARIO_RUNNER_ROOT, STATUS, python_path,
 };
 use crate::pod::run::{RUNNER, TOOLS, console_name};
-use leaderboard_api::{LeaderboardVersion, effective, names};
+use leaderboard_api::{GpuSource, LeaderboardVersion, SimulatorContainer, effective, names};
+use leaderboard_runner::graphics::Needs;
+use leaderboard_runner::protocol::Side;
 
 const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
@@ -30,6 +33,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
     let (spec, deadlines) = (&input.spec().simulator, input.deadlines());
     let own = input.track().and_then(|track| track.simulator.as_ref());
     let name = names::simulator_container(pair);
+    let (version, gpus) = (input.plan.leaderboard_version, source(input.spec()));
     let flags = [
         format!("--port={}", port(pair)),
         seconds("ready", deadlines.ready_seconds),
@@ -38,21 +42,43 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         format!("--log={}/{}", SAVED, console_name(pair)),
         format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
     ];
+    let flags = flags.into_iter().chain(gpu::check(gpus, needs(spec, version)));
     let host = spec
         .command
         .as_deref()
         .map(|command| commands::words(command, spec.args.as_deref()));
-    let gpus = Gpus::of(input);
-    let words = host.unwrap_or_else(|| commands::simulator(input.plan.leaderboard_version, gpus));
+    let words = host.unwrap_or_else(|| commands::simulator(version, adapter(spec, gpus)));
+    let env = [variable("CARLA_PORT", &port(pair).to_string())].into_iter();
+    let env = env
+        .chain(display::variables(spec, version))
+        .chain(gpu::variables(gpus, Side::Simulator, pair));
+    let resources = effective::resources(own, spec.resources.as_ref());
     Container {
         image: Some(input.plan.simulator_image.clone()),
-        command: Some(behind_runner("simulator", pair, flags, words)),
-        env: Some(merged(simulator_env(pair, gpus), &spec.env)),
-        resources: effective::resources(own, spec.resources.as_ref()),
+        command: Some(behind_runner(Side::Simulator, pair, flags, words)),
+        env: Some(merged(env.collect(), &spec.env)),
+        resources: gpu::resources(gpus, Side::Simulator, pair, resources),
         security_context: Some(context(spec.security_context.as_ref())),
-        volume_mounts: Some(volumes::of_simulator(&name)),
+        volume_mounts: Some(volumes::of_simulator(input, &name)),
         name,
         ..Container::default()
+    }
+}
+
+/// What the server draws with. Of a command of the host's that is not known.
+fn needs(spec: &SimulatorContainer, version: LeaderboardVersion) -> Needs {
+    match (&spec.command, version) {
+        (Some(_), _) => Needs::Any,
+        (None, LeaderboardVersion::V1) => Needs::OpenGl,
+        (None, LeaderboardVersion::V2) => Needs::Vulkan,
+    }
+}
+
+fn adapter(spec: &SimulatorContainer, gpus: GpuSource<'_>) -> Adapter {
+    match (spec.graphics_adapter, gpus) {
+        (Some(number), _) => Adapter::Numbered(number),
+        (None, GpuSource::None) => Adapter::Unnamed,
+        (None, _) => Adapter::Found,
     }
 }
 
@@ -76,22 +102,23 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
     let words = host.unwrap_or_else(|| commands::agent(input.plan.leaderboard_version));
     // The runner expands these words, so that RESUME is what it is in this round.
     let words = words.iter().map(|word| commands::literal(word)).collect();
+    let resources = effective::resources(own, spec.resources.as_ref());
     Container {
         image: Some(input.plan.image.clone()),
-        command: Some(behind_runner("agent", pair, flags, words)),
+        command: Some(behind_runner(Side::Agent, pair, flags, words)),
         env: Some(merged(agent_env(input, pair), &spec.env)),
-        resources: effective::resources(own, spec.resources.as_ref()),
+        resources: gpu::resources(source(input.spec()), Side::Agent, pair, resources),
         security_context: Some(context(spec.security_context.as_ref())),
-        volume_mounts: Some(volumes::of_agent(&name, pair)),
+        volume_mounts: Some(volumes::of_agent(input, &name, pair)),
         name,
         ..Container::default()
     }
 }
 
-fn behind_runner<const N: usize>(side: &str, pair: usize, flags: [String; N], words: Vec<String>) -> Vec<String> {
+fn behind_runner(side: Side, pair: usize, flags: impl IntoIterator<Item = String>, words: Vec<String>) -> Vec<String> {
     let start = [
         format!("{TOOLS}/{RUNNER}"),
-        side.to_owned(),
+        side.name().to_owned(),
         format!("--pair={pair}"),
         format!("--status={STATUS}"),
     ];
@@ -109,12 +136,6 @@ fn seconds(what: &str, value: i64) -> String {
     format!("--{what}-seconds={value}")
 }
 
-fn simulator_env(pair: usize, gpus: Gpus) -> Vec<EnvVar> {
-    let mut env = vec![variable("CARLA_PORT", &port(pair).to_string())];
-    env.extend(gpus.variables(pair));
-    env
-}
-
 fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
     let (plan, track) = (input.plan, input.track());
     let routes = track
@@ -124,12 +145,6 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         .and_then(|track| track.scenarios_file.as_deref())
         .unwrap_or(SCENARIOS_FILE);
     let slice = plan.slices.get(pair - 1).map(ToString::to_string).unwrap_or_default();
-    // The evaluator takes any text for a yes.
-    let resume = if plan.resume || input.number.attempt > 1 {
-        "1"
-    } else {
-        ""
-    };
     let mut env = vec![
         variable("CARLA_PORT", &port(pair).to_string()),
         variable("CARLA_TM_PORT", &(port(pair) + 10).to_string()),
@@ -137,7 +152,7 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         variable("ROUTES", routes),
         variable("ROUTES_SUBSET", &slice),
         variable("REPETITIONS", &plan.repetitions.to_string()),
-        variable("RESUME", resume),
+        variable("RESUME", resume(input)),
         variable("CHECKPOINT_ENDPOINT", CHECKPOINT),
         variable("RECORD_PATH", SAVED),
         variable("DEBUG_CHALLENGE", "0"),
@@ -150,7 +165,7 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         // The original's file lies in the contents, which are read-only here.
         LeaderboardVersion::V2 => variable("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS),
     });
-    env.extend(Gpus::of(input).variables(pair));
+    env.extend(gpu::variables(source(input.spec()), Side::Agent, pair));
     env
 }
 

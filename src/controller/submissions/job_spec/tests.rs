@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::*;
 use crate::allowed::Allowed;
 use crate::kubernetes::Namespaces;
-use leaderboard_api::{JobNumber, effective};
+use leaderboard_api::{JobNumber, NodeWithoutGpu, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
 
@@ -19,6 +19,7 @@ pub(super) struct Case {
     pub(super) plan: RunPlan,
     pub(super) number: JobNumber,
     pub(super) settings: Settings,
+    pub(super) without_gpu: Vec<NodeWithoutGpu>,
 }
 
 impl Case {
@@ -28,7 +29,8 @@ impl Case {
             "leaderboardVersion": format,
             "tracks": [{"name": "sensors", "codename": "SENSORS"}],
             "contents": {"image": "registry.example/contents:1"},
-            "simulator": {"image": "registry.example/carla:1", "resources": {"limits": {"nvidia.com/gpu": "1"}}},
+            "simulator": {"image": "registry.example/carla:1"},
+            "gpu": {"resourceName": "nvidia.com/gpu"},
             "agent": {},
             "storage": {"bucket": "results", "prefix": "runs/", "region": "eu-west-1"},
         });
@@ -70,6 +72,7 @@ impl Case {
                 allowed: Allowed::default(),
                 concurrency: 16,
             },
+            without_gpu: Vec::new(),
         }
     }
 
@@ -80,6 +83,7 @@ impl Case {
             plan: &self.plan,
             number: self.number,
             settings: &self.settings,
+            without_gpu: &self.without_gpu,
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }
     }
@@ -230,7 +234,7 @@ fn the_nets_are_wider_than_the_rules_above_them() {
         (
             json!({"pairs": 1, "retries": {"perPair": 0}, "deadlines": {"runSeconds": 7200}}),
             22,
-            Some(1800 + 7200 + 120 + 1800 + 1800),
+            Some(5400 + 1800 + 7200 + 120 + 1800 + 1800),
         ),
         (
             json!({"pairs": 16, "retries": {"perPair": 100}, "deadlines": {"runSeconds": i64::MAX}}),

@@ -6,12 +6,12 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::JobInput;
+use super::{JobInput, display};
 use crate::controller::submissions::pod_layout::{
-    AGENT, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, STATUS, TOOLS_VOLUME,
+    AGENT, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
 use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
-use leaderboard_api::names;
+use leaderboard_api::{ByteQuantity, names};
 
 const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;
@@ -28,7 +28,23 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
         podinfo(),
     ];
     let identity = has_role(input).then(identity);
-    contents.into_iter().chain(own).chain(identity).collect()
+    let shared = input.spec().agent.shm_size.iter();
+    let shared = shared.flat_map(|size| (1..=input.pairs()).map(|pair| memory(pair, size)));
+    let display = display::volume(input);
+    let all = contents.into_iter().chain(own).chain(identity);
+    all.chain(display).chain(shared).collect()
+}
+
+/// The shared memory of one agent, which no other one sees.
+fn memory(pair: usize, size: &ByteQuantity) -> Volume {
+    Volume {
+        name: format!("{SHM_VOLUME}{pair}"),
+        empty_dir: Some(EmptyDirVolumeSource {
+            size_limit: Some(Quantity(size.bytes().to_string())),
+            medium: Some("Memory".into()),
+        }),
+        ..Volume::default()
+    }
 }
 
 /// Whether the Pod proves its identity with a token of its ServiceAccount.
@@ -124,21 +140,24 @@ pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
 }
 
 /// What a simulator sees.
-pub(super) fn of_simulator(container: &str) -> Vec<VolumeMount> {
+pub(super) fn of_simulator(input: &JobInput<'_>, container: &str) -> Vec<VolumeMount> {
     let own = [mount_part(LOGS_VOLUME, "simulator".into(), SAVED)];
     let mounts = runner_and_status(container).into_iter().chain(own);
-    mounts.chain(name_files()).collect()
+    mounts.chain(name_files()).chain(display::mount(input)).collect()
 }
 
 /// What an agent sees.
-pub(super) fn of_agent(container: &str, pair: usize) -> Vec<VolumeMount> {
+pub(super) fn of_agent(input: &JobInput<'_>, container: &str, pair: usize) -> Vec<VolumeMount> {
     let contents = CONTENTS_VOLUMES.map(|(volume, _, read)| read_only(mount(volume, read)));
     let own = [mount_part(LOGS_VOLUME, format!("agent/agent{pair}"), AGENT)];
+    let shared = input.spec().agent.shm_size.as_ref();
+    let shared = shared.map(|_| mount(&format!("{SHM_VOLUME}{pair}"), SHM));
     runner_and_status(container)
         .into_iter()
         .chain(contents)
         .chain(own)
         .chain(name_files())
+        .chain(shared)
         .collect()
 }
 

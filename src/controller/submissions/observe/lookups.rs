@@ -1,5 +1,5 @@
-//! What no watch shows and is asked of the API server now and then: why a Job has no Pod, and, where nodes are not watched, whether
-//! one reports. Asked by a task of its own, once for all who want to know; an answer that differs wakes them. No reconcile waits
+//! What no watch shows and is asked of the API server now and then: why a Job has no Pod, whether a node is on its way for a Pod
+//! that none accepts, and, where nodes are not watched, whether one reports. Asked by a task of its own, once for all who want to know; an answer that differs wakes them. No reconcile waits
 //! for it.
 
 use std::collections::HashMap;
@@ -15,9 +15,9 @@ use kube::{Api, Client};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use super::node;
+use super::{node, scale_up};
 use crate::controller::objects::Wake;
-use crate::controller::submissions::view::ObservedNode;
+use crate::controller::submissions::view::{NodeView, ScaleUp};
 use crate::kubernetes::CALL_TIMEOUT;
 use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
@@ -41,12 +41,18 @@ enum Question {
         namespace: String,
         job: String,
     },
+    /// What an autoscaler reports of a Pod.
+    ScaleUp {
+        namespace: String,
+        pod: String,
+    },
 }
 
 #[derive(Clone, Debug, PartialEq)]
 enum Answer {
-    Node(ObservedNode),
+    Node(NodeView),
     Refusal(Option<String>),
+    ScaleUp(Option<ScaleUp>),
 }
 
 #[derive(Default)]
@@ -80,11 +86,23 @@ impl Lookups {
         Self(shared)
     }
 
-    /// Whether a node reports, as far as it was read.
-    pub fn node(&self, name: &str, by: ObjectRef<Submission>) -> ObservedNode {
+    /// How a node is, as far as it was read.
+    pub fn node(&self, name: &str, by: ObjectRef<Submission>) -> NodeView {
         match self.0.want(Question::Node(name.to_owned()), by) {
             Some(Answer::Node(seen)) => seen,
-            _ => ObservedNode::Unknown,
+            _ => NodeView::default(),
+        }
+    }
+
+    /// What an autoscaler reports of a Pod, as far as it was read.
+    pub fn scale_up(&self, namespace: &str, pod: &str, by: ObjectRef<Submission>) -> Option<ScaleUp> {
+        let question = Question::ScaleUp {
+            namespace: namespace.to_owned(),
+            pod: pod.to_owned(),
+        };
+        match self.0.want(question, by) {
+            Some(Answer::ScaleUp(report)) => report,
+            _ => None,
         }
     }
 
@@ -142,10 +160,11 @@ impl Shared {
             return Vec::new();
         };
         entry.is_under_way = false;
-        let is_nothing = matches!(
-            answer,
-            Answer::Node(ObservedNode::Unknown | ObservedNode::Reports) | Answer::Refusal(None)
-        );
+        let is_nothing = match &answer {
+            Answer::Node(node) => *node == NodeView::default() || *node == node::healthy(),
+            Answer::Refusal(text) => text.is_none(),
+            Answer::ScaleUp(report) => report.is_none(),
+        };
         let is_new = match &entry.answer {
             Some(known) => *known != answer,
             None => !is_nothing,
@@ -185,18 +204,25 @@ async fn answer(client: &Client, question: &Question) -> Answer {
     match question {
         Question::Node(name) => Answer::Node(node::read(client, name).await),
         Question::Refusal { namespace, job } => Answer::Refusal(refusal(client, namespace, job).await),
+        Question::ScaleUp { namespace, pod } => {
+            let selector = format!("involvedObject.kind=Pod,involvedObject.name={pod}");
+            let found = events(client, namespace, &selector).await;
+            Answer::ScaleUp(found.and_then(scale_up::of))
+        }
     }
 }
 
-async fn refusal(client: &Client, namespace: &str, job: &str) -> Option<String> {
+async fn events(client: &Client, namespace: &str, selector: &str) -> Option<Vec<Event>> {
     let events: Api<Event> = Api::namespaced(client.clone(), namespace);
+    let params = ListParams::default().fields(selector).limit(50);
+    let found = tokio::time::timeout(CALL_TIMEOUT, events.list(&params)).await;
+    Some(found.ok()?.ok()?.items)
+}
+
+async fn refusal(client: &Client, namespace: &str, job: &str) -> Option<String> {
     let selector = format!("involvedObject.kind=Job,involvedObject.name={job},reason=FailedCreate");
-    let params = ListParams::default().fields(&selector).limit(50);
-    let found = tokio::time::timeout(CALL_TIMEOUT, events.list(&params))
-        .await
-        .ok()?
-        .ok()?;
-    let latest = found.items.into_iter().max_by_key(|e| {
+    let found = events(client, namespace, &selector).await?;
+    let latest = found.into_iter().max_by_key(|e| {
         e.last_timestamp
             .as_ref()
             .or(e.first_timestamp.as_ref())
@@ -209,6 +235,7 @@ async fn refusal(client: &Client, namespace: &str, job: &str) -> Option<String> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::controller::submissions::view::ObservedNode;
 
     fn by(name: &str) -> ObjectRef<Submission> {
         ObjectRef::new(name).within("one")
@@ -223,20 +250,23 @@ mod tests {
         assert_eq!(shared.next(Instant::now()), Some(node.clone()));
         assert_eq!(shared.next(Instant::now()), None, "it is under way");
         assert!(
-            shared.done(&node, Answer::Node(ObservedNode::Reports)).is_empty(),
+            shared.done(&node, Answer::Node(node::healthy())).is_empty(),
             "nothing to decide on"
         );
         tokio::time::advance(Duration::from_secs(59)).await;
         assert_eq!(shared.next(Instant::now()), None);
         tokio::time::advance(Duration::from_secs(1)).await;
         assert_eq!(shared.next(Instant::now()), Some(node.clone()));
-        let mut woken = shared.done(&node, Answer::Node(ObservedNode::Gone));
+        let gone = || {
+            Answer::Node(NodeView {
+                state: ObservedNode::Gone,
+                leaving: None,
+            })
+        };
+        let mut woken = shared.done(&node, gone());
         woken.sort_by(|one, other| one.name.cmp(&other.name));
         assert_eq!(woken, [by("1"), by("2")]);
-        assert_eq!(
-            shared.want(node.clone(), by("2")),
-            Some(Answer::Node(ObservedNode::Gone))
-        );
+        assert_eq!(shared.want(node.clone(), by("2")), Some(gone()));
     }
 
     #[tokio::test(start_paused = true)]

@@ -4,6 +4,7 @@ pub mod job;
 pub mod lookups;
 pub mod node;
 pub mod pod;
+mod scale_up;
 
 use std::sync::Arc;
 
@@ -14,20 +15,25 @@ use kube::runtime::reflector::ObjectRef;
 use super::archive::ArchiveWorkers;
 use super::decide::job_name;
 use super::external::ExternalSystems;
+use super::foreign_runs::ForeignRuns;
 use super::images::Images;
 use super::memory::Memory;
 use super::reruns::Reruns;
 use super::team_history::{self, TeamHistory};
-use super::view::{ObservedJob, ObservedNode, PodView, View};
+use super::view::{NodeView, ObservedJob, PodView, View};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
+use leaderboard_api::check::without_retries;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus, conditions};
 use lookups::Lookups;
 
 /// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
 /// than all the rest.
 const REFUSED_AFTER: SignedDuration = SignedDuration::from_secs(45);
+
+/// An autoscaler has spoken after this long. A Pod that waits for the one before it to leave asks for no node.
+const SCALED_UP_AFTER: SignedDuration = SignedDuration::from_secs(20);
 
 /// What reading the world of a submission uses.
 #[derive(Clone, Copy)]
@@ -38,6 +44,7 @@ pub struct Uses<'a> {
     pub archive: &'a ArchiveWorkers,
     pub lookups: &'a Lookups,
     pub images: &'a Images,
+    pub foreign_runs: &'a ForeignRuns,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
@@ -49,18 +56,28 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let namespace = submission.namespace().unwrap_or_default();
     let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
     let leaderboard = uses.stores.leaderboards.get(&board);
+    let leaderboard = leaderboard.map(|found| {
+        if submission.spec.check {
+            Arc::new(without_retries(&found))
+        } else {
+            found
+        }
+    });
     let (job, pod) = children(uses, &submission, now);
     let status = submission.status.as_ref();
     let is_over = status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::FINISHED));
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
+    let node = node(uses, &submission, pod.as_ref());
     let archive = uses.archive.observe(&submission, pod_uid, is_over);
     let others = || uses.stores.submissions_of(&namespace);
     View {
         now,
         is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
         image: uses.images.observe(&submission),
+        traces: uses.foreign_runs.observe(&submission),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
-        node: node(uses, &submission, pod.as_ref()),
+        node: node.state,
+        leaving: node.leaving,
         report: archive.report.report,
         report_stage: archive.report.stage,
         report_waited: archive.report.waited,
@@ -110,16 +127,29 @@ fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (Observe
         let by = ObjectRef::from_obj(submission);
         job.failed_create = uses.lookups.refusal(&namespace, &name, by);
     }
-    (ObservedJob::Ours(job), pod.map(|pod| pod::view(&pod)))
+    let mut pod = pod.map(|pod| pod::view(&pod));
+    let is_waiting = job.created.is_some_and(|at| now.duration_since(at) >= SCALED_UP_AFTER);
+    if let Some(pod) = pod.as_mut().filter(|pod| is_waiting && pod.unschedulable.is_some()) {
+        pod.scale_up = uses
+            .lookups
+            .scale_up(&namespace, &pod.name, ObjectRef::from_obj(submission));
+    }
+    (ObservedJob::Ours(job), pod)
 }
 
-/// The node of a Pod that runs or is being deleted.
-fn node(uses: Uses<'_>, submission: &Submission, pod: Option<&PodView>) -> ObservedNode {
-    let matters = |pod: &&PodView| pod.delete_by.is_some() || (pod.agent_started.is_some() && pod.run_ended.is_none());
-    let name = pod.filter(matters).and_then(|pod| pod.node.as_ref());
-    name.map_or(ObservedNode::Unknown, |name| {
-        node::watched(uses.stores, name).unwrap_or_else(|| uses.lookups.node(name, ObjectRef::from_obj(submission)))
-    })
+/// The node of a Pod that has not ended. Where nodes are not watched, only that of one that runs or is being deleted is asked for.
+fn node(uses: Uses<'_>, submission: &Submission, pod: Option<&PodView>) -> NodeView {
+    let is_there = |pod: &&PodView| pod.delete_by.is_some() || pod.run_ended.is_none();
+    let Some((pod, name)) = pod.filter(is_there).and_then(|pod| Some((pod, pod.node.as_ref()?))) else {
+        return NodeView::default();
+    };
+    if let Some(seen) = node::watched(uses.stores, name) {
+        return seen;
+    }
+    if pod.delete_by.is_none() && pod.agent_started.is_none() {
+        return NodeView::default();
+    }
+    uses.lookups.node(name, ObjectRef::from_obj(submission))
 }
 
 /// How its team's attempts ended. Read only if this may be the reconcile that ends it.

@@ -1,6 +1,6 @@
-//! Whether a Pod's node still reports, as the watch of nodes shows it, or read where there is none. Of a Pod that is being deleted
-//! the answer decides between waiting for its kubelet and giving the Pod up; of one that runs, people learn of it before
-//! Kubernetes has given the Pod up.
+//! Whether a Pod's node still reports, and whether it is about to be taken away, as the watch of nodes shows it, or read where there
+//! is none. Of a Pod that is being deleted the answer decides between waiting for its kubelet and giving the Pod up; of one that
+//! runs, people learn of it before Kubernetes has given the Pod up, and its results are stored before the node is gone.
 
 use std::collections::HashMap;
 
@@ -10,31 +10,41 @@ use kube::{Api, Client};
 
 use crate::controller::objects::Wake;
 use crate::controller::stores::Stores;
-use crate::controller::submissions::view::ObservedNode;
+use crate::controller::submissions::view::{NodeView, ObservedNode};
 use crate::kubernetes::objects::{Node, Pod};
 use crate::kubernetes::{CALL_TIMEOUT, Item, Store, WatchEvents};
 use leaderboard_api::{Submission, client_errors};
 
+/// Taints with which a cluster announces that a node is about to go: Karpenter, cluster-autoscaler, and a person or a controller
+/// that knows a node to be off.
+const LEAVING: [&str; 3] = [
+    "karpenter.sh/disrupted",
+    "ToBeDeletedByClusterAutoscaler",
+    "node.kubernetes.io/out-of-service",
+];
+/// What those of the AWS Node Termination Handler begin with: `spot-itn`, `scheduled-maintenance`, and others.
+const TERMINATION_HANDLER: &str = "aws-node-termination-handler/";
+
 /// What a watch shows of a node; None without a watch that can be relied on.
-pub(super) fn watched(stores: &Stores, name: &str) -> Option<ObservedNode> {
+pub(super) fn watched(stores: &Stores, name: &str) -> Option<NodeView> {
     let nodes = stores.nodes.as_ref().filter(|nodes| nodes.synced.is_true())?;
     let found = nodes.store.get(&ObjectRef::new(name));
-    Some(found.map_or(ObservedNode::Gone, |node| of(&node)))
+    Some(found.map_or_else(gone, |node| of(&node)))
 }
 
-/// Wakes the submissions of a node when it falls silent, reports again or goes. All Pods are walked then, which is rare: a node
-/// that reports as before is no news.
+/// Wakes the submissions of a node when it falls silent, reports again, is about to go or goes. All Pods are walked then, which is
+/// rare: a node that reports as before is no news.
 pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Submission>) {
-    let mut known: HashMap<Box<str>, ObservedNode> = HashMap::new();
+    let mut known: HashMap<Box<str>, NodeView> = HashMap::new();
     while let Some(event) = nodes.next().await {
         let name: &str = &event.object.metadata.name;
         let (before, now) = if event.is_gone {
-            (known.remove(name), ObservedNode::Gone)
+            (known.remove(name), gone())
         } else {
             let now = of(&event.object);
-            (known.insert(name.into(), now), now)
+            (known.insert(name.into(), now.clone()), now)
         };
-        if before.unwrap_or(ObservedNode::Reports) != now {
+        if before.unwrap_or_else(healthy) != now {
             let pods = pods.state();
             let of_node = pods.iter().filter(|pod| pod.spec.node_name.as_deref() == Some(name));
             of_node.filter_map(|pod| Stores::owner_of(pod.as_ref())).for_each(&wake);
@@ -43,22 +53,54 @@ pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Sub
 }
 
 /// Reads a node. Without the right to (an operator of one namespace has none) it stays unknown.
-pub(super) async fn read(client: &Client, name: &str) -> ObservedNode {
+pub(super) async fn read(client: &Client, name: &str) -> NodeView {
     let nodes: Api<Item<Node>> = Api::all(client.clone());
     match tokio::time::timeout(CALL_TIMEOUT, nodes.get_opt(name)).await {
-        Ok(Ok(Some(node))) => node.object.map_or(ObservedNode::Unknown, |node| of(&node)),
-        Ok(Ok(None)) => ObservedNode::Gone,
+        Ok(Ok(Some(node))) => node.object.map_or_else(|_| NodeView::default(), |node| of(&node)),
+        Ok(Ok(None)) => gone(),
         Ok(Err(error)) => {
             let error = client_errors::kube(&error);
             tracing::debug!(node = %name, error, "a node cannot be read");
-            ObservedNode::Unknown
+            NodeView::default()
         }
-        Err(_) => ObservedNode::Unknown,
+        Err(_) => NodeView::default(),
     }
 }
 
+fn gone() -> NodeView {
+    NodeView {
+        state: ObservedNode::Gone,
+        leaving: None,
+    }
+}
+
+/// A node of which there is nothing to be known.
+pub(super) fn healthy() -> NodeView {
+    NodeView {
+        state: ObservedNode::Reports,
+        leaving: None,
+    }
+}
+
+fn of(node: &Node) -> NodeView {
+    NodeView {
+        state: state(node),
+        leaving: leaving(node),
+    }
+}
+
+/// One that only asks new Pods to prefer other nodes announces no end, and the next Pod could come to this node again.
+fn leaving(node: &Node) -> Option<String> {
+    let mut taints = node.spec.taints.iter();
+    let found = taints.find(|taint| {
+        let keeps_off = ["NoSchedule", "NoExecute"].contains(&&*taint.effect);
+        keeps_off && (LEAVING.contains(&&*taint.key) || taint.key.starts_with(TERMINATION_HANDLER))
+    })?;
+    Some(found.key.to_string())
+}
+
 /// The node controller says `Unknown` of a kubelet whose lease and status have run out; `False` is the kubelet's own word.
-fn of(node: &Node) -> ObservedNode {
+fn state(node: &Node) -> ObservedNode {
     match &node.status.ready {
         Some(ready) if &*ready.status != "Unknown" => ObservedNode::Reports,
         Some(ready) => ready
@@ -82,11 +124,12 @@ mod tests {
     #[tokio::test]
     async fn only_the_submissions_of_a_node_that_has_changed_are_woken() {
         let node = |name: &str, ready: &str| -> Node {
+            let (ready, taint) = ready.split_once(' ').unwrap_or((ready, ""));
             let conditions = json!([{"type": "Ready", "status": ready, "lastTransitionTime": "2026-01-01T00:00:00Z"}]);
-            serde_json::from_value(
-                json!({"metadata": {"name": name, "uid": name}, "status": {"conditions": conditions}}),
-            )
-            .unwrap()
+            let taints = json!([{"key": taint, "effect": "NoSchedule"}]);
+            let metadata = json!({"name": name, "uid": name});
+            let node = json!({"metadata": metadata, "spec": {"taints": taints}, "status": {"conditions": conditions}});
+            serde_json::from_value(node).unwrap()
         };
         let pod = |name: &str, node: &str| -> Pod {
             let metadata = json!({"name": name, "namespace": "n", "labels": {names::LABEL_SUBMISSION: name}});
@@ -110,6 +153,8 @@ mod tests {
         assert!(shows("a", "True", false).is_empty(), "a node reports all the time");
         assert_eq!(shows("a", "Unknown", false), ["one"]);
         assert_eq!(shows("a", "True", false), ["one"]);
+        assert_eq!(shows("a", "True karpenter.sh/disrupted", false), ["one"]);
+        assert!(shows("a", "True karpenter.sh/disrupted", false).is_empty());
         assert_eq!(shows("b", "True", true), ["two"]);
         assert_eq!(
             shows("b", "Unknown", false),
@@ -137,8 +182,30 @@ mod tests {
             (json!([]), ObservedNode::Unknown),
         ] {
             let node = json!({"metadata": {"name": "n"}, "status": {"conditions": conditions}});
-            assert_eq!(of(&serde_json::from_value(node.clone()).unwrap()), expected, "{node}");
+            let seen = of(&serde_json::from_value(node.clone()).unwrap());
+            assert_eq!((seen.state, seen.leaving), (expected, None), "{node}");
         }
-        assert_eq!(of(&Node::default()), ObservedNode::Unknown);
+        assert_eq!(of(&Node::default()), NodeView::default());
+    }
+
+    #[test]
+    fn a_taint_that_keeps_new_pods_off_announces_the_end_of_its_node() {
+        for (key, effect, announces) in [
+            ("karpenter.sh/disrupted", "NoSchedule", true),
+            ("ToBeDeletedByClusterAutoscaler", "NoSchedule", true),
+            ("aws-node-termination-handler/spot-itn", "NoSchedule", true),
+            ("aws-node-termination-handler/scheduled-maintenance", "NoExecute", true),
+            ("node.kubernetes.io/out-of-service", "NoExecute", true),
+            ("karpenter.sh/disrupted", "PreferNoSchedule", false),
+            ("DeletionCandidateOfClusterAutoscaler", "PreferNoSchedule", false),
+            ("node.kubernetes.io/unschedulable", "NoSchedule", false),
+            ("node.kubernetes.io/unreachable", "NoExecute", false),
+            ("nvidia.com/gpu", "NoSchedule", false),
+        ] {
+            let others = json!({"key": "nvidia.com/gpu", "value": "true", "effect": "NoSchedule"});
+            let node = json!({"spec": {"taints": [others, {"key": key, "effect": effect}]}});
+            let seen = of(&serde_json::from_value(node).unwrap()).leaving;
+            assert_eq!(seen.as_deref(), announces.then_some(key), "{key}:{effect}");
+        }
     }
 }

@@ -21,12 +21,14 @@ pub fn view(pod: &Pod) -> PodView {
         node: pod.spec.node_name.as_deref().map(str::to_owned),
         scheduled: scheduled(status),
         unschedulable: unschedulable(status),
+        scale_up: None,
         delete_by: meta.deletion_timestamp.as_ref().map(|t| t.0),
         deleted: deleted(pod),
         agent_started: agent_started(status),
         logcopy_running: running(names::CONTAINER_LOGCOPY),
         run_ended: run_ended(pod),
         ended_by_node: ended_by_node(status),
+        disruption: status.conditions.disruption.as_deref().map(short),
         stop: meta.annotations.stop.as_deref().and_then(Stop::parse),
         containers,
     }
@@ -41,7 +43,7 @@ fn deleted(pod: &Pod) -> Option<jiff::Timestamp> {
 
 /// Whether it has a node, if the scheduler says this of it.
 fn scheduling<'a>(status: &'a PodStatus, truth: &str) -> Option<&'a Condition> {
-    status.scheduled.as_deref().filter(|c| &*c.status == truth)
+    status.conditions.scheduled.as_deref().filter(|c| &*c.status == truth)
 }
 
 fn scheduled(status: &PodStatus) -> Option<jiff::Timestamp> {
@@ -101,6 +103,11 @@ fn container(status: &ContainerStatus) -> ContainerView {
         name: status.name.to_string(),
         restarts: status.restart_count,
         running: state.running.is_some(),
+        began: state
+            .running
+            .as_ref()
+            .and_then(|running| running.started_at.as_ref())
+            .map(|t| t.0),
         waiting: state.waiting.as_ref().map(|w| {
             (
                 w.reason.as_deref().unwrap_or_default().to_owned(),
@@ -257,6 +264,21 @@ mod tests {
             "state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}});
         assert_eq!(seen(vec![agent.clone(), running]), None);
         assert_eq!((seen(vec![agent]), seen(vec![])), (None, None), "not all are known yet");
+    }
+
+    #[test]
+    fn who_takes_a_pod_away_is_read_while_it_does() {
+        let seen = |status: &str| {
+            let pod = json!({"metadata": {"name": "p"}, "status": {"conditions": [
+                {"type": "PodScheduled", "status": "True", "lastTransitionTime": "2026-01-01T00:00:00Z"},
+                {"type": "DisruptionTarget", "status": status, "reason": "EvictionByEvictionAPI"},
+            ]}});
+            let seen = view(&serde_json::from_value(pod).unwrap());
+            assert!(seen.scheduled.is_some());
+            seen.disruption
+        };
+        assert_eq!(seen("True").as_deref(), Some("EvictionByEvictionAPI"));
+        assert_eq!(seen("False"), None);
     }
 
     #[test]

@@ -40,6 +40,8 @@ pub(super) enum Priority {
     CancelList,
     Acceptance,
     Sweep,
+    /// The next request about a challenge's queue.
+    Inbox,
     Progress,
     /// An end that EvalAI knows already, or refused several times.
     Cancelled,
@@ -52,6 +54,7 @@ enum What<'a> {
     Sub(&'a Key, Step),
     List(i64, Purpose),
     Check(i64),
+    Inbox(&'a str),
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -114,6 +117,10 @@ impl Queue {
             }
             What::List(id, purpose) => self.start_list(id, purpose, &now),
             What::Check(id) => self.start_check(id),
+            What::Inbox(name) => {
+                let name = name.to_owned();
+                self.inboxes.start(&name, now.at)
+            }
         };
         match started {
             Some(request) => {
@@ -174,6 +181,16 @@ impl Queue {
             offer_of_list(Priority::Sweep, challenge, *id, *purpose)
         });
         offers.extend(lists);
+        // Only a leader makes objects of messages.
+        if may_write {
+            offers.extend(self.inboxes.offers(now.at).map(|(name, due)| Offer {
+                priority: Priority::Inbox,
+                ended: None,
+                since: due,
+                ready: due,
+                what: What::Inbox(name),
+            }));
+        }
         offers
     }
 

@@ -126,22 +126,26 @@ impl Queue {
     /// A row that asks to be run, long enough ago for its message to be lost, and that no object here is for.
     fn sweep_row(&mut self, id: i64, row: &Row, now: &Now) {
         let lost = SignedDuration::try_from(self.timing.lost).unwrap_or(SignedDuration::MAX);
+        let (Some(time), Some(phase)) = (row.wanted_at(), row.phase) else {
+            return;
+        };
+        // Another Leaderboard of the challenge may be far older: what came before that of the row's phase has another worker.
+        let targets = self.served.values().filter(|target| target.challenge == id);
+        let Some(target) = targets
+            .filter(|target| target.phases.contains(&phase))
+            .min_by_key(|target| target.since)
+        else {
+            return;
+        };
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
         };
-        let (Some((_, since)), Some(time), Some(phase)) = (challenge.sweep, row.wanted_at(), row.phase) else {
-            return;
-        };
-        let age = now.wall.duration_since(time);
+        let (age, since) = (now.wall.duration_since(time), target.since);
         challenge.swept.retain(|_, (_, found)| *found + SWEPT_FOR > now.at);
         let is_known = challenge.swept.get(&row.id).is_some_and(|(at, _)| *at == time);
         if age < lost || time < since || is_known || self.pks.contains_key(&row.id) {
             return;
         }
-        // All that this queue serves is of one server.
-        let Some(target) = self.served.values().find(|target| target.challenge == id) else {
-            return;
-        };
         challenge.swept.insert(row.id, (time, now.at));
         self.sweep.push(SweepRow {
             server: target.api_server.clone(),

@@ -11,6 +11,7 @@
 
 mod answers;
 mod choose;
+mod inbox;
 mod lists;
 mod outlook;
 mod poll;
@@ -25,6 +26,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use self::inbox::Inboxes;
 use self::poll::Challenge;
 use self::sub::{Asked, Pending, Sub};
 use super::budget::Budget;
@@ -32,10 +34,13 @@ use super::labels::{Labels, compare};
 use super::payload::{check, digest};
 use super::request::Request;
 use super::status::{Outcome, Progress};
-use super::types::{Changed, DesiredUpdate, Ended, Key, Payload, Subject, SubmissionState, SweepRow, Target};
+use super::types::{Changed, DesiredUpdate, Ended, Key, Load, Payload, Subject, SubmissionState, SweepRow, Target};
 
 /// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
 const MAX_IN_FLIGHT: usize = 4;
+/// Of so many requests one at most is a list of cancelled submissions, which may go before most others: a write takes two, and
+/// would never get them if a short period asked for each.
+const LIST_SHARE: u32 = 3;
 
 /// The moment, on both clocks.
 #[derive(Clone, Copy, Debug)]
@@ -132,6 +137,7 @@ pub struct Queue {
     token_refused: Option<(String, Duration)>,
     changes: BTreeSet<Changed>,
     sweep: Vec<SweepRow>,
+    inboxes: Inboxes,
 }
 
 impl Queue {
@@ -150,6 +156,7 @@ impl Queue {
             token_refused: None,
             changes: BTreeSet::new(),
             sweep: Vec::new(),
+            inboxes: Inboxes::new(requests_per_minute, now.at),
         }
     }
 
@@ -322,8 +329,17 @@ impl Queue {
         self.budget.used(now.at)
     }
 
+    /// What the budget allows and what of it is used.
+    pub fn load(&self, now: Now) -> Load {
+        Load {
+            used: self.requests_of_last_minute(now) as usize,
+            limit: self.budget.limit() as usize,
+            waiting: self.waiting(),
+        }
+    }
+
     /// Updates and questions that wait for a request.
-    pub fn waiting(&self) -> usize {
+    fn waiting(&self) -> usize {
         let of = |sub: &Sub| {
             usize::from(sub.asked.is_some())
                 + usize::from(sub.progress.is_some())
@@ -381,13 +397,18 @@ impl Queue {
         if let Some(limit) = self.served.values().map(|target| target.requests_per_minute).min() {
             self.budget.set_limit(limit, now.at);
         }
+        let served: BTreeSet<i64> = self.served.values().map(|target| target.challenge).collect();
+        let lists = u32::try_from(served.len()).unwrap_or(u32::MAX).max(1);
+        let least = self.budget.interval().saturating_mul(lists.saturating_mul(LIST_SHARE));
         for (id, challenge) in &mut self.challenges {
             let of = || self.served.values().filter(|target| target.challenge == *id);
-            challenge.period = of().map(|target| target.period).min().unwrap_or(challenge.period);
+            let period = of().map(|target| target.period).min().unwrap_or(challenge.period);
+            challenge.period = period.max(least);
             let since = of().map(|target| target.since).min();
             challenge.sweep = of().map(|target| target.sweep).min().zip(since);
             challenge.check.wanted = of().flat_map(|target| target.phases.iter().copied()).collect();
         }
+        self.arrange_inboxes(&now);
     }
 }
 

@@ -57,7 +57,7 @@ pub(super) fn pause(failures: u32) -> Duration {
 pub(super) struct Challenge {
     /// Time between two lists of cancelled submissions.
     pub period: Duration,
-    /// Time between two sweeps, and since when what they find counts; none while no Leaderboard serves it.
+    /// Time between two sweeps, and from when on their lists reach, that of the oldest Leaderboard; none while none serves it.
     pub sweep: Option<(Duration, Timestamp)>,
     /// When each of its lists is due. One that was never asked for is due at once.
     pub lists: BTreeMap<Purpose, Poll>,

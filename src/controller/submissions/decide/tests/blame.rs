@@ -73,8 +73,21 @@ fn check(rows: Vec<Row>) {
 
 #[test]
 fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_says() {
-    use EndReason::{SimulatorCrashed, SimulatorNotReady, SimulatorSilent};
+    use EndReason::{GraphicsDriverMissing, NoGPU, SimulatorCrashed, SimulatorNotReady, SimulatorSilent};
     check(vec![
+        both("no GPU", "noGpu", "peerCrashed", NoGPU),
+        both(
+            "nothing to draw with",
+            "graphicsDriverMissing",
+            "exited",
+            GraphicsDriverMissing,
+        ),
+        Row {
+            what: "no GPU, and the agent's image is still pulled",
+            simulator: Some(ended("simulator-1", 1, "noGpu", 69, 100)),
+            agent: None,
+            expected: Settled(NoGPU),
+        },
         both("exited", "exited", "peerCrashed", SimulatorCrashed),
         both("the agent noticed first", "exited", "exited", SimulatorCrashed),
         both("killed", "killed", "exited", SimulatorCrashed),
@@ -118,6 +131,7 @@ fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_word() {
         both("killed with its runner", "peerCrashed", "silentDeath", SilentDeath),
         both("says done and crashes", "finished", "exited", Exited),
         both("blames its simulator", "peerCrashed", "notReady", BlamesSimulator),
+        both("blames its node", "peerCrashed", "noGpu", BlamesSimulator),
         both("each blames the other", "peerCrashed", "peerCrashed", BlamesSimulator),
         both("took a port", "portTaken", "peerCrashed", PortTaken),
         row(

@@ -9,12 +9,13 @@ use serde_json::json;
 use super::rules;
 use crate::controller::submissions::decide::blame::is_crash;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
+use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
-    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, PodView, RecordView, Stage, Standing, Texts,
-    Turn, View,
+    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, ObservedTraces, PodView, RecordView, Stage,
+    Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -80,11 +81,17 @@ pub fn info() -> EvalaiInfo {
         team_id: "42".into(),
         team_name: Some("Team".into()),
         submitted_at: Some(at(-60)),
+        resumed_at: None,
         rerun_of: None,
         last_attempt: 0,
         image: Some("ecr/agent:9".into()),
         image_problem: None,
     }
+}
+
+/// An answer of table and bucket that was asked for at this moment.
+pub fn looked(at: Timestamp, found: Result<Traces, Unread>) -> Looked {
+    Looked { at, found }
 }
 
 /// A world, and what the last pass in it wanted.
@@ -106,10 +113,13 @@ impl World {
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
                 is_policy_in_place: true,
                 image: ObservedImage::NotAsked,
+                // Nobody else runs it; the tests of foreign runs say otherwise.
+                traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
                 turn: Turn::Go,
                 job: ObservedJob::Absent,
                 pod: None,
                 node: ObservedNode::Unknown,
+                leaving: None,
                 report: ObservedReport::NotRead,
                 // Whatever is asked for is there already; the tests of waiting say otherwise.
                 report_stage: Some(Stage::JobEnded),

@@ -1,12 +1,13 @@
 //! Crashes of a pair: whose they are, how many are forgiven.
 
 use super::builders::*;
+use crate::controller::submissions::decide::end;
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
 use crate::pod::run::Stop;
-use leaderboard_api::Failure;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
 use leaderboard_api::reasons;
+use leaderboard_api::{Failure, MAX_NODES_WITHOUT_GPU, NodeWithoutGpu};
 
 /// Each side of pair 1 ends like this until its retries are used up: what comes of it.
 fn used_up(agent: &str, simulator: &str) -> Failure {
@@ -343,4 +344,76 @@ fn ends_on_command_are_no_crashes() {
         assert_eq!(plan.status.pairs.len(), 2);
         assert!(plan.status.pairs.iter().all(|p| p.crashes == 0 && p.last.is_none()));
     }
+}
+
+/// The first simulator of a Pod ended like this before any agent began.
+fn see_without_graphics(world: &mut World, what: &str) {
+    world.view.pod = Some(pod(0));
+    world.pod().logcopy_running = true;
+    world.see_alone(running("logcopy"));
+    world.see_alone(ended("simulator-1", 0, what, 69, 5));
+}
+
+#[test]
+fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
+    let mut world = World::local().with_job();
+    see_without_graphics(&mut world, "noGpu");
+    for jobs in [1, 2] {
+        let plan = world.pass_to(Pending, reasons::STOPPING);
+        assert_eq!(annotated(&plan), Some(Stop::Retries));
+        let failure = plan.status.failure.unwrap();
+        assert_eq!(
+            (failure.reason.as_str(), failure.class),
+            (reasons::NO_GPU, Infrastructure)
+        );
+        let message = "Simulator 1 saw no GPU on node node-a, although the Leaderboard gives it one.";
+        assert_eq!((failure.message.as_str(), failure.pair), (message, Some(1)));
+        world.complete();
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        let node_name = "node-a".into();
+        assert_eq!(plan.status.nodes_without_gpu, [NodeWithoutGpu { node_name, jobs }]);
+        world.job_gone();
+        world.wait(60);
+        assert!(creates(&world.pass()));
+        world.see_job();
+        world.view.report = ObservedReport::NotRead;
+        see_without_graphics(&mut world, "noGpu");
+    }
+    world.pass_to(Pending, reasons::STOPPING);
+    world.complete();
+    let failure = world.pass_to(Failed, reasons::NO_GPU).status.failure.unwrap();
+    assert!(
+        !failure.charged && failure.message.contains("Look at the node"),
+        "{}",
+        failure.message
+    );
+    assert!(!failure.participant_message.unwrap().contains("node-a"));
+}
+
+#[test]
+fn a_node_whose_driver_cannot_draw_is_no_reason_for_another_job() {
+    let mut world = World::local().with_job();
+    see_without_graphics(&mut world, "graphicsDriverMissing");
+    world.pass_to(Pending, reasons::STOPPING);
+    world.complete();
+    let failure = world
+        .pass_to(Failed, reasons::GRAPHICS_DRIVER_MISSING)
+        .status
+        .failure
+        .unwrap();
+    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    let begin = "Simulator 1 had a GPU and could not draw: the NVIDIA driver of node node-a has no Vulkan/OpenGL part (nvidia_icd.json). \
+                 Use a node image";
+    assert!(failure.message.starts_with(begin), "{}", failure.message);
+}
+
+#[test]
+fn of_nodes_without_a_gpu_the_newest_are_remembered() {
+    let mut nodes = Vec::new();
+    for node in 0..=MAX_NODES_WITHOUT_GPU {
+        end::note_without_gpu(&mut nodes, format!("node-{node}"));
+    }
+    end::note_without_gpu(&mut nodes, "node-1".into());
+    let found: Vec<(&str, i32)> = nodes.iter().map(|node| (node.node_name.as_str(), node.jobs)).collect();
+    assert_eq!((found.len(), found[0]), (MAX_NODES_WITHOUT_GPU, ("node-1", 2)));
 }

@@ -278,6 +278,7 @@ fn participants_read_nothing_of_what_a_registry_or_the_network_answers_to_a_pull
     ] {
         let mut world = World::local().with_pod();
         world.see(waiting("agent-1", "ImagePullBackOff", words));
+        world.pass();
         world.go_to(2000);
         let failure = world.pass().status.failure.unwrap();
         let shown = failure.participant_message.unwrap();

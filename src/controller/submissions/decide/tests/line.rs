@@ -61,6 +61,7 @@ fn joining_the_line_shows_nothing_and_starts_nothing() {
             track: "sensors".into(),
             priority: 0,
             submitted: if is_evalais { at(-60) } else { created },
+            is_check: false,
         };
         assert_eq!(plan.actions, [Action::JoinLine(place.clone())]);
 

@@ -134,6 +134,7 @@ fn a_preparation_that_fails_is_told_by_its_container_before_the_job_is_deleted()
     for name in ["contents", "workspace", "logcopy"] {
         let mut world = World::local().with_pod();
         world.see(ended(name, 5, "", 3, 1700));
+        world.pass();
         world.go_to(1800);
         let plan = world.pass_to(Pending, reasons::STOPPING);
         assert_eq!(places(&plan), [format!("node {name}")]);
@@ -176,6 +177,7 @@ fn what_never_ran_has_no_log() {
     ] {
         let mut world = World::local().with_pod();
         world.see(waiting("agent-1", word, "it is missing"));
+        world.pass();
         world.go_to(1800);
         let plan = world.pass_to(Pending, reasons::STOPPING);
         assert_eq!(plan.status.failure.as_ref().unwrap().reason, reason);

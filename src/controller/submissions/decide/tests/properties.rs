@@ -22,7 +22,7 @@ enum Change {
     Time(i64),
     Job(JobCase),
     Pod(Option<Box<PodView>>),
-    Node(ObservedNode),
+    Node(ObservedNode, Option<&'static str>),
     Report(ObservedReport),
     Answers {
         stage: Option<Stage>,
@@ -149,18 +149,25 @@ fn pod_view() -> impl Strategy<Value = PodView> {
         select(vec![None, Some(at(10))]),
         any::<bool>(),
     );
-    let fate = (
+    let outcome = (
         select(vec![None, None, Some(at(30)), Some(at(900))]),
         select(ends),
         any::<bool>(),
         select(vec![None, None, Some(at(400))]),
+        select(vec![
+            None,
+            None,
+            None,
+            Some("EvictionByEvictionAPI"),
+            Some("TerminationByKubelet"),
+        ]),
     );
     let stop = select(vec![None, Some(Stop::Cancel), Some(Stop::Retries)]);
     let containers = prop::collection::vec(container(), 0..5);
     let uid = select(vec!["pod-uid", "pod-2"]);
-    (times, fate, stop, containers, uid).prop_map(|(times, fate, stop, containers, uid)| {
+    (times, outcome, stop, containers, uid).prop_map(|(times, outcome, stop, containers, uid)| {
         let (scheduled, agent_started, logcopy_running) = times;
-        let (delete_by, ended_by_node, unschedulable, run_ended) = fate;
+        let (delete_by, ended_by_node, unschedulable, run_ended, disruption) = outcome;
         PodView {
             uid: uid.into(),
             scheduled,
@@ -170,6 +177,7 @@ fn pod_view() -> impl Strategy<Value = PodView> {
             delete_by,
             deleted: delete_by.map(|by| by.min(at(300))),
             ended_by_node,
+            disruption: disruption.map(str::to_owned),
             unschedulable: (unschedulable && scheduled.is_none()).then(|| "no node".into()),
             stop,
             containers,
@@ -300,7 +308,7 @@ fn change() -> impl Strategy<Value = Change> {
         6 => select(vec![1i64, 20, 130, 2000, 90_000, -500, -200_000]).prop_map(Change::Time),
         8 => job().prop_map(Change::Job),
         6 => prop::option::weighted(0.9, pod_view().prop_map(Box::new)).prop_map(Change::Pod),
-        3 => select(nodes).prop_map(Change::Node),
+        3 => (select(nodes), select(vec![None, None, Some("karpenter.sh/disrupted")])).prop_map(|(node, leaving)| Change::Node(node, leaving)),
         5 => report_sight().prop_map(Change::Report),
         4 => answers(),
         3 => evalai_view().prop_map(Box::new).prop_map(Change::Evalai),
@@ -346,7 +354,9 @@ fn apply(world: &mut World, change: Change) {
         Change::Time(seconds) => world.wait(seconds),
         Change::Job(case) => set_job(world, case),
         Change::Pod(pod) => world.view.pod = pod.map(|pod| *pod),
-        Change::Node(node) => world.view.node = node,
+        Change::Node(node, leaving) => {
+            (world.view.node, world.view.leaving) = (node, leaving.map(str::to_owned));
+        }
         Change::Report(report) => world.view.report = report,
         Change::Answers {
             stage,

@@ -196,6 +196,7 @@ fn a_job_is_deleted_after_a_failure_when_its_log_is_kept_or_was_waited_for() {
     ] {
         let mut world = World::local().with_pod();
         world.see(ended("workspace", 5, "", 3, 1700));
+        world.pass();
         world.go_to(1800);
         world.view.log = log;
         let plan = world.pass_to(Pending, reasons::STOPPING);

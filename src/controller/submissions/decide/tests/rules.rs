@@ -13,6 +13,13 @@ const SETTLED_AFTER: usize = 5;
 
 /// Checks one pass, and that the world comes to rest after it.
 pub fn check(view: &View, plan: &Plan) {
+    if view.submission.awaits_import() {
+        assert!(
+            plan.actions.is_empty() && plan.events.is_empty(),
+            "its import writes first"
+        );
+        return;
+    }
     terminal_states_stay(view, plan);
     one_job(view, plan);
     tells_fit(view, plan);
@@ -177,9 +184,14 @@ fn tells_fit(view: &View, plan: &Plan) {
 
 fn status_is_whole(plan: &Plan) {
     let status = &plan.status;
-    let waits = |action: &Action| matches!(action, Action::JoinLine(_) | Action::AskEvalai | Action::LookUpImage(_));
+    let waits = |action: &Action| {
+        matches!(
+            action,
+            Action::JoinLine(_) | Action::AskEvalai | Action::LookUpImage(_) | Action::LookForForeignRun(_)
+        )
+    };
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
-        // Nothing was written of it yet, and its place, EvalAI's answer or the registry's comes first.
+        // Nothing was written of it yet, and its place, or an answer of EvalAI, table and bucket or the registry comes first.
         return;
     }
     let state = status.state.expect("a state");

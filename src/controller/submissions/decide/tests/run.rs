@@ -125,7 +125,7 @@ fn a_run_without_a_limit_goes_on_and_a_track_has_its_own() {
     world.pass_to(Running, reasons::RUNNING);
     world.leaderboard().tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
         run_seconds: Some(86_400),
-        start_seconds: None,
+        ..Default::default()
     });
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::TIME_LIMIT);

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::view::ContainerView;
+use crate::controller::submissions::view::{ContainerView, ScaleUp};
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Pending, Running};
@@ -222,6 +222,53 @@ fn a_silent_kubelet_fails_as_infrastructure_after_start_seconds() {
 }
 
 #[test]
+fn slow_pulls_use_up_their_own_deadline_and_not_that_of_the_start() {
+    let mut world = World::local().with_pod();
+    world.leaderboard().retries.infrastructure = 0;
+    world.see(ended("contents", 0, "", 0, 1500));
+    world.see(ended("workspace", 0, "", 0, 1550));
+    world.see(running("logcopy"));
+    for name in ["simulator-1", "simulator-2", "agent-1", "agent-2"] {
+        world.see(waiting(name, "PodInitializing", ""));
+    }
+    // Two containers of 50 s have run meanwhile.
+    for second in [1801, 5400, 5499] {
+        world.go_to(second);
+        world.pass_to(Pending, reasons::PREPARING);
+    }
+    world.leaderboard().tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
+        pull_seconds: Some(6000),
+        ..Default::default()
+    });
+    world.go_to(5500);
+    world.pass_to(Pending, reasons::PREPARING);
+    world.leaderboard().tracks[0].deadlines = None;
+    world.pass_to(Pending, reasons::STOPPING);
+    world.job_gone();
+    let failure = world.pass_to(Failed, reasons::START_DEADLINE).status.failure.unwrap();
+    assert_eq!(failure.class, Infrastructure);
+    let expected = "The images of the Pod were not pulled within 5400 s on node-a; these containers wait: simulator-1, simulator-2, \
+                    agent-1, agent-2.";
+    assert!(failure.message.starts_with(expected), "{}", failure.message);
+}
+
+#[test]
+fn a_pull_that_fails_late_is_shown_at_once_and_has_the_time_of_a_start() {
+    let mut world = World::local().with_pod();
+    world.leaderboard().retries.infrastructure = 0;
+    world.see(waiting("contents", "PodInitializing", ""));
+    world.go_to(4000);
+    world.pass_to(Pending, reasons::PREPARING);
+    world.see(waiting("contents", "ErrImagePull", "unexpected EOF"));
+    let plan = world.pass_to(Pending, reasons::IMAGE_PULL);
+    assert_eq!(events(&plan), [reasons::IMAGE_PULL]);
+    world.go_to(5799);
+    world.pass_to(Pending, reasons::IMAGE_PULL);
+    world.go_to(5800);
+    world.pass_to(Pending, reasons::STOPPING);
+}
+
+#[test]
 fn without_a_node_it_waits_for_ever_saying_why() {
     let words = "0/1 nodes are available: 1 Insufficient nvidia.com/gpu.";
     let mut world = World::local().with_pod();
@@ -253,6 +300,31 @@ fn without_a_node_it_waits_for_ever_saying_why() {
         .unwrap();
     assert_eq!(failure.class, Infrastructure);
     assert!(failure.message.contains(words));
+}
+
+#[test]
+fn a_wait_for_a_node_says_whether_one_is_on_its_way() {
+    let coming = ScaleUp::Coming("pod triggered scale-up: [{gpu 0->1 (max: 2)}]".into());
+    let refused = ScaleUp::Refused("pod didn't trigger scale-up: 1 max node group size reached".into());
+    for (said, expected) in [
+        (None, "0/1 nodes are available."),
+        (
+            Some(coming),
+            "0/1 nodes are available. A node is on its way: pod triggered scale-up: [{gpu 0->1 (max: 2)}].",
+        ),
+        (
+            Some(refused),
+            "0/1 nodes are available. The autoscaler adds no node: pod didn't trigger scale-up: 1 max node group size reached.",
+        ),
+    ] {
+        let mut world = World::local().with_pod();
+        let pod = world.pod();
+        (pod.scheduled, pod.node, pod.scale_up) = (None, None, said);
+        pod.unschedulable = Some("0/1 nodes are available".into());
+        world.go_to(30);
+        let plan = world.pass_to(Pending, reasons::UNSCHEDULABLE);
+        assert_eq!(plan.status.message.as_deref(), Some(expected));
+    }
 }
 
 #[test]
@@ -303,7 +375,7 @@ fn an_agent_that_waits_for_a_simulator_without_image_is_no_run() {
     let plan = world.pass_to(Pending, reasons::IMAGE_PULL);
     assert!(plan.status.message.as_ref().unwrap().contains("simulator-1"));
     assert_eq!(evalai_updates(&plan), [], "it has begun, and does not run");
-    world.go_to(1800);
+    world.go_to(10 + 1800);
     let plan = world.pass_to(Pending, reasons::STOPPING);
     let stop = Stop::Retries;
     assert!(has(&plan, |a| *a

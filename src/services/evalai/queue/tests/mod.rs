@@ -3,6 +3,7 @@
 mod bursts;
 mod cancels;
 mod faults;
+mod inbox;
 mod life;
 mod order;
 mod outage;
@@ -35,6 +36,8 @@ fn target() -> Target {
         period: Duration::from_secs(10),
         phases: [1].into(),
         labels: ["Driving score".to_owned()].into(),
+        inbox: None,
+        is_observed: false,
         since: wall(-3600),
     }
 }

@@ -150,6 +150,74 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
 }
 
 #[test]
+fn lists_that_are_wanted_more_often_than_the_budget_allows_leave_enough_for_the_rest() {
+    for (period, requests_per_minute) in [(2, 27), (1, 54), (10, 6)] {
+        let mut bench = Bench::new();
+        let often = Target {
+            period: Duration::from_secs(period),
+            requests_per_minute,
+            ..target()
+        };
+        let now = bench.now();
+        bench.queue.serve(&key(100), &often, now);
+        bench.live(7, 1);
+        bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+        bench.ask(8, 1);
+        bench.live(9, 1);
+        let mut sent = Vec::new();
+        for _ in 0..300 {
+            bench.wait(1.0);
+            while let Some((name, ticket)) = bench.next() {
+                let reply = match &ticket.request {
+                    Request::List { .. } => Reply::Rows(Answer::Done(vec![])),
+                    Request::Get(subject) => Reply::Row(Answer::Done(row(subject.pk, Status::Submitted))),
+                    Request::Phases(_) => Reply::Phases(Answer::Done(vec![])),
+                    Request::Splits(_) => Reply::Splits(Answer::Done(vec![])),
+                    _ => Reply::Written(Answer::Done(())),
+                };
+                bench.answer(&ticket, reply);
+                sent.push(name);
+            }
+        }
+        for wanted in [
+            "finished 7",
+            "submission 8",
+            "sweep of submitted",
+            "sweep of resuming",
+            "list of cancelled",
+        ] {
+            assert!(
+                sent.iter().any(|name| name == wanted),
+                "{requests_per_minute} requests a minute, a list every {period} s: no {wanted} in {sent:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn the_sweep_takes_of_each_phase_what_came_after_its_own_leaderboard() {
+    let mut bench = Bench::new();
+    bench.serve();
+    let younger = Target {
+        phases: [2].into(),
+        since: wall(-1800),
+        ..target()
+    };
+    let now = bench.now();
+    bench.queue.serve(&key(90), &younger, now);
+    let at = |pk, phase, seconds| Row {
+        phase: Some(phase),
+        submitted_at: Some(wall(seconds)),
+        ..row(pk, Status::Submitted)
+    };
+    // The second came when only the first Leaderboard was there: whatever served its phase then still works on it.
+    let rows = vec![at(1, 1, -2000), at(2, 2, -2000), at(3, 2, -1000), at(4, 3, -1000)];
+    bench.list("sweep of submitted", rows);
+    let swept: Vec<_> = bench.queue.take_sweep().into_iter().map(|row| row.submission).collect();
+    assert_eq!(swept, [1, 3]);
+}
+
+#[test]
 fn a_swept_row_that_was_run_before_is_told_from_a_lost_rerun() {
     let edited = |pk| Row {
         submitted_at: Some(wall(-1000)),

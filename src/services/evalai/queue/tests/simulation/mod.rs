@@ -118,6 +118,8 @@ fn target() -> Target {
         period: Duration::from_secs(10),
         phases: [1].into(),
         labels: ["Driving score".to_owned()].into(),
+        inbox: None,
+        is_observed: false,
         since: submitted_at(),
     }
 }

@@ -1,0 +1,208 @@
+//! A check of a Leaderboard: one route with one pair and an image of the host's own, of which no other system keeps anything.
+//!
+//! A check is a Submission with `spec.check`, which `kubectl leaderboard check` creates. Its plan is cut to one route here; the
+//! Leaderboard remembers how the last one ended. Pure.
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::route_slice::RouteSlice;
+use super::submission_status::{RunPlan, State};
+use super::{Leaderboard, Submission, conditions, reasons};
+
+/// What the name of a check begins with: its prefix in the bucket can never be a team's.
+pub const NAME_PREFIX: &str = "check-";
+
+/// What `kubectl leaderboard check` runs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct CheckImage {
+    /// The image of an agent of the host's own, which drives one route. `agent.images` need not allow it.
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][!-~]*$"))]
+    pub image: String,
+}
+
+/// How a check came out.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CheckResult {
+    Passed,
+    Failed,
+}
+
+/// The check of a Leaderboard that ended last.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct LastCheck {
+    /// When it ended.
+    pub time: Time,
+    pub result: CheckResult,
+    /// Why: the reason of the run's end, else the one for which the Leaderboard was not Ready then.
+    #[schemars(length(max = 64))]
+    pub reason: String,
+    /// Generation of the spec that it ran with.
+    pub leaderboard_generation: i64,
+    /// Name of its Submission.
+    #[schemars(length(max = 253))]
+    pub submission_name: String,
+}
+
+/// The end of a check, as its Submission shows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CheckEnd {
+    pub time: Timestamp,
+    /// Name of its Submission.
+    pub name: String,
+    /// Why it ended so.
+    pub reason: String,
+    /// Whether its route has finished with results that count, and the table would take them.
+    pub has_finished: bool,
+    /// Generation of the Leaderboard that it ran with; none if it was never accepted.
+    pub generation: Option<i64>,
+}
+
+impl Submission {
+    /// The end of a check that has nothing left to do.
+    pub fn check_end(&self) -> Option<CheckEnd> {
+        let status = self.status.as_ref().filter(|_| self.spec.check)?;
+        let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
+        let recorded = conditions::get(&status.conditions, conditions::RECORDED)?;
+        if !is_finished || recorded.reason == reasons::WAITING {
+            return None;
+        }
+        let is_refused = recorded.reason == reasons::REFUSED;
+        let has_result = status.state_of_conditions() == State::Finished;
+        let reason = if has_result && is_refused {
+            reasons::TABLE_UNREACHABLE
+        } else {
+            status.reason.as_deref().unwrap_or_default()
+        };
+        Some(CheckEnd {
+            time: status.times.finished.as_ref()?.0,
+            name: self.metadata.name.clone().unwrap_or_default(),
+            reason: reason.to_owned(),
+            has_finished: has_result && !is_refused,
+            generation: status.checked_generation,
+        })
+    }
+}
+
+impl CheckEnd {
+    /// What the Leaderboard notes of it. `fault`: for what the Leaderboard is not Ready at its end; `generation`: its present one.
+    pub fn noted(&self, fault: Option<&str>, generation: i64) -> LastCheck {
+        let (result, reason) = match fault {
+            _ if !self.has_finished => (CheckResult::Failed, self.reason.as_str()),
+            Some(fault) => (CheckResult::Failed, fault),
+            None => (CheckResult::Passed, self.reason.as_str()),
+        };
+        LastCheck {
+            time: Time(self.time),
+            result,
+            reason: reason.to_owned(),
+            leaderboard_generation: self.generation.unwrap_or(generation),
+            submission_name: self.name.clone(),
+        }
+    }
+}
+
+/// The plan of a check: the first route, once, with one pair.
+pub fn first_route(plan: RunPlan) -> RunPlan {
+    let first = plan.slices.first().map_or(0, |slice| slice.first);
+    RunPlan {
+        slices: vec![RouteSlice { first, last: first }],
+        routes: 1,
+        repetitions: 1,
+        ..plan
+    }
+}
+
+/// The Leaderboard as a check takes it: the first crash and the first fault of the infrastructure end it, since they are what it is
+/// to show.
+pub fn without_retries(leaderboard: &Leaderboard) -> Leaderboard {
+    let mut strict = leaderboard.clone();
+    (strict.spec.retries.per_pair, strict.spec.retries.infrastructure) = (0, 0);
+    strict
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::{Value, json};
+
+    fn condition(type_: &str, status: &str, reason: &str) -> Value {
+        json!({"type": type_, "status": status, "reason": reason, "message": "", "lastTransitionTime": "2026-11-01T10:00:00Z"})
+    }
+
+    fn check(conditions: &[Value]) -> Submission {
+        let spec = json!({"leaderboardName": "lb", "image": "i", "track": "sensors", "check": true});
+        let mut submission = Submission::new("check-lb-1", serde_json::from_value(spec).unwrap());
+        let status = json!({"attempt": 1, "reason": "Finished", "checkedGeneration": 3, "conditions": conditions,
+                            "times": {"finished": "2026-11-01T10:00:00Z"}});
+        submission.status = serde_json::from_value(status).unwrap();
+        submission
+    }
+
+    #[test]
+    fn only_a_check_with_nothing_left_to_do_has_an_end() {
+        let finished = condition("Finished", "True", "Finished");
+        let recorded = |reason| condition("Recorded", "False", reason);
+        let cases = [
+            (vec![], None),
+            (vec![finished.clone()], None),
+            (vec![finished.clone(), recorded("Waiting")], None),
+            (
+                vec![finished.clone(), recorded("NotRequired")],
+                Some((true, "Finished")),
+            ),
+            (
+                vec![finished.clone(), recorded("Refused")],
+                Some((false, "TableUnreachable")),
+            ),
+            (
+                vec![condition("Finished", "True", "ImagePull"), recorded("NotRequired")],
+                Some((false, "Finished")),
+            ),
+        ];
+        for (conditions, expected) in cases {
+            let end = check(&conditions).check_end();
+            let found = end.as_ref().map(|end| (end.has_finished, end.reason.as_str()));
+            assert_eq!(found, expected, "{conditions:?}");
+        }
+        let mut team = check(&[finished, recorded("NotRequired")]);
+        team.spec.check = false;
+        assert_eq!(team.check_end(), None);
+    }
+
+    #[test]
+    fn a_leaderboard_that_is_not_ready_fails_the_check_of_a_good_run() {
+        let conditions = [
+            condition("Finished", "True", "Finished"),
+            condition("Recorded", "False", "NotRequired"),
+        ];
+        let end = check(&conditions).check_end().unwrap();
+        let noted = |end: &CheckEnd, fault| {
+            let noted = end.noted(fault, 5);
+            (noted.result, noted.reason, noted.leaderboard_generation)
+        };
+        assert_eq!(noted(&end, None), (CheckResult::Passed, "Finished".into(), 3));
+        let fault = Some("TokenRefused");
+        assert_eq!(noted(&end, fault), (CheckResult::Failed, "TokenRefused".into(), 3));
+        let unaccepted = CheckEnd {
+            generation: None,
+            has_finished: false,
+            reason: "ImagePull".into(),
+            ..end
+        };
+        assert_eq!(noted(&unaccepted, fault), (CheckResult::Failed, "ImagePull".into(), 5));
+    }
+
+    #[test]
+    fn a_check_drives_the_first_route_once() {
+        let plan = json!({"runId": "check-lb-1", "leaderboardVersion": "V1", "track": "sensors", "codename": "SENSORS",
+                          "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}], "routes": 12, "repetitions": 5,
+                          "storage": {"bucket": "b"}, "image": "a:1", "contentsImage": "c:1", "simulatorImage": "s:1"});
+        let plan = first_route(serde_json::from_value(plan).unwrap());
+        assert_eq!(plan.slices, [RouteSlice { first: 4, last: 4 }]);
+        assert_eq!((plan.routes, plan.repetitions), (1, 1));
+    }
+}

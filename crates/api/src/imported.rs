@@ -1,0 +1,163 @@
+//! Submissions that were made from the rows of a table, after their end.
+//!
+//! Kubernetes takes no status with a new object. Until it has one the annotation [`names::ANNOTATION_IMPORTED`] keeps the controller
+//! away, which would otherwise run it. Pure.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use crate::conditions::{self, FINISHED, PUBLISHED, RECORDED, Truth};
+use crate::{
+    Failure, FailureClass, Progress, Score, Submission, SubmissionSpec, SubmissionStatus, TeamStatus, Times, names,
+    reasons,
+};
+
+/// How a submission ended before it was imported.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ImportedState {
+    Finished,
+    Failed,
+    Cancelled,
+}
+
+/// What a row shows of a submission that has ended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImportedEnd {
+    /// How it ended.
+    pub state: ImportedState,
+    /// Name of its track.
+    pub track: String,
+    /// Where its results are.
+    pub results_url: Option<String>,
+    /// Routes that were done.
+    pub progress: Option<Progress>,
+    /// Its final scores.
+    pub score: Option<Score>,
+    /// When it was submitted, started and finished.
+    pub times: Times,
+    /// Name of the table.
+    pub table: String,
+}
+
+impl Submission {
+    /// Whether it is being imported: its status, which shows its end, is still to come.
+    pub fn awaits_import(&self) -> bool {
+        let annotations = self.metadata.annotations.as_ref();
+        let is_imported = annotations.is_some_and(|all| all.contains_key(names::ANNOTATION_IMPORTED));
+        is_imported && self.status.as_ref().is_none_or(|status| status.attempt.is_none())
+    }
+}
+
+impl SubmissionStatus {
+    /// The status of a submission that ended before it was imported. Every system has its end, so nothing is written anywhere.
+    pub fn of_imported(spec: &SubmissionSpec, end: ImportedEnd, generation: i64, now: &Time) -> Self {
+        let what = format!("Imported from the table {}, where it has ended.", end.table);
+        let (reason, failure) = match end.state {
+            ImportedState::Finished => (reasons::FINISHED, None),
+            ImportedState::Failed => (reasons::IMPORTED_FAILURE, Some(failure(&what))),
+            ImportedState::Cancelled => (reasons::CANCELLED, None),
+        };
+        let mut status = Self {
+            observed_generation: Some(generation),
+            attempt: Some(spec.attempt),
+            reason: Some(reason.to_owned()),
+            message: Some(what.clone()),
+            team: spec.team.clone().map(TeamStatus::from),
+            track: Some(end.track),
+            progress: end.progress,
+            score: end.score,
+            results_url: end.results_url,
+            failure,
+            ..Self::default()
+        };
+        let ended = end.times.finished.clone().unwrap_or_else(|| now.clone());
+        status.times = Times {
+            finished: Some(ended.clone()),
+            ..end.times
+        };
+        for (type_, truth, reason, message) in [
+            (FINISHED, Truth::True, reason, what.as_str()),
+            (PUBLISHED, Truth::False, reasons::NOT_REQUIRED, ""),
+            (RECORDED, Truth::True, reasons::RECORDED, ""),
+        ] {
+            let conditions = &mut status.conditions;
+            conditions::set(conditions, type_, truth, reason, message, Some(generation), &ended);
+        }
+        status.state = Some(status.state_of_conditions());
+        status.fit();
+        status
+    }
+}
+
+fn failure(what: &str) -> Failure {
+    let next_step = reasons::after_failure(reasons::IMPORTED_FAILURE).map(reasons::plain);
+    Failure {
+        class: FailureClass::Infrastructure,
+        reason: reasons::IMPORTED_FAILURE.to_owned(),
+        message: format!("{what} {}", next_step.clone().unwrap_or_default())
+            .trim_end()
+            .to_owned(),
+        next_step,
+        participant_message: None,
+        charged: false,
+        pair: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::State;
+    use jiff::Timestamp;
+    use serde_json::json;
+
+    fn spec() -> SubmissionSpec {
+        let spec = json!({"leaderboardName": "lb", "evalai": {"challenge": 1, "phase": 2, "submission": 77},
+                          "team": {"id": "7", "name": "Team Seven"}, "attempt": 2});
+        serde_json::from_value(spec).unwrap()
+    }
+
+    fn end(state: ImportedState) -> ImportedEnd {
+        ImportedEnd {
+            state,
+            track: "sensors".into(),
+            results_url: None,
+            progress: None,
+            score: None,
+            times: Times::default(),
+            table: "leaderboard-20".into(),
+        }
+    }
+
+    #[test]
+    fn the_state_of_an_imported_submission_is_that_of_its_row() {
+        let now = Time(Timestamp::UNIX_EPOCH);
+        for (state, shown) in [
+            (ImportedState::Finished, State::Finished),
+            (ImportedState::Failed, State::Failed),
+            (ImportedState::Cancelled, State::Cancelled),
+        ] {
+            let status = SubmissionStatus::of_imported(&spec(), end(state), 1, &now);
+            assert_eq!((status.state, status.attempt), (Some(shown), Some(2)));
+            assert_eq!(status.state_of_conditions(), shown);
+            assert_eq!(status.failure.is_some(), shown == State::Failed);
+            assert!(!status.failure.is_some_and(|failure| failure.charged));
+        }
+    }
+
+    #[test]
+    fn only_an_imported_object_without_its_status_is_left_alone() {
+        let mut submission = Submission::new("submission-77", spec());
+        assert!(!submission.awaits_import(), "a person made it");
+        let table = ("leaderboard.carla.org/imported".to_owned(), "t".to_owned());
+        submission.metadata.annotations = Some([table].into());
+        assert!(submission.awaits_import());
+        let now = Time(Timestamp::UNIX_EPOCH);
+        submission.status = Some(SubmissionStatus::of_imported(
+            &submission.spec,
+            end(ImportedState::Failed),
+            1,
+            &now,
+        ));
+        assert!(!submission.awaits_import(), "from now on it is resumed as any other");
+    }
+}

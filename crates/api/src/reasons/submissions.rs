@@ -1,0 +1,341 @@
+//! The reasons of submissions, and of events.
+
+use super::{Class, Reason};
+
+reasons! {
+    Pending {
+        ASKING_EVALAI = "AskingEvalAI",
+            "The operator is asking EvalAI whether the submission should still run.",
+            "Nothing. If it lasts, the message has EvalAI's last error: check the token and EvalAI.";
+        LEADERBOARD_NOT_FOUND = "LeaderboardNotFound",
+            "The namespace has no Leaderboard of that name. Running submissions continue without it; new ones do not start.",
+            "Apply the Leaderboard; the submission then continues.";
+        LEADERBOARD_NOT_READY = "LeaderboardNotReady",
+            "The Leaderboard has a fault, and no Job can or may be created for it.",
+            "Fix what the Leaderboard's condition `Ready` reports.";
+        TRACK_NOT_FOUND = "TrackNotFound",
+            "The Leaderboard has no track of that name or phase.",
+            "Add the track, or cancel the submission.";
+        IMAGE_MISSING = "ImageMissing",
+            "The Submission names no image, and the file in EvalAI that names it could not be read yet. The operator retries.",
+            "Check that EvalAI serves the submission's input file, or set `spec.image`. If it lasts, ask the participant to push \
+             again, and cancel this submission.";
+        PHASE_DIFFERS = "PhaseDiffers",
+            "EvalAI's row belongs to another phase than the Submission: one of the two was edited, or the Submission was applied \
+             with the wrong phase. It does not run, and for an hour nothing is reported to EvalAI; then it fails (which does not \
+             count as an attempt), so that the participant sees an end in EvalAI.",
+            "Set the phase back in EvalAI: within the hour the submission continues without further action; after it has failed, \
+             resume it. If the Submission has the wrong phase, delete it within the hour and apply it with the right one.",
+            after_failure: "Set the phase back in EvalAI, then resume the submission. If the Submission has the wrong phase, \
+             delete it and apply it with the right one.";
+        LOOKING_FOR_FOREIGN_RUN = "LookingForForeignRun",
+            "Table and bucket are being asked whether another program runs the submission. Shown if that takes 5 s or longer.",
+            "Nothing. Within 20 s the submission goes on, or shows why it waits.";
+        FOREIGN = "Foreign",
+            "Another program, such as the old pipeline, runs the submission, or whether one does cannot be read: the table's row is \
+             `SUBMITTED` or `RUNNING` and has no `attempt`; or, where there is no row, objects below its prefix are younger than \
+             `deadlines.runSeconds` (without a limit: than a day) and have no `logcopy/owner`. No Job is created, and nothing is \
+             written to EvalAI, table and bucket.",
+            "Wait for the end of the other run; the submission is looked for every 30 s. If nothing runs it any more, set the row's \
+             `submission_status` to `FAILED`, or annotate the Submission with `leaderboard.carla.org/adopt=true`: it then continues \
+             from what is stored. If the message has an error, do what it asks.";
+        CHECKING_IMAGE = "CheckingImage",
+            "The registry is being asked for the image's digest, size and platform. Shown if that takes 5 s or longer.",
+            "Nothing. Within a minute the submission goes on, or fails for what the registry says.";
+        WAITING_FOR_SLOT = "WaitingForSlot",
+            "All slots that `concurrency.total` and `concurrency.perTeam` allow are in use. `status.waiting` has the position in the line \
+             and an estimate.",
+            "Wait, or raise the limits.";
+        PAUSED = "Paused",
+            "The Leaderboard is paused: nothing new starts.",
+            "Set `paused: false`.";
+        JOB_NAME_TAKEN = "JobNameTaken",
+            "A Job of an older Submission of the same name is still being deleted.",
+            "Nothing. If the Job stays, delete it.";
+        PREPARING = "Preparing",
+            "The Job is created; its Pod is being scheduled, pulls images, copies the contents or fills the workspace. After 45 s \
+             the message names the step.",
+            "Nothing. If it lasts, check the node that the message names.";
+        UNSCHEDULABLE = "Unschedulable",
+            "No node has accepted the Pod for 5 s or longer. The message is the scheduler's, with what cluster-autoscaler or \
+             Karpenter says of it.",
+            "Add a node, or lower the requests. Without `deadlines.scheduleSeconds` the submission waits without a limit.";
+        QUOTA_EXCEEDED = "QuotaExceeded",
+            "The namespace's quota does not allow the Pod.",
+            "Raise the quota, or wait until other Pods end.";
+        POD_REFUSED = "PodRefused",
+            "The API server refuses the Pod: a LimitRange, Pod Security, or a webhook.",
+            "Fix what the message names, in the Leaderboard or in the namespace.";
+        IMAGE_PULL = "ImagePull",
+            "An image cannot be pulled. The submission fails after `deadlines.startSeconds`: as a participant failure if it is the \
+             agent's image and the registry answers, else as an infrastructure failure.",
+            "The participant pushes the image again for linux/amd64. For the host's images and the registry: fix the name, the \
+             rights or the network.",
+            after_failure: "Fix this, then resume the submission.";
+        CONTAINER_CONFIG = "ContainerConfig",
+            "A container cannot be set up: a Secret or a key is missing, or the image's user is not allowed.",
+            "Create what the message names.",
+            after_failure: "Fix this, then resume the submission.";
+        NOT_ISOLATED = "NotIsolated",
+            "The NetworkPolicy of the Leaderboard is not in place, and no Job is created without it. As a failure: \
+             `network.enforcement` is `Require`, and the Pod could reach what the policy forbids, or could not measure it.",
+            "Nothing for a moment after the Leaderboard was applied or edited. If it lasts, do what the condition `Isolated` of the \
+             Leaderboard reports.",
+            after_failure: "Do what the message asks, then resume the submission.";
+    }
+    Running {
+        ACCEPTED = "Accepted",
+            "Leaderboard, track and image are known, and the plan is pinned (condition `Accepted`).",
+            "Nothing.";
+        IMAGE_NOT_PINNED = "ImageNotPinned",
+            "As `Accepted`, but the image's registry could not be asked (condition `Accepted`; the message says why). Size, platform \
+             and volumes of the image were not checked, and its Pods pull it by its tag.",
+            "Let the operator reach the registry, and give it credentials, as docs/images.md says.";
+        RUNNING = "Running",
+            "The agents of the first attempt are running.",
+            "Nothing.";
+        RESUMED = "Resumed",
+            "The agents are running and continue from the stored results.",
+            "Nothing.";
+        REPLACING = "Replacing",
+            "The Pod or the Job was lost, and a new one continues from the stored results; or the operator retries after an \
+             infrastructure failure.",
+            "Nothing. The message names what was lost.";
+        STOPPING = "Stopping",
+            "The submission is being stopped; completed routes are kept.",
+            "Nothing. It ends within about three minutes after `deadlines.cancelSeconds`; later while the bucket cannot be read.";
+        NOT_STALLED = "NotStalled",
+            "The submission is not held up (condition `Stalled`).",
+            "Nothing.";
+    }
+    End {
+        FINISHED = "Finished",
+            "All routes are done, and the results count.",
+            "Nothing.";
+        CANCELLED = "Cancelled",
+            "A person cancelled it; completed routes are kept.",
+            "To continue it, resume it: a patch to a higher `attempt` with `cancel: false`.";
+        ENDED_IN_EVALAI = "EndedInEvalAI",
+            "It ended in EvalAI: cancelled, archived, deleted, or set to an end by hand. (`finished` counts only before the run was \
+             under way: participants can write it, and the operator's own result later replaces it.) The operator then writes \
+             nothing to EvalAI, with one exception: for a Submission deleted before its end it writes `cancelled`, because EvalAI \
+             would otherwise count it as in progress permanently.",
+            "To run it after all: resume it in EvalAI if EvalAI shows `failed`, else re-run it there. A submission deleted in \
+             EvalAI cannot continue; the participant submits again.";
+        DELETED = "Deleted",
+            "The Submission was deleted.",
+            "Nothing. To continue from the stored results, apply it again with a higher attempt.";
+    }
+    Participant {
+        AGENT_CRASHED = "AgentCrashed",
+            "An agent crashed more often than `retries.perPair` allows.",
+            "Look at `agent/agent<n>/leaderboard.log` of the results; the participant fixes the agent and submits again.",
+            log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
+        OUT_OF_MEMORY = "OutOfMemory",
+            "An agent crashed more often than `retries.perPair` allows, the last time because it ran out of memory.",
+            "The participant reduces the agent's memory use; its limit is `agent.resources` of the Leaderboard.",
+            log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
+        IDLE = "Idle",
+            "An agent ended early more often than `retries.perPair` allows, the last time because it printed nothing for \
+             `deadlines.idleSeconds`.",
+            "Look at `agent/agent<n>/leaderboard.log` of the results; the participant fixes the agent and submits again.",
+            log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
+        CANNOT_START = "CannotStart",
+            "The agent's command is missing in the image or is not for this machine. For a simulator: an infrastructure failure.",
+            "Rebuild the image for linux/amd64.",
+            after_failure: "Fix this, then resume the submission.",
+            log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
+        TIME_LIMIT = "TimeLimit",
+            "The run took longer than `deadlines.runSeconds`. Completed routes are kept.",
+            "Make the agent faster, or ask the host for more time.",
+            log: "the log of the agent of the first pair that was not done, else of the first pair";
+        INVALID_RESULTS = "InvalidResults",
+            "A checkpoint was refused: malformed, implausible, or incomplete at the end.",
+            "Check what the agent writes into its checkpoint, and submit again.",
+            log: "the log of the agent whose checkpoint was refused";
+        NOT_ELIGIBLE = "NotEligible",
+            "The run is complete, but its results do not count (`Rejected`, `Invalid`).",
+            "Compare the agent's sensors with those the track allows, and submit again.",
+            log: "the log of the agent of the first pair that was not done, else of the first pair";
+        IMAGE_INVALID = "ImageInvalid",
+            "The submitted image is not a valid image reference: empty, no text, upper-case letters in the repository, or white \
+             space; or what its registry has under that name is not a container image. The submission fails at once, usually before a \
+             Job is created; where only the kubelet refuses the name, with the first Pod.",
+            "Submit again with an image such as registry.example/team/agent:1.";
+        IMAGE_NOT_ALLOWED = "ImageNotAllowed",
+            "`agent.images` of the Leaderboard does not allow the submitted image: it is another team's, of another registry, or the \
+             host's own. No Job is created.",
+            "Push the image to the team's own repository, and submit again.";
+        IMAGE_NOT_FOUND = "ImageNotFound",
+            "The registry does not have the submitted image. No Job is created.",
+            "Push the image under the name that is submitted, and submit again.";
+        IMAGE_TOO_LARGE = "ImageTooLarge",
+            "The layers of the submitted image are larger than `agent.imageSizeLimit`, compressed. No Job is created.",
+            "Make the image smaller, and submit again.";
+        IMAGE_PLATFORM = "ImagePlatform",
+            "The registry has the submitted image for other machines only. No Job is created.",
+            "Build the image for linux/amd64, and submit again.";
+        IMAGE_VOLUMES = "ImageVolumes",
+            "The submitted image declares volumes, whose content no limit of the cluster counts. No Job is created.",
+            "Remove VOLUME from the image's Dockerfile or use a base image without it, and submit again.";
+        REPEATED_FAILURES = "RepeatedFailures",
+            "The attempt ended because of the infrastructure in a way that an agent can cause as well, and so did the team's attempts \
+             before it, while other teams' runs with the same simulator finished. Only with \
+             `retries.onRepeatedInfrastructure: Charge`.",
+            "Look at the log of the simulator and of the agent. If the agent is not the cause, resume the submission; else the \
+             participant fixes the agent and submits again.",
+            log: "the log of simulator `<n>`, read from its node before the Pod ends, else `simulator/console-<n>.log`; where no simulator \
+             failed, the log of `logcopy`";
+        DISK_FULL = "DiskFull",
+            "The Pod was evicted because the agent filled its disk.",
+            "Write less to disk or to the log.",
+            log: "the log of the agent of the first pair that was not done, else of the first pair";
+    }
+    Infrastructure {
+        SIMULATION_CRASHED = "SimulationCrashed",
+            "A simulator crashed, or was not ready, more often than `retries.perPair` allows; or a route ended as crashed.",
+            "Look at the simulator's log, then resume the submission; it repeats the route it was at.",
+            log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";
+        NO_GPU = "NoGPU",
+            "A simulator saw no GPU on its node although `gpu` of the Leaderboard gives it one: it was not started. The Job ends at \
+             once, and another one follows; after two on one node the Jobs of this attempt avoid it.",
+            "Look at the node: driver, device plugin, container runtime, and what docs/gpu.md asks for the Leaderboard's `gpu.mode`. Then \
+             resume the submission.";
+        GRAPHICS_DRIVER_MISSING = "GraphicsDriverMissing",
+            "A simulator saw its GPU, but the node's NVIDIA driver has no Vulkan/OpenGL part: nvidia_icd.json (V2) or libGLX_nvidia.so.0 (V1) \
+             is missing in the container. It was not started. There is no retry.",
+            "Use a node image whose driver includes Vulkan and OpenGL, as docs/gpu.md says, then resume the submission.";
+        RESULTS_NOT_STORED = "ResultsNotStored",
+            "The Pod ended before its final results were stored.",
+            "Look at the log of logcopy and at the bucket, then resume the submission.",
+            log: "the log of `logcopy`";
+        NODE_LOST = "NodeLost",
+            "The node went silent or was removed with the Pod, or did not end the Pod within its grace period.",
+            "Look at the node, then resume the submission.";
+        NODE_INTERRUPTED = "NodeInterrupted",
+            "The node was about to be taken away (Spot, Karpenter, cluster-autoscaler, the AWS Node Termination Handler), or the Pod was \
+             evicted from it or preempted. The results were stored, and a new Job resumes from them; this uses up neither an attempt nor \
+             `retries.infrastructure`.",
+            "Nothing. If it happens often, give the track nodes that stay.",
+            after_failure: "Resume the submission.";
+        START_DEADLINE = "StartDeadline",
+            "No agent started within `deadlines.startSeconds` after the Pod was scheduled and its images were pulled, or the images were \
+             not pulled within `deadlines.pullSeconds`.",
+            "Fix this, then resume the submission.",
+            log: "the log of `contents`, `workspace` or `logcopy`, whichever fails, read from its node before the Job is deleted";
+        IMAGE_DENIED = "ImageDenied",
+            "The registry refuses the image to the operator's credentials. No Job is created, and there is no retry.",
+            "Give the operator's role or pull secret the right to read the repository, then resume the submission.";
+        SCHEDULE_DEADLINE = "ScheduleDeadline",
+            "No node accepted the Pod within `deadlines.scheduleSeconds`. There is no retry.",
+            "Add a node or free one, then resume the submission.";
+        JOB_DELETED = "JobDeleted",
+            "Somebody deleted the Job four times between two retries. There is no further retry.",
+            "Find out who deletes Jobs in this namespace, then resume the submission.";
+        JOB_EXPIRED = "JobExpired",
+            "The Job ended while the operator was away, or the bucket could not be read, for longer than the Job is kept (at least 7 \
+             days): Kubernetes removed it before its end was read. There is no further Job.",
+            "Look at the stored results and logs, then resume the submission.";
+        IMPORTED_FAILURE = "ImportedFailure",
+            "The Submission was made by `leaderboard-operator import --from-table` from a row that has failed. The row does not hold why.",
+            "Look at the results and logs that are stored for it. To run it again, resume it in EvalAI, or raise `spec.attempt`.";
+        JOB_FAILED = "JobFailed",
+            "Kubernetes ended the Job for a reason that no container explains.",
+            "Look at the Job's events, then resume the submission.",
+            log: "the log of `logcopy`";
+        PREFIX_IN_USE = "PrefixInUse",
+            "The run's folder in the bucket holds another Submission's results. There is no retry.",
+            "Apply the Submission with `attempt: 2` to continue from these results, or empty the prefix.";
+    }
+    System {
+        STORED = "Stored",
+            "The final results are in S3.",
+            "Nothing.";
+        NOT_STORED = "NotStored",
+            "No final results are in S3. For a live submission: they cannot be read at the moment.",
+            "Nothing while the submission is live: the operator waits for the bucket for up to a day (after a cancel: for \
+             `deadlines.cancelSeconds`, at least 60 s).";
+        PUBLISHED = "Published",
+            "EvalAI has the result.",
+            "Nothing.";
+        RECORDED = "Recorded",
+            "DynamoDB has the result.",
+            "Nothing.";
+        WAITING = "Waiting",
+            "The other system does not have the result yet.",
+            "Nothing. The message has the last error, or why the stored result cannot be read.";
+        WAITING_FOR_PREVIOUS_CONTROLLER = "WaitingForPreviousController",
+            "The previous controller process (perhaps the same container before a restart) did not confirm its last requests to \
+             EvalAI. Nothing is written there for 75 s after the takeover: such a request may still be running.",
+            "Nothing. The message names the time until which it waits.";
+        REFUSED = "Refused",
+            "The other system rejected the result. The operator keeps retrying (EvalAI: every ten minutes); if EvalAI has cancelled \
+             or archived the submission meanwhile, it becomes Cancelled.",
+            "EvalAI: check that the phase's leaderboard schema has all metric labels. DynamoDB: check the table and the operator's \
+             rights.";
+        NOT_REQUIRED = "NotRequired",
+            "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself.",
+            "Nothing.";
+        CONCURRENT_UPDATE = "ConcurrentUpdate",
+            "An update of EvalAI and one of the operator happened at the same time, or the submission was deleted before its end: \
+             EvalAI may show the wrong end. The operator reads EvalAI again and writes `cancelled` if needed.",
+            "Nothing.";
+    }
+    Comparison {
+        SAME_END = "SameEnd",
+            "EvalAI shows the same end as this run (condition `Compared`, only with `evalai.mode: Observe`).",
+            "Nothing. Scores are not compared: runs are not deterministic.";
+        DIFFERENT_END = "DifferentEnd",
+            "EvalAI shows another end than this run (condition `Compared`, only with `evalai.mode: Observe`).",
+            "Compare `status.failure` and the logs of this run with those of the other program.";
+        AWAITING_OTHER_END = "AwaitingOtherEnd",
+            "This run has ended, and EvalAI shows no end of the other program's yet (condition `Compared`).",
+            "Nothing. EvalAI is read until it does.";
+    }
+    Scores {
+        UNEXPLAINED_SCORES = "UnexplainedScores",
+            "The Leaderboard's `verify` is `Warn`, and scores in a checkpoint do not follow from its infractions. The message has \
+             the first one; `logcopy/report.json` has up to 50.",
+            "Look at the checkpoint before you trust the score (docs/results.md). `verify: Refuse` refuses such results.";
+        SCORES_EXPLAINED = "ScoresExplained",
+            "The scores follow from the infractions again.",
+            "Nothing.";
+    }
+    Event {
+        MESSAGES_HELD_BACK = "MessagesHeldBack",
+            "Event of a Leaderboard: the bridge cannot use messages of its queue yet, and receives them again later: no Leaderboard \
+             serves their phase, an older Submission of the same name is being deleted, or the API server does not take them.",
+            "Apply the Leaderboard of their phase. If it lasts, look at the log of the bridge.";
+        JOB_RECREATED = "JobRecreated",
+            "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",
+            "Find out who deletes Jobs.";
+        ATTEMPT_WITHOUT_MESSAGE = "AttemptWithoutMessage",
+            "EvalAI's row asks for another attempt that no message has announced. EvalAI lets only hosts resume and re-run, but \
+             participants can edit the row. One such attempt begins (a message can be lost) if the row shows `resuming` and the \
+             attempt before has failed, or if it is the new row of a re-run; the next one begins only after a message. Until then \
+             the condition `Stalled` reports it, too.",
+            "Check in EvalAI who asked. If the attempt has begun and must not run, cancel it. If it has not begun and must run, \
+             raise `spec.attempt`; otherwise set the status back in EvalAI.";
+        TEAM_DIFFERS = "TeamDiffers",
+            "EvalAI showed the submission under another team when its result was published; the run counts for the team it was \
+             accepted for.",
+            "Set the team back in EvalAI, or correct the table.";
+        RERUN_IN_EVALAI = "RerunInEvalAI",
+            "A host re-ran the submission in EvalAI, which cancelled its result there and created a new submission; the message and \
+             `status.rerunAs` name it. State, score and the table's row keep the result; the row names the re-run in its column \
+             `rerun_as`.",
+            "Nothing.";
+        RELEASED_UNPUBLISHED = "ReleasedUnpublished",
+            "A deleted Submission was released after `deadlines.finalizeSeconds` before all systems had its result.",
+            "Correct EvalAI or the table by hand.";
+        DEAD_LETTER = "DeadLetter",
+            "Event of a Leaderboard: a message of its queue cannot be used and was moved to the dead-letter queue. The message \
+             names the cause.",
+            "Look at the message in the dead-letter queue: its attributes `reason` and `detail` name the cause.";
+        MESSAGE_DROPPED = "MessageDropped",
+            "Event of a Leaderboard: a message of its queue in EvalAI (`evalai.queue`) cannot be used and was deleted there. The event \
+             and the controller's log have the cause and the message. Its submission stays in EvalAI, and starts later if EvalAI \
+             shows it as `submitted` and a Leaderboard serves its phase by then.",
+            "As the cause asks. To start a submission after all, re-run it in EvalAI.";
+    }
+}

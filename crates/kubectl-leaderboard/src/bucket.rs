@@ -1,0 +1,56 @@
+//! Commands about a run's objects in its bucket, for people to copy: the plugin itself reads no bucket.
+
+use leaderboard_api::Storage;
+
+/// Prints one object.
+pub fn print(object: &str, storage: Option<&Storage>) -> String {
+    format!("aws s3 cp {} -{}", word(object), flags(storage))
+}
+
+/// Removes all objects below a prefix.
+pub fn remove(prefix: &str, storage: Option<&Storage>) -> String {
+    format!("aws s3 rm --recursive {}{}", word(prefix), flags(storage))
+}
+
+/// A word of a command that people copy: an imported address is a text of a table's row, and no shell may run any part of it.
+fn word(text: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "/._:-=@+,".contains(c);
+    if text.chars().all(is_plain) {
+        text.to_owned()
+    } else {
+        format!("'{}'", text.replace('\'', r"'\''"))
+    }
+}
+
+/// Where a bucket is, as flags of `aws`.
+fn flags(storage: Option<&Storage>) -> String {
+    let flag = |name: &str, value: Option<&String>| value.map(|v| format!(" {name} {}", word(v))).unwrap_or_default();
+    let region = flag("--region", storage.and_then(|s| s.region.as_ref()));
+    let endpoint = flag("--endpoint-url", storage.and_then(|s| s.endpoint.as_ref()));
+    format!("{region}{endpoint}")
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn no_part_of_an_address_is_a_command() {
+        let hostile = "s3://b/$(reboot)';reboot;#";
+        let quoted = r"'s3://b/$(reboot)'\'';reboot;#'";
+        assert_eq!(print(hostile, None), format!("aws s3 cp {quoted} -"));
+        assert_eq!(remove(hostile, None), format!("aws s3 rm --recursive {quoted}"));
+    }
+
+    #[test]
+    fn the_place_of_the_bucket_is_in_the_command() {
+        let storage = json!({"bucket": "b", "region": "eu-west-1", "endpoint": "https://s3.example"});
+        let storage: Storage = serde_json::from_value(storage).unwrap();
+        assert_eq!(
+            print("s3://b/1/a.log", Some(&storage)),
+            "aws s3 cp s3://b/1/a.log - --region eu-west-1 --endpoint-url https://s3.example"
+        );
+    }
+}

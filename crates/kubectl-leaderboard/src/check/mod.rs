@@ -1,0 +1,19 @@
+//! `check`: what one route with one pair shows of every part of a Leaderboard.
+//!
+//! `parts` turns the objects into findings (`finding`), `table` prints them, `plan` makes the Submission, `give_up` decides when waiting is
+//! over, `readers` asks who else reads the queue. All but the program that `readers` starts is pure.
+
+mod finding;
+mod give_up;
+mod parts;
+mod plan;
+mod readers;
+mod table;
+
+#[cfg(test)]
+pub use finding::{Mark, Part};
+pub use give_up::Patience;
+pub use parts::{Seen, findings};
+pub use plan::{Wanted, submission, which};
+pub use readers::{Readers, ask as ask_for_readers};
+pub use table::{Outcome, lines};

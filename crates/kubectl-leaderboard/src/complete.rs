@@ -1,0 +1,142 @@
+//! What a shell offers for a command line that is not finished. Pure; `main` asks the cluster for names.
+//!
+//! kubectl calls a program `kubectl_complete-leaderboard` with the words so far, and takes lines and a directive in cobra's form.
+
+use clap::builder::PossibleValue;
+use clap::{Arg, Command};
+
+/// The program that kubectl calls.
+pub const SCRIPT: &str = "\
+#!/bin/sh
+# kubectl runs this to complete `kubectl leaderboard`: put it on the PATH as kubectl_complete-leaderboard.
+exec kubectl-leaderboard complete -- \"$@\"
+";
+/// cobra's directive: offer no files.
+pub const NO_FILES: &str = ":4";
+
+/// What fits.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Offer {
+    Words(Vec<String>),
+    /// Names of submissions.
+    Submissions,
+    /// Names of Leaderboards.
+    Leaderboards,
+}
+
+/// What fits in place of the last word, which may be empty.
+pub fn offer(command: &Command, words: &[String]) -> Offer {
+    let (last, before) = words
+        .split_last()
+        .map_or(("", &[][..]), |(last, before)| (last.as_str(), before));
+    let verb = verb(command, before);
+    let within = verb.unwrap_or(command);
+    if let Some(flag) = before
+        .last()
+        .and_then(|word| flag(command, within, word))
+        .filter(|flag| takes_value(flag))
+    {
+        return value_of(flag, last);
+    }
+    if last.starts_with('-') {
+        let globals = command
+            .get_arguments()
+            .filter(|flag| verb.is_some() && flag.is_global_set());
+        let flags = within.get_arguments().chain(globals);
+        let names = flags.filter_map(|flag| flag.get_long()).map(|name| format!("--{name}"));
+        return fitting(names, last);
+    }
+    match verb {
+        None => {
+            let verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
+            fitting(verbs.map(|verb| verb.get_name().to_owned()), last)
+        }
+        Some(verb) if verb.get_positionals().next().is_none() => Offer::Words(Vec::new()),
+        Some(verb) if verb.get_name() == "check" => Offer::Leaderboards,
+        Some(_) => Offer::Submissions,
+    }
+}
+
+/// Those of the words that begin like the last one, each once.
+pub fn fitting(words: impl IntoIterator<Item = String>, last: &str) -> Offer {
+    let mut words: Vec<String> = words.into_iter().filter(|word| word.starts_with(last)).collect();
+    words.sort();
+    words.dedup();
+    Offer::Words(words)
+}
+
+fn verb<'a>(command: &'a Command, before: &[String]) -> Option<&'a Command> {
+    let mut words = before.iter();
+    while let Some(word) = words.next() {
+        if let Some(flag) = flag(command, command, word) {
+            if takes_value(flag) {
+                words.next();
+            }
+        } else if !word.starts_with('-') {
+            return command.find_subcommand(word);
+        }
+    }
+    None
+}
+
+fn flag<'a>(command: &'a Command, within: &'a Command, word: &str) -> Option<&'a Arg> {
+    let is_it = |flag: &&Arg| {
+        let long = word
+            .strip_prefix("--")
+            .is_some_and(|name| flag.get_long() == Some(name));
+        let short = word
+            .strip_prefix('-')
+            .is_some_and(|name| flag.get_short().is_some_and(|letter| name == letter.to_string()));
+        long || short
+    };
+    within.get_arguments().chain(command.get_arguments()).find(is_it)
+}
+
+fn takes_value(flag: &Arg) -> bool {
+    flag.get_action().takes_values()
+}
+
+fn value_of(flag: &Arg, last: &str) -> Offer {
+    match flag.get_long() {
+        Some("leaderboard") => Offer::Leaderboards,
+        _ => fitting(
+            flag.get_possible_values()
+                .iter()
+                .map(PossibleValue::get_name)
+                .map(str::to_owned),
+            last,
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn verbs_flags_values_and_names_are_offered() {
+        let words = |words: &[&str]| Offer::Words(words.iter().map(|word| (*word).to_owned()).collect());
+        for (line, expected) in [
+            (&["c"][..], words(&["cancel", "check", "completion"])),
+            (&["-n", "carla", "sta"], words(&["status"])),
+            (&["status", "--wat"], words(&["--watch"])),
+            (&["status", "--name"], words(&["--namespace"])),
+            (&["status", "-o", "j"], words(&["json"])),
+            (&["status", "-n", ""], words(&[])),
+            (&["status", "-w", ""], Offer::Submissions),
+            (&["why", "sub"], Offer::Submissions),
+            (&["check", ""], Offer::Leaderboards),
+            (&["submit", "--leaderboard", ""], Offer::Leaderboards),
+            (&["top", ""], words(&[])),
+        ] {
+            let line: Vec<String> = line.iter().map(|word| (*word).to_owned()).collect();
+            assert_eq!(offer(&crate::Cli::command(), &line), expected, "{line:?}");
+        }
+    }
+
+    #[test]
+    fn the_command_line_is_sound() {
+        crate::Cli::command().debug_assert();
+    }
+}

@@ -1,0 +1,209 @@
+//! `status`: one screen of a submission, or one line of each. Pure: the time is handed in.
+
+use jiff::Timestamp;
+use kube::ResourceExt;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{PairState, PairStatus, State, Submission, SubmissionStatus, Times, conditions};
+use serde_json::{Value, json};
+
+use super::board::{self, Observed};
+use super::table::{bar, table};
+use super::text::{Page, join, span};
+use super::why;
+
+/// Columns of the bar of a run, and of one pair's.
+const BAR: usize = 20;
+
+/// One screen of a submission.
+pub fn screen(submission: &Submission, leaderboard: Observed<'_>, now: Timestamp) -> Vec<String> {
+    let nothing = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let mut page = Page::default();
+    page.paragraph(&why::headline(submission, now));
+    for problem in board::problems(&submission.spec.leaderboard_name, leaderboard) {
+        page.paragraph(&problem.text);
+    }
+    page.gap();
+    page.row("Track", &why::track(submission));
+    let reason = status.reason.as_deref().unwrap_or_default();
+    let message = sentence(status.message.as_deref().unwrap_or_default());
+    page.row("Reason", join(&[&format!("{reason}:"), &message]).trim_matches(':'));
+    if let Some(waiting) = &status.waiting {
+        let eta = waiting
+            .eta()
+            .map(|eta| format!("; starts in about {eta}"))
+            .unwrap_or_default();
+        page.row("In line", &format!("position {}{eta}.", waiting.position));
+    }
+    if let Some(progress) = &status.progress {
+        let score = status
+            .score
+            .as_ref()
+            .map(|score| format!(", driving score {}", score.text));
+        let bar = bar(progress.done, progress.total, BAR);
+        page.row(
+            "Routes",
+            &format!("{bar} {}{}", progress.text, score.unwrap_or_default()),
+        );
+    }
+    for each in &status.pairs {
+        page.row(&format!("Pair {}", each.id), &pair(each, now));
+    }
+    page.row("Times", &times(submission, &status.times, now));
+    let node = status
+        .node_name
+        .as_ref()
+        .map(|node| format!("on node {node}"))
+        .unwrap_or_default();
+    page.row("Job", &join(&[status.job_name.as_deref().unwrap_or_default(), &node]));
+    if let Some(results) = &status.results_url {
+        page.whole("Results", results);
+    }
+    page.row("Systems", &systems(status));
+    page.gap();
+    page.whole("Next", &why::command("why", submission));
+    page.into_lines()
+}
+
+fn pair(pair: &PairStatus, now: Timestamp) -> String {
+    let state = match pair.state {
+        PairState::Waiting => "waiting",
+        PairState::Running => "running",
+        PairState::Done => "done",
+        PairState::Crashed => "crashed, starts again",
+        PairState::Unknown => "",
+    };
+    let crashes = match pair.crashes {
+        0 => String::new(),
+        1 => ", 1 crash".to_owned(),
+        count => format!(", {count} crashes"),
+    };
+    let last = pair.last.as_ref().filter(|_| pair.crashes > 0).map(|last| {
+        let ago = last
+            .time
+            .as_ref()
+            .map(|time| format!(" {} ago", span(now.duration_since(time.0).as_secs())));
+        format!("; last end {}{}", last.reason, ago.unwrap_or_default())
+    });
+    let bar = bar(pair.done, pair.total, BAR);
+    format!(
+        "{bar} {}/{} {state}{crashes}{}",
+        pair.done,
+        pair.total,
+        last.unwrap_or_default()
+    )
+}
+
+/// The moments of a run, each with the time since the one before.
+fn times(submission: &Submission, times: &Times, now: Timestamp) -> String {
+    let created = submission.metadata.creation_timestamp.as_ref();
+    let moments = [
+        ("submitted", times.submitted.as_ref().or(created)),
+        ("accepted", times.accepted.as_ref()),
+        ("on a node", times.scheduled.as_ref()),
+        ("started", times.started.as_ref()),
+        ("stopping", times.stopping.as_ref()),
+        ("ended", times.finished.as_ref()),
+        ("published", times.published.as_ref()),
+    ];
+    let mut texts = Vec::new();
+    let mut before: Option<Timestamp> = None;
+    for (what, at) in moments.into_iter().filter_map(|(what, time)| Some((what, time?.0))) {
+        texts.push(match before {
+            None => format!("{what} {}", super::text::when(at, now)),
+            Some(before) => format!("{what} after {}", span(at.duration_since(before).as_secs().max(0))),
+        });
+        before = Some(at);
+    }
+    sentence(&texts.join(", "))
+}
+
+fn systems(status: &SubmissionStatus) -> String {
+    let systems = [
+        (conditions::ARCHIVED, "S3"),
+        (conditions::PUBLISHED, "EvalAI"),
+        (conditions::RECORDED, "DynamoDB"),
+    ];
+    let texts = systems.into_iter().filter_map(|(type_, system)| {
+        let condition = conditions::get(&status.conditions, type_)?;
+        Some(format!("{system} {}", condition.reason))
+    });
+    sentence(&texts.collect::<Vec<_>>().join(", "))
+}
+
+/// One line of each submission: running ones first, then waiting ones by place, then ended ones, the latest first.
+pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, now: Timestamp) -> Vec<String> {
+    let mut all: Vec<&Submission> = submissions.iter().collect();
+    all.sort_by_key(|one| order(one, now));
+    let mut head = vec!["NAME", "STATE", "REASON", "ROUTES", "SCORE", "QUEUE", "SINCE"];
+    if is_qualified {
+        head.insert(0, "NAMESPACE");
+    }
+    if is_wide {
+        head.extend(["LEADERBOARD", "TRACK", "TEAM", "ATTEMPT", "CRASHES", "NODE"]);
+    }
+    let rows: Vec<Vec<String>> = all
+        .into_iter()
+        .map(|one| row(one, is_qualified, is_wide, now))
+        .collect();
+    table(&head, &rows)
+}
+
+fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
+    let nothing = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let since = why::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
+    let place = status
+        .waiting
+        .as_ref()
+        .map_or(i64::MAX, |waiting| waiting.position.into());
+    let (class, within) = match why::state(status) {
+        Some(State::Running | State::Resumed) => (0, -since),
+        None | Some(State::Pending) => (1, place),
+        Some(_) => (2, since),
+    };
+    (class, within, submission.name_any())
+}
+
+fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestamp) -> Vec<String> {
+    let nothing = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let text = |text: Option<&str>| text.unwrap_or_default().to_owned();
+    let since = why::since(submission).or_else(|| submission.creation_timestamp().map(|made| made.0));
+    let since = since.map(|at| span(now.duration_since(at).as_secs()));
+    let mut row = vec![
+        submission.name_any(),
+        why::state(status).map_or("(new)", State::as_str).to_owned(),
+        text(status.reason.as_deref()),
+        text(status.progress.as_ref().map(|progress| progress.text.as_str())),
+        text(status.score.as_ref().map(|score| score.text.as_str())),
+        text(status.waiting.as_ref().map(|waiting| waiting.text.as_str())),
+        since.unwrap_or_default(),
+    ];
+    if is_qualified {
+        row.insert(0, submission.namespace().unwrap_or_default());
+    }
+    if is_wide {
+        let crashes: i32 = status.pairs.iter().map(|pair| pair.crashes).sum();
+        row.extend([
+            submission.spec.leaderboard_name.clone(),
+            text(status.track.as_deref().or(submission.spec.track.as_deref())),
+            why::team(submission).unwrap_or_default(),
+            status.attempt.map(|attempt| attempt.to_string()).unwrap_or_default(),
+            crashes.to_string(),
+            text(status.node_name.as_deref()),
+        ]);
+    }
+    row
+}
+
+/// The same for programs.
+pub fn value(submission: &Submission) -> Value {
+    json!({
+        "name": submission.name_any(),
+        "namespace": submission.namespace(),
+        "leaderboard": submission.spec.leaderboard_name,
+        "isCheck": submission.spec.check,
+        "status": submission.status,
+    })
+}

@@ -1,0 +1,338 @@
+//! The table of a check: which part each end proves, breaks or leaves open.
+
+use serde_json::{Value, json};
+
+use super::{assert_width, condition, now, with};
+use crate::check::{Mark, Outcome, Part, Patience, Readers, Seen, findings, lines};
+use leaderboard_api::{Leaderboard, State, Submission};
+
+/// A Leaderboard of EvalAI with a queue, a table and a log group, that is Ready.
+fn leaderboard(conditions: &Value) -> Leaderboard {
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
+        "metadata": {"name": "carla-20", "namespace": "carla", "generation": 4},
+        "spec": {
+            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 7}], "leaderboardVersion": "V2",
+            "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+            "check": {"image": "123456789012.dkr.ecr.us-east-1.amazonaws.com/carla/baseline:1"},
+            "evalai": {"apiServer": "https://eval.ai", "challenge": 3, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+            "queue": {"url": "https://sqs.us-east-1.amazonaws.com/1/carla", "region": "us-east-1"},
+            "storage": {"bucket": "results", "prefix": "v2/"}, "table": {"name": "submissions"}, "logGroup": {"name": "/carla"},
+        },
+        "status": {"conditions": conditions},
+    });
+    serde_json::from_value(object).unwrap()
+}
+
+fn good_leaderboard() -> Leaderboard {
+    leaderboard(&json!([
+        condition("Ready", "True", "Ready", ""),
+        condition(
+            "Isolated",
+            "True",
+            "Enforced",
+            "The Pod of check-carla-20-x7k2p could not reach 10.96.0.1:443."
+        ),
+    ]))
+}
+
+fn check(status: &Value) -> Submission {
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+        "metadata": {"name": "check-carla-20-x7k2p", "namespace": "carla"},
+        "spec": {"leaderboardName": "carla-20", "track": "sensors", "check": true,
+                 "image": "123456789012.dkr.ecr.us-east-1.amazonaws.com/carla/baseline:1"},
+        "status": status,
+    });
+    serde_json::from_value(object).unwrap()
+}
+
+/// Its route is driven and stored, and the table would take a row.
+fn passed() -> Value {
+    json!({
+        "attempt": 1, "reason": "Finished", "message": "1 of 1 routes, driving score 98.00.", "track": "sensors",
+        "progress": {"done": 1, "total": 1, "text": "1/1"}, "score": {"driving": "98.00", "final": true, "text": "98.00"},
+        "jobName": "check-carla-20-x7k2p-1", "nodeName": "gpu-3", "resultsURL": "s3://results/v2/check-carla-20-x7k2p",
+        "image": {"digest": format!("sha256:{}", "4f".repeat(32))}, "plan": plan(),
+        "times": {"accepted": "2026-11-01T11:50:00Z", "scheduled": "2026-11-01T11:50:41Z", "started": "2026-11-01T11:54:02Z",
+                  "finished": "2026-11-01T11:57:00Z"},
+        "conditions": [
+            condition("Accepted", "True", "Accepted", ""), condition("Finished", "True", "Finished", ""),
+            condition("Archived", "True", "Stored", ""), condition("Published", "False", "NotRequired", ""),
+            condition("Recorded", "True", "Recorded", "The table would take a row; a check writes none."),
+        ],
+    })
+}
+
+fn plan() -> Value {
+    json!({"runId": "check-carla-20-x7k2p", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS",
+           "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1, "storage": {"bucket": "results"}, "image": "a:1",
+           "contentsImage": "contents:1", "simulatorImage": "simulator:1"})
+}
+
+/// It failed before its agent ran.
+fn failed(class: &str, reason: &str, message: &str) -> Value {
+    with(
+        passed(),
+        &json!({
+            "reason": reason, "message": message, "progress": null, "score": null,
+            "times": {"accepted": "2026-11-01T11:50:00Z", "scheduled": "2026-11-01T11:50:41Z", "finished": "2026-11-01T11:57:00Z"},
+            "failure": {"class": class, "reason": reason, "message": message, "charged": false},
+            "conditions": [
+                condition("Accepted", "True", "Accepted", ""), condition("Finished", "True", reason, message),
+                condition("Archived", "False", "NotStored", ""), condition("Recorded", "True", "Recorded", ""),
+            ],
+        }),
+    )
+}
+
+fn printed(leaderboard: &Leaderboard, status: &Value, given_up: Option<&str>, readers: &Readers) -> (String, bool) {
+    let submission = check(status);
+    let found = findings(Seen {
+        leaderboard,
+        submission: Some(&submission),
+        given_up,
+        readers,
+    });
+    let state = submission
+        .status
+        .as_ref()
+        .map(leaderboard_api::SubmissionStatus::state_of_conditions);
+    let outcome = Outcome::of(&found, state == Some(State::Finished));
+    let lines = lines(&found, outcome);
+    let bare: Vec<String> = lines.iter().filter(|line| !line.contains("  aws ")).cloned().collect();
+    assert_width(&bare);
+    (lines.join("\n"), outcome.has_passed)
+}
+
+const PASSED: &str = "\
+✔ Leaderboard    Ready
+✔ EvalAI         accepts the token; phases, split and labels fit
+✔ Queue          answers
+✔ Other readers  no running Pipe and no Lambda function reads the queue
+✔ Registry       has the image,
+                 sha256:4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f
+✔ Slot           granted
+✔ Node           gpu-3, after 41 s
+✔ Images         pulled, 201 s from the node to the agent
+✔ Contents       copied
+✔ Isolation      Enforced: The Pod of check-carla-20-x7k2p could not reach 10.96.0.1:443.
+✔ Simulator      started, and the agent drove in it
+✔ Agent          ran
+✔ Bucket         has the results, s3://results/v2/check-carla-20-x7k2p
+✔ Route          1/1 done, driving score 98.00
+✔ Table          would take a row; a check writes none
+– CloudWatch     not known here: the Pod sends its logs by itself
+                 → See whether the streams are there:
+                   aws logs describe-log-streams --log-group-name /carla --log-stream-name-prefix check-carla-20-x7k2p/
+
+The check passed.";
+
+#[test]
+fn a_good_leaderboard_has_every_part_proved() {
+    let (text, has_passed) = printed(&good_leaderboard(), &passed(), None, &Readers::Nobody);
+    assert_eq!(text, PASSED);
+    assert!(has_passed);
+    let docs = include_str!("../../../../docs/check.md");
+    assert!(
+        docs.contains(PASSED),
+        "docs/check.md shows another table than\n{PASSED}"
+    );
+}
+
+#[test]
+fn a_fault_marks_its_part_and_leaves_open_what_was_not_reached() {
+    let pull = "The image of simulator-1 cannot be pulled: not found. It was tried for 60 s.";
+    let (text, has_passed) = printed(
+        &good_leaderboard(),
+        &failed("Infrastructure", "ImagePull", pull),
+        None,
+        &Readers::Nobody,
+    );
+    let end = "\
+✔ Node           gpu-3, after 41 s
+✘ Images         ImagePull: The image of simulator-1 cannot be pulled: not found. It was tried for
+                 60 s.
+                 → Fix this.
+– Contents       not reached
+✔ Isolation      Enforced: The Pod of check-carla-20-x7k2p could not reach 10.96.0.1:443.
+– Simulator      not reached
+– Agent          not reached
+– Bucket         not reached
+– Route          not reached
+✔ Table          would take a row; a check writes none
+– CloudWatch     not reached
+
+The check failed: 1 part is broken (✘). Parts that were not reached may be broken, too.";
+    assert!(text.ends_with(end), "{text}");
+    assert!(!has_passed);
+}
+
+/// The part that each failure breaks.
+#[test]
+fn every_failure_has_its_part() {
+    let cases = [
+        (
+            "ImageNotFound",
+            "The submitted image is not in its registry.",
+            Part::Registry,
+        ),
+        (
+            "ImageNotAllowed",
+            "The image of the check is not named.",
+            Part::Registry,
+        ),
+        (
+            "ScheduleDeadline",
+            "No node accepted the Pod within 60 s: exceeded quota.",
+            Part::Node,
+        ),
+        (
+            "ImagePull",
+            "The image of agent-1 cannot be pulled: not found.",
+            Part::Images,
+        ),
+        (
+            "StartDeadline",
+            "Contents fails: no such file. It was tried for 60 s.",
+            Part::Contents,
+        ),
+        (
+            "StartDeadline",
+            "Workspace fails: the bucket refuses. It was tried for 60 s.",
+            Part::Bucket,
+        ),
+        (
+            "CannotStart",
+            "Contents cannot be started: cp is missing.",
+            Part::Contents,
+        ),
+        (
+            "CannotStart",
+            "Simulator-1 cannot be started: bash is missing.",
+            Part::Simulator,
+        ),
+        (
+            "CannotStart",
+            "Agent-1 cannot be started: bash is missing.",
+            Part::Agent,
+        ),
+        ("NotIsolated", "The Pod could reach 10.96.0.1:443.", Part::Network),
+        ("SimulationCrashed", "Simulator 1 crashed.", Part::Simulator),
+        ("NoGPU", "Simulator 1 has no GPU.", Part::Simulator),
+        (
+            "GraphicsDriverMissing",
+            "The node's driver has no Vulkan.",
+            Part::Simulator,
+        ),
+        ("AgentCrashed", "Agent 1 crashed.", Part::Agent),
+        ("InvalidResults", "A checkpoint was refused.", Part::Route),
+        (
+            "ResultsNotStored",
+            "The Pod ended before its results were stored.",
+            Part::Bucket,
+        ),
+        ("ReasonOfALaterVersion", "Something failed.", Part::Route),
+    ];
+    for (reason, message, expected) in cases {
+        let submission = check(&failed("Infrastructure", reason, message));
+        let found = findings(Seen {
+            leaderboard: &good_leaderboard(),
+            submission: Some(&submission),
+            given_up: None,
+            readers: &Readers::Nobody,
+        });
+        let broken: Vec<Part> = found
+            .iter()
+            .filter(|f| f.mark == Mark::Broken)
+            .map(|f| f.part)
+            .collect();
+        assert_eq!(broken, [expected], "{reason}: {message}");
+    }
+}
+
+#[test]
+fn a_leaderboard_that_is_not_ready_fails_the_check_of_a_good_run() {
+    let cases = [
+        ("TokenRefused", "EvalAI", "Renew the token"),
+        ("LabelsDiffer", "EvalAI", "Compare evalai.challenge"),
+        ("BucketUnreachable", "Bucket", "Check storage"),
+        ("TableUnreachable", "Table", "create the table"),
+        ("QueueUnreachable", "Queue", "create the queue"),
+        ("PhaseConflict", "Leaderboard", "Remove the phase"),
+        ("InvalidPod", "Node", "Correct what the message names"),
+    ];
+    for (reason, part, step) in cases {
+        let broken = leaderboard(&json!([condition("Ready", "False", reason, "It is broken")]));
+        let (text, has_passed) = printed(&broken, &passed(), None, &Readers::Nobody);
+        let line = format!("✘ {part:<15}{reason}: It is broken.");
+        assert!(text.contains(&line) && text.contains(step), "{line}\n{text}");
+        assert!(!has_passed, "{reason}");
+        assert_eq!(text.matches('✘').count(), 2, "the part and the last line: {text}");
+    }
+}
+
+#[test]
+fn what_a_host_allows_is_a_note() {
+    let noted = leaderboard(&json!([
+        condition(
+            "Ready",
+            "True",
+            "Ready",
+            "Runs of the track sensors have no time limit."
+        ),
+        condition("Isolated", "False", "NotEnforced", "The Pod could reach 10.96.0.1:443."),
+    ]));
+    let (text, has_passed) = printed(&noted, &passed(), None, &Readers::Nobody);
+    assert!(
+        text.contains("! Leaderboard    Ready. Runs of the track sensors have no time limit."),
+        "{text}"
+    );
+    assert!(
+        text.contains("! Isolation      NotEnforced: The Pod could reach 10.96.0.1:443."),
+        "{text}"
+    );
+    assert!(
+        text.contains("→ Use a network plugin that enforces policies."),
+        "{text}"
+    );
+    assert!(
+        text.ends_with("The check passed, with 2 notes (!).") && has_passed,
+        "{text}"
+    );
+}
+
+#[test]
+fn one_that_is_given_up_shows_what_it_waited_for() {
+    let waiting = json!({"attempt": 1, "reason": "Unschedulable", "message": "0/3 nodes are available: 3 Insufficient nvidia.com/gpu.",
+                         "jobName": "check-carla-20-x7k2p-1", "conditions": [condition("Accepted", "True", "Accepted", "")]});
+    let why = "The check did not end within 600 s (--timeout).";
+    let (text, has_passed) = printed(&good_leaderboard(), &waiting, Some(why), &Readers::Nobody);
+    let found = "✘ Node           The check did not end within 600 s (--timeout). Unschedulable: 0/3 nodes are";
+    assert!(text.contains(found) && !has_passed, "{text}");
+    let unseen = "The operator has not processed the check for 60 s.";
+    let (text, _) = printed(&good_leaderboard(), &Value::Null, Some(unseen), &Readers::Nobody);
+    assert!(
+        text.contains("✘ Leaderboard    The operator has not processed the check for 60 s."),
+        "{text}"
+    );
+}
+
+#[test]
+fn only_what_a_person_has_to_change_is_given_up_after_a_minute() {
+    let later = |seconds| now().checked_add(jiff::SignedDuration::from_secs(seconds)).unwrap();
+    for (reason, seconds) in [
+        (None, 60),
+        (Some("LeaderboardNotReady"), 60),
+        (Some("Unschedulable"), 900),
+        (Some("WaitingForSlot"), 900),
+        (Some("Preparing"), 900),
+    ] {
+        let mut patience = Patience::new(now(), 900);
+        let status = reason.map_or(Value::Null, |reason| json!({"attempt": 1, "reason": reason}));
+        patience.observe(&check(&status), now());
+        assert_eq!(patience.next(), later(seconds), "{reason:?}");
+        assert_eq!(patience.given_up(later(seconds - 1)), None, "{reason:?}");
+        assert!(patience.given_up(later(seconds)).is_some(), "{reason:?}");
+    }
+}

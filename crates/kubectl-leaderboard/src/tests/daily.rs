@@ -1,0 +1,240 @@
+//! `status`, `top`, `submit` and `rerun`, as they print.
+
+use clap::Parser;
+use serde_json::{Value, json};
+
+use super::{
+    assert_width, cancelled, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
+};
+use crate::board::Observed;
+use crate::submit::{Submit, object};
+use crate::{rerun, status, top, why};
+
+const DOCS: &str = include_str!("../../../../docs/plugin.md");
+
+/// The text, which docs/plugin.md has to show.
+fn shown(lines: &[String]) -> String {
+    let text = lines.join("\n");
+    assert!(
+        DOCS.contains(&format!("```\n{text}\n```\n")),
+        "docs/plugin.md does not show\n```\n{text}\n```"
+    );
+    text
+}
+
+/// Two pairs, one of which has crashed.
+fn driving() -> Value {
+    with(
+        running(),
+        &json!({
+            "team": {"id": "7", "name": "Team Seven"},
+            "pairs": [
+                {"id": 1, "done": 9, "total": 10, "crashes": 0, "state": "Running"},
+                {"id": 2, "done": 3, "total": 10, "crashes": 1, "state": "Running",
+                 "last": {"reason": "SimulatorCrashed", "time": "2026-11-01T11:40:00Z"}},
+            ],
+            "times": {"submitted": "2026-11-01T10:00:00Z", "accepted": "2026-11-01T10:00:02Z",
+                      "scheduled": "2026-11-01T10:56:00Z", "started": "2026-11-01T11:00:00Z"},
+        }),
+    )
+}
+
+#[test]
+fn one_screen_has_progress_crashes_times_and_links() {
+    let board = leaderboard();
+    let lines = status::screen(&submission(&driving()), Observed::Found(&board), now());
+    assert_width(&lines);
+    assert_eq!(
+        shown(&lines),
+        "\
+submission-42 is Running since 2026-11-01 11:00:00 UTC (60 min ago).
+
+Track:       sensors of Leaderboard carla-20, by Team Seven; EvalAI submission 42, phase 7
+Reason:      Running: 12/20 routes done.
+Routes:      ████████████░░░░░░░░ 12/20, driving score ~41.20
+Pair 1:      ██████████████████░░ 9/10 running
+Pair 2:      ██████░░░░░░░░░░░░░░ 3/10 running, 1 crash; last end SimulatorCrashed 20 min ago
+Times:       submitted 2026-11-01 10:00:00 UTC (2 h ago), accepted after 2 s, on a node after 55
+             min, started after 4 min.
+Job:         submission-42-1 on node gpu-3
+Results:     s3://results/v2/42
+
+Next:        kubectl leaderboard why submission-42 -n carla"
+    );
+}
+
+#[test]
+fn a_screen_exists_for_every_state() {
+    for state in [
+        Value::Null,
+        waiting(),
+        running(),
+        crashed(),
+        node_lost(),
+        finished(),
+        cancelled(),
+    ] {
+        let lines = status::screen(&submission(&state), Observed::Missing, now());
+        assert_width(&lines);
+        let text = lines.join("\n");
+        assert!(
+            text.starts_with("submission-42 is ") && text.contains("Next:"),
+            "{text}"
+        );
+        assert!(!text.contains("Reason:      :"), "{text}");
+    }
+    let text = status::screen(&submission(&waiting()), Observed::Missing, now()).join("\n");
+    assert!(
+        text.contains("In line:     position 3; starts in about 20-35 min."),
+        "{text}"
+    );
+    let text = status::screen(&submission(&finished()), Observed::Missing, now()).join("\n");
+    assert!(
+        text.contains("Systems:     S3 Stored, EvalAI Published, DynamoDB Recorded."),
+        "{text}"
+    );
+}
+
+fn some() -> Vec<leaderboard_api::Submission> {
+    let of = |status: Value, id: &str, name: &str| with(status, &json!({"team": {"id": id, "name": name}}));
+    vec![
+        named("submission-38", &of(finished(), "7", "Team Seven")),
+        named("submission-39", &of(node_lost(), "8", "Team Eight")),
+        named("submission-40", &driving()),
+        named("submission-42", &of(crashed(), "7", "Team Seven")),
+        named(
+            "submission-43",
+            &of(
+                with(waiting(), &json!({"waiting": {"position": 1, "text": "1st"}})),
+                "8",
+                "Team Eight",
+            ),
+        ),
+        named("submission-45", &of(waiting(), "7", "Team Seven")),
+        named("submission-46", &Value::Null),
+    ]
+}
+
+#[test]
+fn every_submission_has_a_line_those_that_run_first() {
+    let lines = status::lines(&some(), false, false, now());
+    assert_eq!(
+        shown(&lines),
+        "\
+NAME           STATE     REASON          ROUTES  SCORE   QUEUE           SINCE
+submission-40  Running   Running         12/20   ~41.20                  60 min
+submission-43  Pending   WaitingForSlot                  1st             60 min
+submission-45  Pending   WaitingForSlot                  3rd, 20-35 min  60 min
+submission-46  (new)                                                     2 h
+submission-38  Finished  Finished        20/20   43.13                   3 min
+submission-39  Failed    NodeLost                                        3 min
+submission-42  Failed    AgentCrashed    12/20   ~41.20                  3 min"
+    );
+    let wide = status::lines(&some(), true, true, now());
+    assert!(
+        wide[0].starts_with("NAMESPACE  NAME") && wide[0].contains("TEAM        ATTEMPT  CRASHES"),
+        "{}",
+        wide[0]
+    );
+    assert!(
+        wide[1].starts_with("carla      submission-40") && wide[1].ends_with("gpu-3"),
+        "{}",
+        wide[1]
+    );
+}
+
+#[test]
+fn top_shows_slots_and_teams() {
+    let lines = top::lines(&some(), &[leaderboard()]);
+    assert_eq!(
+        shown(&lines),
+        "\
+NAMESPACE  LEADERBOARD  SLOTS  WAITING
+carla      carla-20     1/2    3
+
+LEADERBOARD  TEAM        RUNNING  WAITING  NEXT  FINISHED  FAILED  CANCELLED  CRASHES
+carla-20     Team Seven  1        1        #3    1         1       0          5
+carla-20     (none)      0        1        -     0         0       0          0
+carla-20     Team Eight  0        1        #1    0         1       0          0"
+    );
+    assert_eq!(top::lines(&[], &[]), ["There is no Leaderboard and no submission."]);
+    let value = top::value(&some());
+    assert_eq!(
+        (&value[0]["team"], &value[0]["crashes"]),
+        (&json!("Team Seven"), &json!(5))
+    );
+}
+
+#[test]
+fn programs_get_the_same_facts() {
+    let value = why::value(&submission(&crashed()), Observed::Missing);
+    assert_eq!(value["state"], "Failed");
+    assert_eq!(value["failure"]["charged"], true);
+    let step = value["nextSteps"][0].as_str().unwrap();
+    assert!(step.starts_with("Look at agent/agent2/leaderboard.log"), "{step}");
+    assert_eq!(
+        status::value(&submission(&waiting()))["status"]["waiting"]["position"],
+        3
+    );
+}
+
+#[derive(Parser)]
+struct Line {
+    #[command(flatten)]
+    submit: Submit,
+}
+
+#[test]
+fn a_submission_is_made_of_the_flags() {
+    let made = |more: &[&str]| {
+        let usual = [
+            "submit",
+            "--leaderboard",
+            "carla-20",
+            "--track",
+            "sensors",
+            "--image",
+            "a:1",
+        ];
+        object(&Line::parse_from(usual.iter().chain(more)).submit)
+    };
+    let plain = made(&[]);
+    assert_eq!(plain["metadata"]["generateName"], "carla-20-");
+    assert_eq!(
+        plain["spec"],
+        json!({"leaderboardName": "carla-20", "track": "sensors", "image": "a:1", "priority": 0})
+    );
+    let full = made(&[
+        "--name",
+        "mine",
+        "--team-id",
+        "7",
+        "--team",
+        "Team Seven",
+        "--priority",
+        "-5",
+    ]);
+    assert_eq!(full["metadata"]["name"], "mine");
+    assert_eq!(full["spec"]["team"], json!({"id": "7", "name": "Team Seven"}));
+    assert_eq!(full["spec"]["priority"], -5);
+}
+
+#[test]
+fn only_what_the_infrastructure_failed_is_run_again() {
+    let mut check = named("check-a", &node_lost());
+    check.spec.check = true;
+    let mut again = named("again", &node_lost());
+    again.spec.attempt = 2;
+    let all = [
+        named("b-lost", &node_lost()),
+        named("a-lost", &node_lost()),
+        named("crashed", &crashed()),
+        named("done", &finished()),
+        named("stopped", &cancelled()),
+        check,
+        again,
+    ];
+    assert_eq!(rerun::chosen(&all, None), ["a-lost", "b-lost"]);
+    assert_eq!(rerun::chosen(&all, Some("NodeLost")), ["a-lost", "b-lost"]);
+    assert_eq!(rerun::chosen(&all, Some("SimulationCrashed")), Vec::<String>::new());
+}

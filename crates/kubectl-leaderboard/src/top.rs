@@ -1,0 +1,153 @@
+//! `top`: who uses the slots of each Leaderboard and who waits, by team. Pure.
+
+use std::collections::BTreeMap;
+
+use kube::ResourceExt;
+use leaderboard_api::{Leaderboard, State, Submission};
+use serde_json::{Value, json};
+
+use super::table::table;
+use super::why;
+
+/// Leaderboard and team.
+type Key = (String, String, String);
+
+/// What a team has in a Leaderboard.
+#[derive(Clone, Debug, Default)]
+struct Use {
+    running: usize,
+    waiting: usize,
+    first_in_line: Option<i32>,
+    finished: usize,
+    failed: usize,
+    cancelled: usize,
+    crashes: i64,
+}
+
+fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
+    let mut uses: BTreeMap<Key, Use> = BTreeMap::new();
+    for one in submissions {
+        let team = if one.spec.check {
+            "(check)".to_owned()
+        } else {
+            why::team(one).unwrap_or_else(|| "(none)".to_owned())
+        };
+        let key = (
+            one.namespace().unwrap_or_default(),
+            one.spec.leaderboard_name.clone(),
+            team,
+        );
+        let each = uses.entry(key).or_default();
+        let status = one.status.as_ref();
+        match status.and_then(why::state) {
+            Some(State::Running | State::Resumed) => each.running += 1,
+            None | Some(State::Pending) => each.waiting += 1,
+            Some(State::Finished) => each.finished += 1,
+            Some(State::Failed) => each.failed += 1,
+            Some(State::Cancelled) => each.cancelled += 1,
+        }
+        let place = status
+            .and_then(|status| status.waiting.as_ref())
+            .map(|waiting| waiting.position);
+        each.first_in_line = [each.first_in_line, place].into_iter().flatten().min();
+        each.crashes += status.map_or(0, |status| {
+            status.pairs.iter().map(|pair| i64::from(pair.crashes)).sum()
+        });
+    }
+    let mut all: Vec<(Key, Use)> = uses.into_iter().collect();
+    let within = |each: &Use| {
+        let load = (each.running, each.waiting);
+        std::cmp::Reverse(load)
+    };
+    all.sort_by(|(a, x), (b, y)| {
+        (&a.0, &a.1)
+            .cmp(&(&b.0, &b.1))
+            .then_with(|| within(x).cmp(&within(y)).then_with(|| a.2.cmp(&b.2)))
+    });
+    all
+}
+
+/// The slots of a Leaderboard: `2/4`, or `2` where nothing limits them.
+fn slots(leaderboards: &[Leaderboard], namespace: &str, name: &str, running: usize) -> String {
+    let board = leaderboards
+        .iter()
+        .find(|board| board.name_any() == name && board.namespace().as_deref().unwrap_or_default() == namespace);
+    let total = board.and_then(|board| board.spec.concurrency.total);
+    let paused = board.is_some_and(|board| board.spec.paused);
+    let paused = if paused { ", paused" } else { "" };
+    match total {
+        Some(total) => format!("{running}/{total}{paused}"),
+        None => format!("{running}{paused}"),
+    }
+}
+
+/// The table, and above it the slots of each Leaderboard.
+pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard]) -> Vec<String> {
+    let uses = uses(submissions);
+    let mut boards: BTreeMap<(String, String), (usize, usize)> = BTreeMap::new();
+    for board in leaderboards {
+        boards.insert((board.namespace().unwrap_or_default(), board.name_any()), (0, 0));
+    }
+    for ((namespace, board, _), each) in &uses {
+        let entry = boards.entry((namespace.clone(), board.clone())).or_default();
+        (entry.0, entry.1) = (entry.0 + each.running, entry.1 + each.waiting);
+    }
+    let rows: Vec<Vec<String>> = boards
+        .iter()
+        .map(|((namespace, name), (running, waiting))| {
+            vec![
+                namespace.clone(),
+                name.clone(),
+                slots(leaderboards, namespace, name, *running),
+                waiting.to_string(),
+            ]
+        })
+        .collect();
+    if rows.is_empty() {
+        return vec!["There is no Leaderboard and no submission.".to_owned()];
+    }
+    let mut lines = table(&["NAMESPACE", "LEADERBOARD", "SLOTS", "WAITING"], &rows);
+    lines.push(String::new());
+    let rows: Vec<Vec<String>> = uses.iter().map(|(key, each)| row(key, each)).collect();
+    let head = [
+        "LEADERBOARD",
+        "TEAM",
+        "RUNNING",
+        "WAITING",
+        "NEXT",
+        "FINISHED",
+        "FAILED",
+        "CANCELLED",
+        "CRASHES",
+    ];
+    lines.extend(table(&head, &rows));
+    lines
+}
+
+fn row((_, board, team): &Key, each: &Use) -> Vec<String> {
+    vec![
+        board.clone(),
+        team.clone(),
+        each.running.to_string(),
+        each.waiting.to_string(),
+        each.first_in_line
+            .map_or_else(|| "-".to_owned(), |place| format!("#{place}")),
+        each.finished.to_string(),
+        each.failed.to_string(),
+        each.cancelled.to_string(),
+        each.crashes.to_string(),
+    ]
+}
+
+/// The same for programs.
+pub fn value(submissions: &[Submission]) -> Value {
+    let uses = uses(submissions);
+    let items = uses.iter().map(|((namespace, leaderboard, team), each)| {
+        json!({
+            "namespace": namespace, "leaderboard": leaderboard, "team": team, "running": each.running, "waiting": each.waiting,
+            "firstInLine": each.first_in_line, "finished": each.finished, "failed": each.failed,
+            "cancelled": each.cancelled, "crashes": each.crashes,
+        })
+    });
+    Value::Array(items.collect())
+}

@@ -1,0 +1,148 @@
+//! The PriorityClasses of a Leaderboard's Pods: they have to be there, and a run must not end another one.
+//!
+//! Asks the API server, where the operator may read them (`rbac.clusterRole`); what it may not read, nobody checks. `judge` is pure.
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::api::scheduling::v1::PriorityClass;
+use kube::{Api, Client};
+use serde_json::Value;
+
+use super::pod_notes::TrackPods;
+use crate::kubernetes::call;
+use leaderboard_api::Track;
+
+/// A class, and who asks for it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Asked {
+    tracks: Vec<String>,
+    /// By `priorityClassName` of a track; else by `podOverrides`.
+    is_of_track: bool,
+}
+
+/// What is wrong with the classes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Problems {
+    /// No Pod could be made, or it would preempt against the rule of the field.
+    pub(super) refused: Option<String>,
+    pub(super) notes: Vec<String>,
+}
+
+/// How a class was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Seen {
+    Unreadable,
+    Missing,
+    Preempts,
+    Waits,
+}
+
+/// The classes that the Pods of the tracks have.
+pub(super) fn asked(tracks: &[Track], pods: &[TrackPods]) -> BTreeMap<String, Asked> {
+    let mut found: BTreeMap<String, Asked> = BTreeMap::new();
+    for pods in pods {
+        let Some(class) = pods.template.pointer("/spec/priorityClassName").and_then(Value::as_str) else {
+            continue;
+        };
+        let mut own = tracks.iter().filter(|track| track.name == pods.track);
+        let asked = found.entry(class.to_owned()).or_default();
+        asked.tracks.push(pods.track.clone());
+        asked.is_of_track |= own.any(|track| track.priority_class_name.as_deref() == Some(class));
+    }
+    found
+}
+
+/// Reads the classes.
+pub(super) async fn look(client: &Client, asked: &BTreeMap<String, Asked>) -> Problems {
+    let api: Api<PriorityClass> = Api::all(client.clone());
+    let mut problems = Problems::default();
+    for (class, asked) in asked {
+        let seen = match call("reading the PriorityClass", class, api.get(class)).await {
+            Ok(found) if found.preemption_policy.as_deref() == Some("Never") => Seen::Waits,
+            Ok(_) => Seen::Preempts,
+            Err(error) if error.is_gone() => Seen::Missing,
+            Err(_) => Seen::Unreadable,
+        };
+        judge(class, asked, seen, &mut problems);
+    }
+    problems
+}
+
+fn judge(class: &str, asked: &Asked, seen: Seen, problems: &mut Problems) {
+    let named = if asked.tracks.len() == 1 { "track" } else { "tracks" };
+    let tracks = asked.tracks.join(", ");
+    let what = format!("PriorityClass {class} of the {named} {tracks}");
+    let text = match seen {
+        Seen::Unreadable | Seen::Waits => return,
+        Seen::Missing => format!("{what} does not exist. Create it, or correct its name."),
+        Seen::Preempts => format!(
+            "{what} preempts: one run would end another, which then repeats a route of each pair. Set preemptionPolicy: Never \
+             in the class."
+        ),
+    };
+    if seen == Seen::Missing || asked.is_of_track {
+        problems.refused.get_or_insert(text);
+    } else {
+        problems.notes.push(text);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn track(name: &str, class: Option<&str>) -> Track {
+        serde_json::from_value(json!({"name": name, "codename": "S", "priorityClassName": class})).unwrap()
+    }
+
+    fn pods(track: &str, class: Option<&str>) -> TrackPods {
+        TrackPods {
+            track: track.to_owned(),
+            template: json!({"spec": {"priorityClassName": class}}),
+        }
+    }
+
+    #[test]
+    fn a_class_is_asked_for_by_a_track_or_by_the_overrides_of_all() {
+        let tracks = [track("a", Some("high")), track("b", None), track("c", None)];
+        let all = [pods("a", Some("high")), pods("b", Some("low")), pods("c", None)];
+        let found = asked(&tracks, &all);
+        let of = |track: &str, is_of_track| Asked {
+            tracks: vec![track.to_owned()],
+            is_of_track,
+        };
+        assert_eq!(
+            found,
+            [("high".into(), of("a", true)), ("low".into(), of("b", false))].into()
+        );
+    }
+
+    #[test]
+    fn a_class_that_preempts_is_refused_where_a_track_names_it_and_noted_where_the_overrides_do() {
+        for (is_of_track, seen, is_refused, has_note) in [
+            (true, Seen::Waits, false, false),
+            (true, Seen::Unreadable, false, false),
+            (true, Seen::Preempts, true, false),
+            (false, Seen::Preempts, false, true),
+            (true, Seen::Missing, true, false),
+            (false, Seen::Missing, true, false),
+        ] {
+            let asked = Asked {
+                tracks: vec!["a".into(), "b".into()],
+                is_of_track,
+            };
+            let mut problems = Problems::default();
+            judge("high", &asked, seen, &mut problems);
+            let found = (problems.refused.is_some(), !problems.notes.is_empty());
+            assert_eq!(found, (is_refused, has_note), "{seen:?} {is_of_track}");
+            let texts = problems.refused.iter().chain(&problems.notes);
+            assert!(
+                texts
+                    .into_iter()
+                    .all(|text| text.starts_with("PriorityClass high of the tracks a, b "))
+            );
+        }
+    }
+}

@@ -1,0 +1,203 @@
+//! What another program still runs is left alone: a row or objects without this operator's mark hold a submission back until the
+//! other run has ended, or a person hands it over.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+
+use super::plan::Action;
+use super::plan_builder::{PlanBuilder, after};
+use crate::controller::submissions::foreign_runs::{
+    AGAIN, ObservedTraces, Question, StoredRun, Traces, Unread, question,
+};
+use crate::controller::submissions::view::{EvalaiInfo, Standing};
+use crate::services::table::ObservedRow;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
+use leaderboard_api::{LeaderboardSpec, Track, effective, names, reasons};
+
+/// How long the look may take before that is shown: an answer within it costs no write.
+const SILENCE: Duration = Duration::from_secs(5);
+/// The old pipeline writes its end to the row and to EvalAI, one after the other: EvalAI is read again so long after the row was.
+const SETTLED_SECONDS: i64 = 15;
+/// How long an object may be the newest of a run that has no time limit and still goes on.
+const DAY_SECONDS: i64 = 86_400;
+/// What the old pipeline's row shows of a run that has not ended.
+const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
+
+/// A person has handed the submission over: it takes up what is stored, by whatever program.
+pub(super) fn is_adopted(draft: &PlanBuilder<'_>) -> bool {
+    let annotations = draft.submission().metadata.annotations.as_ref();
+    annotations.is_some_and(|all| all.get(names::ANNOTATION_ADOPT).is_some_and(|text| text == "true"))
+}
+
+/// Whether the submission has to wait, because another program runs it or that is not known yet. Only EvalAI hands a submission
+/// to more than one program.
+pub(super) fn waits(
+    draft: &mut PlanBuilder<'_>,
+    leaderboard: &LeaderboardSpec,
+    track: &Track,
+    info: Option<&EvalaiInfo>,
+) -> bool {
+    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let is_accepted = accepted.is_some_and(|c| c.status == "True");
+    let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
+    // One that observes stores below a prefix of its own, and runs what another program runs on purpose.
+    let is_settled = is_accepted || has_run || is_adopted(draft) || draft.observes();
+    let Some(info) = info.filter(|_| !is_settled) else {
+        return false;
+    };
+    let attempt = draft.status.attempt.unwrap_or(1);
+    let question = question(draft.submission(), leaderboard, attempt, info.team_id.clone());
+    let prefix = question.prefix();
+    let view = draft.view;
+    let answer = match &view.traces {
+        ObservedTraces::Answered(answer) => answer.as_ref(),
+        ObservedTraces::NotAsked => return looks(draft, question, Duration::ZERO),
+        ObservedTraces::Asked(waited) => return looks(draft, question, *waited),
+    };
+    let window = match effective::deadlines(leaderboard, Some(track)).run_seconds {
+        0 => DAY_SECONDS,
+        seconds => seconds,
+    };
+    let why = match &answer.found {
+        Ok(traces) => {
+            let Some(found) = found(traces, info, window, draft.now()) else {
+                return is_unsettled(draft, answer.at);
+            };
+            draft.moves();
+            found.message(&prefix)
+        }
+        Err(unread) => not_known(draft, unread),
+    };
+    draft.act(Action::LookForForeignRun(Box::new(question)));
+    draft.requeue_in(AGAIN + Duration::from_secs(1));
+    draft.condition(conditions::ACCEPTED, Truth::False, reasons::FOREIGN, &why);
+    draft.show(reasons::FOREIGN, why);
+    true
+}
+
+/// Whether a submission that was held back waits for EvalAI's own word on how the other run has ended: what is known of it may be
+/// older than that end.
+fn is_unsettled(draft: &mut PlanBuilder<'_>, looked_at: Timestamp) -> bool {
+    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let was_held = accepted.is_some_and(|c| c.reason == reasons::FOREIGN);
+    let settled = after(looked_at, SETTLED_SECONDS);
+    let read_at = draft.view.evalai.as_ref().and_then(|evalai| evalai.read_at);
+    if !was_held || read_at.is_some_and(|at| at >= settled) {
+        return false;
+    }
+    draft.keeps_status();
+    if draft.now() < settled {
+        draft.requeue_at(settled);
+    } else {
+        draft.act(Action::ForgetEvalai);
+        draft.requeue_in(Duration::from_secs(1));
+    }
+    true
+}
+
+fn looks(draft: &mut PlanBuilder<'_>, question: Question, waited: Duration) -> bool {
+    draft.act(Action::LookForForeignRun(Box::new(question)));
+    if let Some(left) = SILENCE.checked_sub(waited).filter(|left| !left.is_zero()) {
+        draft.keeps_status();
+        draft.requeue_in(left);
+        return true;
+    }
+    draft.requeue_in(AGAIN);
+    draft.condition(
+        conditions::ACCEPTED,
+        Truth::Unknown,
+        reasons::LOOKING_FOR_FOREIGN_RUN,
+        "",
+    );
+    let message = "Table and bucket are asked whether another program runs the submission.";
+    draft.show(reasons::LOOKING_FOR_FOREIGN_RUN, message);
+    true
+}
+
+/// While that cannot be known nothing starts: a second run would write over the first one's results.
+fn not_known(draft: &mut PlanBuilder<'_>, unread: &Unread) -> String {
+    let why = sentence(&unread.why);
+    let message = format!(
+        "Whether another program runs the submission is not known: {why} It is looked for again; to start it all the same, {}",
+        adoption()
+    );
+    if unread.is_refused {
+        return draft.stall(reasons::FOREIGN, &message);
+    }
+    draft.moves();
+    message
+}
+
+/// What shows that another program runs the submission.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Found {
+    Row {
+        status: String,
+        since: Option<String>,
+    },
+    /// Objects, the newest of this moment; from `until` on they are those of a run that has ended.
+    Objects {
+        newest: Timestamp,
+        until: Timestamp,
+    },
+}
+
+impl Found {
+    fn message(&self, prefix: &str) -> String {
+        let adoption = adoption();
+        match self {
+            Self::Row { status, since } => {
+                let since = since
+                    .as_ref()
+                    .map(|since| format!(" since {since}"))
+                    .unwrap_or_default();
+                format!(
+                    "The table's row says {status}{since} and is not this operator's, since it has no column attempt: another \
+                     program runs the submission. It goes on when the row's submission_status is FINISHED, FAILED or \
+                     CANCELLED. If nothing runs it any more, set that to FAILED, or {adoption}"
+                )
+            }
+            Self::Objects { newest, until } => format!(
+                "The newest object below {prefix} is of {newest:.0}, and none has this operator's mark: another program may run the \
+                 submission. It goes on at {until:.0} if nothing more is stored there. If nothing runs it any more, {adoption}"
+            ),
+        }
+    }
+}
+
+/// How a person hands a submission over.
+fn adoption() -> String {
+    format!(
+        "annotate the Submission with {}=true: it then takes up what is stored.",
+        names::ANNOTATION_ADOPT
+    )
+}
+
+/// What shows that another program runs the submission; `window` is how many seconds an object may be the newest of a live run.
+pub(super) fn found(traces: &Traces, info: &EvalaiInfo, window: i64, now: Timestamp) -> Option<Found> {
+    match &traces.row {
+        // The row decides: the old pipeline writes it before all else, and at the end.
+        Some(row) => of_row(row),
+        None => of_objects(&traces.stored, info, window, now),
+    }
+}
+
+fn of_row(row: &ObservedRow) -> Option<Found> {
+    let is_under_way = UNDER_WAY.contains(&row.status.as_str());
+    let line = |text: &String| one_line(text, LONGEST_NAME);
+    (is_under_way && !row.is_ours).then(|| Found::Row {
+        status: row.status.clone(),
+        since: row.since.as_ref().map(line),
+    })
+}
+
+fn of_objects(stored: &StoredRun, info: &EvalaiInfo, window: i64, now: Timestamp) -> Option<Found> {
+    let newest = stored.newest.filter(|_| !stored.is_ours && !stored.has_ended)?;
+    // EvalAI resumes only what has failed: what was stored before is of a run that has ended.
+    let resumed = info.resumed_at.filter(|_| info.standing == Standing::Resumed);
+    let until = after(newest, window);
+    let is_of_ended = resumed.is_some_and(|at| newest < at) || now >= until;
+    (!is_of_ended).then_some(Found::Objects { newest, until })
+}

@@ -1,0 +1,191 @@
+//! Questions of submissions to services outside the cluster. A task asks them, and an answer wakes its submission, so that no
+//! reconcile waits for such a service.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use futures::stream::FuturesUnordered;
+use futures::{FutureExt, StreamExt};
+use kube::runtime::reflector::ObjectRef;
+use tokio::sync::Notify;
+use tokio::time::Instant;
+
+use crate::controller::objects::{Wake, uid_of};
+use crate::observability::tasks::Tasks;
+use leaderboard_api::Submission;
+
+/// How long an answer is kept that nobody asks for again.
+pub(super) const KEPT: Duration = Duration::from_mins(10);
+
+/// What is asked for one attempt of a submission.
+pub trait Question: Clone + PartialEq + Send + 'static {
+    /// What is found.
+    type Answer: Send + Sync + 'static;
+    /// How many are asked at once.
+    const AT_ONCE: usize;
+    /// How long an answer is good: after that the same question is asked again.
+    const GOOD_FOR: Duration;
+    /// Another attempt asks anew.
+    fn attempt(&self) -> i64;
+}
+
+/// What is known for a submission's present attempt.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Observed<A> {
+    NotAsked,
+    /// It was asked this long ago.
+    Asked(Duration),
+    Answered(Arc<A>),
+}
+
+struct Entry<Q: Question> {
+    question: Q,
+    by: ObjectRef<Submission>,
+    asked: Instant,
+    is_due: bool,
+    is_under_way: bool,
+    answer: Option<Arc<Q::Answer>>,
+}
+
+/// What the reconciles and the task share.
+pub(super) struct Shared<Q: Question> {
+    /// By the UID of the submission.
+    entries: Mutex<HashMap<String, Entry<Q>>>,
+    notify: Notify,
+}
+
+/// The questions and their answers.
+#[derive(Clone)]
+pub struct Questions<Q: Question>(Arc<Shared<Q>>);
+
+impl<Q: Question> Questions<Q> {
+    /// Starts the task. `ask` gets a question and the namespace of its submission.
+    pub(super) fn answered_by<F>(
+        ask: impl Fn(Q, String) -> F + Send + 'static,
+        name: &'static str,
+        tasks: &Tasks,
+        wake: Wake<Submission>,
+    ) -> Self
+    where
+        F: Future<Output = Q::Answer> + Send + 'static,
+    {
+        let shared = Arc::new(Shared::default());
+        let stop = tasks.stop().clone();
+        let asking = ask_all(ask, Arc::clone(&shared), wake);
+        tasks.stay(name, async move {
+            tokio::select! { () = stop.wait() => {}, () = asking => {} }
+        });
+        Self(shared)
+    }
+
+    /// Asks, unless there is a good answer or the question is under way.
+    pub fn want(&self, submission: &Submission, question: Q) {
+        self.0
+            .want(uid_of(submission), ObjectRef::from_obj(submission), question);
+    }
+
+    /// What is known for the submission's present attempt.
+    pub fn observe(&self, submission: &Submission) -> Observed<Q::Answer> {
+        let attempt = submission.status.as_ref().and_then(|status| status.attempt);
+        self.0.observe(&uid_of(submission), attempt.unwrap_or(1))
+    }
+
+    /// Drops what is known for an object that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.0.lock().remove(uid);
+    }
+}
+
+impl<Q: Question> Default for Shared<Q> {
+    fn default() -> Self {
+        Self {
+            entries: Mutex::default(),
+            notify: Notify::default(),
+        }
+    }
+}
+
+impl<Q: Question> Shared<Q> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry<Q>>> {
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn want(&self, uid: String, by: ObjectRef<Submission>, question: Q) {
+        let now = Instant::now();
+        let age = |entry: &Entry<Q>| now.saturating_duration_since(entry.asked);
+        let mut entries = self.lock();
+        entries.retain(|_, entry| entry.answer.is_none() || age(entry) < KEPT);
+        if let Some(entry) = entries.get_mut(&uid).filter(|entry| entry.question == question) {
+            // The old answer stays until there is another one: what is shown does not flap.
+            if entry.is_due || entry.is_under_way || age(entry) < Q::GOOD_FOR {
+                return;
+            }
+            (entry.is_due, entry.asked) = (true, now);
+        } else {
+            let entry = Entry {
+                question,
+                by,
+                asked: now,
+                is_due: true,
+                is_under_way: false,
+                answer: None,
+            };
+            entries.insert(uid, entry);
+        }
+        self.notify.notify_one();
+    }
+
+    pub(super) fn observe(&self, uid: &str, attempt: i64) -> Observed<Q::Answer> {
+        let entries = self.lock();
+        let Some(entry) = entries.get(uid).filter(|entry| entry.question.attempt() == attempt) else {
+            return Observed::NotAsked;
+        };
+        match &entry.answer {
+            Some(answer) => Observed::Answered(Arc::clone(answer)),
+            None => Observed::Asked(entry.asked.elapsed()),
+        }
+    }
+
+    /// The question that has waited longest, with the UID and the namespace of its submission.
+    pub(super) fn next(&self) -> Option<(String, Q, String)> {
+        let mut entries = self.lock();
+        let due = entries
+            .iter_mut()
+            .filter(|(_, entry)| entry.is_due && !entry.is_under_way);
+        let (uid, entry) = due.min_by_key(|(_, entry)| entry.asked)?;
+        (entry.is_due, entry.is_under_way) = (false, true);
+        let namespace = entry.by.namespace.clone().unwrap_or_default();
+        Some((uid.clone(), entry.question.clone(), namespace))
+    }
+
+    /// Takes an answer in. Returns whom it is for.
+    pub(super) fn done(&self, uid: &str, question: &Q, answer: Q::Answer) -> Option<ObjectRef<Submission>> {
+        let mut entries = self.lock();
+        let entry = entries.get_mut(uid).filter(|entry| entry.question == *question)?;
+        entry.is_under_way = false;
+        entry.answer = Some(Arc::new(answer));
+        Some(entry.by.clone())
+    }
+}
+
+async fn ask_all<Q: Question, F>(ask: impl Fn(Q, String) -> F, shared: Arc<Shared<Q>>, wake: Wake<Submission>)
+where
+    F: Future<Output = Q::Answer> + Send + 'static,
+{
+    let mut under_way = FuturesUnordered::new();
+    loop {
+        while under_way.len() < Q::AT_ONCE
+            && let Some((uid, question, namespace)) = shared.next()
+        {
+            let answer = ask(question.clone(), namespace);
+            under_way.push(answer.map(move |answer| (uid, question, answer)));
+        }
+        tokio::select! {
+            Some((uid, question, answer)) = under_way.next() => {
+                shared.done(&uid, &question, answer).into_iter().for_each(&wake);
+            }
+            () = shared.notify.notified() => {}
+        }
+    }
+}

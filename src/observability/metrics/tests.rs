@@ -1,0 +1,182 @@
+//! Names and labels of all families, and which program exports which.
+
+use std::time::Duration;
+
+use super::*;
+
+/// One of everything.
+fn all(program: Program) -> Metrics {
+    let metrics = Metrics::new(program);
+    metrics.reconciled("Submission", "ok", Duration::from_millis(20));
+    metrics.reconcile_failed("Submission", "conflict");
+    let queue = metrics.queue("Submission", ["urgent", "new"]);
+    queue.waiting([0, 3]);
+    queue.began(1, Duration::from_millis(20));
+    let watch = metrics.watch("Job");
+    watch.failed();
+    watch.event();
+    metrics.set_leading(Some(7));
+    metrics.lease_failed("timeout");
+    metrics.set_submissions("Running", 2);
+    metrics.set_repeating_teams(1);
+    metrics.gpus_used("ns/board".into(), "sensors".into(), 400);
+    metrics.attempt_failed(FailedAttempt {
+        leaderboard: "ns/board".into(),
+        class: "Participant",
+        reason: "AgentCrashed",
+        is_charged: true,
+    });
+    let state = BoardState {
+        is_ready: true,
+        oldest_pending: Duration::from_secs(9),
+        oldest_unpublished: Duration::from_secs(4),
+    };
+    metrics.set_leaderboard("ns/board", state);
+    metrics.evalai_request("put_finished", "ok", Duration::from_millis(20));
+    metrics.set_evalai_load(50, 54, 1);
+    metrics.cloud_call("s3", "GetObject", "ok", Duration::from_secs(1));
+    metrics.sqs_message("created");
+    metrics
+}
+
+#[test]
+fn every_metric_has_its_name_and_its_labels() {
+    let text = all(Program::Controller).text().unwrap();
+    for line in [
+        "leaderboard_reconciles_total{kind=\"Submission\",outcome=\"ok\"} 1",
+        "leaderboard_reconcile_duration_seconds_bucket{le=\"0.025\",kind=\"Submission\"} 1",
+        "leaderboard_reconcile_errors_total{kind=\"Submission\",reason=\"conflict\"} 1",
+        "leaderboard_reconciles_waiting{kind=\"Submission\",class=\"new\"} 3",
+        "leaderboard_reconcile_wait_duration_seconds_bucket{le=\"0.025\",kind=\"Submission\",class=\"new\"} 1",
+        "leaderboard_reconcile_wait_duration_seconds_count{kind=\"Submission\",class=\"urgent\"} 0",
+        "leaderboard_watch_errors_total{kind=\"Job\"} 1",
+        "leaderboard_watch_malformed_objects_total{kind=\"Job\"} 0",
+        "leaderboard_is_leader 1",
+        "leaderboard_leader_term 7",
+        "leaderboard_lease_errors_total{reason=\"timeout\"} 1",
+        "leaderboard_submissions{state=\"Running\"} 2",
+        "leaderboard_teams_with_repeated_infrastructure_failures 1",
+        "leaderboard_gpu_seconds_total{leaderboard=\"ns/board\",track=\"sensors\"} 400",
+        "leaderboard_submission_failures_total{leaderboard=\"ns/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"} 1",
+        "leaderboard_ready{leaderboard=\"ns/board\"} 1",
+        "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9.0",
+        "leaderboard_oldest_unpublished_seconds{leaderboard=\"ns/board\"} 4.0",
+        "leaderboard_evalai_requests_total{op=\"put_finished\",outcome=\"ok\"} 1",
+        "leaderboard_evalai_request_duration_seconds_bucket{le=\"0.025\",op=\"put_finished\"} 1",
+        "leaderboard_evalai_budget_used 50",
+        "leaderboard_evalai_budget_limit 54",
+        "leaderboard_evalai_waiting 1",
+        "leaderboard_cloud_calls_total{service=\"s3\",op=\"GetObject\",outcome=\"ok\"} 1",
+        "leaderboard_cloud_call_duration_seconds_bucket{le=\"1.0\",service=\"s3\",op=\"GetObject\"} 1",
+    ] {
+        assert!(text.lines().any(|l| l == line), "{line} is missing in\n{text}");
+    }
+    for start in [
+        concat!(
+            "leaderboard_build_info{version=\"",
+            env!("CARGO_PKG_VERSION"),
+            "\",revision=\""
+        ),
+        "leaderboard_watch_last_event_timestamp_seconds{kind=\"Job\"} 1",
+        "process_start_time_seconds 1",
+        "process_cpu_seconds_total ",
+        "process_resident_memory_bytes ",
+        "process_open_fds ",
+        "process_max_fds ",
+    ] {
+        assert!(
+            text.lines().any(|l| l.starts_with(start)),
+            "{start} is missing in\n{text}"
+        );
+    }
+    assert!(text.ends_with("# EOF\n"));
+}
+
+#[test]
+fn a_bridge_exports_what_it_counts_and_nothing_of_a_controller() {
+    let families = |text: &str| -> Vec<String> {
+        let types = text.lines().filter_map(|line| line.strip_prefix("# TYPE "));
+        let names = types.filter_map(|line| line.split(' ').next());
+        let own = names.filter(|name| name.starts_with("leaderboard_"));
+        own.map(str::to_owned).collect()
+    };
+    let bridge = families(&all(Program::Bridge).text().unwrap());
+    let expected = [
+        "leaderboard_build",
+        "leaderboard_watch_errors",
+        "leaderboard_watch_malformed_objects",
+        "leaderboard_watch_last_event_timestamp_seconds",
+        "leaderboard_cloud_calls",
+        "leaderboard_cloud_call_duration_seconds",
+        "leaderboard_sqs_messages",
+    ];
+    assert_eq!(bridge, expected);
+    let controller = families(&all(Program::Controller).text().unwrap());
+    assert!(!controller.contains(&"leaderboard_sqs_messages".to_owned()));
+    assert!(
+        controller.len() > 15
+            && expected[..6]
+                .iter()
+                .all(|name| controller.contains(&(*name).to_owned()))
+    );
+}
+
+#[test]
+fn durations_and_times_are_in_seconds() {
+    let text = all(Program::Controller).text().unwrap();
+    let histograms: Vec<_> = text
+        .lines()
+        .filter_map(|line| line.strip_prefix("# TYPE ")?.strip_suffix(" histogram"))
+        .collect();
+    assert!(histograms.len() >= 4, "{histograms:?}");
+    assert_eq!(
+        histograms.iter().find(|name| !name.ends_with("_duration_seconds")),
+        None
+    );
+}
+
+#[test]
+fn who_does_not_lead_shows_nothing_that_only_the_leader_counts() {
+    let metrics = all(Program::Controller);
+    metrics.set_leading(None);
+    let text = metrics.text().unwrap();
+    for sample in [
+        "leaderboard_submissions{",
+        "leaderboard_ready{",
+        "leaderboard_oldest_pending_seconds{",
+        "leaderboard_oldest_unpublished_seconds{",
+    ] {
+        assert!(!text.contains(sample), "{sample} in\n{text}");
+    }
+    for zero in [
+        "leaderboard_is_leader 0\n",
+        "leaderboard_teams_with_repeated_infrastructure_failures 0\n",
+        "leaderboard_evalai_budget_limit 0\n",
+        "leaderboard_evalai_waiting 0\n",
+    ] {
+        assert!(text.contains(zero), "{zero} is missing in\n{text}");
+    }
+}
+
+#[test]
+fn a_leaderboard_that_is_gone_has_no_samples() {
+    let metrics = all(Program::Controller);
+    metrics.forget_leaderboard("ns/board");
+    let text = metrics.text().unwrap();
+    assert!(
+        !text.contains("leaderboard_ready{") && !text.contains("_oldest_pending_seconds{"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_process_that_stops_leading_keeps_its_last_term() {
+    let metrics = Metrics::default();
+    metrics.set_leading(Some(4));
+    metrics.set_leading(None);
+    let text = metrics.text().unwrap();
+    assert!(
+        text.contains("leaderboard_is_leader 0\n") && text.contains("leaderboard_leader_term 4\n"),
+        "{text}"
+    );
+}

@@ -1,0 +1,204 @@
+//! `check` against a real API server. No controller runs; the test writes what one would.
+
+use std::process::Stdio;
+
+use kube::ResourceExt;
+use kube::api::{DynamicObject, ListParams};
+use kube::runtime::wait::await_condition;
+use serde_json::{Value, json};
+use tokio::io::AsyncReadExt;
+use tokio::process::Command;
+use tokio::time::timeout;
+
+use super::terminal::{Terminal, assert_has, condition};
+use crate::api::bridge::LIMIT;
+use crate::api::objects::Kind;
+
+/// The Submission of the check that the command has created.
+async fn created(terminal: &Terminal) -> DynamicObject {
+    let api = terminal.api(Kind::Submission);
+    let found = async {
+        loop {
+            let all = api.list(&ListParams::default()).await.unwrap().items;
+            if let Some(check) = all.into_iter().find(|one| one.name_any().starts_with("check-")) {
+                return check;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        }
+    };
+    timeout(LIMIT, found).await.expect("the check is created")
+}
+
+/// Starts the command without an `aws` on its PATH.
+fn check(terminal: &Terminal, arguments: &[&str]) -> Command {
+    let mut command = terminal.command(&[&["check"], arguments].concat());
+    command.env("PATH", "").stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn ended(reason: &str, truth: &Value) -> Value {
+    let mut status = json!({
+        "state": "Finished", "attempt": 1, "reason": reason, "message": "It has ended.", "track": "sensors", "jobName": "a-1",
+        "resultsURL": "s3://results/check", "progress": {"done": 1, "total": 1, "text": "1/1"},
+        "times": {"started": "2026-11-01T10:00:00Z", "finished": "2026-11-01T10:00:00Z"},
+        "conditions": [condition("Accepted", "True", "Accepted"), condition("Finished", "True", reason),
+                       condition("Archived", "True", "Stored"), condition("Recorded", "False", "NotRequired")],
+    });
+    crate::api::objects::merge(&mut status, truth);
+    status
+}
+
+/// Plays the controller: ends the check, and notes it in the Leaderboard.
+async fn play(terminal: &Terminal, status: &Value) -> DynamicObject {
+    let check = created(terminal).await;
+    let name = check.name_any();
+    terminal.status(Kind::Submission, &name, status).await;
+    let last = json!({"lastCheck": {"time": "2026-11-01T10:00:00Z", "result": "Passed", "reason": "Finished",
+                                    "leaderboardGeneration": 1, "submissionName": name}});
+    terminal.status(Kind::Leaderboard, "local", &last).await;
+    check
+}
+
+async fn output(command: &mut Command) -> (Option<i32>, String, String) {
+    let mut child = command.spawn().unwrap();
+    let (mut out, mut err) = (String::new(), String::new());
+    let (mut stdout, mut stderr) = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
+    let read = async {
+        tokio::try_join!(stdout.read_to_string(&mut out), stderr.read_to_string(&mut err)).unwrap();
+        child.wait().await.unwrap().code()
+    };
+    let code = timeout(LIMIT, read).await.expect("it ends");
+    (code, out, err)
+}
+
+#[tokio::test]
+async fn a_check_is_created_followed_printed_and_deleted() {
+    let terminal = Terminal::new().await;
+    terminal
+        .leaderboard(&json!({"check": {"image": "host/baseline:1"}}))
+        .await;
+    let mut command = check(&terminal, &[]);
+    let well = ended("Finished", &json!({}));
+    let ((code, out, err), object) = tokio::join!(output(&mut command), play(&terminal, &well));
+    assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
+    let name = object.name_any();
+    assert_eq!(object.data["spec"]["check"], true);
+    assert_eq!(object.data["spec"]["image"], "host/baseline:1");
+    assert_has(
+        &out,
+        &[
+            &format!("Check {name} of Leaderboard local: one route of track sensors with host/baseline:1."),
+            &format!("{name} is Finished (Finished): It has ended."),
+            "✔ Leaderboard    Ready",
+            "✔ Bucket         has the results, s3://results/check",
+            "✔ Route          1/1 done",
+            "The check passed.",
+            "aws s3 rm --recursive s3://results/check/",
+        ],
+    );
+    let gone = await_condition(terminal.api(Kind::Submission), &name, |one: Option<&DynamicObject>| {
+        one.is_none()
+    });
+    timeout(LIMIT, Box::pin(gone)).await.expect("it is deleted").unwrap();
+}
+
+#[tokio::test]
+async fn a_fault_is_named_with_its_step_and_the_code_is_one() {
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({})).await;
+    let failure = json!({"class": "Infrastructure", "reason": "ImagePull", "charged": false,
+                         "message": "The image of simulator-1 cannot be pulled: not found."});
+    let bad = ended(
+        "ImagePull",
+        &json!({"state": "Failed", "failure": failure, "progress": null, "times": {"started": null}}),
+    );
+    let mut command = check(&terminal, &["local", "--image", "host/other:2", "--keep"]);
+    let ((code, out, _), object) = tokio::join!(output(&mut command), play(&terminal, &bad));
+    assert_eq!(code, Some(1), "{out}");
+    assert_has(
+        &out,
+        &[
+            "✘ Images         ImagePull: The image of simulator-1 cannot be pulled: not found.",
+            "The check failed: 1 part is broken",
+            &format!("Kept: kubectl delete submission {}", object.name_any()),
+        ],
+    );
+    let kept = terminal
+        .api(Kind::Submission)
+        .get_opt(&object.name_any())
+        .await
+        .unwrap();
+    assert!(kept.is_some());
+}
+
+#[tokio::test]
+async fn what_does_not_end_in_time_is_cancelled_and_deleted() {
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({})).await;
+    let mut command = check(&terminal, &["--image", "host/a:1", "--timeout", "2"]);
+    let plays = async {
+        let check = created(&terminal).await;
+        let name = check.name_any();
+        let waits = json!({"attempt": 1, "reason": "Unschedulable", "message": "0/3 nodes are available.",
+                           "conditions": [condition("Finished", "False", "Preparing")]});
+        terminal.status(Kind::Submission, &name, &waits).await;
+        let cancelled = |one: Option<&DynamicObject>| one.is_some_and(|one| one.data["spec"]["cancel"] == true);
+        let api = terminal.api(Kind::Submission);
+        let asked = Box::pin(await_condition(api, &name, cancelled));
+        timeout(LIMIT, asked).await.expect("it is cancelled").unwrap();
+        let end = ended("Cancelled", &json!({"state": "Cancelled"}));
+        terminal.status(Kind::Submission, &check.name_any(), &end).await;
+        let last = json!({"lastCheck": {"time": "2026-11-01T10:00:00Z", "result": "Failed", "reason": "Cancelled",
+                                        "leaderboardGeneration": 1, "submissionName": check.name_any()}});
+        terminal.status(Kind::Leaderboard, "local", &last).await;
+    };
+    let ((code, out, _), ()) = tokio::join!(output(&mut command), plays);
+    assert_eq!(code, Some(1), "{out}");
+    let found = "✘ Node           The check did not end within 2 s (--timeout). Unschedulable: 0/3 nodes are";
+    assert_has(&out, &[found]);
+    assert_eq!(
+        terminal
+            .api(Kind::Submission)
+            .list(&ListParams::default())
+            .await
+            .unwrap()
+            .items
+            .len(),
+        0
+    );
+}
+
+#[tokio::test]
+async fn without_image_or_leaderboard_nothing_is_created() {
+    let terminal = Terminal::new().await;
+    let words = terminal.run(&["check"]).await.refused();
+    assert!(
+        words.ends_with("has no Leaderboard. Use -n for another namespace"),
+        "{words}"
+    );
+    terminal.leaderboard(&json!({})).await;
+    for (arguments, expected) in [
+        (
+            &["check"][..],
+            "Give the image of an agent of your own with --image, or set spec.check.image",
+        ),
+        (&["check", "other"], "there is no Leaderboard other in namespace"),
+        (
+            &["check", "--track", "map", "--image", "a:1"],
+            "has no track map. Give one of sensors",
+        ),
+    ] {
+        let words = terminal.run(arguments).await.refused();
+        assert!(words.contains(expected), "{words}");
+    }
+    assert_eq!(
+        terminal
+            .api(Kind::Submission)
+            .list(&ListParams::default())
+            .await
+            .unwrap()
+            .items
+            .len(),
+        0
+    );
+}

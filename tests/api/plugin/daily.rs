@@ -1,0 +1,204 @@
+//! `status`, `top`, `submit`, `logs`, `rerun`, `report` and completion against a real API server.
+
+use kube::ResourceExt;
+use kube::api::ListParams;
+use serde_json::{Value, json};
+use tokio::process::Command;
+
+use super::terminal::{
+    Printed, Terminal, assert_has, condition, end, ended, failed, finished, plugin, running, waiting,
+};
+use crate::api::objects::Kind;
+
+#[tokio::test]
+async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({"concurrency": {"total": 2}})).await;
+    let team = |id: &str| json!({"team": {"id": id, "name": format!("Team {id}")}});
+    terminal.submission("runs", &team("7"), &running()).await;
+    terminal.submission("waits", &team("8"), &waiting()).await;
+    terminal.submission("done", &team("7"), &finished()).await;
+    let text = terminal.run(&["status"]).await.well();
+    let names: Vec<&str> = text.lines().filter_map(|line| line.split_whitespace().next()).collect();
+    assert_eq!(names, ["NAME", "runs", "waits", "done"]);
+    let text = terminal.run(&["status", "runs"]).await.well();
+    assert_has(
+        &text,
+        &[
+            "runs is Running since",
+            "Job:         a-1",
+            "Next:        kubectl leaderboard why runs",
+        ],
+    );
+    let text = terminal.run(&["top"]).await.well();
+    assert_has(&text, &["local        1/2    1", "Team 7", "Team 8"]);
+    let text = terminal.run(&["status", "-o", "json"]).await.out;
+    let value: Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(value.as_array().unwrap().len(), 3);
+    let text = terminal.run(&["why", "waits", "-o", "yaml"]).await.out;
+    assert_has(&text, &["\"reason\": \"WaitingForSlot\"", "\"nextSteps\":\n  - "]);
+    let text = terminal.run(&["status", "-l", "a=b"]).await.well();
+    assert_has(&text, &["No submission has the labels a=b."]);
+}
+
+#[tokio::test]
+async fn a_wrong_namespace_is_answered_with_the_right_one() {
+    let (empty, full) = (Terminal::new().await, Terminal::new().await);
+    full.submission("submission-4711", &json!({}), &waiting()).await;
+    for command in ["status", "why"] {
+        let text = empty.run(&[command]).await.well().replace('\n', " ");
+        assert_has(&text, &["has no submissions. There are some in ", &full.namespace]);
+        let text = empty.run(&[command, "submission-4711"]).await.refused();
+        assert_has(
+            &text,
+            &[&format!("There is one in namespace {0}: use -n {0}", full.namespace)],
+        );
+    }
+    let text = empty.run(&["why", "-A"]).await.out;
+    assert_has(&text, &[&format!("{}/submission-4711", full.namespace)]);
+    let text = empty.run(&["status", "-A"]).await.out;
+    assert_has(&text, &["NAMESPACE", &full.namespace]);
+}
+
+#[tokio::test]
+async fn submit_creates_and_waits() {
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({})).await;
+    let flags = [
+        "--leaderboard",
+        "local",
+        "--track",
+        "sensors",
+        "--image",
+        "a:1",
+        "--name",
+        "mine",
+        "--team-id",
+        "7",
+    ];
+    let mut waits = terminal.waits(&[&["submit"], &flags[..], &["--wait"]].concat());
+    waits.until("Submitted mine.").await;
+    let made = terminal.api(Kind::Submission).get("mine").await.unwrap();
+    assert_eq!(made.data["spec"]["team"], json!({"id": "7"}));
+    terminal.status(Kind::Submission, "mine", &finished()).await;
+    assert_eq!(waits.code().await, Some(0));
+    let again = terminal.run(&[&["submit"], &flags[..]].concat()).await.refused();
+    assert_has(&again, &["already exists"]);
+}
+
+#[tokio::test]
+async fn status_is_followed_until_the_end() {
+    let terminal = Terminal::new().await;
+    terminal.submission("runs", &json!({}), &running()).await;
+    let mut waits = terminal.waits(&["status", "runs", "-w"]);
+    waits.until("runs is Running since").await;
+    terminal
+        .status(Kind::Submission, "runs", &end("Cancelled", "Cancelled"))
+        .await;
+    waits.until("runs is Cancelled since").await;
+    assert_eq!(waits.code().await, Some(0));
+}
+
+#[tokio::test]
+async fn only_what_the_infrastructure_failed_is_resumed() {
+    let terminal = Terminal::new().await;
+    let mut lost = failed("Infrastructure", "NodeLost");
+    lost["failure"]["charged"] = json!(false);
+    terminal.submission("lost", &json!({}), &lost).await;
+    terminal
+        .submission("crashed", &json!({}), &failed("Participant", "AgentCrashed"))
+        .await;
+    let text = terminal.run(&["rerun", "--all", "--dry-run"]).await.well();
+    assert_eq!(text, "Would resume lost.\n");
+    assert_eq!(terminal.requested("lost").await, (1, false));
+    let text = terminal
+        .run(&["rerun", "--all", "--reason", "SimulationCrashed"])
+        .await
+        .well();
+    assert_has(&text, &["No submission has failed so"]);
+    terminal.run(&["rerun", "--all"]).await.well();
+    assert_eq!(terminal.requested("lost").await, (2, false));
+    assert_eq!(terminal.requested("crashed").await, (1, false));
+}
+
+#[tokio::test]
+async fn logs_of_a_pod_that_is_gone_are_in_the_bucket() {
+    let terminal = Terminal::new().await;
+    let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
+                      "slices": [{"first": 0, "last": 0}, {"first": 1, "last": 1}], "routes": 2, "repetitions": 1,
+                      "storage": {"bucket": "results"}, "image": "a", "contentsImage": "c", "simulatorImage": "s"});
+    let mut status = finished();
+    status["plan"] = plan;
+    terminal.submission("mine", &json!({}), &status).await;
+    let text = terminal.run(&["logs", "mine", "--pair", "2"]).await.well();
+    assert_has(&text, &["aws s3 cp s3://results/42/agent/agent2/leaderboard.log -"]);
+    assert!(!text.contains("agent1"), "{text}");
+    let text = terminal.run(&["logs", "mine", "--pair", "3"]).await.refused();
+    assert_has(&text, &["mine has no pair 3. It has 2, counted from 1"]);
+}
+
+#[tokio::test]
+async fn a_report_is_an_archive_without_secrets() {
+    let terminal = Terminal::new().await;
+    terminal
+        .leaderboard(&json!({"agent": {"env": [{"name": "TOKEN", "value": "s3cr3t"}]}}))
+        .await;
+    terminal
+        .submission("runs", &json!({"team": {"id": "7", "name": "Team Seven"}}), &running())
+        .await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("report.tar");
+    let text = terminal.run(&["report", "--file", file.to_str().unwrap()]).await.out;
+    assert_has(&text, &["Wrote ", "report.tar"]);
+    let archive = String::from_utf8(std::fs::read(&file).unwrap()).unwrap();
+    assert_has(
+        &archive,
+        &[
+            "leaderboards.json",
+            "submissions.json",
+            "pods.json",
+            "events.json",
+            "TOKEN",
+            "\"runs\"",
+        ],
+    );
+    assert!(
+        !archive.contains("s3cr3t") && !archive.contains("Team Seven"),
+        "{archive}"
+    );
+}
+
+#[tokio::test]
+async fn a_shell_gets_names_from_the_cluster() {
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({})).await;
+    terminal.submission("submission-7", &json!({}), &waiting()).await;
+    let complete = async |words: &[&str]| {
+        let mut command = Command::new(plugin());
+        command
+            .env("KUBECONFIG", &terminal.kubeconfig)
+            .args(["complete", "--"])
+            .args(words);
+        Printed::of(&ended(&mut command).await).out
+    };
+    let here = &terminal.namespace;
+    assert_eq!(complete(&["why", "-n", here, "sub"]).await, "submission-7\n:4\n");
+    assert_eq!(complete(&["check", "-n", here, ""]).await, "local\n:4\n");
+    assert_eq!(complete(&["re"]).await, "report\nrerun\nresume\n:4\n");
+}
+
+/// A screen without any of the optional parts.
+#[tokio::test]
+async fn one_that_nobody_has_processed_has_a_screen_too() {
+    let terminal = Terminal::new().await;
+    let bare = json!({"conditions": [condition("Finished", "False", "Preparing")]});
+    terminal.submission("new", &json!({}), &bare).await;
+    let text = terminal.run(&["status", "new"]).await.well();
+    assert_has(&text, &["new is new, created"]);
+    let all = terminal
+        .api(Kind::Submission)
+        .list(&ListParams::default())
+        .await
+        .unwrap();
+    assert_eq!(all.items[0].name_any(), "new");
+}

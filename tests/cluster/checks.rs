@@ -1,0 +1,162 @@
+//! `kubectl leaderboard check` on a real cluster: a good Leaderboard, and one that is broken in each of several ways.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use leaderboard_api::{Leaderboard, Submission, conditions};
+use serde_json::{Value, json};
+use tokio::process::Command;
+use tokio::time::timeout;
+
+use crate::operator::controller;
+use crate::scene::{Scene, scenario};
+
+/// A check pulls, prepares, drives one route and stores it; a broken one is given up after a minute of the same fault.
+const LIMIT: Duration = Duration::from_mins(8);
+
+fn plugin() -> PathBuf {
+    Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard")
+}
+
+/// Runs a check of this Leaderboard; its exit code, and what it printed.
+async fn check(scene: &Scene, board: &str, agent: &str) -> (Option<i32>, String) {
+    let mut command = Command::new(plugin());
+    command
+        .args([
+            "check",
+            board,
+            "--timeout",
+            "400",
+            "--image",
+            &scene.lab.challenge(agent),
+            "-n",
+            &scene.namespace,
+        ])
+        .env("PATH", "")
+        .stdin(Stdio::null())
+        .kill_on_drop(true);
+    let output = timeout(LIMIT, command.output()).await.expect("the check ends").unwrap();
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (
+        output.status.code(),
+        format!("{}{}", text(&output.stdout), text(&output.stderr)),
+    )
+}
+
+fn has(text: &str, expected: &[&str]) {
+    for part in expected {
+        assert!(text.contains(part), "{part}\n\n{text}");
+    }
+}
+
+#[tokio::test]
+async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
+    scenario("check-good", async |scene: &Scene| {
+        let table = json!({"name": scene.cloud.table, "region": crate::aws::REGION, "endpoint": scene.gate.url});
+        scene.leaderboard("lb", json!({"table": table, "paused": true})).await;
+        let _controller = controller(scene);
+        scene.ready("lb").await;
+        let (code, text) = check(scene, "lb", "agent:standard").await;
+        assert_eq!(code, Some(0), "{text}");
+        assert!(!text.contains('✘'), "{text}");
+        has(
+            &text,
+            &[
+                "Leaderboard    Ready",
+                "✔ Slot           granted",
+                "✔ Node           leaderboard-local",
+                "✔ Images         pulled",
+                "✔ Contents       copied",
+                "✔ Simulator      started",
+                "✔ Agent          ran",
+                "✔ Bucket         has the results",
+                "✔ Route          1/1 done",
+                "✔ Table          would take a row; a check writes none",
+                "The check passed",
+            ],
+        );
+        assert_eq!(scene.all::<Submission>().await.len(), 0, "it is deleted");
+        assert_eq!(
+            scene.cloud.rows(&scene.cloud.table).await.len(),
+            0,
+            "the table has no row"
+        );
+        let board = scene.api::<Leaderboard>().get("lb").await.unwrap();
+        let status = board.status.unwrap();
+        assert!(
+            conditions::is_true(&status.conditions, conditions::CHECKED),
+            "{:?}",
+            status.conditions
+        );
+        let counts = status.counts.unwrap_or_default();
+        assert_eq!(counts.finished, 0, "a check is in no count");
+        println!("{text}");
+    })
+    .await;
+}
+
+/// What is broken, the part that the check marks, and the step that it names.
+#[tokio::test]
+async fn each_broken_part_is_marked_with_its_next_step() {
+    scenario("check-broken", async |scene: &Scene| {
+        let _controller = controller(scene);
+        let missing = scene.lab.challenge("simulator:does-not-exist");
+        let root = json!([{"name": "LEADERBOARD_ROOT", "value": "/nothing"}]);
+        let cases: [(&str, Value, &str, &[&str]); 4] = [
+            (
+                "image",
+                json!({"simulator": {"image": missing}}),
+                "agent:standard",
+                &[
+                    "✘ Images         ImagePull: The image of simulator-1 cannot be pulled",
+                    "→ Fix this.",
+                ],
+            ),
+            (
+                "bucket",
+                json!({"storage": {"bucket": "leaderboard-tests-none"}}),
+                "agent:standard",
+                &[
+                    "✘ Bucket         ",
+                    "– Leaderboard    not Ready: see Bucket",
+                    "– Route          not reached",
+                ],
+            ),
+            (
+                "contents",
+                json!({"contents": {"env": root}}),
+                "agent:standard",
+                &[
+                    "✘ Contents       ",
+                    "✔ Node           leaderboard-local",
+                    "– Agent          not reached",
+                ],
+            ),
+            (
+                "agent",
+                json!({}),
+                "agent:print-routes",
+                &[
+                    "✘ Agent          AgentCrashed",
+                    "✔ Simulator      started",
+                    "→ Correct the image of the check, or name another one with --image.",
+                ],
+            ),
+        ];
+        let runs = cases.into_iter().map(async |(name, change, agent, expected)| {
+            scene.leaderboard(name, change).await;
+            let (code, text) = check(scene, name, agent).await;
+            assert_eq!(code, Some(1), "{name}: {text}");
+            has(&text, expected);
+            println!("{name}:\n{text}");
+        });
+        futures::future::join_all(runs).await;
+        assert_eq!(scene.all::<Submission>().await.len(), 0, "all are deleted");
+        let board = scene.api::<Leaderboard>().get("image").await.unwrap();
+        let status = board.status.unwrap();
+        assert!(!conditions::is_true(&status.conditions, conditions::CHECKED));
+        assert_eq!(status.last_check.unwrap().reason, "ImagePull");
+    })
+    .await;
+}

@@ -1,0 +1,205 @@
+//! The original's entries in Secrets Manager, imported and applied: one submission of each Leaderboard runs to its score.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use evalai_stand_in::model::Status;
+use kube::Api;
+use kube::api::{ApiResource, DynamicObject, Patch, PatchParams};
+use kube::core::{GroupVersionKind, TypeMeta};
+use leaderboard_api::{Leaderboard, State, Submission};
+use leaderboard_operator::services::aws::Aws;
+use serde_json::{Value, json};
+use tokio::process::Command;
+
+use super::expected::{assert_finished, assert_row};
+use crate::aws::{BUCKET, REGION};
+use crate::evalai::{Evalai, HOST_TOKEN};
+use crate::operator::{bridge, controller};
+use crate::scene::{Scene, USER_AGENT, lay_over, scenario, state};
+
+/// Of the entries alone: the lab has its own in [`REGION`].
+const ENTRIES: &str = "us-west-2";
+const LIMIT: Duration = Duration::from_mins(5);
+
+/// Stores the four entries, as the original has them.
+async fn store_entries(scene: &Scene, evalai: &Evalai) {
+    let secrets = Aws::load().await.secrets(Some(ENTRIES), Some(&scene.cloud.endpoint));
+    let board = |table: &str| {
+        json!({
+            "name": "cluster", "endpoint": "https://cluster.example", "certificate_authority": "LS0t",
+            "simulator_image": scene.lab.challenge("simulator:1"),
+            "leaderboard_image": scene.lab.challenge("contents:1"),
+            "logcopy_image": scene.lab.challenge("logcopy:1"),
+            "s3_bucket": BUCKET, "dynamodb_submissions_table": table,
+        })
+    };
+    for (name, entry) in [
+        ("evalai", json!({"auth_token": HOST_TOKEN, "api_server": evalai.url})),
+        (
+            "evalai-tracks",
+            json!({"1": "leaderboard-20-sensors", "2": "leaderboard-10-map"}),
+        ),
+        ("leaderboard-10", board(&scene.cloud.hyphen_table)),
+        ("leaderboard-20", board(&scene.cloud.table)),
+    ] {
+        let text = entry.to_string();
+        // A run before this one may have left it.
+        _ = secrets.create_secret().name(name).secret_string(&text).send().await;
+        secrets
+            .put_secret_value()
+            .secret_id(name)
+            .secret_string(&text)
+            .send()
+            .await
+            .unwrap();
+    }
+}
+
+/// What the command prints.
+async fn import(scene: &Scene) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_leaderboard-operator"));
+    command
+        .args([
+            "import",
+            "--challenge",
+            "1",
+            "--region",
+            ENTRIES,
+            "--endpoint",
+            &scene.cloud.endpoint,
+        ])
+        .args([
+            "--queue",
+            &scene.cloud.queue_url,
+            "--queue-region",
+            REGION,
+            "--dead-letter",
+            &scene.cloud.dead_url,
+        ])
+        .args([
+            "--namespace",
+            &scene.namespace,
+            "--egress",
+            &format!("{}/32", scene.lab.host),
+        ]);
+    let output = command.output().await.unwrap();
+    let (out, err) = (
+        String::from_utf8(output.stdout).unwrap(),
+        String::from_utf8(output.stderr).unwrap(),
+    );
+    assert!(output.status.success(), "{err}");
+    assert!(!out.contains(HOST_TOKEN) && !err.contains(HOST_TOKEN));
+    // The lab's stand-in has neither of the two services, which must not keep anybody from the manifests.
+    for unread in [
+        "EventBridge Pipes could not be listed",
+        "Lambda's event source mappings could not be listed",
+    ] {
+        assert!(err.contains(unread), "{err}");
+    }
+    out
+}
+
+/// What this cluster needs otherwise: it has no GPUs and one small node, AWS and EvalAI are stand-ins, and nothing enforces policies.
+fn fit(scene: &Scene, object: &mut Value) {
+    let disk = json!({"requests": {"ephemeral-storage": "16Mi"}, "limits": {"ephemeral-storage": "4Gi"}});
+    let small = |resources: &Value| json!({"resources": resources});
+    let (region, endpoint) = (REGION, &scene.cloud.endpoint);
+    let change = json!({
+        "gpu": {"mode": "None", "resourceName": null},
+        "simulator": {"resources": null, "securityContext": null, "display": "Offscreen"},
+        "agent": {"resources": null, "images": [], "env": [{"name": "ROUTE_MS", "value": "100"}]},
+        "storage": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix},
+        "table": {"region": region, "endpoint": scene.gate.url},
+        "queue": {"endpoint": scene.gate.url},
+        "podIdentity": {"secretName": "aws"},
+        "network": {"dns": "None", "enforcement": "Off"},
+        "syncPeriodSeconds": 2,
+    });
+    lay_over(&mut object["spec"], change);
+    lay_over(
+        &mut object["spec"],
+        json!({"simulator": small(&disk), "agent": small(&disk)}),
+    );
+    for track in object["spec"]["tracks"].as_array_mut().unwrap() {
+        track.as_object_mut().unwrap().remove("nodeSelector");
+    }
+}
+
+/// Applies what was printed, object by object.
+async fn apply(scene: &Scene, manifests: &str) {
+    let objects: Vec<Value> = serde_saphyr::from_multiple(manifests).unwrap();
+    let kinds: Vec<_> = objects.iter().map(|object| object["kind"].as_str().unwrap()).collect();
+    assert_eq!(kinds, ["Namespace", "ServiceAccount", "Leaderboard", "Leaderboard"]);
+    for mut object in objects {
+        if object["kind"] == "Leaderboard" {
+            fit(scene, &mut object);
+        }
+        let types: TypeMeta = serde_json::from_value(object.clone()).unwrap();
+        let kind = ApiResource::from_gvk(&GroupVersionKind::try_from(&types).unwrap());
+        let name = object["metadata"]["name"].as_str().unwrap().to_owned();
+        let api: Api<DynamicObject> = if object["kind"] == "Namespace" {
+            Api::all_with(scene.client.clone(), &kind)
+        } else {
+            Api::namespaced_with(scene.client.clone(), &scene.namespace, &kind)
+        };
+        let params = PatchParams::apply(USER_AGENT).force();
+        let applied = api.patch(&name, &params, &Patch::Apply(&object)).await;
+        applied.unwrap_or_else(|error| panic!("{name}: {error}"));
+    }
+}
+
+#[tokio::test]
+async fn what_import_prints_runs_a_submission_of_each_leaderboard() {
+    scenario("import", async |scene: &Scene| {
+        let evalai = Evalai::start(scene).await;
+        Box::pin(store_entries(scene, &evalai)).await;
+        let manifests = import(scene).await;
+        apply(scene, &manifests).await;
+        let (_controller, _bridge) = (controller(scene), bridge(scene));
+        for name in ["leaderboard-10", "leaderboard-20"] {
+            scene.ready(name).await;
+        }
+        let boards = scene.all::<Leaderboard>().await;
+        let token = |board: &Leaderboard| board.spec.evalai.as_ref().unwrap().token.secrets_manager.clone();
+        assert!(
+            boards.iter().all(|board| token(board).unwrap().id == "evalai"),
+            "the token is read where it was"
+        );
+
+        let image = scene.lab.challenge("agent:standard");
+        let (twenty, ten) = (evalai.submit(&image, 1).await, evalai.submit(&image, 2).await);
+        let finished = scene.settled(&format!("submission-{twenty}"), LIMIT).await;
+        assert_finished(&finished);
+        assert_eq!(finished.spec.leaderboard_name, "leaderboard-20");
+        assert_row(&scene.cloud.row(&scene.cloud.table).await);
+
+        let finished = scene.settled(&format!("submission-{ten}"), LIMIT).await;
+        assert_eq!(finished.spec.leaderboard_name, "leaderboard-10");
+        assert_eq!(state(&finished), Some(State::Finished));
+        assert_eq!(progress(&finished).as_deref(), Some("100/100"), "20 routes, five times");
+        let row = scene.cloud.row(&scene.cloud.hyphen_table).await;
+        assert_metrics_of_ten(&row);
+        for pk in [twenty, ten] {
+            assert_eq!(evalai.submission(pk).status, Status::Finished);
+        }
+    })
+    .await;
+}
+
+fn progress(submission: &Submission) -> Option<String> {
+    let progress = submission.status.as_ref()?.progress.as_ref()?;
+    Some(progress.text.clone())
+}
+
+/// 1.0 has twelve metrics, and none of the three that only 2.0 has.
+fn assert_metrics_of_ten(row: &BTreeMap<String, String>) {
+    assert_eq!(row["submission_status"], "FINISHED");
+    for (column, is_there) in [
+        ("driving_score", true),
+        ("agent_blocked", true),
+        ("min_speed_infractions", false),
+    ] {
+        assert_eq!(row.contains_key(column), is_there, "{column} of {row:?}");
+    }
+}
