@@ -59,6 +59,9 @@ RARE: Mapping[Right, str] = {
         ): "only with gpu.mode Claim, as tests/api/claims.rs has it"
         for verb in ("get", "list", "create", "patch", "delete")
     },
+    Right(
+        "controller", "get", "priorityclasses", "scheduling.k8s.io"
+    ): "only for a track with priorityClassName, as tests/api/boards.rs has it",
     Right("controller", "create", "submissions", GROUP): "only for a submission whose message was lost",
     Right("controller", "get", "submissions", GROUP): "only for a submission whose message was lost",
 }

@@ -132,19 +132,14 @@ def compile_all(plan: Plan) -> None:
 def unit(plan: Plan) -> None:
     """Pure logic, scenarios against a mock, processes against folders and stand-ins of this machine."""
     names = [name for name in test_targets(plan.settings) if name not in APART]
-    cargo_test(plan, ["--lib", "--bins", *(f"--test={name}" for name in names)], test_environment(plan.settings))
+    target = ["--lib", "--bins", *(f"--test={name}" for name in names)]
+    run_twice(plan, target, test_environment(plan.settings), None)
 
 
 def api(plan: Plan) -> None:
     """Many controllers on one API server; on a busy machine a test can run out of time next to others."""
     require_target(plan.settings, "api")
-    target, env = ["--test=api"], test_environment(plan.settings)
-
-    def at_once(threads: int, harness: Sequence[str]) -> Outcome:
-        return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
-
-    if not settle(plan.summary, at_once(AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names])):
-        raise LabError("cargo test found failures, see below")
+    run_twice(plan, ["--test=api"], test_environment(plan.settings), AT_ONCE)
 
 
 def chart(plan: Plan) -> None:
@@ -259,10 +254,15 @@ def test_environment(settings: Settings) -> dict[str, str]:
     return {"KUBEBUILDER_ASSETS": str(assets), "LEADERBOARD_MINISTACK": str(ministack)}
 
 
-def cargo_test(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> None:
-    outcome = cargo_outcome(plan, targets, env, [plan.filter])
-    plan.summary.failed += outcome.failures
-    if not outcome.passed:
+def run_twice(plan: Plan, targets: Sequence[str], env: dict[str, str], threads: int | None) -> None:
+    """Runs tests at once, as many as the machine has cores unless told, and a few that failed once more, alone."""
+    many = {} if threads is None else {"RUST_TEST_THREADS": str(threads)}
+    first = cargo_outcome(plan, targets, {**env, **many}, [plan.filter])
+
+    def again(names: Sequence[str]) -> Outcome:
+        return cargo_outcome(plan, targets, {**env, "RUST_TEST_THREADS": "1"}, ["--exact", *names])
+
+    if not settle(plan.summary, first, again):
         raise LabError("cargo test found failures, see below")
 
 

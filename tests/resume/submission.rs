@@ -123,6 +123,11 @@ impl Submission {
         self.ports[usize::from(member.pair.get()) - 1]
     }
 
+    /// The file that an agent with the knob `hang@ROUTE:once` leaves, below the logs.
+    pub fn hang_marker(&self, agent: Member, route: u32) -> String {
+        format!("agent/agent{}/.hang-{route}-{}.happened", agent.pair, self.port(agent))
+    }
+
     fn simulator(&self, command: &mut Command, member: Member, places: &Places) {
         let port = self.port(member);
         command

@@ -51,11 +51,14 @@ fn is_inside(name: &str) -> bool {
         .env(INSIDE, "1")
         .output();
     let output = output.unwrap();
-    let said = String::from_utf8_lossy(&output.stdout);
+    let said = [output.stdout, output.stderr].concat();
+    let said = String::from_utf8_lossy(&said);
+    // The failure itself comes first, as the end of a long text is what a summary keeps.
+    let why = said.split_once("panicked at").map_or("", |(_, why)| why);
     assert!(
         output.status.success() && said.contains("1 passed"),
-        "{said}{}",
-        String::from_utf8_lossy(&output.stderr)
+        "{said}\nfailed at {}",
+        why.lines().take(12).collect::<Vec<_>>().join("\n")
     );
     false
 }
@@ -101,10 +104,13 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
         let logs = root.join("logs");
         mount(&["-t", "tmpfs", "-o", "size=2m", "none", logs.to_str().unwrap()]);
     });
+    let agents = || members().filter(|member| member.side == Side::Agent);
     let begun = async {
-        while report(&submission.archive)
-            .await
-            .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
+        // An agent that is killed before it has left its marker hangs once more.
+        while !agents().all(|agent| kubelet.path(&submission.hang_marker(agent, 3)).exists())
+            || report(&submission.archive)
+                .await
+                .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
         {
             let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
             if let Ok((name, status)) = ended {
@@ -116,7 +122,6 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
     assert!(in_time.is_ok(), "it does not begin\n{}", kubelet.story());
     let filler = kubelet.path("simulator/filler");
     fill(&filler);
-    let agents = || members().filter(|member| member.side == Side::Agent);
     for agent in agents() {
         assert!(kubelet.kill_command(agent), "{agent} hangs in its third route");
     }
