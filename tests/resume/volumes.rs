@@ -86,6 +86,23 @@ async fn run_to_the_end(kubelet: &mut Kubelet<'_>, mut stop_when: impl FnMut(&Ku
     assert!(in_time.is_ok(), "it does not end\n{}", kubelet.story());
 }
 
+/// Goes on until each pair has two routes done.
+async fn run_to_the_third_route(kubelet: &mut Kubelet<'_>, submission: &Submission) {
+    let begun = async {
+        while report(&submission.archive)
+            .await
+            .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
+        {
+            let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
+            if let Ok((name, status)) = ended {
+                kubelet.handle(name, status);
+            }
+        }
+    };
+    let in_time = tokio::time::timeout(LIMIT, begun).await;
+    assert!(in_time.is_ok(), "it does not begin\n{}", kubelet.story());
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_disk_that_runs_full_ends_the_run_in_order() {
     if !is_inside("resume::volumes::a_disk_that_runs_full_ends_the_run_in_order") {
@@ -101,19 +118,7 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
         let logs = root.join("logs");
         mount(&["-t", "tmpfs", "-o", "size=2m", "none", logs.to_str().unwrap()]);
     });
-    let begun = async {
-        while report(&submission.archive)
-            .await
-            .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
-        {
-            let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
-            if let Ok((name, status)) = ended {
-                kubelet.handle(name, status);
-            }
-        }
-    };
-    let in_time = tokio::time::timeout(LIMIT, begun).await;
-    assert!(in_time.is_ok(), "it does not begin\n{}", kubelet.story());
+    run_to_the_third_route(&mut kubelet, &submission).await;
     let filler = kubelet.path("simulator/filler");
     fill(&filler);
     let agents = || members().filter(|member| member.side == Side::Agent);
