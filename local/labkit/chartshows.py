@@ -3,8 +3,6 @@
 Every value of values.yaml has a case here, and every template renders an object in one: `chartrender` refuses a gap.
 """
 
-from typing import Any
-
 from .chartcases import RELEASE, SYSTEM
 from .chartshown import (
     ABSENT,
