@@ -1,4 +1,4 @@
-//! What only a real API server can tell: whether it takes the definitions, and what it then refuses, fills in and shows.
+//! What only a real API server can show: whether it takes the definitions, and what it then refuses, fills in and shows.
 
 #![allow(
     clippy::unwrap_used,

@@ -1,20 +1,22 @@
 //! etcd, kube-apiserver and the Job controller as processes of their own, on free loopback ports, gone with this program.
 
 use std::fs::{self, File};
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use kube::config::{KubeConfigOptions, Kubeconfig};
 use kube::{Client, Config};
 use serde_json::json;
 use tempfile::TempDir;
 use tokio::process::{Child, Command};
 use tokio::time::sleep;
 
-use crate::api;
 use crate::bench::Outcome;
+pub use control_plane::free_ports;
+use control_plane::{apiserver_arguments, etcd_arguments, kubeconfig, probe};
+
+#[path = "../../tests/support/control_plane.rs"]
+mod control_plane;
 
 const START_LIMIT: Duration = Duration::from_mins(3);
 const POLL: Duration = Duration::from_millis(50);
@@ -127,7 +129,10 @@ impl Servers {
         let [client, peer, port, controllers] = free_ports()?;
         prepare(folder.path(), audit)?;
         let at = folder.path();
-        let mut etcd = Program::start("etcd", &tools.join("etcd"), &etcd_arguments(at, client, peer), at)?;
+        let mut arguments = etcd_arguments(at, client, peer);
+        // 5,000 submissions with all their versions do not fit into the default of 2 GiB.
+        arguments.push("--quota-backend-bytes=8589934592".into());
+        let mut etcd = Program::start("etcd", &tools.join("etcd"), &arguments, at)?;
         let binary = tools.join("kube-apiserver");
         let mut apiserver = Program::start("kube-apiserver", &binary, &apiserver_arguments(at, client, port), at)?;
         let end = Instant::now() + START_LIMIT;
@@ -135,9 +140,9 @@ impl Servers {
             if let Some(why) = etcd.ended().or_else(|| apiserver.ended()) {
                 return Err(why.into());
             }
-            match probe(at, port).await {
+            match probe(at, port, &USERS).await {
                 Ok(config) => break config,
-                Err(error) if Instant::now() > end => return Err(error),
+                Err(error) if Instant::now() > end => return Err(error.into()),
                 Err(_) => sleep(POLL).await,
             }
         };
@@ -187,85 +192,13 @@ impl Servers {
     }
 }
 
-/// Ports that nobody listens on now, all different.
-pub fn free_ports<const N: usize>() -> Outcome<[u16; N]> {
-    let mut listeners = Vec::new();
-    let mut ports = [0; N];
-    for port in &mut ports {
-        let listener = TcpListener::bind(("127.0.0.1", 0))?;
-        *port = listener.local_addr()?.port();
-        listeners.push(listener);
-    }
-    Ok(ports)
-}
-
-fn kubeconfig(folder: &Path, user: &str) -> PathBuf {
-    folder.join(format!("{user}.kubeconfig"))
-}
-
-/// The users' tokens, what is logged of their requests, and the key that signs the tokens of service accounts.
-fn prepare(folder: &Path, audit: Audit) -> Outcome<()> {
-    let tokens: Vec<String> = USERS
-        .map(|user| format!("{user},{user},{user},system:masters"))
-        .to_vec();
-    fs::write(folder.join("tokens.csv"), tokens.join("\n"))?;
-    let mut rules = vec![json!({"level": "Metadata"})];
-    if audit == Audit::Bodies {
-        rules.insert(0, json!({"level": "Request", "users": [OPERATOR]}));
-    }
-    let policy = json!({
-        "apiVersion": "audit.k8s.io/v1", "kind": "Policy", "omitStages": ["RequestReceived", "ResponseStarted"],
-        "rules": rules,
-    });
-    fs::write(folder.join("audit-policy.json"), policy.to_string())?;
-    let key = std::process::Command::new("openssl")
-        .args(["ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out"])
-        .arg(folder.join("accounts.key"))
-        .output()
-        .map_err(|error| format!("openssl does not run: {error}; install it"))?;
-    if key.status.success() {
-        return Ok(());
-    }
-    Err(format!("openssl made no key: {}", String::from_utf8_lossy(&key.stderr).trim()).into())
-}
-
-fn etcd_arguments(folder: &Path, client: u16, peer: u16) -> Vec<String> {
-    let (client, peer) = (format!("http://127.0.0.1:{client}"), format!("http://127.0.0.1:{peer}"));
-    vec![
-        format!("--data-dir={}", folder.join("etcd").display()),
-        format!("--listen-client-urls={client}"),
-        format!("--advertise-client-urls={client}"),
-        format!("--listen-peer-urls={peer}"),
-        format!("--initial-advertise-peer-urls={peer}"),
-        format!("--initial-cluster=default={peer}"),
-        "--unsafe-no-fsync".into(),
-        // 5,000 submissions with all their versions do not fit into the default of 2 GiB.
-        "--quota-backend-bytes=8589934592".into(),
-        "--log-level=warn".into(),
-    ]
-}
-
-fn apiserver_arguments(folder: &Path, etcd: u16, port: u16) -> Vec<String> {
-    let file = |name: &str| folder.join(name).display().to_string();
-    vec![
-        format!("--etcd-servers=http://127.0.0.1:{etcd}"),
-        "--bind-address=127.0.0.1".into(),
-        "--advertise-address=127.0.0.1".into(),
-        "--endpoint-reconciler-type=none".into(),
-        format!("--secure-port={port}"),
-        format!("--cert-dir={}", file("certificates")),
-        format!("--token-auth-file={}", file("tokens.csv")),
-        format!("--audit-policy-file={}", file("audit-policy.json")),
-        format!("--audit-log-path={}", file("audit.log")),
-        "--authorization-mode=RBAC".into(),
-        // Nobody makes the namespaces' service accounts.
-        "--disable-admission-plugins=ServiceAccount".into(),
-        "--allow-privileged=true".into(),
-        "--service-cluster-ip-range=10.0.0.0/24".into(),
-        "--service-account-issuer=https://kubernetes.default.svc".into(),
-        format!("--service-account-key-file={}", file("accounts.key")),
-        format!("--service-account-signing-key-file={}", file("accounts.key")),
-    ]
+/// The users, what is logged of their requests, and the key that signs the tokens of service accounts.
+fn prepare(folder: &Path, audit: Audit) -> Result<(), String> {
+    let rules = match audit {
+        Audit::Metadata => json!([{"level": "Metadata"}]),
+        Audit::Bodies => json!([{"level": "Request", "users": [OPERATOR]}, {"level": "Metadata"}]),
+    };
+    control_plane::prepare(folder, USERS, &rules)
 }
 
 /// Jobs and their time to live only, at a rate that is no limit.
@@ -285,29 +218,4 @@ fn controllers_arguments(folder: &Path, port: u16) -> Vec<String> {
         "--kube-api-burst=2000".into(),
         "--concurrent-job-syncs=5".into(),
     ]
-}
-
-/// Writes every user's kubeconfig once there is a certificate, and asks the server whether it is ready.
-async fn probe(folder: &Path, port: u16) -> Outcome<Config> {
-    let authority = folder.join("certificates/apiserver.crt");
-    if !authority.is_file() {
-        return Err("no certificate".into());
-    }
-    for user in USERS {
-        let text = json!({
-            "apiVersion": "v1",
-            "kind": "Config",
-            "clusters": [{"name": "bench", "cluster": {
-                "server": format!("https://127.0.0.1:{port}"), "certificate-authority": authority,
-            }}],
-            "users": [{"name": user, "user": {"token": user}}],
-            "contexts": [{"name": "bench", "context": {"cluster": "bench", "user": user, "namespace": "default"}}],
-            "current-context": "bench",
-        });
-        fs::write(kubeconfig(folder, user), text.to_string())?;
-    }
-    let read = Kubeconfig::read_from(kubeconfig(folder, BENCH))?;
-    let config = Config::from_custom_kubeconfig(read, &KubeConfigOptions::default()).await?;
-    api::text(&Client::try_from(config.clone())?, "/readyz").await?;
-    Ok(config)
 }

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import LabError
+from .marks import between
 
 BEGIN = "<!-- made from values.yaml by `make chart-docs`: edit that file -->"
 END = "<!-- end of the values -->"
@@ -95,11 +96,7 @@ def cell(text: str) -> str:
 
 def with_table(readme: str, text: str) -> str:
     """The README with the table of now between its two marks."""
-    before, begin, rest = readme.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise LabError(f"the chart's README lacks the lines {BEGIN!r} and {END!r}: put them where the table is to be")
-    return f"{before}{BEGIN}\n\n{table(text)}\n\n{END}{after}"
+    return between(readme, BEGIN, END, f"\n{table(text)}\n", "the chart's README")
 
 
 def update(chart: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from . import chartdocs, chartmetrics, chartshows
 from .chartcases import NOTES, RELEASE, SYSTEM
-from .chartshows import ABSENT, Case, Shown
+from .chartshown import ABSENT, MONITORING, Case, Shown
 from .errors import LabError
 from .kube import Kube
 
@@ -147,7 +147,7 @@ def notes(kube: Kube, chart: Path) -> str:
 def queries(kube: Kube, chart: Path, repository: Path) -> str:
     """Every metric, label and value that an alert or the dashboard asks for must be one that the operator exports."""
     values = {"prometheusRule.enabled": True, "dashboard.enabled": True}
-    kinds = [f"{chartshows.MONITORING}/{kind}" for kind in MONITORING_KINDS]
+    kinds = [f"{MONITORING}/{kind}" for kind in MONITORING_KINDS]
     rendered = objects(kube, template(kube, chart, values, kinds))
     asked = [
         *of_alerts(rendered[f"PrometheusRule/{RELEASE}"]["spec"]["groups"]),

@@ -3,77 +3,31 @@
 Every value of values.yaml has a case here, and every template renders an object in one: `chartrender` refuses a gap.
 """
 
-from dataclasses import dataclass
-from typing import Any
-
 from .chartcases import RELEASE, SYSTEM
-
-# The path does not exist, or the object is not rendered.
-ABSENT = "(absent)"
-MONITORING = "monitoring.coreos.com/v1"
-CONTROLLER = f"Deployment/{RELEASE}-controller"
-BRIDGE = f"Deployment/{RELEASE}-bridge"
-CRD = "CustomResourceDefinition/submissions.leaderboard.carla.org"
-ROLE = "arn:aws:iam::123456789012:role/one"
-POD = "spec.template.spec"
-CONTAINER = f"{POD}.containers.0"
-
-
-@dataclass(frozen=True)
-class Shown:
-    """An object holds something: `holds` may name fewer keys of a map than there are. A path's parts are keys or places in a list."""
-
-    object: str
-    path: str
-    holds: Any
-
-
-@dataclass(frozen=True)
-class Case:
-    """Values by their paths, and what they show. `kinds` are those that the cluster has besides Kubernetes' own."""
-
-    values: dict[str, Any]
-    shown: tuple[Shown, ...]
-    kinds: tuple[str, ...] = ()
-
-
-def case(values: dict[str, Any], *shown: tuple[str, str, Any], kinds: tuple[str, ...] = ()) -> Case:
-    return Case(values, tuple(Shown(*one) for one in shown), tuple(f"{MONITORING}/{kind}" for kind in kinds))
-
-
-def selector(component: str) -> dict[str, str]:
-    return {
-        "app.kubernetes.io/name": RELEASE,
-        "app.kubernetes.io/instance": RELEASE,
-        "app.kubernetes.io/component": component,
-    }
-
-
-def env(name: str, value: str) -> dict[str, str]:
-    return {"name": name, "value": value}
-
-
-def key_of_secret(name: str, **more: bool) -> dict[str, Any]:
-    return {"name": name, "valueFrom": {"secretKeyRef": {"name": "aws", "key": name, **more}}}
-
-
-def both(value: str, given: Any, path: str, holds: Any) -> list[Case]:
-    """A value of the Pods of both programs."""
-    return [
-        case({f"controller.{value}": given}, (CONTROLLER, path, holds), (BRIDGE, path, ABSENT)),
-        case({f"bridge.{value}": given}, (BRIDGE, path, holds), (CONTROLLER, path, ABSENT)),
-    ]
+from .chartshown import (
+    ABSENT,
+    BRIDGE,
+    CONTAINER,
+    CONTROLLER,
+    CRD,
+    POD,
+    ROLE,
+    Case,
+    both,
+    case,
+    env,
+    key_of_secret,
+    selector,
+)
 
 
 def of_program(component: str, deployment: str) -> list[Case]:
     """Values that both programs have, with defaults in the rendering without them."""
-    name = f"{RELEASE}-{component}"
-    budget = f"PodDisruptionBudget/{name}"
-    affinity = {"nodeAffinity": {"preferredDuringSchedulingIgnoredDuringExecution": []}}
-    spread = {"maxSkew": 1, "topologyKey": "topology.kubernetes.io/zone", "whenUnsatisfiable": "ScheduleAnyway"}
-    own = {"matchLabels": selector(component)}
-    foreign = {"matchExpressions": [{"key": "app", "operator": "Exists"}]}
-    apart = f"{POD}.affinity.podAntiAffinity.preferredDuringSchedulingIgnoredDuringExecution.0.podAffinityTerm"
+    return [*replicas(component, deployment), *placement(component, deployment), *own_objects(component, deployment)]
+
+
+def replicas(component: str, deployment: str) -> list[Case]:
+    budget = f"PodDisruptionBudget/{RELEASE}-{component}"
     return [
         case(
             {f"{component}.replicas": 3},
@@ -99,6 +53,16 @@ def of_program(component: str, deployment: str) -> list[Case]:
             {f"{component}.replicas": 3, f"{component}.podDisruptionBudget.enabled": False},
             (budget, "", ABSENT),
         ),
+    ]
+
+
+def placement(component: str, deployment: str) -> list[Case]:
+    affinity = {"nodeAffinity": {"preferredDuringSchedulingIgnoredDuringExecution": []}}
+    spread = {"maxSkew": 1, "topologyKey": "topology.kubernetes.io/zone", "whenUnsatisfiable": "ScheduleAnyway"}
+    own = {"matchLabels": selector(component)}
+    foreign = {"matchExpressions": [{"key": "app", "operator": "Exists"}]}
+    apart = f"{POD}.affinity.podAntiAffinity.preferredDuringSchedulingIgnoredDuringExecution.0.podAffinityTerm"
+    return [
         case(
             {},
             (deployment, f"{apart}.topologyKey", "kubernetes.io/hostname"),
@@ -116,6 +80,13 @@ def of_program(component: str, deployment: str) -> list[Case]:
             (deployment, f"{POD}.topologySpreadConstraints.1", {**spread, "labelSelector": own}),
             (deployment, f"{POD}.topologySpreadConstraints.1.labelSelector.matchExpressions", ABSENT),
         ),
+    ]
+
+
+def own_objects(component: str, deployment: str) -> list[Case]:
+    """Its account, what it may use, and what its Pods are marked with."""
+    name = f"{RELEASE}-{component}"
+    return [
         case(
             {
                 f"{component}.roleArn": ROLE,

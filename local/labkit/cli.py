@@ -57,17 +57,7 @@ def parser() -> argparse.ArgumentParser:
         "aws-venv", help="print the folder of programs of the Python environment with ministack and boto3"
     )
     commands.add_parser("demo", help="start everything, run one submission from message to score, and check it")
-    tests = commands.add_parser("test", help="run the tests; prints what each layer took")
-    tests.add_argument("--core", action="store_true", help="only the layers that need neither root nor a node")
-    tests.add_argument("--filter", default="", metavar="TEXT", help="only tests whose name contains TEXT")
-    tests.add_argument(
-        "--only",
-        action="append",
-        default=[],
-        choices=testrun.NAMES,
-        metavar="LAYER",
-        help=f"only this layer (may be repeated): {', '.join(testrun.NAMES)}",
-    )
+    add_arguments_of_test(commands.add_parser("test", help="run the tests; prints what each layer took"))
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
     commands.add_parser("chart-docs", help="write the tables of the chart's values and of the metrics")
@@ -87,6 +77,19 @@ def parser() -> argparse.ArgumentParser:
         "--tar", type=Path, metavar="OUT", help="write an archive instead of pushing (a file with one image)"
     )
     return top
+
+
+def add_arguments_of_test(tests: argparse.ArgumentParser) -> None:
+    tests.add_argument("--core", action="store_true", help="only the layers that need neither root nor a node")
+    tests.add_argument("--filter", default="", metavar="TEXT", help="only tests whose name contains TEXT")
+    tests.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        choices=testrun.NAMES,
+        metavar="LAYER",
+        help=f"only this layer (may be repeated): {', '.join(testrun.NAMES)}",
+    )
 
 
 def run(settings: Settings, arguments: argparse.Namespace) -> int:

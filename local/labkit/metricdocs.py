@@ -7,6 +7,7 @@ from pathlib import Path
 
 from . import chartmetrics
 from .errors import LabError
+from .marks import between
 
 PAGE = Path("docs/metrics.md")
 BEGIN = "<!-- made from src/observability/metrics by `make chart-docs`: edit those files -->"
@@ -60,11 +61,7 @@ def table(source: str) -> str:
 
 def page(text: str, source: str) -> str:
     """The page with the table of this source."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise LabError(f"{PAGE} lacks the lines {BEGIN} and {END}, between which the table goes")
-    return f"{before}{BEGIN}\n{table(source)}\n{END}{after}"
+    return between(text, BEGIN, END, table(source), str(PAGE))
 
 
 def update(repository: Path) -> None:

@@ -6,7 +6,7 @@ import unittest
 from pathlib import Path
 
 from labkit import chartdocs, chartmetrics, chartrender, chartshows
-from labkit.chartshows import ABSENT, Shown
+from labkit.chartshown import ABSENT, Shown
 from labkit.errors import LabError
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -1,4 +1,4 @@
-//! A controller's surroundings without a cluster, for the tests of this room: caches that a test fills, an API server that takes
+//! A controller's surroundings without a cluster, for the tests of this module: caches that a test fills, an API server that takes
 //! everything, AWS wherever the test says.
 
 use std::collections::HashMap;
@@ -39,8 +39,7 @@ use crate::kubernetes::{Store, Synced};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Hub, Options, Timeouts, Timing};
-use crate::services::meter::Meter;
+use crate::services::evalai::{Hub, Options};
 use crate::services::table::Recorder;
 use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 
@@ -169,17 +168,7 @@ fn stores(cluster: Cluster) -> Stores {
 
 /// Services that nobody listens to.
 fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
-    let hub = Hub::new(Options {
-        write_guard: Arc::new(|| true),
-        not_before: Instant::now(),
-        changed: mpsc::unbounded_channel().0,
-        sweep: mpsc::unbounded_channel().0,
-        arrived: mpsc::unbounded_channel().0,
-        timing: Timing::default(),
-        timeouts: Timeouts::default(),
-        meter: Meter::default(),
-        tasks: tasks.clone(),
-    });
+    let hub = Hub::new(Options::unheard(tasks, || true));
     let rows = mpsc::unbounded_channel().0;
     ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, rows, tasks.clone()))
 }

@@ -303,7 +303,7 @@ impl Archive {
         Ok(())
     }
 
-    /// S3 says 403 for a missing object to whom may list one prefix only. The list of that prefix tells the two apart.
+    /// S3 says 403 for a missing object to whom may list one prefix only. The list of that prefix distinguishes the two.
     async fn is_unlisted(&self, key: &str) -> bool {
         let listing = self.list(key, 1).await;
         listing.is_ok_and(|listing| listing.objects.iter().all(|object| object.key != key))

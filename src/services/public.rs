@@ -2,7 +2,7 @@
 //!
 //! A name is looked up once, and what was found is checked and connected to, so that a second look-up cannot lead elsewhere. An address
 //! that stands in the URL itself is looked up by nobody: ask [`check`] before each request, and follow no redirect without asking again.
-//! Where a proxy is set, it is the proxy that connects, and its rules that hold.
+//! Where a proxy is set and used, it is the proxy that connects, and its rules that hold.
 
 use std::error::Error;
 use std::net::{IpAddr, SocketAddr};
@@ -36,20 +36,24 @@ impl Default for Reach {
 
 impl Reach {
     /// Another rule than the internet's.
-    #[cfg(test)]
-    pub fn of(rule: fn(IpAddr) -> bool) -> Self {
+    pub const fn of(rule: fn(IpAddr) -> bool) -> Self {
         Self(rule)
     }
 
     /// A client that connects nowhere else. It follows no redirect.
     pub fn limit(self, builder: ClientBuilder) -> ClientBuilder {
-        let resolver = Resolver {
-            reach: self,
-            proxies: proxies(|name| std::env::var(name).ok()),
-        };
+        self.resolve(builder, proxies(|name| std::env::var(name).ok()))
+    }
+
+    /// As `limit`, and through no proxy, which would connect to addresses that nobody has checked.
+    pub fn limit_without_proxy(self, builder: ClientBuilder) -> ClientBuilder {
+        self.resolve(builder.no_proxy(), Vec::new())
+    }
+
+    fn resolve(self, builder: ClientBuilder, proxies: Vec<String>) -> ClientBuilder {
         builder
             .redirect(reqwest::redirect::Policy::none())
-            .dns_resolver(Arc::new(resolver))
+            .dns_resolver(Arc::new(Resolver { reach: self, proxies }))
     }
 
     /// Whether an address in a URL may be connected to. A name is judged when it is looked up.

@@ -3,6 +3,7 @@
 //! Called through `Recorder` by the controller's leader, which alone writes. Knows no Kubernetes objects; what a
 //! column holds is the caller's.
 
+mod keys;
 mod ledger;
 mod read;
 mod recorder;
@@ -16,11 +17,10 @@ use aws_sdk_dynamodb::config::http::HttpResponse;
 use aws_sdk_dynamodb::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_dynamodb::operation::update_item::UpdateItemError;
 use aws_sdk_dynamodb::operation::update_item::builders::UpdateItemFluentBuilder;
-use aws_sdk_dynamodb::types::{
-    AttributeValue, KeyType, ReturnValuesOnConditionCheckFailure, ScalarAttributeType, TableDescription,
-};
+use aws_sdk_dynamodb::types::{AttributeValue, ReturnValuesOnConditionCheckFailure};
 use thiserror::Error;
 
+use keys::Key;
 pub use ledger::{RowState, TableId};
 pub use read::ObservedRow;
 pub use recorder::Recorder;
@@ -192,13 +192,6 @@ pub struct Table {
     sort: Key,
 }
 
-/// A key of a table.
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Key {
-    name: String,
-    kind: ScalarAttributeType,
-}
-
 impl Table {
     /// Asks the table for the names and types of its keys. Where that is not allowed, keys that are set are taken
     /// for strings.
@@ -209,10 +202,10 @@ impl Table {
         let request = client.describe_table().table_name(&name).send();
         let answer = aws.meter().aws("dynamodb", "DescribeTable", request).await;
         let (partition, sort) = match answer.map_err(|error| failed(&name, "DescribeTable", &error)) {
-            Ok(output) => keys(&name, output.table.as_ref(), set)?,
+            Ok(output) => keys::read(&name, output.table.as_ref(), set)?,
             Err(TableError::Denied { .. }) if set.is_some() => {
                 let (partition, sort) = set.unwrap_or_default();
-                (text_key(partition), text_key(sort))
+                (Key::text(partition), Key::text(sort))
             }
             Err(error) => return Err(error),
         };
@@ -244,21 +237,24 @@ impl Table {
         }
     }
 
+    /// An update of the row with these keys, which names the column of the attempt, without a condition.
+    fn update(&self, row: &Row) -> Result<UpdateItemFluentBuilder, TableError> {
+        let team = self.partition.value(&self.name, &row.team_id, "team")?;
+        let submission = self.sort.value(&self.name, &row.run_id, "submission")?;
+        let update = self.client.update_item().table_name(&self.name);
+        Ok(update
+            .key(&self.partition.name, team)
+            .key(&self.sort.name, submission)
+            .expression_attribute_names("#attempt", ATTEMPT)
+            .expression_attribute_values(":attempt", AttributeValue::N(row.attempt.to_string())))
+    }
+
     /// The update of a row, under its condition, without columns.
     fn request(&self, row: &Row) -> Result<UpdateItemFluentBuilder, TableError> {
         let mut request = self
-            .client
-            .update_item()
-            .table_name(&self.name)
-            .key(
-                &self.partition.name,
-                self.key_value(&self.partition, &row.team_id, "team")?,
-            )
-            .key(&self.sort.name, self.key_value(&self.sort, &row.run_id, "submission")?)
+            .update(row)?
             .condition_expression(condition(row))
-            .expression_attribute_names("#attempt", ATTEMPT)
             .expression_attribute_names("#status", STATUS)
-            .expression_attribute_values(":attempt", AttributeValue::N(row.attempt.to_string()))
             .return_values_on_condition_check_failure(ReturnValuesOnConditionCheckFailure::AllOld);
         for (index, end) in ENDS.into_iter().enumerate() {
             request = request.expression_attribute_values(format!(":end{index}"), AttributeValue::S(end.into()));
@@ -271,24 +267,6 @@ impl Table {
         let mut columns = row.columns();
         columns.retain(|column, _| *column != self.partition.name && *column != self.sort.name);
         columns
-    }
-
-    fn key_value(&self, key: &Key, text: &str, what: &str) -> Result<AttributeValue, TableError> {
-        let problem = if text.is_empty() {
-            format!("is empty: the {what} is not known")
-        } else {
-            match key.kind {
-                ScalarAttributeType::S => return Ok(AttributeValue::S(text.to_owned())),
-                ScalarAttributeType::N if text.parse::<i64>().is_ok() => return Ok(AttributeValue::N(text.to_owned())),
-                ScalarAttributeType::N => format!("is a number in this table, but the {what} is called {text}"),
-                _ => "is neither a string nor a number in this table".to_owned(),
-            }
-        };
-        Err(TableError::Key {
-            table: self.name.clone(),
-            key: key.name.clone(),
-            problem,
-        })
     }
 }
 
@@ -332,48 +310,6 @@ fn is_same(old: &HashMap<String, AttributeValue>, attempt: i64, columns: &Column
         })
 }
 
-/// The keys as the table describes them.
-fn keys(
-    table: &str,
-    described: Option<&TableDescription>,
-    set: Option<(String, String)>,
-) -> Result<(Key, Key), TableError> {
-    let find = |kind: KeyType| {
-        let schema = described.map(TableDescription::key_schema).unwrap_or_default();
-        let name = schema
-            .iter()
-            .find(|element| *element.key_type() == kind)?
-            .attribute_name();
-        let types = described
-            .map(TableDescription::attribute_definitions)
-            .unwrap_or_default();
-        let definition = types.iter().find(|definition| definition.attribute_name() == name);
-        Some(Key {
-            name: name.to_owned(),
-            kind: definition.map_or(ScalarAttributeType::S, |d| d.attribute_type().clone()),
-        })
-    };
-    let found = find(KeyType::Hash).zip(find(KeyType::Range));
-    let (partition, sort) = found.ok_or_else(|| TableError::NoSortKey {
-        table: table.to_owned(),
-    })?;
-    match set {
-        Some((first, second)) if (&first, &second) != (&partition.name, &sort.name) => Err(TableError::OtherKeys {
-            table: table.to_owned(),
-            found: format!("{} and {}", partition.name, sort.name),
-            set: format!("{first} and {second}"),
-        }),
-        _ => Ok((partition, sort)),
-    }
-}
-
-fn text_key(name: String) -> Key {
-    Key {
-        name,
-        kind: ScalarAttributeType::S,
-    }
-}
-
 fn failed<E>(table: &str, action: &'static str, error: &SdkError<E, HttpResponse>) -> TableError
 where
     E: ProvideErrorMetadata + std::error::Error + 'static,
@@ -389,64 +325,7 @@ where
 
 #[cfg(test)]
 mod tests {
-    use aws_sdk_dynamodb::types::{AttributeDefinition, KeySchemaElement};
-
     use super::*;
-
-    fn described(all: &[(&str, KeyType, ScalarAttributeType)]) -> TableDescription {
-        let mut builder = TableDescription::builder();
-        for (name, role, kind) in all {
-            builder = builder
-                .key_schema(
-                    KeySchemaElement::builder()
-                        .attribute_name(*name)
-                        .key_type(role.clone())
-                        .build()
-                        .unwrap(),
-                )
-                .attribute_definitions(
-                    AttributeDefinition::builder()
-                        .attribute_name(*name)
-                        .attribute_type(kind.clone())
-                        .build()
-                        .unwrap(),
-                );
-        }
-        builder.build()
-    }
-
-    #[test]
-    fn keys_are_what_the_table_says() {
-        use {KeyType::Hash, KeyType::Range, ScalarAttributeType as Kind};
-        for (team, submission, kind) in [
-            ("team_id", "submission_id", Kind::S),
-            ("team-id", "submission-id", Kind::N),
-        ] {
-            // Definitions come in any order and may hold keys of indexes.
-            let table = described(&[(submission, Range, kind.clone()), (team, Hash, Kind::S)]);
-            let key = |name: &str, kind| Key {
-                name: name.into(),
-                kind,
-            };
-            let want = (key(team, Kind::S), key(submission, kind));
-            assert_eq!(keys("t", Some(&table), None), Ok(want.clone()));
-            assert_eq!(
-                keys("t", Some(&table), Some((team.into(), submission.into()))),
-                Ok(want)
-            );
-        }
-        let single = described(&[("team_id", Hash, Kind::S)]);
-        assert_eq!(
-            keys("t", Some(&single), None),
-            Err(TableError::NoSortKey { table: "t".into() })
-        );
-        let table = described(&[("team_id", Hash, Kind::S), ("submission_id", Range, Kind::S)]);
-        let other = keys("t", Some(&table), Some(("team-id".into(), "submission-id".into()))).unwrap_err();
-        assert_eq!(
-            other.to_string(),
-            "table t has the keys team_id and submission_id but table.partitionKey and table.sortKey are team-id and submission-id; leave both out"
-        );
-    }
 
     #[test]
     fn unknown_columns_are_left_alone_and_metrics_hide_none_of_ours() {

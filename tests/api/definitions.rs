@@ -156,6 +156,11 @@ fn half_filled_runs() -> Vec<HalfFilled> {
                 "finalizeSeconds": 900,
             }),
         ),
+    ]
+}
+
+fn half_filled_pods() -> Vec<HalfFilled> {
+    vec![
         (
             "network",
             json!({"egress": [{"cidr": "10.0.0.0/16"}]}),
@@ -252,7 +257,8 @@ fn half_filled_services() -> Vec<HalfFilled> {
 async fn every_half_filled_object_reads_back_whole() {
     let server = server().await;
     let api = Kind::Leaderboard.api(&server.client(), &server.namespace("half").await);
-    for (field, sent, expected) in half_filled_runs().into_iter().chain(half_filled_services()) {
+    let all = [half_filled_runs(), half_filled_pods(), half_filled_services()];
+    for (field, sent, expected) in all.into_iter().flatten() {
         let mut object = Kind::Leaderboard.object("a", &[&json!({"spec": {field: sent}})]);
         if ["evalai", "queue"].contains(&field) {
             serve_evalai(&mut object);

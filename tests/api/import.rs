@@ -305,50 +305,34 @@ async fn has_job(api: &Api<Job>, name: &str) {
     made.unwrap_or_else(|_| panic!("no Job {name}")).unwrap();
 }
 
-#[tokio::test]
-async fn rows_become_submissions_for_which_nothing_is_published_or_recorded_again() {
-    let table = Table::new(World::new().await).await;
-    let world = &table.world;
-    let spec = json!({"table": {"name": table.name, "endpoint": world.aws.endpoint}});
-    let ids: Vec<u64> = (0..6).map(|_| table.in_evalai()).collect();
+/// The ids of a row of each kind: three that have ended, one that goes on, one that another pipeline may run, one of another phase.
+async fn rows_of_each_kind(table: &Table) -> [u64; 6] {
     let score = [
         ("driving_score", "43.129"),
         ("route_completion", "80"),
         ("infraction_penalty", "0.5151"),
     ];
+    let ids = [(); 6].map(|()| table.in_evalai());
     table.put(ids[0], "FINISHED", None, &score).await;
     table.put(ids[1], "FAILED", Some(1), &[("progress", "1/2")]).await;
     table.put(ids[2], "CANCELLED", None, &[]).await;
     table.put(ids[3], "RUNNING", Some(1), &[]).await;
     table.put(ids[4], "RUNNING", None, &[]).await;
     table.put(ids[5], "FINISHED", None, &[("track_id", "9")]).await;
-    let before = table.rows().await;
+    ids
+}
 
-    let none = import(&["--from-table", &table.name, "--namespace", &world.namespace]).await;
-    assert!(texts(&none).1.contains("no Leaderboard of the namespace"));
-    world.leaderboard_with("lb", 1, "Hosts", &spec).await;
-    let shown = table.import(&["--dry-run"]).await;
-    assert!(
-        shown.contains("kind: Submission") && shown.contains("driving: \"43.13\""),
-        "{shown}"
-    );
-    assert!(
-        shown.contains("6 rows: would make 3 that have ended, 1 that goes on;"),
-        "{shown}"
-    );
-    assert_eq!(table.submissions().await.len(), 0, "nothing was made");
-
-    // The controller leads while they are made, and must run none of the ended ones.
-    let _controller = world.controller();
+/// The controller leads while they are made, and must run none of the ended ones.
+async fn are_made(table: &Table) {
     let notes = table.import(&[]).await;
     let undecided: Vec<&str> = notes.lines().filter(|line| line.starts_with("undecided")).collect();
     assert_eq!(undecided.len(), 2, "{notes}");
     assert!(notes.contains("another pipeline may still run it") && notes.contains("track_id 9 is the phase"));
     let last = "6 rows: made 3 that have ended, 1 that goes on; 0 were there already; 2 undecided\n";
     assert!(notes.ends_with(last), "{notes}");
+}
 
-    let name = |index: usize| format!("submission-{}", ids[index]);
-    has_job(&world.api(), &format!("{}-2", name(3))).await;
+async fn are_counted(world: &World) {
     let has_counted = |board: Option<&Leaderboard>| {
         let counts = board
             .and_then(|board| board.status.as_ref())
@@ -357,51 +341,68 @@ async fn rows_become_submissions_for_which_nothing_is_published_or_recorded_agai
     };
     let counted = timeout(LIMIT, await_condition(world.api(), "lb", has_counted)).await;
     counted.expect("the controller has read all three").unwrap();
+}
 
+fn was_never_accepted(submission: &Submission, state: State) {
+    let status = submission.status.as_ref().unwrap();
+    assert_eq!(status.state, Some(state));
+    assert_eq!((&status.job_name, &status.plan), (&None, &None));
+    assert_eq!(submission.finalizers().len(), 0);
+    assert_eq!(submission.metadata.generation, Some(1));
+}
+
+fn has_no_update(table: &Table, id: &str) {
+    let (text, number) = (format!("\"submission\":\"{id}\""), format!("\"submission\":{id},"));
+    let names_it = |update: &String| update.contains(&text) || update.contains(&number);
+    let updates = table.updates();
+    assert!(!updates.iter().any(names_it), "{updates:?}");
+}
+
+#[tokio::test]
+async fn rows_become_submissions_for_which_nothing_is_published_or_recorded_again() {
+    let table = Table::new(World::new().await).await;
+    let world = &table.world;
+    let ids = rows_of_each_kind(&table).await;
+    let name = |index: usize| format!("submission-{}", ids[index]);
+    let before = table.rows().await;
+
+    let none = import(&["--from-table", &table.name, "--namespace", &world.namespace]).await;
+    assert!(texts(&none).1.contains("no Leaderboard of the namespace"));
+    let spec = json!({"table": {"name": table.name, "endpoint": world.aws.endpoint}});
+    world.leaderboard_with("lb", 1, "Hosts", &spec).await;
+    let shown = table.import(&["--dry-run"]).await;
+    let [object, count] = [
+        "driving: \"43.13\"",
+        "6 rows: would make 3 that have ended, 1 that goes on;",
+    ];
+    assert!(shown.contains("kind: Submission") && shown.contains(object), "{shown}");
+    assert!(shown.contains(count), "{shown}");
+    assert_eq!(table.submissions().await.len(), 0, "nothing was made");
+
+    let _controller = world.controller();
+    are_made(&table).await;
+    has_job(&world.api(), &format!("{}-2", name(3))).await;
+    are_counted(world).await;
     let found = table.submissions().await;
     assert_eq!(found.len(), 4);
     for (index, state) in [(0, State::Finished), (1, State::Failed), (2, State::Cancelled)] {
-        let submission = &found[&name(index)];
-        let status = submission.status.as_ref().unwrap();
-        assert_eq!(status.state, Some(state));
-        assert_eq!(
-            (&status.job_name, &status.plan),
-            (&None, &None),
-            "it was never accepted"
-        );
-        assert_eq!(submission.finalizers().len(), 0);
-        assert_eq!(submission.metadata.generation, Some(1));
+        was_never_accepted(&found[&name(index)], state);
     }
     let score = found[&name(0)].status.as_ref().unwrap().score.as_ref().unwrap();
     assert_eq!((score.text.as_str(), score.is_final), ("43.13", true));
     let after = table.rows().await;
-    for index in [0, 1, 2, 4, 5] {
-        let id = ids[index].to_string();
+    for id in [0, 1, 2, 4, 5].map(|index: usize| ids[index].to_string()) {
         assert_eq!(after[&id], before[&id], "the row is as it was");
-        let path = format!("\"submission\":\"{id}\"");
-        let other = format!("\"submission\":{id},");
-        let updates = table.updates();
-        assert!(
-            !updates
-                .iter()
-                .any(|update| update.contains(&path) || update.contains(&other)),
-            "{updates:?}"
-        );
+        has_no_update(&table, &id);
     }
 
     let again = table.import(&[]).await;
-    assert!(
-        again.ends_with("6 rows: made 0 that have ended, 0 that go on; 4 were there already; 2 undecided\n"),
-        "{again}"
-    );
+    let none = "6 rows: made 0 that have ended, 0 that go on; 4 were there already; 2 undecided\n";
+    assert!(again.ends_with(none), "{again}");
     let now = table.submissions().await;
-    for index in [0, 1, 2] {
-        let name = name(index);
-        assert_eq!(
-            now[&name].resource_version(),
-            found[&name].resource_version(),
-            "nobody writes it"
-        );
+    for name in [0, 1, 2].map(name) {
+        let versions = [&now, &found].map(|all| all[&name].resource_version());
+        assert_eq!(versions[0], versions[1], "nobody writes {name}");
     }
     shown_by_kubectl(&world.namespace).await;
 

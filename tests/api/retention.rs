@@ -61,6 +61,17 @@ async fn uid_of(world: &World, name: &str) -> String {
     world.api::<Submission>().get(name).await.unwrap().uid().unwrap()
 }
 
+fn resumed_by_a_host(world: &World, pk: u64) {
+    let resumed = world.evalai.with_state(|state| {
+        let host = User {
+            staff: true,
+            ..state.user(1).unwrap().clone()
+        };
+        resume(state, &host, pk, Timestamp::now())
+    });
+    assert!(resumed.is_ok());
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again() {
     let world = World::new().await;
@@ -91,31 +102,17 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     };
     world.until(&name, "it has ended in EvalAI", ended).await;
     until_deleted(&world, &name, &uid).await;
-    let job = world
-        .api::<Job>()
-        .get_opt(&names::job(&name, JobNumber::first(1)))
-        .await
-        .unwrap();
-    assert_eq!(job, None);
+    let job = names::job(&name, JobNumber::first(1));
+    assert_eq!(world.api::<Job>().get_opt(&job).await.unwrap(), None);
     assert_eq!(in_evalai(), Status::Failed);
     assert_eq!(row(&world, &table).await, ("1".to_owned(), "FAILED".to_owned()));
 
     // The cluster's garbage collector, which does not run here.
-    let pods = world.api::<Pod>();
-    let now = DeleteParams::default().grace_period(0);
-    pods.delete(&format!("{}-x", names::job(&name, JobNumber::first(1))), &now)
-        .await
-        .unwrap();
+    let (pods, now) = (world.api::<Pod>(), DeleteParams::default().grace_period(0));
+    pods.delete(&format!("{job}-x"), &now).await.unwrap();
 
-    // A host resumes it: it goes on from the stored results, and the table counts on.
-    let resumed = world.evalai.with_state(|state| {
-        let host = User {
-            staff: true,
-            ..state.user(1).unwrap().clone()
-        };
-        resume(state, &host, pk, Timestamp::now())
-    });
-    assert!(resumed.is_ok());
+    // It goes on from the stored results, and the table counts on.
+    resumed_by_a_host(&world, pk);
     world.object("short", 1, pk, &image).await;
     let uid = uid_of(&world, &name).await;
     let is_resumed = |s: &SubmissionStatus| s.plan.as_ref().is_some_and(|p| p.resume && p.earlier_attempts == 1);

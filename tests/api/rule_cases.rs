@@ -65,7 +65,9 @@ pub fn all() -> Vec<Case> {
         times(),
         server(),
         queue(),
-        pods_and_tables(),
+        networks(),
+        identities_and_tables(),
+        sizes_and_images(),
         gpu::all(),
         submissions::all(),
     ]
@@ -337,21 +339,14 @@ fn queue() -> Vec<Case> {
     ]
 }
 
-fn pods_and_tables() -> Vec<Case> {
+fn networks() -> Vec<Case> {
     let to = |cidr: &str| json!({"network": {"egress": [{"cidr": cidr, "ports": [443]}]}});
     let policy = |policy: &str, enforcement: &str| json!({"network": {"policy": policy, "enforcement": enforcement}});
-    let identity = |identity: Value| json!({ "podIdentity": identity });
-    let role = "arn:aws:iam::123456789012:role/pods";
-    let secret = identity(json!({"secretName": "aws", "serviceAccountName": "pods"}));
-    let assumed = identity(json!({"roleARN": role, "serviceAccountName": "pods"}));
-    let table = |sort_key: &Value| json!({"table": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}});
-    let both = table(&json!("submission_id"));
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let probe = |probe: &str| json!({"network": {"probe": probe}});
     let not_a_probe = "network.probe is not an address and port";
     let servers = |servers: &[&str]| json!({"network": {"dnsServers": servers}});
     let not_a_server = "network.dnsServers is neither an address nor a range";
-    let one_way = "exactly one of roleARN and secretName";
     vec![
         case("is not a range of addresses", &to("2001:db8::/32"), &to("10.0.0.1")),
         case(
@@ -366,6 +361,19 @@ fn pods_and_tables() -> Vec<Case> {
             &policy("Managed", "Require"),
             &policy("External", "Require"),
         ),
+    ]
+}
+
+fn identities_and_tables() -> Vec<Case> {
+    let identity = |identity: Value| json!({ "podIdentity": identity });
+    let role = "arn:aws:iam::123456789012:role/pods";
+    let secret = identity(json!({"secretName": "aws", "serviceAccountName": "pods"}));
+    let assumed = identity(json!({"roleARN": role, "serviceAccountName": "pods"}));
+    let table = |sort_key: &Value| json!({"table": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}});
+    let both = table(&json!("submission_id"));
+    let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    let one_way = "exactly one of roleARN and secretName";
+    vec![
         case(one_way, &secret, &identity(json!({"roleARN": role}))),
         case(one_way, &secret, &identity(json!({"secretName": null}))),
         case(
@@ -373,6 +381,14 @@ fn pods_and_tables() -> Vec<Case> {
             &assumed,
             &identity(json!({"serviceAccountName": null})),
         ),
+        case("are set together", &both, &table(&Value::Null)),
+        case("are the same key", &both, &table(&json!("team_id"))),
+    ]
+}
+
+fn sizes_and_images() -> Vec<Case> {
+    let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
+    vec![
         case(
             "storage.sizeLimit must be",
             &json!({"storage": {"sizeLimit": "1Ti"}}),
@@ -418,8 +434,6 @@ fn pods_and_tables() -> Vec<Case> {
             &images("r.example:5000/{team}/x_{team}.agent/*"),
             &images("r.example/team-{team}0/*"),
         ),
-        case("are set together", &both, &table(&Value::Null)),
-        case("are the same key", &both, &table(&json!("team_id"))),
     ]
 }
 

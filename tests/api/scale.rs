@@ -328,7 +328,7 @@ impl World {
             }
             assert!(
                 Instant::now() < end,
-                "not told to stop after {:?}: {open:?}",
+                "not asked to stop after {:?}: {open:?}",
                 size.limit
             );
             tokio::time::sleep(Duration::from_millis(200)).await;
@@ -412,7 +412,7 @@ impl World {
     /// What was stopped is Cancelled in EvalAI too, also where a write that was on its way just then had undone that.
     fn check_cancelled<'a>(&self, pks: impl Iterator<Item = &'a u64>, log: &[Entry]) {
         let state = self.evalai.state();
-        let mut told_again = 0;
+        let mut sent_again = 0;
         for pk in pks {
             assert!(self.submissions.is(&name(*pk), State::Cancelled), "submission {pk}");
             assert_eq!(
@@ -421,13 +421,13 @@ impl World {
                 "submission {pk} in EvalAI"
             );
             let is_again = |entry: &&Entry| entry.method == "PUT" && entry.body["submission"] == json!(pk);
-            told_again += usize::from(
+            sent_again += usize::from(
                 log.iter()
                     .filter(is_again)
                     .any(|entry| entry.body["submission_status"] == json!("cancelled")),
             );
         }
-        println!("{told_again} cancels were told again after a write of ours that was on its way");
+        println!("{sent_again} cancels were sent again after a write of ours that was on its way");
     }
 }
 

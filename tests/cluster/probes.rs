@@ -55,7 +55,7 @@ async fn no_probe_of_a_hostile_image_gets_through() {
     .await;
 }
 
-/// Something of the namespace that a Pod would be told of.
+/// Something of the namespace that a Pod would read of.
 async fn make_service(scene: &Scene) {
     let service = json!({"metadata": {"name": "other"}, "spec": {"ports": [{"port": 80}]}});
     let service: Service = serde_json::from_value(service).unwrap();

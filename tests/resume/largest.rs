@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use leaderboard_api::LeaderboardVersion;
+use leaderboard_api::{LeaderboardVersion, RouteSlice};
 use leaderboard_operator::pod::gather::results_plan;
 use leaderboard_operator::pod::report::Report;
 use leaderboard_operator::pod::run::STATUS_FOLDER;
@@ -130,16 +130,22 @@ async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) -> Repo
     }
 }
 
+fn two_routes(pair: usize) -> RouteSlice {
+    let first = u32::try_from(2 * pair).unwrap();
+    RouteSlice { first, last: first + 1 }
+}
+
+/// Size and digest of the merged file.
+fn merged(report: &Report) -> Option<(u64, String)> {
+    let file = report.files.get("evalai/metadata.json")?;
+    Some((file.size, file.sha256.clone()))
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn sixteen_pairs_with_the_largest_checkpoints_stay_below_logcopys_memory() {
     let (sink, endpoint, serving) = serve().await;
     let mut submission = Submission::on(&endpoint, "bucket", LeaderboardVersion::V2, &mut Rng::new()).await;
-    submission.run.plan.slices = (0..PAIRS)
-        .map(|pair| leaderboard_api::RouteSlice {
-            first: u32::try_from(2 * pair).unwrap(),
-            last: u32::try_from(2 * pair + 1).unwrap(),
-        })
-        .collect();
+    submission.run.plan.slices = (0..PAIRS).map(two_routes).collect();
     submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
     // Half of it is for the agents' files, so the sparse ones are sent in part.
     submission.run.plan.storage.size_limit = leaderboard_api::ByteQuantity::gibibytes(1);
@@ -162,12 +168,6 @@ async fn sixteen_pairs_with_the_largest_checkpoints_stay_below_logcopys_memory()
     for pair in 0..PAIRS {
         put(&logs, pair, &checkpoint(pair, most, values, "x"));
     }
-    let merged = |report: &Report| {
-        report
-            .files
-            .get("evalai/metadata.json")
-            .map(|file| (file.size, file.sha256.clone()))
-    };
     let first = reported(&sink, pid, |report| report.done == 16).await;
     let size = merged(&first).map_or(0, |(size, _)| size);
     assert!(size > 40 << 20, "{size} bytes are merged");

@@ -9,7 +9,7 @@ use nix::unistd::Pid;
 
 /// One line that is seen although the test passes.
 pub fn say(line: &str) {
-    // Nobody is left to tell when stderr is gone.
+    // Nobody is left to report to when stderr is gone.
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
@@ -28,7 +28,7 @@ fn state(pid: Pid) -> Option<char> {
 }
 
 /// Kills a runner and all that it has started, so that none of them can do anything about the death of another. Returns those
-/// whose end nobody tells.
+/// whose end nobody reports.
 pub async fn kill_container(runner: Pid) -> Vec<Pid> {
     // It must not start anything between the look at its children and its end.
     let _ = kill(runner, Signal::SIGSTOP);
@@ -43,7 +43,7 @@ pub async fn kill_container(runner: Pid) -> Vec<Pid> {
     orphans
 }
 
-/// Waits until they are gone: the kernel tells only their parent, who is dead.
+/// Waits until they are gone: the kernel notifies only their parent, who is dead.
 pub async fn gone(pids: &[Pid]) {
     for pid in pids {
         while state(*pid).is_some() {

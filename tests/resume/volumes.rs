@@ -10,7 +10,7 @@ use std::time::Duration;
 use fastrand::Rng;
 use leaderboard_api::LeaderboardVersion;
 use leaderboard_operator::pod::run::Stop;
-use leaderboard_runner::protocol::{Mark, Side, StatusFile};
+use leaderboard_runner::protocol::{Mark, Member, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, all_done, members};
 use super::process::say;
@@ -89,6 +89,29 @@ async fn run_to_the_end(kubelet: &mut Kubelet<'_>, mut stop_when: impl FnMut(&Ku
     assert!(in_time.is_ok(), "it does not end\n{}", kubelet.story());
 }
 
+fn agents() -> impl Iterator<Item = Member> {
+    members().filter(|member| member.side == Side::Agent)
+}
+
+/// Goes on until each pair has two routes done, and its agent hangs in the third: one that is killed before it has left its marker
+/// hangs once more.
+async fn run_to_the_third_route(kubelet: &mut Kubelet<'_>, submission: &Submission) {
+    let begun = async {
+        while !agents().all(|agent| kubelet.path(&submission.hang_marker(agent, 3)).exists())
+            || report(&submission.archive)
+                .await
+                .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
+        {
+            let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
+            if let Ok((name, status)) = ended {
+                kubelet.handle(name, status);
+            }
+        }
+    };
+    let in_time = tokio::time::timeout(LIMIT, begun).await;
+    assert!(in_time.is_ok(), "it does not begin\n{}", kubelet.story());
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_disk_that_runs_full_ends_the_run_in_order() {
     if !is_inside("resume::volumes::a_disk_that_runs_full_ends_the_run_in_order") {
@@ -104,22 +127,7 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
         let logs = root.join("logs");
         mount(&["-t", "tmpfs", "-o", "size=2m", "none", logs.to_str().unwrap()]);
     });
-    let agents = || members().filter(|member| member.side == Side::Agent);
-    let begun = async {
-        // An agent that is killed before it has left its marker hangs once more.
-        while !agents().all(|agent| kubelet.path(&submission.hang_marker(agent, 3)).exists())
-            || report(&submission.archive)
-                .await
-                .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
-        {
-            let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
-            if let Ok((name, status)) = ended {
-                kubelet.handle(name, status);
-            }
-        }
-    };
-    let in_time = tokio::time::timeout(LIMIT, begun).await;
-    assert!(in_time.is_ok(), "it does not begin\n{}", kubelet.story());
+    run_to_the_third_route(&mut kubelet, &submission).await;
     let filler = kubelet.path("simulator/filler");
     fill(&filler);
     for agent in agents() {

@@ -6,7 +6,6 @@
 use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io;
-use std::net::TcpListener;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
@@ -16,10 +15,15 @@ use std::time::{Duration, Instant};
 use k8s_openapi::api::core::v1::Namespace;
 use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
 use kube::api::{Api, ObjectMeta, PostParams};
-use kube::config::{KubeConfigOptions, Kubeconfig};
 use kube::runtime::wait::{await_condition, conditions::is_crd_established};
 use kube::{Client, Config};
+use serde_json::json;
 use tokio::sync::OnceCell;
+
+use control_plane::{apiserver_arguments, etcd_arguments, free_ports, kubeconfig, probe};
+
+#[path = "control_plane.rs"]
+mod control_plane;
 
 const PROGRAMS: [&str; 3] = ["etcd", "kube-apiserver", "kubectl"];
 const HOW_TO_RUN: &str = "run these tests with `make test`, or set KUBEBUILDER_ASSETS to a folder that holds them";
@@ -29,6 +33,8 @@ const POLL: Duration = Duration::from_millis(50);
 /// A free port can be taken by somebody else before the server has it.
 const TRIES: usize = 3;
 
+/// The user that the tests are.
+const ADMIN: &str = "admin";
 /// Users with all rights whose requests the audit log has, each for one test that counts them.
 const COUNTED: u32 = 32;
 
@@ -131,14 +137,14 @@ impl ApiServer {
 
     /// The file that programs reach it by, with all rights.
     pub fn kubeconfig(&self) -> PathBuf {
-        kubeconfig(&self.folder)
+        kubeconfig(&self.folder, ADMIN)
     }
 
     /// A kubectl that speaks to this server and keeps nothing in the user's home.
     pub fn kubectl(&self) -> Command {
         let mut command = Command::new(self.programs.join("kubectl"));
         command
-            .env("KUBECONFIG", kubeconfig(&self.folder))
+            .env("KUBECONFIG", kubeconfig(&self.folder, ADMIN))
             .env("KUBECACHEDIR", self.folder.join("kubectl"))
             .stdin(Stdio::null());
         command
@@ -279,98 +285,18 @@ fn watchdog(attempt: &Attempt) -> io::Result<Child> {
         .spawn()
 }
 
-fn free_ports() -> io::Result<[u16; 3]> {
-    // All at once, so that they differ.
-    let listeners = [free()?, free()?, free()?];
-    let mut ports = [0; 3];
-    for (port, listener) in ports.iter_mut().zip(&listeners) {
-        *port = listener.local_addr()?.port();
-    }
-    Ok(ports)
-}
-
-fn free() -> io::Result<TcpListener> {
-    TcpListener::bind(("127.0.0.1", 0))
-}
-
-fn kubeconfig(folder: &Path) -> PathBuf {
-    folder.join("kubeconfig")
-}
-
 fn log(folder: &Path, program: &str) -> io::Result<File> {
     File::create(folder.join(format!("{program}.log")))
 }
 
-/// The folder, its users' tokens, whose requests are logged, and the key that signs the tokens of service accounts.
+/// The folder, its users, and which of their requests are logged.
 fn prepare(folder: &Path) -> Result<(), String> {
-    let failed = |error: io::Error| format!("{} cannot be prepared: {error}", folder.display());
     _ = fs::remove_dir_all(folder);
-    fs::DirBuilder::new().mode(0o700).create(folder).map_err(failed)?;
-    let counted: Vec<_> = (0..COUNTED).map(|number| format!("counted-{number}")).collect();
-    let mut tokens = "tests,admin,admin,system:masters\n".to_owned();
-    for user in &counted {
-        _ = writeln!(tokens, "{user},{user},{user},system:masters");
-    }
-    fs::write(folder.join("tokens.csv"), tokens).map_err(failed)?;
-    let policy = serde_json::json!({
-        "apiVersion": "audit.k8s.io/v1",
-        "kind": "Policy",
-        "omitStages": ["RequestReceived", "ResponseStarted"],
-        "rules": [{"level": "Metadata", "users": counted}, {"level": "None"}],
-    });
-    fs::write(folder.join("audit-policy.json"), policy.to_string()).map_err(failed)?;
-    let key = Command::new("openssl")
-        // The traditional format: the server reads no other for this kind of key.
-        .args(["ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out"])
-        .arg(folder.join("service-accounts.key"))
-        .output()
-        .map_err(|error| format!("openssl does not run: {error}; install it"))?;
-    if key.status.success() {
-        return Ok(());
-    }
-    Err(format!(
-        "openssl made no key: {}",
-        String::from_utf8_lossy(&key.stderr).trim()
-    ))
-}
-
-fn etcd_arguments(folder: &Path, client_port: u16, peer_port: u16) -> Vec<String> {
-    let client = format!("http://127.0.0.1:{client_port}");
-    let peer = format!("http://127.0.0.1:{peer_port}");
-    vec![
-        format!("--data-dir={}", folder.join("etcd").display()),
-        format!("--listen-client-urls={client}"),
-        format!("--advertise-client-urls={client}"),
-        format!("--listen-peer-urls={peer}"),
-        format!("--initial-advertise-peer-urls={peer}"),
-        format!("--initial-cluster=default={peer}"),
-        "--unsafe-no-fsync".into(),
-        "--log-level=warn".into(),
-    ]
-}
-
-fn apiserver_arguments(folder: &Path, etcd_port: u16, port: u16) -> Vec<String> {
-    let file = |name: &str| folder.join(name).display().to_string();
-    vec![
-        format!("--etcd-servers=http://127.0.0.1:{etcd_port}"),
-        "--bind-address=127.0.0.1".into(),
-        "--advertise-address=127.0.0.1".into(),
-        // It refuses to write a loopback address to the Service `kubernetes`, which nobody here asks for.
-        "--endpoint-reconciler-type=none".into(),
-        format!("--secure-port={port}"),
-        format!("--cert-dir={}", file("certificates")),
-        format!("--token-auth-file={}", file("tokens.csv")),
-        format!("--audit-policy-file={}", file("audit-policy.json")),
-        format!("--audit-log-path={}", file("audit.log")),
-        "--authorization-mode=RBAC".into(),
-        // Nobody makes the namespaces' service accounts.
-        "--disable-admission-plugins=ServiceAccount".into(),
-        "--allow-privileged=true".into(),
-        "--service-cluster-ip-range=10.0.0.0/24".into(),
-        "--service-account-issuer=https://kubernetes.default.svc".into(),
-        format!("--service-account-key-file={}", file("service-accounts.key")),
-        format!("--service-account-signing-key-file={}", file("service-accounts.key")),
-    ]
+    let made = fs::DirBuilder::new().mode(0o700).create(folder);
+    made.map_err(|error| format!("{} cannot be made: {error}", folder.display()))?;
+    let counted: Vec<String> = (0..COUNTED).map(|number| format!("counted-{number}")).collect();
+    let rules = json!([{"level": "Metadata", "users": counted}, {"level": "None"}]);
+    control_plane::prepare(folder, counted.iter().map(String::as_str).chain([ADMIN]), &rules)
 }
 
 /// Waits until the server answers `/readyz`.
@@ -381,43 +307,13 @@ async fn ready(attempt: &mut Attempt, port: u16) -> Result<Config, String> {
         if let Some(why) = attempt.ended() {
             return Err(why);
         }
-        match probe(&attempt.folder, port).await {
+        match probe(&attempt.folder, port, &[ADMIN]).await {
             Ok(config) => return Ok(config),
             Err(why) => last = why,
         }
         tokio::time::sleep(POLL).await;
     }
     Err(format!("not ready after {} s: {last}", START_LIMIT.as_secs()))
-}
-
-async fn probe(folder: &Path, port: u16) -> Result<Config, String> {
-    // The server makes its own authority and writes it behind its certificate.
-    let authority = folder.join("certificates/apiserver.crt");
-    if !authority.is_file() {
-        return Err("no certificate".into());
-    }
-    let path = kubeconfig(folder);
-    let text = serde_json::json!({
-        "apiVersion": "v1",
-        "kind": "Config",
-        "clusters": [{"name": "tests", "cluster": {
-            "server": format!("https://127.0.0.1:{port}"),
-            "certificate-authority": authority,
-        }}],
-        "users": [{"name": "admin", "user": {"token": "tests"}}],
-        "contexts": [{"name": "tests", "context": {"cluster": "tests", "user": "admin", "namespace": "default"}}],
-        "current-context": "tests",
-    });
-    fs::write(&path, text.to_string()).map_err(|error| error.to_string())?;
-    let read = Kubeconfig::read_from(&path).map_err(|error| error.to_string())?;
-    let config = Config::from_custom_kubeconfig(read, &KubeConfigOptions::default())
-        .await
-        .map_err(|error| error.to_string())?;
-    let client = Client::try_from(config.clone()).map_err(|error| error.to_string())?;
-    let request = http::Request::get("/readyz").body(Vec::new());
-    let request = request.map_err(|error| error.to_string())?;
-    client.request_text(request).await.map_err(|error| error.to_string())?;
-    Ok(config)
 }
 
 /// Installs the CRDs and waits until they are served.

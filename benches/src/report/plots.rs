@@ -116,71 +116,83 @@ fn frame(title: &str) -> String {
     )
 }
 
-fn curves(title: &str, across: &str, up: &str, curves: &[Curve], marks: &[f64]) -> String {
-    let points = || curves.iter().flat_map(|(_, points)| points);
-    let (far, high) = points().fold((1.0, 1.0), |(x, y): (f64, f64), point| (x.max(point.0), y.max(point.1)));
-    let (wide, tall) = (WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM);
-    let at = |x: f64, y: f64| (LEFT + wide * x / far, TOP + tall * (1.0 - y / high));
-    let mut svg = frame(title);
-    for mark in 0..=MARKS {
-        let part = f64::from(mark) / f64::from(MARKS);
-        let ((x, low), (left, y)) = (at(far * part, 0.0), at(0.0, high * part));
-        let _ = writeln!(
-            svg,
-            "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{:.0}</text>",
-            low + 16.0,
-            far * part
-        );
-        let _ = writeln!(
-            svg,
-            "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{:.0}</text>",
-            left - 6.0,
-            y + 4.0,
-            high * part
-        );
-        let _ = writeln!(svg, "<path d=\"M{left:.1} {y:.1}h{wide}\" stroke=\"#d0d7de\"/>");
+/// Where the area of a plot is, and how values become places in it.
+struct Area {
+    far: f64,
+    high: f64,
+}
+
+const WIDE: f64 = WIDTH - LEFT - RIGHT;
+const TALL: f64 = HEIGHT - TOP - BOTTOM;
+
+impl Area {
+    fn at(&self, x: f64, y: f64) -> (f64, f64) {
+        (LEFT + WIDE * x / self.far, TOP + TALL * (1.0 - y / self.high))
     }
-    for mark in marks {
-        let (x, y) = at(*mark, high);
-        let _ = writeln!(
-            svg,
-            "<path d=\"M{x:.1} {y:.1}v{tall}\" stroke=\"black\" stroke-dasharray=\"4 3\"/>"
-        );
-        let _ = writeln!(svg, "<text x=\"{:.1}\" y=\"{:.1}\">restart</text>", x + 4.0, y + 10.0);
+
+    /// Numbers along both axes, and lines across.
+    fn axes(&self, svg: &mut String) {
+        for mark in 0..=MARKS {
+            let part = f64::from(mark) / f64::from(MARKS);
+            let ((x, low), (left, y)) = (self.at(self.far * part, 0.0), self.at(0.0, self.high * part));
+            let (below, value) = (low + 16.0, self.far * part);
+            let _ = writeln!(
+                svg,
+                "<text x=\"{x:.1}\" y=\"{below:.1}\" text-anchor=\"middle\">{value:.0}</text>"
+            );
+            let (before, beside, value) = (left - 6.0, y + 4.0, self.high * part);
+            let _ = writeln!(
+                svg,
+                "<text x=\"{before:.1}\" y=\"{beside:.1}\" text-anchor=\"end\">{value:.0}</text>"
+            );
+            let _ = writeln!(svg, "<path d=\"M{left:.1} {y:.1}h{WIDE}\" stroke=\"#d0d7de\"/>");
+        }
     }
-    for (number, (name, points)) in curves.iter().enumerate() {
+
+    fn restarts(&self, svg: &mut String, marks: &[f64]) {
+        for mark in marks {
+            let (x, y) = self.at(*mark, self.high);
+            let dashed = "stroke=\"black\" stroke-dasharray=\"4 3\"";
+            let _ = writeln!(svg, "<path d=\"M{x:.1} {y:.1}v{TALL}\" {dashed}/>");
+            let _ = writeln!(svg, "<text x=\"{:.1}\" y=\"{:.1}\">restart</text>", x + 4.0, y + 10.0);
+        }
+    }
+
+    /// A line through all points, which are marked where they are few, and its name beside the plot.
+    fn curve(&self, svg: &mut String, number: usize, (name, points): &Curve) {
         let color = COLORS[number % COLORS.len()];
-        let path: Vec<String> = points
-            .iter()
-            .map(|(x, y)| at(*x, *y))
-            .map(|(x, y)| format!("{x:.1},{y:.1}"))
-            .collect();
-        let _ = writeln!(
-            svg,
-            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\" points=\"{}\"/>",
-            path.join(" ")
-        );
-        for (x, y) in points.iter().filter(|_| points.len() < 30).map(|(x, y)| at(*x, *y)) {
+        let places: Vec<(f64, f64)> = points.iter().map(|(x, y)| self.at(*x, *y)).collect();
+        let path: Vec<String> = places.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
+        let (path, style) = (path.join(" "), "fill=\"none\" stroke-width=\"2\"");
+        let _ = writeln!(svg, "<polyline {style} stroke=\"{color}\" points=\"{path}\"/>");
+        for (x, y) in places.iter().filter(|_| places.len() < 30) {
             let _ = writeln!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3\" fill=\"{color}\"/>");
         }
-        let line = TOP + 14.0 + 18.0 * number as f64;
+        let (beside, line) = (WIDTH - RIGHT + 12.0, TOP + 14.0 + 18.0 * number as f64);
         let _ = writeln!(
             svg,
-            "<text x=\"{:.1}\" y=\"{line:.1}\" fill=\"{color}\">{name}</text>",
-            WIDTH - RIGHT + 12.0
+            "<text x=\"{beside:.1}\" y=\"{line:.1}\" fill=\"{color}\">{name}</text>"
         );
     }
+}
+
+fn curves(title: &str, across: &str, up: &str, curves: &[Curve], marks: &[f64]) -> String {
+    let points = curves.iter().flat_map(|(_, points)| points);
+    let (far, high) = points.fold((1.0, 1.0), |(x, y): (f64, f64), point| (x.max(point.0), y.max(point.1)));
+    let area = Area { far, high };
+    let mut svg = frame(title);
+    area.axes(&mut svg);
+    area.restarts(&mut svg, marks);
+    for (number, curve) in curves.iter().enumerate() {
+        area.curve(&mut svg, number, curve);
+    }
+    let (x, y) = (LEFT + WIDE / 2.0, HEIGHT - 8.0);
     let _ = writeln!(
         svg,
-        "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{across}</text>",
-        LEFT + wide / 2.0,
-        HEIGHT - 8.0
+        "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"middle\">{across}</text>"
     );
-    let _ = writeln!(
-        svg,
-        "<text transform=\"translate(14 {:.1}) rotate(-90)\" text-anchor=\"middle\">{up}</text>\n</svg>",
-        TOP + tall / 2.0
-    );
+    let turned = format!("transform=\"translate(14 {:.1}) rotate(-90)\"", TOP + TALL / 2.0);
+    let _ = writeln!(svg, "<text {turned} text-anchor=\"middle\">{up}</text>\n</svg>");
     svg
 }
 

@@ -1,4 +1,4 @@
-//! Every name that more than one room writes or reads: labels, annotations, finalizers, field managers, Jobs.
+//! Every name that more than one module writes or reads: labels, annotations, finalizers, field managers, Jobs.
 //!
 //! Pure. A name changed here is an API change.
 

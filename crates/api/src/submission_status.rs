@@ -272,7 +272,7 @@ pub struct Times {
     pub scheduled: Option<Time>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub started: Option<Time>,
-    /// When it was told to stop.
+    /// When it was asked to stop.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stopping: Option<Time>,
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -241,8 +241,8 @@ pub enum RecordProblem {
         /// The highest possible.
         high: f64,
     },
-    /// An infraction message that should tell how far the agent was off the road does not.
-    #[error("an outside_route_lanes message does not tell the distance")]
+    /// An infraction message that should show how far the agent was off the road does not.
+    #[error("an outside_route_lanes message does not hold the distance")]
     OffRoadMessage,
     /// The driving score is not the product.
     #[error("score_composed is {}, but score_route x score_penalty is {}", number_text(*.found), number_text(*.expected))]

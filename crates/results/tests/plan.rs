@@ -205,7 +205,7 @@ fn edits_of_numbers() -> Vec<Edit> {
         (
             "/infractions/outside_route_lanes",
             json!(["no distance"]),
-            "does not tell the distance",
+            "does not hold the distance",
         ),
     ]
 }

@@ -222,7 +222,7 @@ fn forged_records_are_told() {
         let said = said(*format, drive).unwrap_or_default();
         assert!(said.starts_with(name(*format)) && said.contains(words), "{said:?}");
     }
-    common::say(&format!("verify: {} forged records are told", table.len()));
+    common::say(&format!("verify: {} forged records are found", table.len()));
 }
 
 #[test]

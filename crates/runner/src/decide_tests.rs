@@ -43,150 +43,122 @@ fn seen(words: &str) -> Seen {
     seen
 }
 
+/// A phase, what is seen, and what follows.
+type Step = (Phase, &'static str, Action);
+
+const SILENT_DEATH: Action = Action::Skip(Skip::SilentDeath);
+const CATCH_UP: Action = Action::Skip(Skip::CatchUp);
+
+const SIMULATORS: &[Step] = &[
+    (Opening, "", Launch),
+    (Opening, "peer-started", Launch),
+    (Opening, "own-started", SILENT_DEATH),
+    (Opening, "own-started cancel", SILENT_DEATH),
+    (Opening, "own-started peer-crashed", SILENT_DEATH),
+    (Opening, "own-started peer-done", End(Cause::PeerDone)),
+    (Opening, "own-started own-done peer-done", End(Cause::AlreadyDone)),
+    (Opening, "peer-crashed", CATCH_UP),
+    (Opening, "cancel peer-crashed", End(Cause::Cancelled)),
+    (Opening, "stored", End(Cause::Cancelled)),
+    (Opening, "terminated own-started", End(Cause::Terminated)),
+    (Booting, "", Wait),
+    (Booting, "ready", Announce),
+    (Booting, "ready overdue", Announce),
+    (Booting, "ready peer-crashed", CATCH_UP),
+    (Booting, "overdue", End(Cause::NotReady)),
+    (Booting, "ended", End(Cause::ChildEnded)),
+    (Booting, "cancel ended", End(Cause::Cancelled)),
+    (Booting, "stored", End(Cause::Cancelled)),
+    (Booting, "peer-done ready cancel", End(Cause::PeerDone)),
+    (Running, "own-started", Wait),
+    (Running, "own-started peer-started overdue stored", Wait),
+    (Running, "peer-done peer-crashed ended cancel", End(Cause::PeerDone)),
+    (Running, "cancel peer-crashed ended", End(Cause::Cancelled)),
+    (Running, "peer-crashed ended", End(Cause::PeerCrashed)),
+    (Running, "ended", End(Cause::ChildEnded)),
+    (Running, "terminated peer-done", End(Cause::Terminated)),
+];
+
+const AGENTS: &[Step] = &[
+    (Opening, "", Wait),
+    (Opening, "peer-started", Launch),
+    (Opening, "peer-started overdue", Launch),
+    (Opening, "overdue", End(Cause::NotReady)),
+    (Opening, "own-started peer-started", SILENT_DEATH),
+    (Opening, "own-started peer-started peer-crashed cancel", SILENT_DEATH),
+    (Opening, "peer-started peer-crashed", CATCH_UP),
+    (Opening, "peer-crashed overdue", CATCH_UP),
+    (Opening, "cancel peer-started", End(Cause::Cancelled)),
+    (Opening, "stored peer-started", End(Cause::Cancelled)),
+    (Opening, "own-started own-done", End(Cause::AlreadyDone)),
+    (Running, "peer-started", Wait),
+    (Running, "stored", Wait),
+    (Running, "ended cancel peer-crashed idle", End(Cause::ChildEnded)),
+    (Running, "cancel peer-crashed idle", End(Cause::Cancelled)),
+    (Running, "peer-crashed idle", End(Cause::PeerCrashed)),
+    (Running, "idle", End(Cause::Idle)),
+    (Running, "terminated ended", End(Cause::Terminated)),
+];
+
 #[test]
 fn next_follows_the_table() {
-    let silent_death = Action::Skip(Skip::SilentDeath);
-    let catch_up = Action::Skip(Skip::CatchUp);
-    let cases = [
-        (Simulator, Opening, "", Launch),
-        (Simulator, Opening, "peer-started", Launch),
-        (Simulator, Opening, "own-started", silent_death),
-        (Simulator, Opening, "own-started cancel", silent_death),
-        (Simulator, Opening, "own-started peer-crashed", silent_death),
-        (Simulator, Opening, "own-started peer-done", End(Cause::PeerDone)),
-        (
-            Simulator,
-            Opening,
-            "own-started own-done peer-done",
-            End(Cause::AlreadyDone),
-        ),
-        (Simulator, Opening, "peer-crashed", catch_up),
-        (Simulator, Opening, "cancel peer-crashed", End(Cause::Cancelled)),
-        (Simulator, Opening, "stored", End(Cause::Cancelled)),
-        (Simulator, Opening, "terminated own-started", End(Cause::Terminated)),
-        (Simulator, Booting, "", Wait),
-        (Simulator, Booting, "ready", Announce),
-        (Simulator, Booting, "ready overdue", Announce),
-        (Simulator, Booting, "ready peer-crashed", catch_up),
-        (Simulator, Booting, "overdue", End(Cause::NotReady)),
-        (Simulator, Booting, "ended", End(Cause::ChildEnded)),
-        (Simulator, Booting, "cancel ended", End(Cause::Cancelled)),
-        (Simulator, Booting, "stored", End(Cause::Cancelled)),
-        (Simulator, Booting, "peer-done ready cancel", End(Cause::PeerDone)),
-        (Simulator, Running, "own-started", Wait),
-        (Simulator, Running, "own-started peer-started overdue stored", Wait),
-        (
-            Simulator,
-            Running,
-            "peer-done peer-crashed ended cancel",
-            End(Cause::PeerDone),
-        ),
-        (Simulator, Running, "cancel peer-crashed ended", End(Cause::Cancelled)),
-        (Simulator, Running, "peer-crashed ended", End(Cause::PeerCrashed)),
-        (Simulator, Running, "ended", End(Cause::ChildEnded)),
-        (Simulator, Running, "terminated peer-done", End(Cause::Terminated)),
-        (Agent, Opening, "", Wait),
-        (Agent, Opening, "peer-started", Launch),
-        (Agent, Opening, "peer-started overdue", Launch),
-        (Agent, Opening, "overdue", End(Cause::NotReady)),
-        (Agent, Opening, "own-started peer-started", silent_death),
-        (
-            Agent,
-            Opening,
-            "own-started peer-started peer-crashed cancel",
-            silent_death,
-        ),
-        (Agent, Opening, "peer-started peer-crashed", catch_up),
-        (Agent, Opening, "peer-crashed overdue", catch_up),
-        (Agent, Opening, "cancel peer-started", End(Cause::Cancelled)),
-        (Agent, Opening, "stored peer-started", End(Cause::Cancelled)),
-        (Agent, Opening, "own-started own-done", End(Cause::AlreadyDone)),
-        (Agent, Running, "peer-started", Wait),
-        (Agent, Running, "stored", Wait),
-        (Agent, Running, "ended cancel peer-crashed idle", End(Cause::ChildEnded)),
-        (Agent, Running, "cancel peer-crashed idle", End(Cause::Cancelled)),
-        (Agent, Running, "peer-crashed idle", End(Cause::PeerCrashed)),
-        (Agent, Running, "idle", End(Cause::Idle)),
-        (Agent, Running, "terminated ended", End(Cause::Terminated)),
-    ];
-    for (side, phase, words, expected) in cases {
-        assert_eq!(next(side, phase, &seen(words)), expected, "{side} {phase:?}: {words}");
+    for (side, steps) in [(Simulator, SIMULATORS), (Agent, AGENTS)] {
+        for (phase, words, expected) in steps {
+            assert_eq!(next(side, *phase, &seen(words)), *expected, "{side} {phase:?}: {words}");
+        }
     }
 }
 
+/// A cause, whether all is complete, what is seen, and what is concluded.
+type Concluded = (Cause, bool, &'static str, Option<EndMark>, Hold, i32);
+
+const CRASH: Option<EndMark> = Some(EndMark::Crash);
+const DONE: Option<EndMark> = Some(EndMark::Done);
+
+const ENDS_OF_SIMULATORS: &[Concluded] = &[
+    (Cause::PeerDone, false, "peer-done", DONE, Hold::Flush, 0),
+    (Cause::PeerDone, false, "peer-done cancel", DONE, Hold::Flush, 0),
+    (Cause::PeerCrashed, false, "peer-crashed", CRASH, Hold::Peer, 1),
+    (Cause::PeerCrashed, false, "peer-crashed cancel", None, Hold::Cancel, 0),
+    (Cause::ChildEnded, false, "", CRASH, Hold::Peer, 1),
+    (Cause::ChildEnded, false, "peer-done", DONE, Hold::Flush, 0),
+    (Cause::NotReady, false, "", CRASH, Hold::Peer, 1),
+    (Cause::CannotStart(127), false, "", CRASH, Hold::Peer, 127),
+    (Cause::NoGpu, false, "", CRASH, Hold::Free, 69),
+    (Cause::GraphicsDriverMissing, false, "", CRASH, Hold::Free, 69),
+    (Cause::Cancelled, false, "cancel", None, Hold::Cancel, 0),
+    (Cause::AlreadyDone, false, "own-done", None, Hold::Flush, 0),
+    (Cause::Terminated, false, "terminated", None, Hold::Free, 143),
+    (Cause::Mute, false, "", None, Hold::Free, 74),
+];
+
+const ENDS_OF_AGENTS: &[Concluded] = &[
+    (Cause::ChildEnded, true, "", DONE, Hold::Peer, 0),
+    (Cause::ChildEnded, true, "cancel", DONE, Hold::Peer, 0),
+    (Cause::ChildEnded, false, "", CRASH, Hold::Peer, 1),
+    (Cause::ChildEnded, false, "cancel", None, Hold::Free, 0),
+    (Cause::PeerCrashed, true, "peer-crashed", DONE, Hold::Peer, 0),
+    (Cause::PeerCrashed, false, "peer-crashed", CRASH, Hold::Peer, 1),
+    (Cause::Idle, true, "", DONE, Hold::Peer, 0),
+    (Cause::Idle, false, "", CRASH, Hold::Peer, 1),
+    (Cause::NotReady, true, "", CRASH, Hold::Peer, 1),
+    (Cause::CannotStart(126), true, "", CRASH, Hold::Peer, 126),
+    (Cause::Cancelled, true, "cancel", None, Hold::Free, 0),
+    (Cause::AlreadyDone, true, "own-done", None, Hold::Free, 0),
+    (Cause::Terminated, true, "terminated", None, Hold::Free, 143),
+    (Cause::Mute, true, "", None, Hold::Free, 74),
+];
+
 #[test]
 fn an_end_is_concluded_by_the_table() {
-    let crash = Some(EndMark::Crash);
-    let done = Some(EndMark::Done);
-    let cases = [
-        (Simulator, Cause::PeerDone, false, "peer-done", done, Hold::Flush, 0),
-        (
-            Simulator,
-            Cause::PeerDone,
-            false,
-            "peer-done cancel",
-            done,
-            Hold::Flush,
-            0,
-        ),
-        (
-            Simulator,
-            Cause::PeerCrashed,
-            false,
-            "peer-crashed",
-            crash,
-            Hold::Peer,
-            1,
-        ),
-        (
-            Simulator,
-            Cause::PeerCrashed,
-            false,
-            "peer-crashed cancel",
-            None,
-            Hold::Cancel,
-            0,
-        ),
-        (Simulator, Cause::ChildEnded, false, "", crash, Hold::Peer, 1),
-        (Simulator, Cause::ChildEnded, false, "peer-done", done, Hold::Flush, 0),
-        (Simulator, Cause::NotReady, false, "", crash, Hold::Peer, 1),
-        (Simulator, Cause::CannotStart(127), false, "", crash, Hold::Peer, 127),
-        (Simulator, Cause::NoGpu, false, "", crash, Hold::Free, 69),
-        (
-            Simulator,
-            Cause::GraphicsDriverMissing,
-            false,
-            "",
-            crash,
-            Hold::Free,
-            69,
-        ),
-        (Simulator, Cause::Cancelled, false, "cancel", None, Hold::Cancel, 0),
-        (Simulator, Cause::AlreadyDone, false, "own-done", None, Hold::Flush, 0),
-        (Simulator, Cause::Terminated, false, "terminated", None, Hold::Free, 143),
-        (Simulator, Cause::Mute, false, "", None, Hold::Free, 74),
-        (Agent, Cause::ChildEnded, true, "", done, Hold::Peer, 0),
-        (Agent, Cause::ChildEnded, true, "cancel", done, Hold::Peer, 0),
-        (Agent, Cause::ChildEnded, false, "", crash, Hold::Peer, 1),
-        (Agent, Cause::ChildEnded, false, "cancel", None, Hold::Free, 0),
-        (Agent, Cause::PeerCrashed, true, "peer-crashed", done, Hold::Peer, 0),
-        (Agent, Cause::PeerCrashed, false, "peer-crashed", crash, Hold::Peer, 1),
-        (Agent, Cause::Idle, true, "", done, Hold::Peer, 0),
-        (Agent, Cause::Idle, false, "", crash, Hold::Peer, 1),
-        (Agent, Cause::NotReady, true, "", crash, Hold::Peer, 1),
-        (Agent, Cause::CannotStart(126), true, "", crash, Hold::Peer, 126),
-        (Agent, Cause::Cancelled, true, "cancel", None, Hold::Free, 0),
-        (Agent, Cause::AlreadyDone, true, "own-done", None, Hold::Free, 0),
-        (Agent, Cause::Terminated, true, "terminated", None, Hold::Free, 143),
-        (Agent, Cause::Mute, true, "", None, Hold::Free, 74),
-    ];
-    for (side, cause, complete, words, mark, hold, code) in cases {
-        let expected = Conclusion { mark, hold, code };
-        assert_eq!(
-            conclude(side, cause, complete, &seen(words)),
-            expected,
-            "{side} {cause:?} {complete}: {words}"
-        );
+    for (side, ends) in [(Simulator, ENDS_OF_SIMULATORS), (Agent, ENDS_OF_AGENTS)] {
+        for &(cause, complete, words, mark, hold, code) in ends {
+            assert_eq!(
+                conclude(side, cause, complete, &seen(words)),
+                Conclusion { mark, hold, code },
+                "{side} {cause:?} {complete}: {words}"
+            );
+        }
     }
 }
 

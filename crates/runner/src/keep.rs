@@ -23,7 +23,7 @@ const PAUSE_NANOS: u64 = 15;
 /// Bits without which `logcopy`, which runs as another user, reads nothing.
 const READABLE: u32 = 0o444;
 
-/// Size, time of change and inode: what tells one content of a file from the next.
+/// Size, time of change and inode: by which one content of a file differs from the next.
 type Stamp = (u64, i64, i64, u64);
 
 /// The keeper of one agent's checkpoint.

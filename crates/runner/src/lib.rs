@@ -2,7 +2,7 @@
 //! ([`protocol`]), the verdict a container leaves behind ([`verdict`]), and what a simulator needs of a GPU ([`graphics`]).
 //!
 //! Used by the runner itself, by `logcopy` (which reads all status files and writes two) and by the controller (which
-//! parses verdicts). It may not know Kubernetes, S3 or EvalAI. `README.md` beside it tells the whole protocol.
+//! parses verdicts). It may not know Kubernetes, S3 or EvalAI. `README.md` next to it describes the whole protocol.
 
 pub mod args;
 pub mod expand;

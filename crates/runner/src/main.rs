@@ -84,6 +84,6 @@ fn print(text: &str) -> ExitCode {
 
 /// One line on stderr. Standard output is the command's.
 pub(crate) fn say(text: fmt::Arguments<'_>) {
-    // Nobody is left to tell when stderr is gone.
+    // Nobody is left to report to when stderr is gone.
     let _ = writeln!(io::stderr(), "leaderboard-runner: {text}");
 }

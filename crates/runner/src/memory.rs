@@ -8,7 +8,7 @@ const COUNTERS: [&str; 2] = [
     "/sys/fs/cgroup/memory/memory.oom_control",
 ];
 
-/// The kernel's count so far; 0 when it tells none.
+/// The kernel's count so far; 0 when it shows none.
 pub(crate) fn kills() -> u64 {
     COUNTERS
         .iter()

@@ -28,7 +28,7 @@ fn pid_in(path: &std::path::Path) -> i32 {
     fs::read_to_string(path).unwrap().trim().parse().unwrap()
 }
 
-/// Waits for what no event tells.
+/// Waits for what no event reports.
 fn until(what: &str, holds: impl Fn() -> bool) {
     let begin = Instant::now();
     while !holds() {

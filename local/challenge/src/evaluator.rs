@@ -68,7 +68,7 @@ pub enum EvaluatorError {
     },
     #[error("ValueError: {0}")]
     Subset(#[from] SubsetError),
-    #[error("{path} tells nothing of the route '{route}'")]
+    #[error("{path} holds nothing of the route '{route}'")]
     UnknownRoute { path: PathBuf, route: String },
     #[error("RuntimeError: {0}")]
     NoSimulator(#[from] NoSimulator),

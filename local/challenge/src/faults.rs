@@ -23,7 +23,7 @@ use crate::{
     knobs::{Knobs, Known, Shape},
 };
 
-/// The agent's knobs; `README.md` tells people what each does.
+/// The agent's knobs; `README.md` describes what each does.
 pub const KNOBS: &[Known] = &[
     ("crash", Shape::At),
     ("hang", Shape::At),

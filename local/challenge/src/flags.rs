@@ -76,7 +76,7 @@ const BOTH: &[&str] = &[
 const ONLY_V1: &[&str] = &["trafficManagerPort", "trafficManagerSeed", "scenarios"];
 const ONLY_V2: &[&str] = &["traffic-manager-port", "traffic-manager-seed", "debug-checkpoint"];
 
-/// Reads what follows `python3`. `format` overrides what the flags tell.
+/// Reads what follows `python3`. `format` overrides what the flags ask for.
 pub fn parse(arguments: &[String], format: Option<Format>) -> Result<Invocation, FlagError> {
     let script = arguments
         .iter()

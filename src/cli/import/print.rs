@@ -159,57 +159,60 @@ mod tests {
         .unwrap()
     }
 
+    /// What YAML 1.1, which kubectl reads, takes for a boolean, a number or nothing.
+    const WORDS: [&str; 20] = [
+        "y",
+        "yes",
+        "No",
+        "on",
+        "OFF",
+        "true",
+        "~",
+        "null",
+        "1",
+        "0x1F",
+        "0o7",
+        "017",
+        "1_000",
+        "1e3",
+        ".inf",
+        "12:30:00",
+        "2026-11-20",
+        "=",
+        "<<",
+        "",
+    ];
+
+    /// What stands for more than itself in YAML.
+    const MARKS: [&str; 23] = [
+        "a: b",
+        "- a",
+        "# a",
+        "a #b",
+        "---",
+        "...",
+        "&a",
+        "*a",
+        "!!binary a",
+        "{a: b}",
+        "[a",
+        "|",
+        "> a",
+        "'",
+        "\"",
+        "%a",
+        "@a",
+        "`a",
+        "? a",
+        ": a",
+        "a:",
+        "a\\nb",
+        "x, y",
+    ];
+
     #[test]
     fn a_text_of_a_row_is_one_value_and_stays_a_text_for_kubectl_too() {
-        // What YAML 1.1, which kubectl reads, takes for a boolean, a number or nothing.
-        let words = [
-            "y",
-            "yes",
-            "No",
-            "on",
-            "OFF",
-            "true",
-            "~",
-            "null",
-            "1",
-            "0x1F",
-            "0o7",
-            "017",
-            "1_000",
-            "1e3",
-            ".inf",
-            "12:30:00",
-            "2026-11-20",
-            "=",
-            "<<",
-            "",
-        ];
-        let texts = [
-            "a: b",
-            "- a",
-            "# a",
-            "a #b",
-            "---",
-            "...",
-            "&a",
-            "*a",
-            "!!binary a",
-            "{a: b}",
-            "[a",
-            "|",
-            "> a",
-            "'",
-            "\"",
-            "%a",
-            "@a",
-            "`a",
-            "? a",
-            ": a",
-            "a:",
-            "a\\nb",
-            "x, y",
-        ];
-        for text in words.into_iter().chain(texts) {
+        for text in WORDS.into_iter().chain(MARKS) {
             let yaml = printed("plain", text);
             let read: Value = serde_saphyr::from_str(&yaml).unwrap();
             assert_eq!(
@@ -221,7 +224,7 @@ mod tests {
                 .lines()
                 .find_map(|line| line.trim().strip_prefix("name: "))
                 .unwrap();
-            assert!(!words.contains(&value), "{value} is no text in YAML 1.1");
+            assert!(!WORDS.contains(&value), "{value} is no text in YAML 1.1");
         }
     }
 

@@ -7,7 +7,6 @@ use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundin
 use crate::controller::submissions::decide::Plan;
 use crate::controller::submissions::observe::observe;
 use crate::observability::logging::tests::Lines;
-use leaderboard_api::Progress;
 
 /// A submission whose Job was made, as one reconcile has read it.
 async fn bench() -> (Surroundings, View) {
@@ -24,40 +23,44 @@ async fn bench() -> (Surroundings, View) {
     (around, view)
 }
 
+/// Carries out a plan that is a status and nothing else.
+async fn write(around: &Surroundings, view: &View, status: SubmissionStatus) {
+    let plan = Plan {
+        status,
+        actions: Vec::new(),
+        events: Vec::new(),
+        report: None,
+        requeue: None,
+    };
+    act(around.context.for_act(), view, plan).await.unwrap();
+}
+
+/// The metrics after this status was written; the view has it then.
+async fn metrics_after(around: &Surroundings, view: &mut View, status: SubmissionStatus) -> String {
+    write(around, view, status.clone()).await;
+    Arc::make_mut(&mut view.submission).status = Some(status);
+    around.context.metrics.text().unwrap()
+}
+
 #[tokio::test(start_paused = true)]
 async fn each_transition_is_one_line_with_all_that_identifies_it() {
     let (around, view) = bench().await;
     let old = view.submission.status.clone().unwrap();
     let lines = Lines::default();
     let _guard = lines.collect();
-    let write = async |status: SubmissionStatus| {
-        let plan = Plan {
-            status,
-            actions: Vec::new(),
-            events: Vec::new(),
-            report: None,
-            requeue: None,
-        };
-        act(around.context.for_act(), &view, plan).await.unwrap();
-    };
+    let write = async |status| write(&around, &view, status).await;
 
     write(old.clone()).await;
     assert_eq!(lines.take(), "", "nothing was written");
-    let node = Some("node-1".to_owned());
-    write(SubmissionStatus {
-        node_name: node.clone(),
+    let scheduled = SubmissionStatus {
+        node_name: Some("node-1".into()),
         ..old.clone()
-    })
-    .await;
-    let progress = Some(Progress {
-        done: 1,
-        total: 4,
-        text: "1/4".into(),
-    });
+    };
+    write(scheduled.clone()).await;
+    let progress = json!({"done": 1, "total": 4, "text": "1/4"});
     write(SubmissionStatus {
-        node_name: node.clone(),
-        progress,
-        ..old.clone()
+        progress: serde_json::from_value(progress).unwrap(),
+        ..scheduled.clone()
     })
     .await;
     assert_eq!(lines.take(), "", "neither the node nor the progress is a transition");
@@ -69,8 +72,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         conditions: vec![condition],
         reason: Some("AgentRunning".into()),
         message: Some("Agents run.".into()),
-        node_name: node,
-        ..old
+        ..scheduled
     };
     write(running).await;
     let text = lines.take();
@@ -91,8 +93,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
 
 #[tokio::test(start_paused = true)]
 async fn gpu_seconds_are_counted_when_they_are_stored_and_once() {
-    let (around, view) = bench().await;
-    let mut view = view;
+    let (around, mut view) = bench().await;
     let old = view.submission.status.clone().unwrap();
     for (gpu_seconds, sum) in [(400, "400"), (400, "400"), (1000, "1000")] {
         let status = SubmissionStatus {
@@ -100,16 +101,7 @@ async fn gpu_seconds_are_counted_when_they_are_stored_and_once() {
             track: Some("sensors".into()),
             ..old.clone()
         };
-        let plan = Plan {
-            status: status.clone(),
-            actions: Vec::new(),
-            events: Vec::new(),
-            report: None,
-            requeue: None,
-        };
-        act(around.context.for_act(), &view, plan).await.unwrap();
-        Arc::make_mut(&mut view.submission).status = Some(status);
-        let text = around.context.metrics.text().unwrap();
+        let text = metrics_after(&around, &mut view, status).await;
         let line = format!("leaderboard_gpu_seconds_total{{leaderboard=\"one/board\",track=\"sensors\"}} {sum}");
         assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
     }
@@ -142,16 +134,7 @@ async fn a_failed_attempt_is_counted_once_when_it_is_stored() {
         (published, Some("1")),
         (resumed, Some("2")),
     ] {
-        let plan = Plan {
-            status: status.clone(),
-            actions: Vec::new(),
-            events: Vec::new(),
-            report: None,
-            requeue: None,
-        };
-        act(around.context.for_act(), &view, plan).await.unwrap();
-        Arc::make_mut(&mut view.submission).status = Some(status);
-        let text = around.context.metrics.text().unwrap();
+        let text = metrics_after(&around, &mut view, status).await;
         let labels = "leaderboard=\"one/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"";
         let found = text.lines().find(|line| line.starts_with(family));
         assert_eq!(

@@ -85,27 +85,6 @@ impl Client {
         match request {
             Request::Get(s) => Reply::Row(self.get(token, &format!("jobs/submission/{}", s.pk)).await),
             Request::Image(_, url) => Reply::Image(self.files.image(url).await),
-            Request::Progress(s, progress, job) => {
-                let body = Patch {
-                    submission: s.pk,
-                    submission_status: progress.as_str(),
-                    job_name: job.as_deref(),
-                };
-                Reply::Written(self.write(token, Method::PATCH, &update(s), &body).await)
-            }
-            Request::Partial(s, payload) => {
-                let path = format!("jobs/challenges/{}/update_partially_evaluated_submission/", s.challenge);
-                let body = put(s, "partially_evaluated", true, payload);
-                let body = Put {
-                    environment_log: None,
-                    ..body
-                };
-                Reply::Written(self.write(token, Method::PUT, &path, &body).await)
-            }
-            Request::Final(s, outcome, payload) => {
-                let body = put(s, outcome.as_str(), *outcome == super::Outcome::Finished, payload);
-                Reply::Written(self.write(token, Method::PUT, &update(s), &body).await)
-            }
             Request::List {
                 challenge,
                 purpose,
@@ -136,7 +115,29 @@ impl Client {
                 let path = format!("jobs/queues/{queue}/");
                 Reply::Written(self.write(token, Method::POST, &path, &body).await)
             }
+            Request::Progress(s, progress, job) => {
+                let body = Patch {
+                    submission: s.pk,
+                    submission_status: progress.as_str(),
+                    job_name: job.as_deref(),
+                };
+                Reply::Written(self.write(token, Method::PATCH, &update(s), &body).await)
+            }
+            Request::Partial(s, payload) => Reply::Written(self.write_partial(token, s, payload).await),
+            Request::Final(s, outcome, payload) => {
+                let body = put(s, outcome.as_str(), *outcome == super::Outcome::Finished, payload);
+                Reply::Written(self.write(token, Method::PUT, &update(s), &body).await)
+            }
         }
+    }
+
+    async fn write_partial(&self, token: &Token, s: &SubmissionRef, payload: &Payload) -> Answer<()> {
+        let path = format!("jobs/challenges/{}/update_partially_evaluated_submission/", s.challenge);
+        let body = Put {
+            environment_log: None,
+            ..put(s, "partially_evaluated", true, payload)
+        };
+        self.write(token, Method::PUT, &path, &body).await
     }
 
     async fn get<T: DeserializeOwned>(&self, token: &Token, path: &str) -> Answer<T> {

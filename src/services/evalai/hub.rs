@@ -42,6 +42,24 @@ pub struct Options {
     pub tasks: Tasks,
 }
 
+#[cfg(test)]
+impl Options {
+    /// Those of a hub to whose news nobody listens.
+    pub fn unheard(tasks: &Tasks, write_guard: impl WriteGuard) -> Self {
+        Self {
+            write_guard: Arc::new(write_guard),
+            not_before: Instant::now(),
+            changed: mpsc::unbounded_channel().0,
+            sweep: mpsc::unbounded_channel().0,
+            arrived: mpsc::unbounded_channel().0,
+            timing: Timing::default(),
+            timeouts: Timeouts::default(),
+            meter: Meter::default(),
+            tasks: tasks.clone(),
+        }
+    }
+}
+
 /// See the module's text. Clones are the same hub.
 #[derive(Clone)]
 pub struct Hub(Arc<Inner>);

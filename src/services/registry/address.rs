@@ -1,35 +1,22 @@
 //! Where a look-up may connect to. Participants choose the name of an image, and a registry chooses where a redirect leads: without
 //! this the operator would connect for them to whatever its own network can reach.
-//!
-//! A name is resolved once, and the connection goes to the address that was checked.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr};
 
 use reqwest::Url;
-use reqwest::dns::{Addrs, Name, Resolve, Resolving};
 
+use crate::services::public::Reach;
 use leaderboard_api::ranges::{self, Range};
 
-/// How far a request may go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Reach {
-    /// To a registry that the host's patterns name: also one in the host's own network.
-    Registry,
-    /// To where a registry points: public addresses alone.
-    Public,
-}
+/// To a registry that the host's patterns name: also one in the host's own network.
+pub(super) const REGISTRY: Reach = Reach::of(may_be_a_registry);
 
-impl Reach {
-    /// Whether it may go to this address.
-    pub(super) fn allows(self, address: IpAddr) -> bool {
-        let address = embedded(address);
-        let is_machines = address.is_loopback() || address.is_unspecified() || address.is_multicast();
-        let answers_for_machines = |alone| ranges::forbidden().any(|range| range.contains(alone));
-        if is_machines || Range::alone(address).is_none_or(answers_for_machines) {
-            return false;
-        }
-        self == Self::Registry || ranges::is_public(address)
-    }
+/// False for this machine, and for what answers machines alone, such as the service that hands out credentials.
+fn may_be_a_registry(address: IpAddr) -> bool {
+    let address = embedded(address);
+    let is_machines = address.is_loopback() || address.is_unspecified() || address.is_multicast();
+    let answers_for_machines = |alone| ranges::forbidden().any(|range| range.contains(alone));
+    !is_machines && !Range::alone(address).is_none_or(answers_for_machines)
 }
 
 /// The host of an address as an IP, where it is one.
@@ -55,28 +42,6 @@ fn embedded(address: IpAddr) -> IpAddr {
         _ => address,
     }
 }
-
-/// A resolver that knows no address out of reach.
-pub(super) struct Resolver(pub(super) Reach);
-
-impl Resolve for Resolver {
-    fn resolve(&self, name: Name) -> Resolving {
-        let reach = self.0;
-        Box::pin(async move {
-            let found = tokio::net::lookup_host((name.as_str(), 0)).await?;
-            let allowed: Vec<SocketAddr> = found.filter(|found| reach.allows(found.ip())).collect();
-            if allowed.is_empty() {
-                return Err(OutOfReach.into());
-            }
-            let addresses: Addrs = Box::new(allowed.into_iter());
-            Ok(addresses)
-        })
-    }
-}
-
-#[derive(thiserror::Error, Debug)]
-#[error("its address is one that no look-up may go to")]
-struct OutOfReach;
 
 #[cfg(test)]
 mod tests {
@@ -119,8 +84,8 @@ mod tests {
             ("ff02::1", false, false),
         ] {
             let ip: IpAddr = address.parse().unwrap();
-            assert_eq!(Reach::Registry.allows(ip), of_registry, "{address}");
-            assert_eq!(Reach::Public.allows(ip), is_public, "{address}");
+            assert_eq!(may_be_a_registry(ip), of_registry, "{address}");
+            assert_eq!(ranges::is_public(ip), is_public, "{address}");
         }
     }
 
@@ -136,12 +101,5 @@ mod tests {
             let url = Url::parse(text).unwrap();
             assert_eq!(ip(&url), wanted.map(|ip| ip.parse().unwrap()), "{text}");
         }
-    }
-
-    #[tokio::test]
-    async fn a_name_of_this_machine_resolves_to_nothing() {
-        let name: Name = "localhost".parse().unwrap();
-        let error = Resolver(Reach::Registry).resolve(name).await.err().unwrap();
-        assert!(error.to_string().contains("no look-up may go to"), "{error}");
     }
 }

@@ -20,7 +20,7 @@ use sha2::{Digest, Sha256};
 use tokio::time::{Instant, timeout};
 
 use super::aws::Aws;
-use address::{Reach, Resolver};
+use super::public::{self, Reach};
 use auth::Challenge;
 pub use auth::Credentials;
 use ecr::Ecr;
@@ -165,20 +165,17 @@ impl Clients {
         // A program that has installed one already keeps it.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let client = |reach: Reach| {
-            reqwest::Client::builder()
-                // A proxy would connect to addresses that nobody has checked.
-                .no_proxy()
-                .dns_resolver(std::sync::Arc::new(Resolver(reach)))
-                .redirect(reqwest::redirect::Policy::none())
+            reach
+                .limit_without_proxy(reqwest::Client::builder())
                 .connect_timeout(CONNECT)
                 .timeout(REQUEST)
                 .pool_max_idle_per_host(0)
                 .user_agent(concat!("leaderboard-operator/", env!("CARGO_PKG_VERSION")))
                 .build()
         };
-        let registry = client(Reach::Registry)?;
+        let registry = client(address::REGISTRY)?;
         Ok(Self {
-            public: client(Reach::Public)?,
+            public: client(Reach::default())?,
             ecr: Ecr::new(aws.clone(), registry.clone()),
             registry,
         })
@@ -345,18 +342,18 @@ impl<'a> Session<'a> {
         if is_registry && self.is_local {
             return Ok(&self.clients.registry);
         }
-        let reach = if is_registry { Reach::Registry } else { Reach::Public };
+        let (reach, client) = if is_registry {
+            (address::REGISTRY, &self.clients.registry)
+        } else {
+            (Reach::default(), &self.clients.public)
+        };
         // A resolver is never asked for what is an address already.
-        let is_out_of_reach = address::ip(url).is_some_and(|ip| !reach.allows(ip));
-        if url.scheme() != "https" || is_out_of_reach || !url.username().is_empty() {
+        if url.scheme() != "https" || reach.check(url).is_err() || !url.username().is_empty() {
             return Err(Fault::Unusable(
                 "it leads to an address that no look-up may go to".into(),
             ));
         }
-        Ok(match reach {
-            Reach::Registry => &self.clients.registry,
-            Reach::Public => &self.clients.public,
-        })
+        Ok(client)
     }
 
     /// Does what a registry asks for before it answers.
@@ -452,6 +449,8 @@ fn unanswered(error: reqwest::Error) -> Fault {
     let error = error.without_url();
     Fault::Unreachable(match () {
         () if error.is_timeout() => "it did not answer in time".into(),
+        // Where a name leads in the host's network is not for those who choose the name.
+        () if public::cause(&error).is_some() => "its address is one that no look-up may go to".into(),
         () => format!("no connection ({})", leaderboard_api::client_errors::chain(&error)),
     })
 }

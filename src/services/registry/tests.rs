@@ -141,6 +141,25 @@ async fn no_redirect_leads_into_a_private_network() {
 }
 
 #[tokio::test]
+async fn a_registry_whose_name_leads_to_this_machine_is_not_asked() {
+    let other = ImageRegistry::start().await;
+    let local = other.host().replace("127.0.0.1", "localhost");
+    assert!(local.starts_with("localhost:"), "{local}");
+    let image = Image {
+        registry: local,
+        may_be_local: false,
+        ..image(&other, "one")
+    };
+    // Where the name leads is not said to those who may choose it.
+    let why = "its address is one that no look-up may go to".to_owned();
+    assert_eq!(
+        registries().await.look_up(&image, None).await,
+        Err(Fault::Unreachable(why))
+    );
+    assert_eq!(other.seen(), []);
+}
+
+#[tokio::test]
 async fn a_redirect_within_the_registry_is_followed_a_few_times() {
     let registry = ImageRegistry::start().await;
     let manifest = registry.push("here", &config(), 1);

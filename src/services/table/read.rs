@@ -29,8 +29,8 @@ impl Table {
             .client
             .get_item()
             .table_name(&self.name)
-            .key(&self.partition.name, self.key_value(&self.partition, team_id, "team")?)
-            .key(&self.sort.name, self.key_value(&self.sort, run_id, "submission")?)
+            .key(&self.partition.name, self.partition.value(&self.name, team_id, "team")?)
+            .key(&self.sort.name, self.sort.value(&self.name, run_id, "submission")?)
             .consistent_read(true)
             .projection_expression("#attempt, #status, #start, #submitted")
             .expression_attribute_names("#attempt", ATTEMPT)

@@ -48,12 +48,12 @@ async fn cancels_between_a_list_and_a_write_are_found_by_the_read_of_that_write(
     for (index, pk) in just_listed(&mut world, 40).await.into_iter().enumerate() {
         world.set(pk, Stored::Cancelled);
         let cancelled = Timestamp::now();
-        let wish = match index % 3 {
+        let update = match index % 3 {
             0 => DesiredUpdate::Queued,
             1 => DesiredUpdate::Running,
             _ => DesiredUpdate::Partial(results(&world.target, 41.0)),
         };
-        world.update(pk, wish);
+        world.update(pk, update);
         let view = world.until(pk, |view| {
             view.ended.is_some() || view.progress.is_some() || view.partial_at.is_some()
         });

@@ -42,10 +42,7 @@ async fn an_unanswered_end_leaves_one_row_on_the_leaderboard() {
         put_delay_ms: 1000,
         ..Knobs::default()
     });
-    world.update(
-        pk,
-        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
-    );
+    world.finish(pk);
     let view = world.until(pk, |view| view.unanswered_until.is_some()).await;
     assert!(
         view.last_error
@@ -123,10 +120,7 @@ async fn a_refused_end_says_why() {
     let mut target = world.target.clone();
     target.labels = ["Bogus".to_owned()].into();
     world.target = target;
-    world.update(
-        pk,
-        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
-    );
+    world.finish(pk);
     let Ended::Refused(why) = world.ended(pk).await else {
         panic!("it was not refused")
     };
@@ -142,14 +136,8 @@ async fn the_end_of_the_process_waits_for_what_is_on_its_way() {
         put_delay_ms: 500,
         ..Knobs::default()
     });
-    world.update(
-        pk,
-        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
-    );
-    world
-        .server
-        .wait_until(|_, log| log.entries().any(|entry| entry.method == "PUT"))
-        .await;
+    world.finish(pk);
+    world.until_put().await;
     assert!(world.hub.drain().await, "the write was answered");
     assert!(matches!(world.ended(pk).await, Ended::Published { .. }));
 
@@ -160,14 +148,8 @@ async fn the_end_of_the_process_waits_for_what_is_on_its_way() {
     let world = World::with(timing(), timeouts).await;
     let pk = world.submit();
     world.fail("PUT", "/api/jobs/", Failure::Hang, When::After);
-    world.update(
-        pk,
-        DesiredUpdate::Final(Outcome::Finished, results(&world.target, 43.0)),
-    );
-    world
-        .server
-        .wait_until(|_, log| log.entries().any(|entry| entry.method == "PUT"))
-        .await;
+    world.finish(pk);
+    world.until_put().await;
     assert!(!world.hub.drain().await, "the server may still be working on it");
 }
 

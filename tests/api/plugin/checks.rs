@@ -29,6 +29,15 @@ async fn created(terminal: &Terminal) -> DynamicObject {
     timeout(LIMIT, found).await.expect("the check is created")
 }
 
+async fn has_no_submission(terminal: &Terminal) {
+    let all = terminal
+        .api(Kind::Submission)
+        .list(&ListParams::default())
+        .await
+        .unwrap();
+    assert_eq!(all.items.len(), 0);
+}
+
 /// Starts the command without an `aws` on its PATH.
 fn check(terminal: &Terminal, arguments: &[&str]) -> Command {
     let mut command = terminal.command(&[&["check"], arguments].concat());
@@ -156,16 +165,7 @@ async fn what_does_not_end_in_time_is_cancelled_and_deleted() {
     assert_eq!(code, Some(1), "{out}");
     let found = "✘ Node           The check did not end within 2 s (--timeout). Unschedulable: 0/3 nodes are";
     assert_has(&out, &[found]);
-    assert_eq!(
-        terminal
-            .api(Kind::Submission)
-            .list(&ListParams::default())
-            .await
-            .unwrap()
-            .items
-            .len(),
-        0
-    );
+    has_no_submission(&terminal).await;
 }
 
 #[tokio::test]
@@ -191,14 +191,5 @@ async fn without_image_or_leaderboard_nothing_is_created() {
         let words = terminal.run(arguments).await.refused();
         assert!(words.contains(expected), "{words}");
     }
-    assert_eq!(
-        terminal
-            .api(Kind::Submission)
-            .list(&ListParams::default())
-            .await
-            .unwrap()
-            .items
-            .len(),
-        0
-    );
+    has_no_submission(&terminal).await;
 }

@@ -169,72 +169,73 @@ The check failed: 1 part is broken (✘). Parts that were not reached may be bro
 }
 
 /// The part that each failure breaks.
+const BROKEN_BY: &[(&str, &str, Part)] = &[
+    (
+        "ImageNotFound",
+        "The submitted image is not in its registry.",
+        Part::Registry,
+    ),
+    (
+        "ImageNotAllowed",
+        "The image of the check is not named.",
+        Part::Registry,
+    ),
+    (
+        "ScheduleDeadline",
+        "No node accepted the Pod within 60 s: exceeded quota.",
+        Part::Node,
+    ),
+    (
+        "ImagePull",
+        "The image of agent-1 cannot be pulled: not found.",
+        Part::Images,
+    ),
+    (
+        "StartDeadline",
+        "Contents fails: no such file. It was tried for 60 s.",
+        Part::Contents,
+    ),
+    (
+        "StartDeadline",
+        "Workspace fails: the bucket refuses. It was tried for 60 s.",
+        Part::Bucket,
+    ),
+    (
+        "CannotStart",
+        "Contents cannot be started: cp is missing.",
+        Part::Contents,
+    ),
+    (
+        "CannotStart",
+        "Simulator-1 cannot be started: bash is missing.",
+        Part::Simulator,
+    ),
+    (
+        "CannotStart",
+        "Agent-1 cannot be started: bash is missing.",
+        Part::Agent,
+    ),
+    ("NotIsolated", "The Pod could reach 10.96.0.1:443.", Part::Network),
+    ("SimulationCrashed", "Simulator 1 crashed.", Part::Simulator),
+    ("NoGPU", "Simulator 1 has no GPU.", Part::Simulator),
+    (
+        "GraphicsDriverMissing",
+        "The node's driver has no Vulkan.",
+        Part::Simulator,
+    ),
+    ("AgentCrashed", "Agent 1 crashed.", Part::Agent),
+    ("InvalidResults", "A checkpoint was refused.", Part::Route),
+    (
+        "ResultsNotStored",
+        "The Pod ended before its results were stored.",
+        Part::Bucket,
+    ),
+    ("ReasonOfALaterVersion", "Something failed.", Part::Route),
+];
+
 #[test]
 fn every_failure_has_its_part() {
-    let cases = [
-        (
-            "ImageNotFound",
-            "The submitted image is not in its registry.",
-            Part::Registry,
-        ),
-        (
-            "ImageNotAllowed",
-            "The image of the check is not named.",
-            Part::Registry,
-        ),
-        (
-            "ScheduleDeadline",
-            "No node accepted the Pod within 60 s: exceeded quota.",
-            Part::Node,
-        ),
-        (
-            "ImagePull",
-            "The image of agent-1 cannot be pulled: not found.",
-            Part::Images,
-        ),
-        (
-            "StartDeadline",
-            "Contents fails: no such file. It was tried for 60 s.",
-            Part::Contents,
-        ),
-        (
-            "StartDeadline",
-            "Workspace fails: the bucket refuses. It was tried for 60 s.",
-            Part::Bucket,
-        ),
-        (
-            "CannotStart",
-            "Contents cannot be started: cp is missing.",
-            Part::Contents,
-        ),
-        (
-            "CannotStart",
-            "Simulator-1 cannot be started: bash is missing.",
-            Part::Simulator,
-        ),
-        (
-            "CannotStart",
-            "Agent-1 cannot be started: bash is missing.",
-            Part::Agent,
-        ),
-        ("NotIsolated", "The Pod could reach 10.96.0.1:443.", Part::Network),
-        ("SimulationCrashed", "Simulator 1 crashed.", Part::Simulator),
-        ("NoGPU", "Simulator 1 has no GPU.", Part::Simulator),
-        (
-            "GraphicsDriverMissing",
-            "The node's driver has no Vulkan.",
-            Part::Simulator,
-        ),
-        ("AgentCrashed", "Agent 1 crashed.", Part::Agent),
-        ("InvalidResults", "A checkpoint was refused.", Part::Route),
-        (
-            "ResultsNotStored",
-            "The Pod ended before its results were stored.",
-            Part::Bucket,
-        ),
-        ("ReasonOfALaterVersion", "Something failed.", Part::Route),
-    ];
-    for (reason, message, expected) in cases {
+    for (reason, message, expected) in BROKEN_BY {
         let submission = check(&failed("Infrastructure", reason, message));
         let found = findings(Seen {
             leaderboard: &good_leaderboard(),
@@ -247,7 +248,7 @@ fn every_failure_has_its_part() {
             .filter(|f| f.mark == Mark::Broken)
             .map(|f| f.part)
             .collect();
-        assert_eq!(broken, [expected], "{reason}: {message}");
+        assert_eq!(broken, [*expected], "{reason}: {message}");
     }
 }
 

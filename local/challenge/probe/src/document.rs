@@ -17,7 +17,7 @@ user 1000, under Leaderboard 1.0 and 2.0. The same tables make this page, so wha
 |---|---|
 | held | the operator's own Pods and rules refuse it in any cluster |
 | by policy | the cluster decides: the named object or setting must be there, and be enforced |
-| inherent | it works for every image and yields nothing that is secret; or nobody can tell it from honest work |
+| inherent | it works for every image and yields nothing that is secret; or nobody can distinguish it from honest work |
 
 A host who gives containers more rights (`securityContext`, `podOverrides`) opens what this page calls held. A test does that on
 purpose, to see that the probes find it.

@@ -1,6 +1,6 @@
 //! The agent and the simulator as processes, each test in a folder of its own.
 
-// `cfg(test)` tells clippy that the helpers may unwrap too.
+// `cfg(test)` shows clippy that the helpers may unwrap too.
 #[cfg(test)]
 mod agent;
 #[cfg(test)]

@@ -69,23 +69,20 @@ fn someone() -> Identity {
     Identity::random("host")
 }
 
+#[track_caller]
+fn leads_in(leadership: &Leadership, wanted: i32, was_drained: bool) {
+    let is_it = matches!(leadership, Leadership::Leader { term, drained_before, .. }
+        if (*term, *drained_before) == (wanted, was_drained));
+    assert!(is_it, "{leadership:?}");
+}
+
 #[tokio::test(start_paused = true)]
 async fn the_first_ever_leads_at_once_and_may_write_to_evalai_at_once() {
     let (server, begin) = (FakeServer::default(), Instant::now());
     let candidate = Candidate::start(&server, someone());
     assert!(!candidate.may_write());
     let leadership = candidate.leads().await;
-    assert!(
-        matches!(
-            leadership,
-            Leadership::Leader {
-                term: 1,
-                drained_before: true,
-                ..
-            }
-        ),
-        "{leadership:?}"
-    );
+    leads_in(&leadership, 1, true);
     assert!(candidate.may_write() && begin.elapsed() < Duration::from_secs(1));
     let not_before = candidate.leader.fence().evalai_not_before().unwrap();
     assert!(not_before <= Instant::now());
@@ -126,17 +123,7 @@ async fn a_standby_takes_over_fifteen_seconds_after_the_last_sign_and_waits_for_
     let leadership = candidate.leads().await;
     let waited = begin.elapsed();
     assert!((15..=18).contains(&waited.as_secs()), "{waited:?}");
-    assert!(
-        matches!(
-            leadership,
-            Leadership::Leader {
-                term: 4,
-                drained_before: false,
-                ..
-            }
-        ),
-        "{leadership:?}"
-    );
+    leads_in(&leadership, 4, false);
     let quiet = candidate.leader.fence().evalai_not_before().unwrap() - Instant::now();
     assert!((74..=75).contains(&quiet.as_secs()), "{quiet:?}");
     assert!(candidate.may_write(), "DynamoDB needs no quiet time");
@@ -169,17 +156,7 @@ async fn an_orderly_end_hands_over_within_a_look_and_without_quiet_time() {
     old.leader.release().await.unwrap();
     let begin = Instant::now();
     let leadership = new.leads().await;
-    assert!(
-        matches!(
-            leadership,
-            Leadership::Leader {
-                term: 2,
-                drained_before: true,
-                ..
-            }
-        ),
-        "{leadership:?}"
-    );
+    leads_in(&leadership, 2, true);
     assert!(begin.elapsed() < Duration::from_secs(3));
     assert!(new.leader.fence().evalai_not_before().unwrap() <= Instant::now());
     assert!(
@@ -197,17 +174,7 @@ async fn an_end_without_all_answers_hands_over_with_the_quiet_time() {
     assert!(server.with(|state| state.spec("holderIdentity")).is_null());
     let new = Candidate::start(&server, someone());
     let leadership = new.leads().await;
-    assert!(
-        matches!(
-            leadership,
-            Leadership::Leader {
-                term: 2,
-                drained_before: false,
-                ..
-            }
-        ),
-        "{leadership:?}"
-    );
+    leads_in(&leadership, 2, false);
 }
 
 #[tokio::test(start_paused = true)]
@@ -216,17 +183,7 @@ async fn an_old_note_of_drained_does_not_count_for_a_later_term() {
     server.with(|state| state.put(Some("gone"), 7, &json!({ANNOTATION_DRAINED: "6"})));
     let candidate = Candidate::start(&server, someone());
     let leadership = candidate.leads().await;
-    assert!(
-        matches!(
-            leadership,
-            Leadership::Leader {
-                term: 8,
-                drained_before: false,
-                ..
-            }
-        ),
-        "{leadership:?}"
-    );
+    leads_in(&leadership, 8, false);
 }
 
 #[tokio::test(start_paused = true)]
@@ -238,17 +195,7 @@ async fn a_restarted_container_takes_over_from_its_own_past_at_once_but_keeps_qu
     let candidate = Candidate::start(&server, Identity::of_pod("pod", "uid"));
     let leadership = candidate.leads().await;
     assert!(begin.elapsed() < Duration::from_secs(1));
-    assert!(
-        matches!(
-            leadership,
-            Leadership::Leader {
-                term: 4,
-                drained_before: false,
-                ..
-            }
-        ),
-        "{leadership:?}"
-    );
+    leads_in(&leadership, 4, false);
 }
 
 #[tokio::test(start_paused = true)]

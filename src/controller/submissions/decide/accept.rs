@@ -54,19 +54,19 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if foreign::waits(draft, leaderboard, track, info.as_ref()) {
         return false;
     }
-    let image = match named_image(draft, info.as_ref()) {
-        Image::Named(image) => image,
+    let (image, fault) = match named_image(draft, info.as_ref()) {
+        Image::Named(image) => {
+            let fault = image::not_allowed(draft, leaderboard, &image);
+            (image, fault)
+        }
+        Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
         Image::Unknown => {
             let message = image_unread(draft);
             draft.stall_with(reasons::IMAGE_MISSING, &message);
             return refuse(draft, reasons::IMAGE_MISSING, &message);
         }
-        Image::Invalid { image, what } => {
-            let found = failure::image_invalid(&what);
-            return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
-        }
     };
-    if let Some(found) = image::not_allowed(draft, leaderboard, &image) {
+    if let Some(found) = fault {
         return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
     }
     if let Some(message) = not_ready(draft) {

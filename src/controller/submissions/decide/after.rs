@@ -26,7 +26,7 @@ const RERUN_SECONDS: i64 = 60;
 const CANCELLED: &str = "cancelled";
 /// What a check finds of the table.
 const TRIED: &str = "The table would take a row; a check writes none.";
-const TOLD_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
+const SENT_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
                            the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
                            needed.";
 
@@ -257,7 +257,7 @@ fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bo
     let (reason, message) = if is_overtaken {
         (
             reasons::CONCURRENT_UPDATE,
-            failed.or_else(|| Some(TOLD_AGAIN.to_owned())),
+            failed.or_else(|| Some(SENT_AGAIN.to_owned())),
         )
     } else if let Some(until) = draft.view.evalai_writes_from {
         draft.requeue_at(until);

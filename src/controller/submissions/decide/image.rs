@@ -1,4 +1,4 @@
-//! Which images may run: the Leaderboard's patterns, and what the registry tells of size, platform and volumes. Pins the digest.
+//! Which images may run: the Leaderboard's patterns, and what the registry reports of size, platform and volumes. Pins the digest.
 
 use std::time::Duration;
 

@@ -46,9 +46,9 @@ pub(super) fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     let before = draft.view.submission.status.as_ref();
     let has_just_ended = !before.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
     let published = before.and_then(|s| conditions::get(&s.conditions, conditions::PUBLISHED));
-    let is_told = published.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED);
+    let is_published = published.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED);
     let is_answered = draft.view.evalai.as_ref().is_some_and(|e| e.end.is_some());
-    let is_awaited = draft.spec().evalai.is_some() && !is_told && !is_answered;
+    let is_awaited = draft.spec().evalai.is_some() && !is_published && !is_answered;
     if is_awaited || (has_just_ended && !is_answered) {
         let places = places(&draft.status, draft.view.pod.as_ref());
         if !places.is_empty() {

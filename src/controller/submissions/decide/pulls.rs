@@ -164,71 +164,68 @@ mod tests {
         }
     }
 
+    fn init(name: &str) -> ContainerView {
+        waits(name, "PodInitializing")
+    }
+
+    /// A Pod that starts: what has been, and who waits for its turn.
+    fn starts(first: Vec<ContainerView>, later: &[&str]) -> Vec<ContainerView> {
+        first.into_iter().chain(later.iter().map(|name| init(name))).collect()
+    }
+
+    /// The containers of a pair, once everything before them is there.
+    fn pair(containers: [ContainerView; 2]) -> Vec<ContainerView> {
+        let first = [
+            ran("contents", 2000, 3000),
+            ran("workspace", 3010, 3020),
+            runs("logcopy", 3030),
+        ];
+        first.into_iter().chain(containers).collect()
+    }
+
+    const PAIR: [&str; 2] = ["simulator-1", "agent-1"];
+
     /// What a Pod that starts goes through, with who waits for an image, and by when it has to be further.
-    #[test]
-    fn pulls_and_the_rest_of_a_start_have_deadlines_of_their_own() {
-        let init = |name: &str| waits(name, "PodInitializing");
-        let pair = || vec![init("simulator-1"), init("agent-1")];
-        let rest = |names: &[&str]| names.iter().map(|name| init(name)).chain(pair()).collect::<Vec<_>>();
-        let of =
-            |first: Vec<ContainerView>, rest: Vec<ContainerView>| first.into_iter().chain(rest).collect::<Vec<_>>();
-        let copied = || vec![ran("contents", 2000, 3000), ran("workspace", 3010, 3020)];
-        let ready = || of(copied(), vec![runs("logcopy", 3030)]);
-        let cases: [(&str, Vec<ContainerView>, &[&str], i64); 9] = [
+    fn stages() -> [(&'static str, Vec<ContainerView>, &'static [&'static str], i64); 9] {
+        const WORKSPACE: [&str; 4] = ["workspace", "logcopy", "simulator-1", "agent-1"];
+        const ALL: [&str; 5] = ["contents", "workspace", "logcopy", "simulator-1", "agent-1"];
+        let contents = ran("contents", 2000, 3000);
+        let copying = starts(vec![runs("contents", 2000)], &WORKSPACE);
+        let no_reason = pair(PAIR.map(|name| waits(name, "")));
+        let simulator = || runs("simulator-1", 4000);
+        let odd = pair([simulator(), waits("agent-1", "Odd")]);
+        let one = pair([simulator(), waits("agent-1", "ContainerCreating")]);
+        [
             ("nothing is known of it", Vec::new(), &[], 1800),
-            (
-                "the contents are pulled",
-                rest(&["contents", "workspace", "logcopy"]),
-                &["contents"],
-                5400,
-            ),
-            (
-                "the contents are copied",
-                of(vec![runs("contents", 2000)], rest(&["workspace", "logcopy"])),
-                &[],
-                3800,
-            ),
+            ("the contents are pulled", starts(Vec::new(), &ALL), &["contents"], 5400),
+            ("the contents are copied", copying, &[], 2000 + 1800),
             (
                 "the operator's image is pulled",
-                of(vec![ran("contents", 2000, 3000)], rest(&["workspace", "logcopy"])),
+                starts(vec![contents], &WORKSPACE),
                 &["workspace"],
-                6400,
+                1000 + 5400,
             ),
             (
                 "the images of the pairs are pulled",
-                of(ready(), pair()),
-                &["simulator-1", "agent-1"],
-                5400 + 1010,
+                pair(PAIR.map(init)),
+                &PAIR,
+                1010 + 5400,
             ),
-            (
-                "one of them is there",
-                of(
-                    ready(),
-                    vec![runs("simulator-1", 4000), waits("agent-1", "ContainerCreating")],
-                ),
-                &["agent-1"],
-                5400 + 1010,
-            ),
-            (
-                "a new kubelet gives no reason",
-                of(ready(), vec![waits("simulator-1", ""), waits("agent-1", "")]),
-                &["simulator-1", "agent-1"],
-                5400 + 1010,
-            ),
+            ("one of them is there", one, &["agent-1"], 1010 + 5400),
+            ("a new kubelet gives no reason", no_reason, &PAIR, 1010 + 5400),
             (
                 "all are there",
-                of(ready(), vec![runs("simulator-1", 4000), runs("agent-1", 4700)]),
+                pair([simulator(), runs("agent-1", 4700)]),
                 &[],
                 4700 + 1800,
             ),
-            (
-                "another reason is no pull",
-                of(ready(), vec![runs("simulator-1", 4000), waits("agent-1", "Odd")]),
-                &[],
-                4000 + 1800,
-            ),
-        ];
-        for (what, containers, names, second) in cases {
+            ("another reason is no pull", odd, &[], 4000 + 1800),
+        ]
+    }
+
+    #[test]
+    fn pulls_and_the_rest_of_a_start_have_deadlines_of_their_own() {
+        for (what, containers, names, second) in stages() {
             let pod = pod(containers);
             assert_eq!(waiting(&pod), names, "{what}");
             let limit = limit(&pod, &deadlines(), None).unwrap();

@@ -261,7 +261,7 @@ fn too_late(found: &Trouble, seconds: i64) -> Failure {
         let next = for_both("Push the image again and check that it runs on linux/amd64.");
         let failure = participant(reason, &what, &next);
         Failure {
-            // A registry's own words, or the network's, would tell a participant what the nodes can reach.
+            // A registry's own words, or the network's, would show a participant what the nodes can reach.
             participant_message: if reason == reasons::IMAGE_PULL {
                 Some(format!(
                     "{} {}",

@@ -12,7 +12,7 @@ use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::reasons;
 
-/// Added to `cancelSeconds` before a Pod that was told to stop is deleted.
+/// Added to `cancelSeconds` before a Pod that was asked to stop is deleted.
 const STOP_MARGIN_SECONDS: i64 = 15;
 /// Grace of a Pod that is deleted because it did not stop by itself.
 pub(super) const DELETE_GRACE_SECONDS: i64 = 60;

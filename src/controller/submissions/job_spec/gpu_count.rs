@@ -85,9 +85,13 @@ mod tests {
         gpus(&spec, Some(&track), &plan)
     }
 
+    /// What a container with one GPU asks for.
+    fn one() -> Value {
+        json!({"limits": {"nvidia.com/gpu": "1", "cpu": "4"}})
+    }
+
     #[test]
     fn gpus_are_counted_as_they_are_requested() {
-        let one = || json!({"limits": {"nvidia.com/gpu": "1", "cpu": "4"}});
         let cases = [
             ("nothing is requested", json!({}), 0),
             (
@@ -138,31 +142,40 @@ mod tests {
                 json!({"simulator": {"resources": {"limits": {"cpu": "2"}}}}),
                 0,
             ),
+        ];
+        for (what, fields, expected) in cases {
+            assert_eq!(counted(&fields), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn an_overlay_changes_what_is_requested() {
+        let one_each = || json!({"resources": one()});
+        let overlay = |container: Value| json!({"spec": {"containers": [container]}});
+        let three = json!({"name": "simulator-1", "resources": {"limits": {"nvidia.com/gpu": "3"}}});
+        let cases = [
+            ("another number for one pair", one_each(), three, 6),
             (
-                "an overlay in place of one",
-                json!({"simulator": {"resources": one()},
-                "podOverrides": {"spec": {"containers": [{"name": "simulator-1", "resources": {"limits": {"nvidia.com/gpu": "3"}}}]}}}),
-                6,
-            ),
-            (
-                "an overlay without a GPU",
-                json!({"simulator": {"resources": one()},
-                "podOverrides": {"spec": {"containers": [{"name": "simulator-1", "env": []}]}}}),
+                "without a GPU",
+                one_each(),
+                json!({"name": "simulator-1", "env": []}),
                 4,
             ),
             (
-                "an overlay of all agents",
-                json!({"podOverrides": {"spec": {"containers": [{"name": "agent", "resources": one()}]}}}),
+                "for all agents",
+                json!({}),
+                json!({"name": "agent", "resources": one()}),
                 4,
             ),
             (
-                "an overlay that takes them away",
-                json!({"simulator": {"resources": one()},
-                "podOverrides": {"spec": {"containers": [{"name": "simulator", "resources": null}]}}}),
+                "none for any simulator",
+                one_each(),
+                json!({"name": "simulator", "resources": null}),
                 0,
             ),
         ];
-        for (what, fields, expected) in cases {
+        for (what, simulator, container, expected) in cases {
+            let fields = json!({"simulator": simulator, "podOverrides": overlay(container)});
             assert_eq!(counted(&fields), expected, "{what}");
         }
     }

@@ -158,7 +158,7 @@ fn foreign_word(message: &str) -> Option<String> {
     let value: serde_json::Value = serde_json::from_str(message).ok()?;
     let verdict = WorkspaceVerdict::parse(message);
     if verdict.is_some_and(|verdict| verdict.reason == WorkspaceReason::NotKnownIsolated) {
-        // For the run it is the same; the Leaderboard's condition tells them apart.
+        // For the run it is the same; the Leaderboard's condition distinguishes them.
         return Some(reasons::NOT_ISOLATED.to_owned());
     }
     value.get("reason")?.as_str().map(short)

@@ -6,17 +6,7 @@ use futures::FutureExt;
 use std::time::Duration;
 
 fn hub(tasks: &Tasks, write_guard: impl WriteGuard) -> Hub {
-    Hub::new(Options {
-        write_guard: Arc::new(write_guard),
-        not_before: Instant::now(),
-        changed: mpsc::unbounded_channel().0,
-        sweep: mpsc::unbounded_channel().0,
-        arrived: mpsc::unbounded_channel().0,
-        timing: Timing::default(),
-        timeouts: Timeouts::default(),
-        meter: Meter::default(),
-        tasks: tasks.clone(),
-    })
+    Hub::new(Options::unheard(tasks, write_guard))
 }
 
 fn target(token: &str) -> Target {

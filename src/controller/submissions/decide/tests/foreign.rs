@@ -53,91 +53,76 @@ fn asked(world: &mut World) -> Option<Question> {
     })
 }
 
-#[test]
-fn what_shows_that_another_program_runs_a_submission() {
-    let resumed = |second| EvalaiInfo {
+fn resumed(second: i64) -> EvalaiInfo {
+    EvalaiInfo {
         standing: Standing::Resumed,
         resumed_at: Some(at(second)),
         ..info()
-    };
-    let objects = |newest, until| {
-        Some(Found::Objects {
-            newest: at(newest),
-            until: at(until),
-        })
-    };
+    }
+}
+
+/// What is found at second 100, and the run that it shows.
+fn each_shows(cases: impl IntoIterator<Item = (&'static str, Traces, EvalaiInfo, Option<Found>)>) {
+    for (name, traces, info, expected) in cases {
+        assert_eq!(found(&traces, &info, 100, at(100)), expected, "{name}");
+    }
+}
+
+#[test]
+fn a_row_of_a_run_shows_that_another_program_runs_it() {
     let by_row = |status: &str| {
         let since = row(status).since;
         let status = status.into();
         Some(Found::Row { status, since })
     };
+    let of = |status: &str| with_row(row(status));
     let ours = ObservedRow {
         is_ours: true,
         ..row("RUNNING")
     };
     let both = |status: &str| Traces {
         stored: stored(90),
-        ..with_row(row(status))
+        ..of(status)
     };
-    let marked = StoredRun {
-        is_ours: true,
-        ..stored(90)
-    };
-    let done = StoredRun {
-        has_ended: true,
-        ..stored(90)
-    };
-    let cases = [
+    each_shows([
         ("nothing", Traces::default(), info(), None),
-        (
-            "a row at its start",
-            with_row(row("SUBMITTED")),
-            info(),
-            by_row("SUBMITTED"),
-        ),
-        ("a row of a run", with_row(row("RUNNING")), info(), by_row("RUNNING")),
-        (
-            "a row of a run that EvalAI resumes",
-            with_row(row("RUNNING")),
-            resumed(50),
-            by_row("RUNNING"),
-        ),
+        ("a row at its start", of("SUBMITTED"), info(), by_row("SUBMITTED")),
+        ("a row of a run", of("RUNNING"), info(), by_row("RUNNING")),
+        ("one that EvalAI resumes", of("RUNNING"), resumed(50), by_row("RUNNING")),
         ("a row with our mark", with_row(ours), info(), None),
         ("an ended row", both("FAILED"), info(), None),
         ("an ended row of a resumed one", both("FAILED"), resumed(80), None),
         ("another ended row", both("CANCELLED"), info(), None),
         ("the last ended row", both("FINISHED"), info(), None),
-        ("young objects", with_objects(stored(90)), info(), objects(90, 190)),
-        ("old objects", with_objects(stored(0)), info(), None),
-        (
-            "objects of this moment and of the future",
-            with_objects(stored(500)),
-            info(),
-            objects(500, 600),
-        ),
-        ("young objects with our mark", with_objects(marked), info(), None),
-        (
-            "young objects of a run that has ended",
-            with_objects(done),
-            info(),
-            None,
-        ),
-        (
-            "objects from before a resume",
-            with_objects(stored(79)),
-            resumed(80),
-            None,
-        ),
-        (
-            "objects from after a resume",
-            with_objects(stored(80)),
-            resumed(80),
-            objects(80, 180),
-        ),
-    ];
-    for (name, traces, info, expected) in cases {
-        assert_eq!(found(&traces, &info, 100, at(100)), expected, "{name}");
-    }
+    ]);
+}
+
+#[test]
+fn young_objects_show_that_another_program_runs_it() {
+    let objects = |newest, until| {
+        Some(Found::Objects {
+            newest: at(newest),
+            until: at(until),
+        })
+    };
+    let marked = with_objects(StoredRun {
+        is_ours: true,
+        ..stored(90)
+    });
+    let ended = with_objects(StoredRun {
+        has_ended: true,
+        ..stored(90)
+    });
+    let of = |newest| with_objects(stored(newest));
+    each_shows([
+        ("young objects", of(90), info(), objects(90, 190)),
+        ("old objects", of(0), info(), None),
+        ("objects of the future", of(500), info(), objects(500, 600)),
+        ("young objects with our mark", marked, info(), None),
+        ("young objects of a run that has ended", ended, info(), None),
+        ("objects from before a resume", of(79), resumed(80), None),
+        ("objects from after a resume", of(80), resumed(80), objects(80, 180)),
+    ]);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Which images run: the patterns, what a registry tells, and what participants read of it.
+//! Which images run: the patterns, what a registry reports, and what participants read of it.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -187,7 +187,7 @@ fn what_never_ran_has_no_log() {
 }
 
 #[test]
-fn a_log_is_wished_for_until_evalai_knows_the_end_and_not_after() {
+fn a_log_is_requested_until_evalai_knows_the_end_and_not_after() {
     let mut world = World::evalai().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();

@@ -22,7 +22,7 @@ pub fn check(view: &View, plan: &Plan) {
     }
     terminal_states_stay(view, plan);
     one_job(view, plan);
-    tells_fit(view, plan);
+    updates_fit(view, plan);
     logs_come_first(plan);
     only_what_every_system_has_is_deleted(view, plan);
     a_reporting_node_has_its_grace(view, plan);
@@ -160,25 +160,25 @@ fn a_reporting_node_has_its_grace(view: &View, plan: &Plan) {
     }
 }
 
-fn tells_fit(view: &View, plan: &Plan) {
+fn updates_fit(view: &View, plan: &Plan) {
     let before = view.submission.status.as_ref();
     let is_new_attempt = before.is_some_and(|s| s.attempt.is_some() && s.attempt != plan.status.attempt);
     for action in &plan.actions {
-        let Action::UpdateEvalai(tell) = action else { continue };
+        let Action::UpdateEvalai(update) = action else { continue };
         assert!(
             view.submission.spec.evalai.is_some(),
-            "tells EvalAI of a local submission"
+            "updates EvalAI for a local submission"
         );
         assert!(!is_new_attempt, "what was seen is the old attempt's");
         let state = plan.status.state;
-        let fits = match tell {
+        let fits = match update {
             EvalaiUpdate::Queued => state == Some(State::Pending),
             EvalaiUpdate::Running | EvalaiUpdate::Partial => matches!(state, Some(State::Running | State::Resumed)),
             EvalaiUpdate::Finished => state == Some(State::Finished),
             EvalaiUpdate::Failed => state == Some(State::Failed),
             EvalaiUpdate::Cancelled => state == Some(State::Cancelled),
         };
-        assert!(fits, "{tell:?} in {state:?}");
+        assert!(fits, "{update:?} in {state:?}");
     }
 }
 
@@ -291,7 +291,7 @@ fn a_wait_hears_evalai(view: &View, plan: &Plan) {
     }
 }
 
-/// A status that is decided again in the same world changes no more, and tells no more events.
+/// A status that is decided again in the same world changes no more, and publishes no more events.
 fn comes_to_rest(view: &View, plan: &Plan) {
     let mut view = view.clone();
     let mut last = plan.clone();

@@ -8,10 +8,10 @@ use crate::pod::run::Stop;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::{names, reasons};
 
-type Wish = fn(&mut World);
+type Request = fn(&mut World);
 
 /// Who requests the end, and which reason it gets.
-const WISHES: [(Wish, &str); 3] = [
+const REQUESTS: [(Request, &str); 3] = [
     (|world| world.submission().spec.cancel = true, reasons::CANCELLED),
     (World::delete, reasons::DELETED),
     (|world| world.in_evalai().cancelled = true, reasons::ENDED_IN_EVALAI),
@@ -19,9 +19,9 @@ const WISHES: [(Wish, &str); 3] = [
 
 #[test]
 fn before_its_job_it_ends_at_once() {
-    for (wish, reason) in WISHES {
+    for (request, reason) in REQUESTS {
         let mut world = World::evalai();
-        wish(&mut world);
+        request(&mut world);
         let plan = world.pass_to(Cancelled, reason);
         assert!(!creates(&plan));
     }
@@ -29,10 +29,10 @@ fn before_its_job_it_ends_at_once() {
 
 #[test]
 fn before_its_pod_or_agents_the_job_is_deleted_at_once() {
-    for (wish, reason) in WISHES {
+    for (request, reason) in REQUESTS {
         for stage in [World::with_job, World::with_pod] {
             let mut world = stage(World::evalai());
-            wish(&mut world);
+            request(&mut world);
             let plan = world.pass_to(Pending, reasons::STOPPING);
             assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 60, .. })));
             world.job().deleting = true;
@@ -45,11 +45,11 @@ fn before_its_pod_or_agents_the_job_is_deleted_at_once() {
 
 #[test]
 fn a_running_one_is_told_and_keeps_what_it_has() {
-    for (wish, reason) in WISHES {
+    for (request, reason) in REQUESTS {
         let mut world = World::evalai().running();
         world.report(report(2));
         world.pass();
-        wish(&mut world);
+        request(&mut world);
         let plan = world.pass_to(Running, reasons::STOPPING);
         assert_eq!(
             plan.actions,
@@ -78,12 +78,12 @@ fn a_running_one_is_told_and_keeps_what_it_has() {
 
 #[test]
 fn between_two_tries_it_ends_at_once() {
-    for (wish, reason) in WISHES {
+    for (request, reason) in REQUESTS {
         let mut world = World::evalai().running();
         world.complete();
         world.pass_to(Pending, reasons::REPLACING);
         world.job_gone();
-        wish(&mut world);
+        request(&mut world);
         let plan = world.pass_to(Cancelled, reason);
         let message = plan.status.message.as_ref().unwrap();
         assert_eq!(message.contains("EvalAI"), reason == reasons::ENDED_IN_EVALAI);
@@ -175,11 +175,11 @@ const STAGES: [Stage; 9] = [
 
 #[test]
 fn a_cancel_is_obeyed_at_each_stage() {
-    for (wish, _) in WISHES {
+    for (request, _) in REQUESTS {
         for (what, stage, wanted) in &STAGES {
             let mut world = stage();
             world.pass();
-            wish(&mut world);
+            request(&mut world);
             let plan = world.pass();
             let done = match plan.status.state {
                 Some(Cancelled) => Done::Ended,

@@ -220,7 +220,7 @@ fn an_end_waits_for_its_own_read() {
 }
 
 #[test]
-fn an_end_replaces_what_was_wished_before() {
+fn an_end_replaces_what_was_requested_before() {
     let mut bench = Bench::new();
     bench.update(7, 1, DesiredUpdate::Queued);
     bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
@@ -234,7 +234,7 @@ fn an_end_replaces_what_was_wished_before() {
 }
 
 #[test]
-fn a_later_attempt_makes_the_wishes_of_the_earlier_one_void() {
+fn a_later_attempt_makes_the_requests_of_the_earlier_one_void() {
     let mut bench = Bench::new();
     bench.running(7);
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
