@@ -207,7 +207,7 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         Command::Submit(wanted) => commands::submit(cluster, &wanted).await,
         Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await,
         Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
-        Command::Requeue(wanted) => changes::requeue(cluster, &wanted).await,
+        Command::Requeue(wanted) => Box::pin(changes::requeue(cluster, &wanted)).await,
         Command::Rerun(wanted) => changes::rerun(cluster, &wanted).await,
         Command::Check(wanted) => Box::pin(checking::check(cluster, &wanted)).await,
         Command::Cancel(target) => changes::change(cluster, Request::Cancel, &target).await,

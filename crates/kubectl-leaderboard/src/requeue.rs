@@ -39,7 +39,7 @@ pub struct Requeue {
     /// Only those that ended since then: 2h, 3d, or 2026-11-22T18:00Z. Runs are not left out.
     #[arg(long, value_name = "TIME", value_parser = since)]
     since: Option<Since>,
-    /// Only those that ran with this image of the simulator.
+    /// Only those that ran with this image of the simulator: the whole name, or its end behind a slash, such as simulator:0.9.15-3.
     #[arg(long, value_name = "IMAGE")]
     simulator: Option<String>,
     /// Only those whose last Pod was on this node.
@@ -138,7 +138,7 @@ impl Requeue {
         });
         let ended = status.and_then(|status| status.times.finished.as_ref());
         let is_recent = |since: &Since| which == Which::Running || ended.is_some_and(|at| at.0 >= since.at(now));
-        let is_of = |image: &String| plan.is_some_and(|plan| plan.simulator_image == *image);
+        let is_of = |image: &String| plan.is_some_and(|plan| is_image(&plan.simulator_image, image));
         let is_on = |node: &String| status.and_then(|status| status.node_name.as_ref()) == Some(node);
         (states.is_empty() || states.contains(&which))
             && class.is_none_or(|class| failure.is_some_and(|failure| failure.class == class))
@@ -167,6 +167,10 @@ fn which(one: &Submission) -> Option<Which> {
     }
 }
 
+fn is_image(image: &str, wanted: &str) -> bool {
+    image == wanted || image.ends_with(&format!("/{wanted}"))
+}
+
 /// What is requeued, with what each has cost.
 pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let rows: Vec<Vec<String>> = chosen.iter().map(|one| row(one, frame.now)).collect();
@@ -176,7 +180,7 @@ pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
         "STATE",
         "REASON",
         "CHARGED",
-        "ENDED",
+        "SINCE",
         "NODE",
         "SIMULATOR",
     ];
@@ -187,22 +191,19 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let status = one.status.as_ref();
     let failure = status.and_then(|status| status.failure.as_ref());
     let charged = failure.map_or("", |failure| if failure.charged { "yes" } else { "no" });
-    let ended = status.and_then(|status| status.times.finished.as_ref());
-    let ended = ended.map(|at| format!("{} ago", span(now.duration_since(at.0).as_secs())));
-    let text = |text: Option<&String>| text.cloned().unwrap_or_default();
+    let plan = status.and_then(|status| status.plan.as_ref());
+    // The registry is the same for all, and the tag tells them apart.
+    let simulator = plan.and_then(|plan| plan.simulator_image.rsplit('/').next());
+    let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
     vec![
         one.name_any(),
         facts::team(one).unwrap_or_default(),
         status.and_then(facts::state).map_or("", State::as_str).to_owned(),
         text(status.and_then(|status| status.reason.as_ref())),
         charged.to_owned(),
-        ended.unwrap_or_default(),
+        since.unwrap_or_default(),
         text(status.and_then(|status| status.node_name.as_ref())),
-        text(
-            status
-                .and_then(|status| status.plan.as_ref())
-                .map(|plan| &plan.simulator_image),
-        ),
+        simulator.unwrap_or_default().to_owned(),
     ]
 }
 

@@ -40,9 +40,9 @@ fn all() -> Vec<Submission> {
     requested.spec.requeue = serde_json::from_value(json!({"number": 1})).unwrap();
     let yesterday = json!({"times": {"finished": "2026-10-31T11:57:00Z"}});
     vec![
-        named("crashed", &of(crashed(), "sim:bad", "gpu-1")),
+        named("crashed", &of(crashed(), "registry/sim:bad", "gpu-1")),
         named("lost", &of(node_lost(), "sim:good", "gpu-2")),
-        named("old", &with(of(crashed(), "sim:bad", "gpu-2"), &yesterday)),
+        named("old", &with(of(crashed(), "registry/sim:bad", "gpu-2"), &yesterday)),
         named("runs", &of(running(), "sim:good", "gpu-1")),
         named("stopped", &cancelled()),
         named(
@@ -71,7 +71,9 @@ fn what_is_chosen_is_what_the_flags_say() {
         ("--all --since 1h", &["crashed", "lost"]),
         ("--all --since 2d", &["crashed", "lost", "old"]),
         ("--all --since 2026-11-01T11:00Z", &["crashed", "lost"]),
+        ("--all --simulator registry/sim:bad", &["crashed", "old"]),
         ("--all --simulator sim:bad", &["crashed", "old"]),
+        ("--all --simulator im:bad", &[]),
         ("--all --simulator sim:bad --since 3h", &["crashed"]),
         ("--all --state running", &["runs"]),
         ("--all --state running,failed --node gpu-1 --since 1m", &["runs"]),

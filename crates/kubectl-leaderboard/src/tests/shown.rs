@@ -22,7 +22,7 @@ use leaderboard_api::Submission;
 /// Columns of the terminals.
 const WIDTHS: [usize; 2] = [80, 120];
 /// Lines that are longer: they are copied.
-const COPIED: [&str; 5] = ["s3://", "aws s3", "https://", "kubectl leaderboard", "NAMESPACE"];
+const COPIED: [&str; 5] = ["s3://", "aws s3", "https://", "kubectl leaderboard", "CANCELLED"];
 
 /// Compares what one command prints with its file.
 fn assert_shown(name: &str, lines: impl Fn(Frame) -> Vec<String>) {
