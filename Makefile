@@ -12,7 +12,7 @@ BENCH_LINES ?= target/bench/lines.jsonl
 BENCH_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale measure-intake cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test
+.PHONY: help demo test test-core measure-scale measure-intake measure-failover cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -30,13 +30,19 @@ measure-scale: ## Measure 200 submissions and 1,000 cancels against the stand-in
 	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
 	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
 	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
-		two_hundred_submissions a_thousand_cancels
+		two_hundred_submissions a_thousand_cancels a_thousand_that_end_at_once
 
 measure-intake: ## Measure the intake of 10,000 messages while controller and bridge are killed 50 times (10 min; no root, no node)
 	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
 	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
 	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
 		ten_thousand_messages
+
+measure-failover: ## Measure how long the other replica takes to go on, ten ends of each kind (10 min; no root, no node)
+	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
+	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
+	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
+		the_leader_ends_ten_times
 
 cluster: ## Start the one-node cluster and the AWS stand-in; prints the KUBECONFIG line to copy
 	$(LAB) up

@@ -21,6 +21,7 @@ mod api {
     mod endpoints;
     mod evalai;
     mod examples;
+    mod failover;
     mod failures;
     mod images;
     mod import;
@@ -37,6 +38,7 @@ mod api {
     mod pod;
     mod pod_security;
     mod queue;
+    mod restore;
     mod retention;
     mod rights;
     mod rule_cases;

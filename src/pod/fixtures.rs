@@ -39,6 +39,7 @@ pub(crate) fn run() -> Run {
             simulator_image: "simulator".to_owned(),
             resume: false,
             earlier_attempts: 0,
+            submission_uid: None,
         },
         verify: Verify::Off,
         period_seconds: 1,

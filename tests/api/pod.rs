@@ -266,6 +266,7 @@ fn run(bucket: &str) -> Run {
             simulator_image: "simulator".to_owned(),
             resume: false,
             earlier_attempts: 0,
+            submission_uid: None,
         },
         verify: Verify::Off,
         period_seconds: 1,

@@ -31,6 +31,8 @@ use player::{Player, Props, ROUTES};
 const BOARD: &str = "carla";
 /// How often it is looked whether the controller goes on.
 const LOOK: Duration = Duration::from_secs(5);
+/// By how many seconds an end may be published after a younger one: its result may still have been read meanwhile.
+const LATE: f64 = 15.0;
 
 /// How much of everything.
 struct Size {
@@ -72,6 +74,15 @@ const FULL: Size = Size {
     limit: Duration::from_mins(20),
 };
 
+/// A deadline's evening, with a budget that lets the test end.
+const THOUSAND: Size = Size {
+    finals: 1000,
+    cancels: 0,
+    requests_per_minute: 3000,
+    put: Duration::from_millis(50),
+    ..FULL
+};
+
 #[tokio::test(flavor = "multi_thread")]
 async fn many_submissions_stay_inside_the_budget_and_all_are_published() {
     measure(&SMALL).await;
@@ -81,6 +92,12 @@ async fn many_submissions_stay_inside_the_budget_and_all_are_published() {
 #[ignore = "it measures for a quarter of an hour: make measure-scale"]
 async fn two_hundred_submissions_at_the_size_of_a_large_challenge() {
     measure(&FULL).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "it measures for a quarter of an hour: make measure-scale"]
+async fn a_thousand_that_end_at_once_are_published_the_oldest_first() {
+    measure(&THOUSAND).await;
 }
 
 async fn measure(size: &Size) {
@@ -180,6 +197,8 @@ struct Seen {
     states: BTreeMap<String, State>,
     terminal: BTreeMap<String, Timestamp>,
     published: BTreeSet<String>,
+    /// When each ended, as its status says.
+    finished: BTreeMap<String, Timestamp>,
     /// Nothing more is to be said of them to EvalAI.
     settled: BTreeSet<String>,
 }
@@ -192,6 +211,8 @@ impl Seen {
     fn take(&mut self, submission: &Submission) {
         let Some(status) = &submission.status else { return };
         let name = submission.name_any();
+        let finished = status.times.finished.as_ref();
+        self.finished.extend(finished.map(|time| (name.clone(), time.0)));
         self.states.extend(status.state.map(|state| (name.clone(), state)));
         if conditions::is_true(&status.conditions, conditions::FINISHED) {
             self.terminal.entry(name.clone()).or_insert_with(Timestamp::now);
@@ -369,6 +390,17 @@ impl World {
             .iter()
             .filter_map(|name| Some(between(ended[name], puts.get(&of(name))?.time)));
         say("the Job's end to the PUT of the result", put.collect());
+        let mut order: Vec<_> = puts.iter().map(|(pk, entry)| (entry.time, *pk)).collect();
+        order.sort();
+        let mut newest = Timestamp::UNIX_EPOCH;
+        for (_, pk) in order {
+            let at = self.submissions.finished[&name(pk)];
+            assert!(
+                between(at, newest) <= LATE,
+                "{pk} ended at {at}, after one of {newest} was published"
+            );
+            newest = newest.max(at);
+        }
     }
 
     fn check(&self, size: &Size, rest: &BTreeSet<String>, cancelled: &[u64], undone: &[u64]) {

@@ -235,6 +235,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
             simulator_image: "simulator".to_owned(),
             resume: false,
             earlier_attempts: 0,
+            submission_uid: None,
         },
         verify: Verify::Refuse,
         // The smallest pause between two rounds is what is left.

@@ -44,6 +44,12 @@ const COUNTED: u32 = 32;
 pub struct Request {
     user: User,
     pub verb: String,
+    /// When it came in.
+    #[serde(rename = "requestReceivedTimestamp")]
+    pub received: jiff::Timestamp,
+    /// When it was answered.
+    #[serde(rename = "stageTimestamp")]
+    pub answered: jiff::Timestamp,
     object_ref: Option<ObjectRef>,
 }
 

@@ -110,6 +110,7 @@ pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String,
         simulator_image: spec.simulator.image.clone(),
         resume,
         earlier_attempts: 0,
+        submission_uid: None,
     }
 }
 

@@ -51,6 +51,11 @@ impl SubmissionStatus {
     /// The status of a submission that ended before it was imported. Every system has its end, so nothing is written anywhere.
     pub fn of_imported(spec: &SubmissionSpec, end: ImportedEnd, generation: i64, now: &Time) -> Self {
         let what = format!("Imported from the table {}, where it has ended.", end.table);
+        Self::of_ended(spec, end, what, generation, now)
+    }
+
+    /// The status of a submission whose end every system has, for a cause that `what` says.
+    pub fn of_ended(spec: &SubmissionSpec, end: ImportedEnd, what: String, generation: i64, now: &Time) -> Self {
         let (reason, failure) = match end.state {
             ImportedState::Finished => (reasons::FINISHED, None),
             ImportedState::Failed => (reasons::IMPORTED_FAILURE, Some(failure(&what))),

@@ -232,6 +232,10 @@ pub struct RunPlan {
     /// Attempts of an earlier Submission of this run, which is gone: the table's row counts on from them.
     #[serde(default, skip_serializing_if = "is_none")]
     pub earlier_attempts: i64,
+    /// UID of the object whose Pods store the results. After a restore from a backup the object has another one.
+    #[schemars(length(max = 128))]
+    #[serde(default, rename = "submissionUID", skip_serializing_if = "Option::is_none")]
+    pub submission_uid: Option<String>,
 }
 
 /// The participant's image as it is run by every Job of the submission, wherever its tag moves.

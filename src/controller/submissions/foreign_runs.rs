@@ -1,5 +1,5 @@
-//! What another program has left of a submission in table and bucket. It is looked for once for each attempt,
-//! before its first Job, and again while the submission waits for the other program.
+//! What another program has left of a submission in table and bucket, or this operator before the object lost its status. It is looked
+//! for once for each attempt, before its first Job, and again while the submission waits for the other program.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,8 +9,9 @@ use jiff::Timestamp;
 
 use super::questions::{self, Observed, Questions};
 use crate::controller::objects::Wake;
+use crate::controller::submissions::report_digest::StoredReport;
 use crate::observability::tasks::Tasks;
-use crate::pod::report::{OWNER_KEY, REPORT_KEY};
+use crate::pod::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY};
 use crate::services::archive::{Archive, ArchiveError, Cause, Listed};
 use crate::services::aws::Aws;
 use crate::services::table::{ObservedRow, Table, TableError, TableId};
@@ -42,11 +43,13 @@ pub struct Question {
 }
 
 /// What was found of a submission.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Traces {
     /// Its row; none without a table, too.
     pub row: Option<ObservedRow>,
     pub stored: StoredRun,
+    /// The last report of a run of ours.
+    pub report: Option<Box<StoredReport>>,
 }
 
 /// What lies below the prefix of a run.
@@ -132,10 +135,30 @@ impl Places {
 
     async fn traces(&self, question: &Question) -> Result<Traces, Unread> {
         let (row, stored) = tokio::join!(self.row(question), self.stored(question));
+        let stored = stored?;
+        let report = if stored.is_ours {
+            self.report(question).await?
+        } else {
+            None
+        };
         Ok(Traces {
             row: row?,
-            stored: stored?,
+            stored,
+            report,
         })
+    }
+
+    /// A report that is none of ours says nothing: the run goes on from the other objects.
+    async fn report(&self, question: &Question) -> Result<Option<Box<StoredReport>>, Unread> {
+        let archive = Archive::of_run(&self.aws, &question.storage, &question.run_id);
+        let object = archive
+            .get(REPORT_KEY, MAX_BYTES as u64)
+            .await
+            .map_err(|error| Unread {
+                is_refused: !error.cause.is_transient(),
+                why: error.to_string(),
+            })?;
+        Ok(object.and_then(|object| StoredReport::read(&object.bytes).ok().map(Box::new)))
     }
 
     async fn row(&self, question: &Question) -> Result<Option<ObservedRow>, Unread> {

@@ -87,6 +87,10 @@ reasons! {
         ACCEPTED = "Accepted",
             "Leaderboard, track and image are known, and the plan is pinned (condition `Accepted`).",
             "Nothing.";
+        RESTORED = "Restored",
+            "As `Accepted`, but the object had no status although it was run before, as after a restore from a backup: what is stored \
+             in the bucket is taken up (condition `Accepted`; the message says where).",
+            "Nothing.";
         IMAGE_NOT_PINNED = "ImageNotPinned",
             "As `Accepted`, but the image's registry could not be asked (condition `Accepted`; the message says why). Size, platform \
              and volumes of the image were not checked, and its Pods pull it by its tag.",
@@ -243,7 +247,8 @@ reasons! {
              days): Kubernetes removed it before its end was read. There is no further Job.",
             "Look at the stored results and logs, then resume the submission.";
         IMPORTED_FAILURE = "ImportedFailure",
-            "The Submission was made by `leaderboard-operator import --from-table` from a row that has failed. The row does not hold why.",
+            "The Submission had failed before it was imported (`leaderboard-operator import --from-table`) or restored from a backup \
+             without its status. Neither the row nor the bucket holds why.",
             "Look at the results and logs that are stored for it. To run it again, resume it in EvalAI, or raise `spec.attempt`.";
         JOB_FAILED = "JobFailed",
             "Kubernetes ended the Job for a reason that no container explains.",

@@ -185,6 +185,7 @@ impl ArchiveWorkers {
             name: submission.name_any(),
             storage: plan.storage.clone(),
             run_id: plan.run_id.clone(),
+            submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
         };
         let id = bucket_id(&plan.storage);
         let mut buckets = self.0.buckets();

@@ -31,6 +31,8 @@ pub struct Target {
     pub name: String,
     pub storage: Storage,
     pub run_id: RunId,
+    /// UID that its reports name.
+    pub submission_uid: String,
 }
 
 /// Something to do now.

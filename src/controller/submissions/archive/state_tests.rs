@@ -54,6 +54,7 @@ impl Bench {
                 name: "sub".into(),
                 storage,
                 run_id: "7".parse().unwrap(),
+                submission_uid: "u".into(),
             }),
         }
     }

@@ -28,9 +28,9 @@ const METADATA_KEY: &str = "evalai/metadata.json";
 pub(super) async fn carry_out(client: &Client, archive: &Archive, budget: &TextBudget, work: &Work) -> Done {
     let target = &work.target;
     match &work.what {
-        What::Report { etag, .. } => Done::Report(report(archive, target, &work.uid, etag.as_deref()).await.0),
+        What::Report { etag, .. } => Done::Report(report(archive, target, etag.as_deref()).await.0),
         What::Texts { sent } => {
-            let (answer, found) = report(archive, target, &work.uid, None).await;
+            let (answer, found) = report(archive, target, None).await;
             let texts = match (&answer, found) {
                 (Answer::Found { report: digest, .. }, Some(report)) => {
                     let is_end = !sent.as_ref().is_some_and(Sent::is_live);
@@ -72,7 +72,7 @@ fn no_answer(target: &Target) -> String {
     format!("the bucket {} did not answer in time", target.storage.bucket)
 }
 
-async fn report(archive: &Archive, target: &Target, uid: &str, etag: Option<&str>) -> (Answer, Option<Report>) {
+async fn report(archive: &Archive, target: &Target, etag: Option<&str>) -> (Answer, Option<Report>) {
     let read = archive.get_if_none_match(REPORT_KEY, etag, MAX_BYTES as u64);
     let object = match within(LIMIT, target, read).await {
         Ok(Fetched::NotModified) => return (Answer::NotModified, None),
@@ -80,7 +80,7 @@ async fn report(archive: &Archive, target: &Target, uid: &str, etag: Option<&str
         Ok(Fetched::Found(object)) => object,
         Err(why) => return (Answer::Failed(why), None),
     };
-    match ReportDigest::read(&object.bytes, uid) {
+    match ReportDigest::read(&object.bytes, &target.submission_uid) {
         Ok(Some((digest, report))) => {
             let found = Answer::Found {
                 etag: object.etag,

@@ -8,7 +8,7 @@ use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
-use super::{end, foreign, image, isolation};
+use super::{end, foreign, image, isolation, restored};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::check::first_route;
 use leaderboard_api::conditions::{self, Truth};
@@ -54,6 +54,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if foreign::waits(draft, leaderboard, track, info.as_ref()) {
         return false;
     }
+    if restored::ends(draft, leaderboard, track, info.as_ref()) {
+        return false;
+    }
     let (image, fault) = match named_image(draft, info.as_ref()) {
         Image::Named(image) => {
             let fault = image::not_allowed(draft, leaderboard, &image);
@@ -83,13 +86,29 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         }
     };
     pin(draft, leaderboard, track, image, info.as_ref());
-    let reason = if note.is_some() {
-        reasons::IMAGE_NOT_PINNED
-    } else {
-        reasons::ACCEPTED
+    let known = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let known = known
+        .filter(|c| c.reason == reasons::RESTORED)
+        .map(|c| c.message.clone());
+    let (reason, note) = match (note, known.or_else(|| restored::note(draft))) {
+        (Some(note), _) => (reasons::IMAGE_NOT_PINNED, note),
+        (None, Some(note)) => (reasons::RESTORED, note),
+        (None, None) => (reasons::ACCEPTED, String::new()),
     };
-    draft.condition(conditions::ACCEPTED, Truth::True, reason, &note.unwrap_or_default());
+    draft.condition(conditions::ACCEPTED, Truth::True, reason, &note);
     true
+}
+
+/// Whether EvalAI's own end is ours, of an object that has lost its status, or that is still being found out.
+pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
+    let evalai = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
+    let Some((leaderboard, info)) = draft.leaderboard().zip(evalai) else {
+        return false;
+    };
+    let track = find_track(draft, leaderboard).filter(|_| restored::may_have_ended(draft, info));
+    let Some(track) = track else { return false };
+    take_team(draft, Some(info));
+    foreign::look(draft, leaderboard, Some(info)).is_none() || restored::ends(draft, leaderboard, track, Some(info))
 }
 
 /// Ends a submission whose image can never run. The plan makes it a row of the table, as any other failure.
@@ -332,7 +351,7 @@ fn take_team(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) {
     }
 }
 
-fn pin(
+pub(super) fn pin(
     draft: &mut PlanBuilder<'_>,
     leaderboard: &LeaderboardSpec,
     track: &Track,
@@ -352,11 +371,13 @@ fn pin(
         },
         Some(pinned) => pinned,
         None => {
-            let resume = resumed || draft.spec().attempt > 1 || foreign::is_adopted(draft);
+            let resume =
+                resumed || draft.spec().attempt > 1 || foreign::is_adopted(draft) || restored::takes_up(draft, info);
             let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
             let plan = if draft.spec().check { first_route(plan) } else { plan };
             leaderboard_api::RunPlan {
-                earlier_attempts: earlier_attempts(draft, info),
+                earlier_attempts: earlier_attempts(draft, info).max(restored::attempts_ahead(draft)),
+                submission_uid: draft.submission().metadata.uid.clone(),
                 ..plan
             }
         }

@@ -94,7 +94,7 @@ pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
     true
 }
 
-fn is_complete(report: &ReportDigest) -> bool {
+pub(super) fn is_complete(report: &ReportDigest) -> bool {
     report.is_final && report.done == report.total && report.total > 0
 }
 
@@ -190,7 +190,8 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const FINAL: [&str; 5] = [
+    const FINAL: [&str; 6] = [
+        reasons::IMPORTED_FAILURE,
         reasons::GRAPHICS_DRIVER_MISSING,
         reasons::PREFIX_IN_USE,
         reasons::JOB_DELETED,

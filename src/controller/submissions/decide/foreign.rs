@@ -7,8 +7,9 @@ use jiff::Timestamp;
 
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
+use super::restored;
 use crate::controller::submissions::foreign_runs::{
-    AGAIN, ObservedTraces, Question, StoredRun, Traces, Unread, question,
+    AGAIN, Looked, ObservedTraces, Question, StoredRun, Traces, Unread, question,
 };
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use crate::services::table::ObservedRow;
@@ -32,7 +33,7 @@ pub(super) fn is_adopted(draft: &PlanBuilder<'_>) -> bool {
 }
 
 /// Whether the submission has to wait, because another program runs it or that is not known yet. Only EvalAI hands a submission
-/// to more than one program.
+/// to more than one program; others, and those that a person hands over, are looked for if they may have lost their status.
 pub(super) fn waits(
     draft: &mut PlanBuilder<'_>,
     leaderboard: &LeaderboardSpec,
@@ -43,32 +44,35 @@ pub(super) fn waits(
     let is_accepted = accepted.is_some_and(|c| c.status == "True");
     let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
     // One that observes stores below a prefix of its own, and runs what another program runs on purpose.
-    let is_settled = is_accepted || has_run || is_adopted(draft) || draft.observes();
-    let Some(info) = info.filter(|_| !is_settled) else {
+    let is_settled = is_accepted || has_run || draft.observes();
+    let is_asked = if is_adopted(draft) || info.is_none() {
+        restored::may_be(draft) && restored::is_marked(draft)
+    } else {
+        true
+    };
+    if is_settled || !is_asked {
         return false;
+    }
+    let Some(answer) = look(draft, leaderboard, info) else {
+        return true;
     };
-    let attempt = draft.status.attempt.unwrap_or(1);
-    let question = question(draft.submission(), leaderboard, attempt, info.team_id.clone());
-    let prefix = question.prefix();
-    let view = draft.view;
-    let answer = match &view.traces {
-        ObservedTraces::Answered(answer) => answer.as_ref(),
-        ObservedTraces::NotAsked => return looks(draft, question, Duration::ZERO),
-        ObservedTraces::Asked(waited) => return looks(draft, question, *waited),
-    };
-    let window = match effective::deadlines(leaderboard, Some(track)).run_seconds {
-        0 => DAY_SECONDS,
-        seconds => seconds,
-    };
-    let why = match &answer.found {
-        Ok(traces) => {
+    let question = ask(draft, leaderboard, info);
+    let why = match (&answer.found, info) {
+        // A person's word stands above what was found of another program.
+        _ if is_adopted(draft) => return false,
+        (Err(unread), _) => not_known(draft, unread),
+        (Ok(_), None) => return false,
+        (Ok(traces), Some(info)) => {
+            let window = match effective::deadlines(leaderboard, Some(track)).run_seconds {
+                0 => DAY_SECONDS,
+                seconds => seconds,
+            };
             let Some(found) = found(traces, info, window, draft.now()) else {
                 return is_unsettled(draft, answer.at);
             };
             draft.moves();
-            found.message(&prefix)
+            found.message(&question.prefix())
         }
-        Err(unread) => not_known(draft, unread),
     };
     draft.act(Action::LookForForeignRun(Box::new(question)));
     draft.requeue_in(AGAIN + Duration::from_secs(1));
@@ -97,12 +101,36 @@ fn is_unsettled(draft: &mut PlanBuilder<'_>, looked_at: Timestamp) -> bool {
     true
 }
 
-fn looks(draft: &mut PlanBuilder<'_>, question: Question, waited: Duration) -> bool {
+/// What was found in table and bucket; none yet: the submission waits.
+pub(super) fn look<'a>(
+    draft: &mut PlanBuilder<'a>,
+    leaderboard: &LeaderboardSpec,
+    info: Option<&EvalaiInfo>,
+) -> Option<&'a Looked> {
+    let view = draft.view;
+    let waited = match &view.traces {
+        ObservedTraces::Answered(answer) => return Some(answer),
+        ObservedTraces::NotAsked => Duration::ZERO,
+        ObservedTraces::Asked(waited) => *waited,
+    };
+    let question = ask(draft, leaderboard, info);
+    looks(draft, question, waited);
+    None
+}
+
+fn ask(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, info: Option<&EvalaiInfo>) -> Question {
+    let attempt = draft.status.attempt.unwrap_or(1);
+    let team = draft.status.team.as_ref().and_then(|team| team.id.clone());
+    let team = info.map_or(team, |info| Some(info.team_id.clone()));
+    question(draft.submission(), leaderboard, attempt, team.unwrap_or_default())
+}
+
+fn looks(draft: &mut PlanBuilder<'_>, question: Question, waited: Duration) {
     draft.act(Action::LookForForeignRun(Box::new(question)));
     if let Some(left) = SILENCE.checked_sub(waited).filter(|left| !left.is_zero()) {
         draft.keeps_status();
         draft.requeue_in(left);
-        return true;
+        return;
     }
     draft.requeue_in(AGAIN);
     draft.condition(
@@ -113,7 +141,6 @@ fn looks(draft: &mut PlanBuilder<'_>, question: Question, waited: Duration) -> b
     );
     let message = "Table and bucket are asked whether another program runs the submission.";
     draft.show(reasons::LOOKING_FOR_FOREIGN_RUN, message);
-    true
 }
 
 /// While that cannot be known nothing starts: a second run would write over the first one's results.

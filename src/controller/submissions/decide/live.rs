@@ -59,7 +59,7 @@ fn is_progress(action: &Action) -> bool {
     )
 }
 
-fn own_job_name(draft: &PlanBuilder<'_>) -> String {
+pub(super) fn own_job_name(draft: &PlanBuilder<'_>) -> String {
     let name = draft.submission().metadata.name.as_deref().unwrap_or_default();
     job_name(name, &draft.status)
 }
@@ -77,6 +77,9 @@ fn name_taken(draft: &mut PlanBuilder<'_>) {
 fn in_line(draft: &mut PlanBuilder<'_>) {
     if draft.is_cancelled() {
         let reason = end::cancel_reason(draft);
+        if reason == reasons::ENDED_IN_EVALAI && accept::had_ended(draft) {
+            return;
+        }
         let what = if reason == reasons::ENDED_IN_EVALAI {
             "EvalAI has ended it"
         } else {
@@ -283,7 +286,7 @@ fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     crashes::note(&mut draft.status, pod, now);
 }
 
-fn take_report(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+pub(super) fn take_report(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let clamp = |n: u32| i32::try_from(n).unwrap_or(i32::MAX);
     draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
     if let Some(score) = report.score {

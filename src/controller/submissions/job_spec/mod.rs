@@ -140,7 +140,12 @@ fn run_document(input: &JobInput<'_>) -> Run {
         schema: SCHEMA,
         namespace: meta.namespace.clone().unwrap_or_default(),
         submission: input.submission_name().to_owned(),
-        uid: meta.uid.clone().unwrap_or_default(),
+        uid: input
+            .plan
+            .submission_uid
+            .clone()
+            .or_else(|| meta.uid.clone())
+            .unwrap_or_default(),
         attempt: input.number.attempt,
         plan: input.plan.clone(),
         verify: spec.verify,

@@ -17,6 +17,7 @@ fn row(status: &str) -> ObservedRow {
     ObservedRow {
         status: status.into(),
         is_ours: false,
+        attempt: None,
         since: Some("2026-11-20 10:00:00 UTC".into()),
     }
 }
@@ -36,7 +37,10 @@ fn stored(newest: i64) -> StoredRun {
 }
 
 fn with_objects(stored: StoredRun) -> Traces {
-    Traces { row: None, stored }
+    Traces {
+        stored,
+        ..Traces::default()
+    }
 }
 
 /// A submission of EvalAI's of which this was found.
@@ -152,6 +156,8 @@ fn it_is_looked_once_before_the_first_job_and_an_answer_within_five_seconds_cost
 fn only_evalai_hands_a_submission_to_two_programs() {
     let mut world = World::local();
     world.view.traces = ObservedTraces::NotAsked;
+    // Our finalizer comes with the first Job: with it and without a status the object was restored, and is looked for.
+    world.submission().metadata.finalizers = None;
     assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
 }
 

@@ -22,6 +22,7 @@ mod observe;
 mod properties;
 mod reading;
 mod requeue;
+mod restored;
 mod resume;
 mod retention;
 mod rules;

@@ -1,0 +1,458 @@
+//! After a disaster: all Submissions and Leaderboards of a namespace come back as a backup's tool brings them, without a status and
+//! with other UIDs. A real API server, S3, DynamoDB and EvalAI know the rest.
+#![cfg(test)]
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::Pod;
+use k8s_openapi::api::networking::v1::NetworkPolicy;
+use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
+use kube::core::NamespaceResourceScope;
+use kube::{Api, Resource, ResourceExt};
+use leaderboard_api::{Leaderboard, PairState, State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
+use leaderboard_operator::services::archive::Archive;
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+
+use super::boards::make_table;
+use super::scale::player::{Player, Props, ROUTES};
+use super::world::{World, running};
+use crate::support::apiserver::server;
+
+/// Routes that what still runs has done.
+const DONE: u32 = 12;
+
+fn is_settled(status: &SubmissionStatus) -> bool {
+    let is_known = |type_: &str| {
+        let found = conditions::get(&status.conditions, type_);
+        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+    };
+    conditions::is_true(&status.conditions, conditions::FINISHED)
+        && is_known(conditions::PUBLISHED)
+        && is_known(conditions::RECORDED)
+}
+
+/// What was there before the disaster, by what became of it.
+struct Season {
+    world: World,
+    table: String,
+    finished: (u64, String),
+    failed: (u64, String),
+    cancelled: (u64, String),
+    /// It runs.
+    running: (u64, String),
+    /// It has ended, and nobody has read that.
+    unread: (u64, String),
+    /// It waits for its turn.
+    pending: (u64, String),
+}
+
+const LOCAL_FINISHED: &str = "local-finished";
+const LOCAL_RUNNING: &str = "local-running";
+
+impl Season {
+    async fn play() -> Self {
+        let world = World::new().await;
+        let table = world.aws.name("restored-rows");
+        make_table(&world.aws, &table).await;
+        let spec = json!({"routes": ROUTES, "table": {"name": table, "endpoint": world.aws.endpoint}});
+        world.leaderboard_with("lb", 1, "Hosts", &spec).await;
+        world
+            .leaderboard_with("held", 2, "Hosts", &json!({"paused": true}))
+            .await;
+        let local = json!({
+            "evalai": null, "routes": ROUTES, "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+        });
+        world.leaderboard_with("local", 1, "Hosts", &local).await;
+        let controller = world.controller();
+        let finished = world.submit("lb", 1).await;
+        local_submission(&world, LOCAL_FINISHED).await;
+        finish(&world, [finished.1.as_str(), LOCAL_FINISHED]).await;
+        let (failed, cancelled) = (world.submit("lb", 1).await, world.submit("lb", 1).await);
+        world.run_that_crashes(failed.0, &failed.1).await;
+        world.job(&cancelled.1, 0).await;
+        let cancel = Patch::Merge(json!({"spec": {"cancel": true}}));
+        let submissions = world.api::<Submission>();
+        submissions
+            .patch(&cancelled.1, &PatchParams::default(), &cancel)
+            .await
+            .unwrap();
+        for name in [&failed.1, &cancelled.1] {
+            world.until(name, "every system has its end", is_settled).await;
+        }
+        let (running, unread) = (world.submit("lb", 1).await, world.submit("lb", 1).await);
+        local_submission(&world, LOCAL_RUNNING).await;
+        for (run, name) in [
+            (running.0.to_string(), running.1.as_str()),
+            (unread.0.to_string(), unread.1.as_str()),
+            (LOCAL_RUNNING.to_owned(), LOCAL_RUNNING),
+        ] {
+            begin(&world, &run, name).await;
+        }
+        let pending = world.submit("held", 2).await;
+        let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::PAUSED);
+        world.until(&pending.1, "it is held", is_held).await;
+        drop(controller);
+        until_released(&world).await;
+        // Its Pod ends while nobody looks.
+        report(&world, &unread.0.to_string(), &unread.1, ROUTES).await;
+        Self {
+            world,
+            table,
+            finished,
+            failed,
+            cancelled,
+            running,
+            unread,
+            pending,
+        }
+    }
+
+    /// All that other systems know, as text.
+    async fn outside(&self, pk: u64) -> (String, Vec<String>) {
+        let rows = self.rows().await;
+        let row = rows.get(&pk.to_string()).cloned().unwrap_or_default();
+        (row, self.written(pk))
+    }
+
+    async fn rows(&self) -> BTreeMap<String, String> {
+        let client = self.world.aws.aws.dynamodb(None, Some(&self.world.aws.endpoint));
+        let items = client
+            .scan()
+            .table_name(&self.table)
+            .send()
+            .await
+            .unwrap()
+            .items
+            .unwrap();
+        let text =
+            |item: std::collections::HashMap<_, _>| format!("{:?}", item.into_iter().collect::<BTreeMap<_, _>>());
+        let id = |item: &std::collections::HashMap<String, aws_sdk_dynamodb::types::AttributeValue>| {
+            item["submission_id"].as_s().unwrap().clone()
+        };
+        items.into_iter().map(|item| (id(&item), text(item))).collect()
+    }
+
+    /// Requests that have changed a submission in EvalAI.
+    fn written(&self, pk: u64) -> Vec<String> {
+        let all = self
+            .world
+            .evalai
+            .requests()
+            .into_iter()
+            .filter(|entry| entry.method != "GET");
+        let texts = all.map(|entry| format!("{} {} {}", entry.method, entry.path, entry.body));
+        let of = [format!("\"submission\":\"{pk}\""), format!("\"submission\":{pk},")];
+        texts
+            .filter(|text| of.iter().any(|id| text.contains(id.as_str())))
+            .collect()
+    }
+
+    async fn status(&self, name: &str) -> SubmissionStatus {
+        let found = self.world.api::<Submission>().get(name).await.unwrap();
+        found.status.unwrap_or_default()
+    }
+
+    async fn jobs(&self) -> Vec<String> {
+        let all = self.world.api::<Job>().list(&ListParams::default()).await.unwrap();
+        all.items.iter().map(ResourceExt::name_any).collect()
+    }
+}
+
+async fn local_submission(world: &World, name: &str) {
+    let spec = json!({"leaderboardName": "local", "track": "sensors", "image": "r/agent:1", "team": {"id": "7"}});
+    let submission = Submission::new(name, serde_json::from_value(spec).unwrap());
+    world.api().create(&PostParams::default(), &submission).await.unwrap();
+}
+
+/// Plays both runs to a good end.
+async fn finish(world: &World, names: [&str; 2]) {
+    let labels = evalai_stand_in::Config::in_memory().unwrap().0.seed.challenges[0].phases[0].splits[0]
+        .schema
+        .labels
+        .clone();
+    let player = Player::start(Props {
+        client: world.client.clone(),
+        namespace: world.namespace.clone(),
+        s3: world.aws.aws.s3(None, Some(&world.aws.endpoint)),
+        bucket: world.bucket.clone(),
+        period: Duration::from_millis(500),
+        labels,
+    });
+    let runs = |status: &SubmissionStatus| status.progress.as_ref().is_some_and(|progress| progress.done > 0);
+    for name in names {
+        world.until(name, "a route is done", runs).await;
+    }
+    player.fall_the_curtain();
+    for name in names {
+        world.until(name, "every system has its end", is_settled).await;
+    }
+}
+
+/// Its Pod runs and has stored some routes.
+async fn begin(world: &World, run: &str, name: &str) {
+    let job = world.job(name, 0).await;
+    world.pod(&job, &running()).await;
+    report(world, run, name, DONE).await;
+    let is_read = |status: &SubmissionStatus| status.progress.as_ref().is_some_and(|p| p.done == 12);
+    world.until(name, "its report is read", is_read).await;
+}
+
+/// What logcopy stores of a run; the last report of one that is complete.
+async fn report(world: &World, run: &str, name: &str, done: u32) {
+    let uid = world.api::<Submission>().get(name).await.unwrap().uid().unwrap();
+    let pods = world.api::<Pod>();
+    let pod = pods
+        .get(&format!(
+            "{}-x",
+            names::job(name, leaderboard_api::JobNumber { attempt: 1, retry: 0 })
+        ))
+        .await;
+    let labels = evalai_stand_in::Config::in_memory().unwrap().0.seed.challenges[0].phases[0].splits[0]
+        .schema
+        .labels
+        .clone();
+    let score = f64::from(done) * 100.0 / f64::from(ROUTES);
+    let accuracies: BTreeMap<_, _> = labels.iter().map(|label| (label.clone(), score)).collect();
+    let is_final = done == ROUTES;
+    let report = Report {
+        schema: SCHEMA,
+        submission_uid: uid,
+        attempt: 1,
+        pod_uid: pod.unwrap().uid().unwrap(),
+        round: u64::from(done),
+        done,
+        total: ROUTES,
+        pairs: vec![ReportPair {
+            id: 1,
+            done,
+            total: ROUTES,
+            crashes: 0,
+            state: PairState::Running,
+        }],
+        score: Some(score),
+        route_completion: None,
+        infraction_penalty: None,
+        is_final,
+        eligible: is_final,
+        entry_status: if is_final { "Finished" } else { "Started" }.into(),
+        stopped: None,
+        why: None,
+        warnings: Vec::new(),
+        results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
+        partial_results: None,
+        files: BTreeMap::new(),
+    };
+    let s3 = world.aws.aws.s3(None, Some(&world.aws.endpoint));
+    let archive = Archive::new(s3, &world.bucket, format!("{run}/"));
+    archive
+        .put(REPORT_KEY, serde_json::to_vec(&report).unwrap())
+        .await
+        .unwrap();
+}
+
+async fn until_released(world: &World) {
+    use k8s_openapi::api::coordination::v1::Lease;
+    let is_free = |lease: Option<&Lease>| {
+        lease.is_some_and(|lease| lease.spec.as_ref().is_some_and(|spec| spec.holder_identity.is_none()))
+    };
+    let seen = kube::runtime::wait::await_condition(world.api::<Lease>(), "operator", is_free);
+    tokio::time::timeout(super::bridge::LIMIT, seen)
+        .await
+        .expect("the Lease is released")
+        .unwrap();
+}
+
+/// What a backup's tool keeps of the objects of a kind: no status, no UID, and Velero's label.
+async fn backup<K>(world: &World) -> Vec<Value>
+where
+    K: Resource<Scope = NamespaceResourceScope, DynamicType = ()> + Clone + std::fmt::Debug + DeserializeOwned,
+{
+    let kind = ApiResource::erase::<K>(&());
+    let api: Api<DynamicObject> = Api::namespaced_with(world.client.clone(), &world.namespace, &kind);
+    let all = api.list(&ListParams::default()).await.unwrap();
+    let kept = |object: DynamicObject| {
+        let mut labels = object.labels().clone();
+        labels.insert(names::LABEL_VELERO_RESTORE.into(), "restore-1".into());
+        json!({
+            "apiVersion": kind.api_version, "kind": kind.kind,
+            "metadata": {"name": object.name_any(), "labels": labels, "annotations": object.annotations(),
+                         "finalizers": object.finalizers()},
+            "spec": object.data["spec"],
+        })
+    };
+    all.items.into_iter().map(kept).collect()
+}
+
+async fn restore<K>(world: &World, objects: Vec<Value>)
+where
+    K: Resource<Scope = NamespaceResourceScope, DynamicType = ()>,
+{
+    let kind = ApiResource::erase::<K>(&());
+    let api: Api<DynamicObject> = Api::namespaced_with(world.client.clone(), &world.namespace, &kind);
+    for object in objects {
+        let object = serde_json::from_value(object).unwrap();
+        api.create(&PostParams::default(), &object).await.unwrap();
+    }
+}
+
+/// Runs a person's commands.
+async fn shell(world: &World, commands: &str) {
+    let kubectl = server().await.kubectl();
+    let folder = std::path::Path::new(kubectl.get_program()).parent().unwrap().to_owned();
+    let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    let mut bash = std::process::Command::new("bash");
+    bash.args(["-euo", "pipefail", "-c", commands])
+        .env("PATH", path)
+        .env("KUBECONFIG", server().await.kubeconfig())
+        .env("NS", &world.namespace);
+    let done = bash.output().unwrap();
+    assert!(
+        done.status.success(),
+        "{commands}: {}",
+        String::from_utf8_lossy(&done.stderr)
+    );
+}
+
+/// Removes all objects of a kind at once; no finalizer does its work.
+async fn lose<K>(world: &World)
+where
+    K: Resource<Scope = NamespaceResourceScope, DynamicType = ()> + Clone + std::fmt::Debug + DeserializeOwned,
+{
+    let api = world.api::<K>();
+    for object in api.list(&ListParams::default()).await.unwrap().items {
+        let name = object.meta().name.clone().unwrap();
+        let now = DeleteParams::default().grace_period(0);
+        api.delete(&name, &now).await.unwrap();
+        let bare = Patch::Merge(json!({"metadata": {"finalizers": null}}));
+        let freed = api.patch(&name, &PatchParams::default(), &bare).await;
+        assert!(
+            freed.is_ok()
+                || freed.is_err_and(|error| matches!(error, kube::Error::Api(status) if status.is_not_found()))
+        );
+    }
+    assert_eq!(api.list(&ListParams::default()).await.unwrap().items.len(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_backup_brings_back_without_a_status_is_neither_run_nor_published_again() {
+    let season = Season::play().await;
+    let world = &season.world;
+    let (boards, submissions) = (backup::<Leaderboard>(world).await, backup::<Submission>(world).await);
+    let folder = tempfile::tempdir().unwrap();
+    // The commands of docs/backup.md.
+    let file = folder.path().join("backup.yaml").display().to_string();
+    shell(
+        world,
+        &format!("kubectl --namespace $NS get submissions {LOCAL_FINISHED} {LOCAL_RUNNING} --output yaml > {file}"),
+    )
+    .await;
+    lose::<Submission>(world).await;
+    lose::<Leaderboard>(world).await;
+    lose::<Job>(world).await;
+    lose::<Pod>(world).await;
+    lose::<NetworkPolicy>(world).await;
+    let ended = [season.finished.0, season.failed.0, season.cancelled.0];
+    let mut before = Vec::new();
+    for pk in ended {
+        before.push(season.outside(pk).await);
+    }
+    let unread_before = season.written(season.unread.0).len();
+
+    restore::<Leaderboard>(world, boards).await;
+    let is_evalais = |object: &Value| !object["spec"]["evalai"].is_null();
+    restore::<Submission>(world, submissions.into_iter().filter(is_evalais).collect()).await;
+    shell(
+        world,
+        &format!("sed '/^    resourceVersion: /d' {file} | kubectl create --filename -"),
+    )
+    .await;
+    let names = format!("{LOCAL_FINISHED} {LOCAL_RUNNING}");
+    shell(
+        world,
+        &format!("kubectl --namespace $NS annotate submissions {names} leaderboard.carla.org/adopt=true"),
+    )
+    .await;
+    let _controller = world.controller();
+    for (name, state) in [
+        (season.finished.1.as_str(), State::Finished),
+        (season.failed.1.as_str(), State::Failed),
+        (season.cancelled.1.as_str(), State::Cancelled),
+        (season.unread.1.as_str(), State::Finished),
+        (LOCAL_FINISHED, State::Finished),
+    ] {
+        world
+            .until(name, "it shows its end", |status| {
+                status.state == Some(state) && is_settled(status)
+            })
+            .await;
+    }
+    for name in [season.running.1.as_str(), LOCAL_RUNNING] {
+        world.job(name, 0).await;
+        let status = season.status(name).await;
+        assert!(status.plan.as_ref().unwrap().resume, "{status:?}");
+        assert_eq!(status.progress.unwrap().text, format!("{DONE}/{ROUTES}"));
+        let accepted = conditions::get(&status.conditions, conditions::ACCEPTED).unwrap();
+        assert_eq!(
+            (accepted.status.as_str(), accepted.reason.as_str()),
+            ("True", reasons::RESTORED)
+        );
+    }
+    let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::PAUSED);
+    world.until(&season.pending.1, "it is held again", is_held).await;
+
+    let mut jobs = season.jobs().await;
+    jobs.sort();
+    assert_eq!(
+        jobs,
+        [format!("{LOCAL_RUNNING}-1"), format!("{}-1", season.running.1)],
+        "nothing else runs"
+    );
+    for (pk, before) in ended.into_iter().zip(before) {
+        assert_eq!(
+            season.outside(pk).await,
+            before,
+            "{pk} is as it was in table and EvalAI"
+        );
+    }
+    let unread = season.written(season.unread.0).split_off(unread_before);
+    let finals = unread
+        .iter()
+        .filter(|text| text.contains("FINISHED") || text.contains("finished"));
+    assert_eq!(finals.count(), 1, "{unread:?}");
+    assert!(season.rows().await[&season.unread.0.to_string()].contains("FINISHED"));
+    shown(&season).await;
+}
+
+/// A host sees what was restored.
+async fn shown(season: &Season) {
+    let mut kubectl = server().await.kubectl();
+    kubectl.args([
+        "get",
+        "submissions",
+        "--namespace",
+        &season.world.namespace,
+        "--no-headers",
+    ]);
+    let output = kubectl.output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    let line = |name: &str| {
+        text.lines()
+            .find(|line| line.starts_with(name))
+            .unwrap_or_else(|| panic!("{name}: {text}"))
+    };
+    assert!(
+        line(&season.finished.1).contains("Finished") && line(&season.finished.1).contains("100.00"),
+        "{text}"
+    );
+    assert!(line(&season.failed.1).contains(reasons::IMPORTED_FAILURE), "{text}");
+    assert!(
+        line(LOCAL_FINISHED).contains("Finished") && line(LOCAL_FINISHED).contains("100.00"),
+        "{text}"
+    );
+    assert!(line(&season.running.1).contains(&format!("{DONE}/{ROUTES}")), "{text}");
+    println!("{text}");
+}
