@@ -216,7 +216,9 @@ def kube_proxy(settings: Settings, tools: Path) -> Component:
 
 
 def aws(settings: Settings, python: Path) -> Component:
-    argv, env = aws_command(settings, python, HOST_ADDRESS, settings.ports["aws"])
+    (program, *_), env = aws_command(settings, python, HOST_ADDRESS, settings.ports["aws"])
+    argv = [program, "-m", "labkit.aws_recorder", str(settings.aws_calls)]
+    env |= {"PYTHONPATH": str(settings.local), "PYTHONDONTWRITEBYTECODE": "1"}
     listens = [(HOST_ADDRESS, settings.ports["aws"])]
     return Component("aws", argv, lambda: answers(f"{settings.aws_endpoint}/_ministack/health"), listens, env)
 

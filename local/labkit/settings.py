@@ -89,6 +89,11 @@ class Settings:
         return self.logs / "audit.log"
 
     @property
+    def aws_calls(self) -> Path:
+        """What the operator's programs asked of the AWS stand-in."""
+        return self.logs / "aws-calls.jsonl"
+
+    @property
     def registry(self) -> str:
         return f"{HOST_ADDRESS}:{self.ports['aws']}"
 

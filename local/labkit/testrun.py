@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from . import build, charttest, cluster, demo, gpus, kube, pythonenv, rights, tools
+from . import awsrecorded, build, charttest, cluster, demo, gpus, kube, pythonenv, rights, tools
 from .console import say, seconds
 from .errors import LabError
 from .failures import Failure, Reader, Summary, failed_cases
@@ -181,6 +181,8 @@ def in_cluster(plan: Plan) -> None:
     # Of a part of the tests it would say that the rest is not used.
     if not plan.filter:
         say(rights.check(kube.of_lab(plan.settings, folder), plan.settings.repository, plan.settings.audit_log, began))
+        policies = plan.settings.repository / "examples" / "aws" / "iam"
+        say(awsrecorded.check(policies, plan.settings.aws_calls, began))
 
 
 def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:

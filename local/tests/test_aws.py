@@ -19,6 +19,7 @@ from labkit import awscalls, pythonenv, settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 AWS = REPOSITORY / "examples" / "aws"
+EXAMPLES = REPOSITORY / "examples"
 POLICIES = AWS / "iam"
 README = REPOSITORY / "charts" / "leaderboard-operator" / "README.md"
 GUIDE = REPOSITORY / "docs" / "aws.md"
@@ -62,6 +63,23 @@ def in_environment(arguments: Sequence[str], **environment: str) -> Any:
 def parsed(name: str) -> list[Any]:
     file = str(AWS / name)
     return in_environment(["yaml", file])[file]
+
+
+def text_as_yaml(text: str) -> Any:
+    """A file within a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "text.yaml"
+        file.write_text(text)
+        ((found,),) = in_environment(["yaml", str(file)]).values()
+    return found
+
+
+def gpus_of(file: Path) -> int:
+    """GPUs that a Pod of a Leaderboard requests. `PerContainer`: one for each simulator and each agent."""
+    ((leaderboard,),) = in_environment(["yaml", str(file)]).values()
+    gpu, pairs = leaderboard["spec"]["gpu"], leaderboard["spec"].get("pairs", 4)
+    assert gpu == {"resourceName": "nvidia.com/gpu"}, gpu
+    return 2 * pairs
 
 
 @functools.cache
@@ -233,6 +251,24 @@ class Cluster(unittest.TestCase):
         (values,) = parsed("cluster-autoscaler-values.yaml")
         self.assertEqual(values["autoDiscovery"]["clusterName"], name)
 
+    def test_a_node_has_the_gpus_that_one_submission_requests(self) -> None:
+        (gpu,) = self.cluster["nodeGroups"]
+        _, pool, overlay = parsed("karpenter.yaml")
+        (plugin,) = parsed("device-plugin-values.yaml")
+        (test,) = parsed("gpu-test.yaml")
+        requested = {gpus_of(EXAMPLES / name) for name in ("leaderboard-10.yaml", "leaderboard-20.yaml")}
+        (shared,) = text_as_yaml(plugin["config"]["map"]["default"])["sharing"]["timeSlicing"]["resources"]
+        # A g5.12xlarge has four.
+        shown = {4 * shared["replicas"]}
+        self.assertEqual(shared["name"], "nvidia.com/gpu")
+        self.assertEqual(requested, shown)
+        self.assertEqual({int(gpu["tags"][f"{TEMPLATE}/resources/nvidia.com/gpu"])}, shown)
+        self.assertEqual({int(overlay["spec"]["capacity"]["nvidia.com/gpu"])}, shown)
+        self.assertEqual({int(test["spec"]["containers"][0]["resources"]["limits"]["nvidia.com/gpu"])}, shown)
+        self.assertEqual(int(pool["spec"]["limits"]["nvidia.com/gpu"]), gpu["maxSize"] * shown.pop())
+        # Where the plugin runs.
+        self.assertTrue(any(f'"{key}"' in json.dumps(plugin["affinity"]) for key in gpu["labels"]))
+
     def test_no_pod_gets_the_nodes_role_and_policies_are_enforced(self) -> None:
         groups = [*self.cluster["managedNodeGroups"], *self.cluster["nodeGroups"]]
         self.assertTrue(all(group["disablePodIMDS"] and group["privateNetworking"] for group in groups))
@@ -256,7 +292,7 @@ class Cluster(unittest.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             by_eksctl = Path(folder) / "eksctl.yaml"
             by_eksctl.write_text(self.cluster["nodeGroups"][0]["overrideBootstrapCommand"])
-            node_class, pool = parsed("karpenter.yaml")
+            node_class, pool, _ = parsed("karpenter.yaml")
             by_karpenter = Path(folder) / "karpenter.yaml"
             by_karpenter.write_text(node_class["spec"]["userData"])
             files = [str(by_eksctl), str(by_karpenter)]

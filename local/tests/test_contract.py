@@ -154,8 +154,10 @@ class CheckContents(unittest.TestCase):
         self.assertEqual(calls.ended.stdout, "20 routes: spec.routes of the Leaderboard\nThe contents are complete.\n")
         made = contractcheck.container(REPOSITORY, "v2", "contents")
         copy = calls.container("a/contents:1")
-        self.assertEqual(("/bin/bash", *copy.words[1:]), made.words)
-        self.assertEqual(set(copy.mounts), set(made.mounts))
+        self.assertEqual(("/bin/bash", *copy.words[1:]), made.command)
+        # In the cluster the runner keeps what the command prints, which Docker shows.
+        runners = {"/leaderboard-tools", "/tmp/leaderboard-log"}
+        self.assertEqual(set(copy.mounts) | runners, set(made.mounts))
 
     def test_what_is_missing_or_out_of_order_is_named(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -180,3 +182,12 @@ class CheckContents(unittest.TestCase):
             "agents/secret.py",
         ):
             self.assertIn(line, calls.ended.stdout)
+
+
+class CheckAgent(unittest.TestCase):
+    def test_its_agent_lies_where_the_contents_are_mounted(self) -> None:
+        text = (REPOSITORY / "examples" / "check-agent" / "Dockerfile").read_text()
+        agent = next(line.partition("=")[2] for line in text.splitlines() if line.startswith("ENV TEAM_AGENT="))
+        root = contractcheck.container(REPOSITORY, "v2", "agent-1").env["LEADERBOARD_ROOT"]
+        # The code of the Leaderboard, and in it the agents that come with it.
+        self.assertTrue(agent.startswith(f"{root}/leaderboard/autoagents/"), agent)

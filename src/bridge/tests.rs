@@ -66,7 +66,7 @@ async fn shared() -> (Shared, Server, watch::Sender<bool>) {
     let (clients, handle) = client();
     let (telemetry, stop) = telemetry();
     (
-        Shared::new(clients, Aws::load().await, everything(), telemetry),
+        Shared::new(clients, Aws::load("bridge").await, everything(), telemetry),
         handle,
         stop,
     )
@@ -120,7 +120,7 @@ async fn start(telemetry: Observability) -> JoinHandle<Result<(), TaskFailed>> {
             }
         }
     });
-    tokio::spawn(run(clients, Aws::load().await, everything(), telemetry))
+    tokio::spawn(run(clients, Aws::load("bridge").await, everything(), telemetry))
 }
 
 #[tokio::test(start_paused = true)]
@@ -157,7 +157,7 @@ async fn a_broken_watch_of_leaderboards_fails_liveness_while_the_api_server_answ
             });
         }
     });
-    let shared = Shared::new(clients, Aws::load().await, everything(), telemetry.clone());
+    let shared = Shared::new(clients, Aws::load("bridge").await, everything(), telemetry.clone());
     shared.leaderboards.store.wait_until_ready().await.unwrap();
     tokio::time::sleep(Duration::from_mins(12)).await;
     assert_eq!(

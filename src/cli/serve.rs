@@ -114,7 +114,7 @@ async fn lead(options: Controller) -> Result<(), String> {
     };
     let identity = Identity::of_pod(&options.pod_name, &options.pod_uid);
     let lease = leader::Settings::new(&options.lease_namespace, &options.lease, identity);
-    let aws = Aws::load().await;
+    let aws = Aws::load("controller").await;
     let settings = Settings {
         image: options.image,
         image_pull_policy: options.image_pull_policy,
@@ -140,7 +140,7 @@ async fn serve_bridge(options: Server) -> Result<(), String> {
         namespaces: Namespaces::of(options.namespaces),
         allowed: options.allowed,
     };
-    let result = bridge::run(clients, Aws::load().await, scope, telemetry).await;
+    let result = bridge::run(clients, Aws::load("bridge").await, scope, telemetry).await;
     server.close().await;
     result.map_err(|e| e.to_string())
 }

@@ -31,6 +31,7 @@ use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history;
 use crate::kubernetes::Namespaces;
@@ -110,6 +111,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
         images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
         foreign_runs: ForeignRuns::start(&aws, &tasks, noting(&answering)),
+        other_results: OtherResults::start(&aws, &tasks, noting(&answering)),
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),

@@ -14,9 +14,9 @@ use super::run::Run;
 use crate::services::aws::Aws;
 use leaderboard_api::effective::key_prefix;
 
-/// The way to AWS for this Pod.
-pub async fn aws(setting: &Setting) -> Aws {
-    for_run(Aws::load().await, setting)
+/// The way to AWS for a program of this Pod.
+pub async fn aws(setting: &Setting, program: &str) -> Aws {
+    for_run(Aws::load(program).await, setting)
 }
 
 /// The same from a way to AWS that is there already.

@@ -21,6 +21,7 @@ use super::blocking;
 use super::gather::{Gatherer, results_plan};
 use super::identity;
 use super::places::{Places, Setting};
+use super::report::Logs;
 use super::run::Stop;
 use super::ship::{STREAM_A_DAY, Shipper};
 use super::tree::{Tree, TreeError};
@@ -32,7 +33,7 @@ use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
 use crate::services::logs::LogClient;
-use round::{Rounds, Why};
+use round::{News, Rounds, Why};
 
 /// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.
 const LAST_FLUSH: Duration = Duration::from_mins(5);
@@ -69,7 +70,7 @@ impl From<std::io::Error> for LogcopyError {
 
 /// Works until `shutdown` (SIGTERM) comes.
 pub async fn main(setting: Setting, shutdown: impl Future<Output = ()>) -> Result<(), LogcopyError> {
-    let aws = identity::aws(&setting).await;
+    let aws = identity::aws(&setting, "logcopy").await;
     let plan = &setting.run.plan;
     let archive = Archive::of_run(&aws, &plan.storage, &plan.run_id);
     work(setting, &aws, archive, shutdown).await
@@ -90,9 +91,10 @@ pub async fn work(
 
     let (end, ending) = shutdown::Stop::new();
     let tasks = Tasks::new(ending);
-    let (shipped, shipping) = ship(&setting, aws, &tree, &uploader, &tasks);
+    let (told, logs) = watch::channel(None);
+    let (shipped, shipping) = ship(&setting, aws, &tree, &uploader, (&tasks, told));
     let (stop, stop_watch) = watch_stop(setting.places.clone(), &tasks);
-    let rounds = Rounds::new(setting, archive, tree, gatherer, uploader, stop);
+    let rounds = Rounds::new(setting, archive, tree, gatherer, uploader, News { stop, logs });
     let result = tokio::select! {
         biased;
         failed = tasks.failed() => Err(failed.into()),
@@ -115,7 +117,7 @@ fn ship(
     aws: &Aws,
     tree: &Arc<Tree>,
     uploader: &Uploader,
-    tasks: &Tasks,
+    (tasks, told): (&Tasks, watch::Sender<Option<Logs>>),
 ) -> (watch::Sender<bool>, Option<JoinHandle<Option<()>>>) {
     let (sender, receiver) = watch::channel(false);
     let task = setting.run.log_group.as_ref().map(|group| {
@@ -124,7 +126,7 @@ fn ship(
         let pairs = plan.slices.len();
         let memory = uploader.memory();
         let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, memory, STREAM_A_DAY);
-        tasks.stay("logs to CloudWatch", shipper.run(SHIP_PERIOD, receiver))
+        tasks.stay("logs to CloudWatch", shipper.run(SHIP_PERIOD, receiver, told))
     });
     (sender, task)
 }

@@ -106,6 +106,9 @@ pub struct Report {
     /// What `verify` noticed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
+    /// Whether the run's lines come to CloudWatch; absent without a log group, and as long as it is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub logs: Option<Logs>,
     /// Text of `evalai/results.json`.
     pub results: String,
     /// The same with the metrics over the routes done so far, in which `results` has zeros; only while the run goes on, and not
@@ -130,6 +133,15 @@ pub struct ReportPair {
     pub crashes: u32,
     /// What it does.
     pub state: PairState,
+}
+
+/// What has become of the lines for CloudWatch.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+pub enum Logs {
+    /// It has taken some, and refuses none.
+    Sent,
+    /// Why it refuses them.
+    Refused(String),
 }
 
 /// Size and digest of a stored file.
@@ -175,6 +187,10 @@ impl Report {
         Self {
             entry_status: line(&self.entry_status),
             why: self.why.as_ref().map(line),
+            logs: self.logs.as_ref().map(|logs| match logs {
+                Logs::Sent => Logs::Sent,
+                Logs::Refused(why) => Logs::Refused(line(why)),
+            }),
             warnings: self.warnings.iter().map(line).collect(),
             ..self
         }

@@ -14,7 +14,8 @@ use tokio::sync::watch;
 use super::blocking;
 use super::daily::{Daily, Spent, today};
 use super::keys::agent_log;
-use super::ownlog::{OWN_LOG, WORKSPACE_LOG};
+use super::ownlog::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG};
+use super::report::Logs;
 use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
@@ -95,6 +96,7 @@ impl Shipper {
             .chain([
                 (OWN_LOG.to_owned(), format!("{run_id}/logcopy")),
                 (WORKSPACE_LOG.to_owned(), format!("{run_id}/workspace")),
+                (CONTENTS_LOG.to_owned(), format!("{run_id}/contents")),
             ])
             .collect();
         let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();
@@ -127,11 +129,15 @@ impl Shipper {
         }
     }
 
-    /// Sends every `period` until `done` is true, and then once more.
-    pub async fn run(mut self, period: Duration, mut done: watch::Receiver<bool>) {
+    /// Sends every `period` until `done` is true, and then once more. Tells what has become of the lines.
+    pub async fn run(mut self, period: Duration, mut done: watch::Receiver<bool>, told: watch::Sender<Option<Logs>>) {
         let mut complained = false;
         while !*done.borrow_and_update() {
-            match self.pass(false).await {
+            let sent = self.pass(false).await;
+            if let Some(logs) = self.what_of(&sent) {
+                told.send_if_modified(|known| known.replace(logs.clone()) != Some(logs));
+            }
+            match sent {
                 Ok(()) => complained = false,
                 Err(error) if !complained => {
                     complained = true;
@@ -148,6 +154,15 @@ impl Shipper {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::warn!("{error}"),
             Err(_) => tracing::warn!("the last lines are not in CloudWatch Logs: it took too long"),
+        }
+    }
+
+    /// What a pass shows of the lines; nothing while CloudWatch does not answer, or nothing was printed.
+    fn what_of(&self, sent: &Result<(), LogsError>) -> Option<Logs> {
+        match sent {
+            Err(error) if error.is_transient() => None,
+            Err(error) => Some(Logs::Refused(error.to_string())),
+            Ok(()) => (!self.made.is_empty()).then_some(Logs::Sent),
         }
     }
 

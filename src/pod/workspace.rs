@@ -29,7 +29,7 @@ use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Enforcement, PairState};
 
 /// Folders that no mount makes. The others are the kubelet's.
-const FOLDERS: [&str; 3] = ["agent", STATUS_FOLDER, "logcopy"];
+const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
 /// Names the Pod whose volume this is, once it is prepared.
 const PREPARED: &str = "logcopy/.prepared";
 /// Tries while S3 does not answer, before the kubelet is left to start this again.
@@ -183,7 +183,7 @@ async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, Works
     let plan = &setting.run.plan;
     results_plan(&setting.run)?;
     let finding = measure(setting).await?;
-    let aws = identity::aws(setting).await;
+    let aws = identity::aws(setting, "workspace").await;
     prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await?;
     Ok(finding)
 }
@@ -320,6 +320,7 @@ fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
         stopped: None,
         why: None,
         warnings: Vec::new(),
+        logs: None,
         results: leaderboard_results::render(&plan, None)?.results_json,
         partial_results: None,
         files: std::collections::BTreeMap::new(),

@@ -6,10 +6,11 @@
 use std::time::Duration;
 
 use aws_config::retry::RetryConfig;
-use aws_config::{BehaviorVersion, Region, SdkConfig};
+use aws_config::{AppName, BehaviorVersion, Region, SdkConfig};
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
 use super::meter::Meter;
+use leaderboard_api::names::OPERATOR;
 
 /// Time an AWS call may take, with its retries.
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);
@@ -36,8 +37,8 @@ pub struct Aws {
 }
 
 impl Aws {
-    /// Reads region and credentials from where AWS's SDKs look for them.
-    pub async fn load() -> Self {
+    /// Reads region and credentials from where AWS's SDKs look for them. Each request names the program, which CloudTrail then shows.
+    pub async fn load(program: &str) -> Self {
         let http = aws_smithy_http_client::Builder::new()
             .tls_provider(Provider::Rustls(CryptoMode::Ring))
             .build_https();
@@ -46,12 +47,13 @@ impl Aws {
             .operation_attempt_timeout(ATTEMPT_TIMEOUT)
             .operation_timeout(OPERATION_TIMEOUT)
             .build();
-        let base = aws_config::defaults(BehaviorVersion::latest())
+        let mut loader = aws_config::defaults(BehaviorVersion::latest())
             .http_client(http)
-            .timeout_config(timeouts)
-            .load()
-            .await;
-        Self::from_config(base)
+            .timeout_config(timeouts);
+        if let Ok(name) = AppName::new(format!("{OPERATOR}-{program}")) {
+            loader = loader.app_name(name);
+        }
+        Self::from_config(loader.load().await)
     }
 
     /// From a ready configuration, for tests and for assumed roles.

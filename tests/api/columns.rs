@@ -160,7 +160,11 @@ async fn leaderboards_in_the_table() {
         "counts": {"pending": 3, "running": 2, "finished": 40, "failed": 1, "cancelled": 0},
         "evalai": {"requestsLastMinute": 12, "requestsPerMinute": 54},
         "tracks": [{"name": "sensors", "pairs": 4, "routes": 20, "repetitions": 1}],
-        "conditions": [condition("Terminating", "InUse"), condition("Ready", "TokenRefused")],
+        "conditions": [
+            condition("Terminating", "InUse"),
+            condition("Ready", "TokenRefused"),
+            condition("Checked", "CheckOutdated"),
+        ],
     });
     let patch = Patch::Merge(json!({ "status": status }));
     let read = api
@@ -174,6 +178,14 @@ async fn leaderboards_in_the_table() {
 NAME       READY    REASON         PAUSED   PENDING   RUNNING   FINISHED   FAILED   CANCELLED   AGE
 carla-20   False    TokenRefused   false    3         2         40         1        0           <age>
 new        <none>   <none>         false    <none>    <none>    <none>     <none>   <none>      <age>
+"
+    );
+    assert_eq!(
+        table(&client, Kind::Leaderboard, &namespace, true).await,
+        "\
+NAME       READY    REASON         PAUSED   PENDING   RUNNING   FINISHED   FAILED   CANCELLED   CHECKED         AGE
+carla-20   False    TokenRefused   false    3         2         40         1        0           CheckOutdated   <age>
+new        <none>   <none>         false    <none>    <none>    <none>     <none>   <none>      <none>          <age>
 "
     );
 }

@@ -122,6 +122,8 @@ async fn what_is_printed_from_secrets_manager_is_accepted_by_the_api_server() {
             role,
             "--egress",
             "10.0.1.10/32",
+            "--taint",
+            "nvidia.com/gpu:NoSchedule",
         ],
         vec!["--only", "leaderboard-20"],
     ] {

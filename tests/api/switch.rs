@@ -4,6 +4,7 @@
 
 use aws_sdk_dynamodb::types::AttributeValue;
 use evalai_stand_in::model::Status;
+use futures::{StreamExt, TryStreamExt};
 use k8s_openapi::api::batch::v1::Job;
 use kube::api::{ListParams, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
@@ -14,6 +15,7 @@ use tokio::time::timeout;
 use super::boards::make_table;
 use super::bridge::LIMIT;
 use super::world::World;
+use crate::support::throttle::Throttle;
 
 /// Id of the team that submits.
 const TEAM: &str = "1";
@@ -134,6 +136,44 @@ async fn what_another_program_stores_is_left_alone_until_a_person_hands_it_over(
     assert_eq!(resume(&world.job(&name, 0).await), "1", "it takes up what is stored");
 }
 
+/// What an agent stores comes first in a list, and the marks of both pipelines come behind it.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn marks_behind_thousands_of_objects_are_found_with_four_requests() {
+    const OBJECTS: usize = 2100;
+    let world = World::new().await;
+    let gate = Throttle::start(&world.aws.endpoint, "SlowDown").await;
+    world
+        .leaderboard_with("lb", 1, "Hosts", &json!({"storage": {"endpoint": gate.endpoint()}}))
+        .await;
+    let (others, ours) = (world.submit("lb", 1).await, world.submit("lb", 1).await);
+    for (pk, _) in [&others, &ours] {
+        let archive = world.archive(*pk);
+        let stored = (0..OBJECTS).map(async |n| archive.put(&format!("agent/agent1/{n:05}.png"), vec![0]).await);
+        let stored = futures::stream::iter(stored)
+            .buffer_unordered(32)
+            .try_collect::<Vec<_>>();
+        assert_eq!(stored.await.unwrap().len(), OBJECTS);
+    }
+    world
+        .archive(ours.0)
+        .put("logcopy/owner", b"a Pod".to_vec())
+        .await
+        .unwrap();
+    let _controller = world.controller();
+    world
+        .until(&others.1, "it waits for the other program", is_foreign)
+        .await;
+    let looked = |pk: u64| gate.asked(&format!("prefix={pk}%2F"));
+    assert_eq!(
+        looked(others.0),
+        4,
+        "two pages of a thousand, and a list of each folder of marks"
+    );
+    assert_eq!(resume(&world.job(&ours.1, 0).await), "", "what is there is its own");
+    assert_eq!(looked(ours.0), 4);
+    assert_eq!(jobs(&world).await, 1);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_submission_that_nobody_has_begun_starts_with_one_look() {
     let world = World::new().await;
@@ -236,6 +276,12 @@ async fn what_is_only_observed_is_run_and_compared_and_never_written_to_evalai()
     let (pk, name) = world.submit("lb", 1).await;
     // The other program was faster.
     set(&world, pk, Status::Finished);
+    let results = json!({"_checkpoint": {"progress": [2, 2], "records": []}}).to_string();
+    world
+        .archive(pk)
+        .put("agent/agent_results.json", results.into_bytes())
+        .await
+        .unwrap();
     let _controller = world.controller();
     world.run_that_crashes(pk, &name).await;
     let differs = |status: &SubmissionStatus| {
@@ -245,6 +291,9 @@ async fn what_is_only_observed_is_run_and_compared_and_never_written_to_evalai()
     world.until(&name, "the ends are compared", differs).await;
     let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
     assert_eq!(status.state, Some(State::Failed));
+    let compared = conditions::get(&status.conditions, conditions::COMPARED).unwrap();
+    let words = "and the other program's results have 2 of 2.";
+    assert!(compared.message.ends_with(words), "{}", compared.message);
     assert_eq!(
         status.results_url.as_deref(),
         Some(format!("s3://{}/observe/{pk}", world.bucket).as_str())

@@ -5,6 +5,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use leaderboard_api::{Leaderboard, Submission, conditions};
+use leaderboard_operator::services::aws::Aws;
 use serde_json::{Value, json};
 use tokio::process::Command;
 use tokio::time::timeout;
@@ -14,6 +15,10 @@ use crate::scene::{Scene, scenario};
 
 /// A check pulls, prepares, drives one route and stores it; a broken one is given up after a minute of the same fault.
 const LIMIT: Duration = Duration::from_mins(8);
+
+/// What the default command does, and a line.
+const COPIES: &str = "cp -r ${LEADERBOARD_ROOT}/* /tmp/leaderboard/ && cp -r ${SCENARIO_RUNNER_ROOT}/* /tmp/scenario_runner/ && \
+                      cp -r ${CARLA_PYTHON_API_ROOT}/* /tmp/CARLA/ && echo copied";
 
 fn plugin() -> PathBuf {
     Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard")
@@ -44,6 +49,15 @@ async fn check(scene: &Scene, board: &str, agent: &str) -> (Option<i32>, String)
     )
 }
 
+/// The streams of a log group, without the run before the slash.
+async fn streams(logs: &aws_sdk_cloudwatchlogs::Client, group: &str) -> Vec<String> {
+    let found = logs.describe_log_streams().log_group_name(group).send().await.unwrap();
+    let names = found.log_streams().iter().filter_map(|stream| stream.log_stream_name());
+    names
+        .filter_map(|name| Some(name.split_once('/')?.1.to_owned()))
+        .collect()
+}
+
 fn has(text: &str, expected: &[&str]) {
     for part in expected {
         assert!(text.contains(part), "{part}\n\n{text}");
@@ -54,7 +68,14 @@ fn has(text: &str, expected: &[&str]) {
 async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
     scenario("check-good", async |scene: &Scene| {
         let table = json!({"name": scene.cloud.table, "region": crate::aws::REGION, "endpoint": scene.gate.url});
-        scene.leaderboard("lb", json!({"table": table, "paused": true})).await;
+        let (region, endpoint) = (crate::aws::REGION, scene.cloud.endpoint.as_str());
+        let logs = Aws::load("tests").await.logs(Some(region), Some(endpoint));
+        let group = &scene.namespace;
+        logs.create_log_group().log_group_name(group).send().await.unwrap();
+        let log_group = json!({"name": group, "region": region, "endpoint": endpoint});
+        let contents = json!({"command": ["/bin/bash", "-c", COPIES]});
+        let change = json!({"table": table, "paused": true, "logGroup": log_group, "contents": contents});
+        scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.ready("lb").await;
         let (code, text) = check(scene, "lb", "agent:standard").await;
@@ -73,9 +94,14 @@ async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
                 "✔ Bucket         has the results",
                 "✔ Route          1/1 done",
                 "✔ Table          would take a row; a check writes none",
+                "✔ CloudWatch     takes the lines",
                 "The check passed",
             ],
         );
+        let names = streams(&logs, group).await;
+        for container in ["contents", "workspace", "logcopy", "agent-1"] {
+            assert!(names.contains(&container.to_owned()), "{container}: {names:?}");
+        }
         assert_eq!(scene.all::<Submission>().await.len(), 0, "it is deleted");
         assert_eq!(
             scene.cloud.rows(&scene.cloud.table).await.len(),

@@ -24,7 +24,9 @@ const LIMIT: Duration = Duration::from_mins(5);
 
 /// Stores the four entries, as the original has them.
 async fn store_entries(scene: &Scene, evalai: &Evalai) {
-    let secrets = Aws::load().await.secrets(Some(ENTRIES), Some(&scene.cloud.endpoint));
+    let secrets = Aws::load("tests")
+        .await
+        .secrets(Some(ENTRIES), Some(&scene.cloud.endpoint));
     let board = |table: &str| {
         json!({
             "name": "cluster", "endpoint": "https://cluster.example", "certificate_authority": "LS0t",

@@ -52,7 +52,7 @@ pub struct Letter {
 impl Cloud {
     /// Makes everything anew under `name`.
     pub async fn make(endpoint: &str, name: &str) -> Self {
-        let aws = Aws::load().await;
+        let aws = Aws::load("tests").await;
         let (region, url) = (Some(REGION), Some(endpoint));
         let mut cloud = Self {
             endpoint: endpoint.to_owned(),

@@ -72,16 +72,18 @@ impl Submission {
         }
         let is_refused = recorded.reason == reasons::REFUSED;
         let has_result = status.state_of_conditions() == State::Finished;
-        let reason = if has_result && is_refused {
-            reasons::TABLE_UNREACHABLE
-        } else {
-            status.reason.as_deref().unwrap_or_default()
+        let logged = conditions::get(&status.conditions, conditions::LOGGED);
+        let is_unlogged = logged.is_some_and(|logged| logged.status == "False");
+        let reason = match (has_result, is_refused, is_unlogged) {
+            (true, true, _) => reasons::TABLE_UNREACHABLE,
+            (true, false, true) => reasons::LOGS_REFUSED,
+            _ => status.reason.as_deref().unwrap_or_default(),
         };
         Some(CheckEnd {
             time: status.times.finished.as_ref()?.0,
             name: self.metadata.name.clone().unwrap_or_default(),
             reason: reason.to_owned(),
-            has_finished: has_result && !is_refused,
+            has_finished: has_result && !is_refused && !is_unlogged,
             generation: status.checked_generation,
         })
     }
@@ -157,6 +159,22 @@ mod tests {
             (
                 vec![finished.clone(), recorded("Refused")],
                 Some((false, "TableUnreachable")),
+            ),
+            (
+                vec![
+                    finished.clone(),
+                    recorded("NotRequired"),
+                    condition("Logged", "True", "LogsSent"),
+                ],
+                Some((true, "Finished")),
+            ),
+            (
+                vec![
+                    finished.clone(),
+                    recorded("NotRequired"),
+                    condition("Logged", "False", "LogsRefused"),
+                ],
+                Some((false, "LogsRefused")),
             ),
             (
                 vec![condition("Finished", "True", "ImagePull"), recorded("NotRequired")],

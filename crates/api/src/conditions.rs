@@ -21,6 +21,8 @@ pub const COMPARED: &str = "Compared";
 pub const STALLED: &str = "Stalled";
 /// The scores follow from the infractions; only there once they did not.
 pub const PLAUSIBLE: &str = "Plausible";
+/// CloudWatch takes the lines of the run; only there for a check, and once it did not.
+pub const LOGGED: &str = "Logged";
 /// The submission has come to its end: True in Finished, Failed and Cancelled.
 pub const FINISHED: &str = "Finished";
 /// A Leaderboard can run submissions.

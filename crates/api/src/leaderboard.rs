@@ -44,6 +44,7 @@ use super::submission_use::{MAX_USING_TEAMS, TeamUse};
     printcolumn = r#"{"name":"Finished","type":"integer","jsonPath":".status.counts.finished"}"#,
     printcolumn = r#"{"name":"Failed","type":"integer","jsonPath":".status.counts.failed"}"#,
     printcolumn = r#"{"name":"Cancelled","type":"integer","jsonPath":".status.counts.cancelled"}"#,
+    printcolumn = r#"{"name":"Checked","type":"string","priority":1,"jsonPath":".status.conditions[?(@.type==\"Checked\")].reason"}"#,
     printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#
 )]
 #[serde(rename_all = "camelCase")]

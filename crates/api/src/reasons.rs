@@ -23,6 +23,8 @@ pub enum Class {
     Comparison,
     /// The condition `Plausible`.
     Scores,
+    /// The condition `Logged`.
+    CloudWatch,
     /// An event, and no state or condition.
     Event,
     /// The conditions `Ready` and `Terminating` of a Leaderboard.

@@ -13,9 +13,10 @@ use thiserror::Error;
 pub const USAGE: &str = "\
 usage: leaderboard-runner simulator --pair N --status DIR --port P [options] -- CMD ARGS...
        leaderboard-runner agent --pair N --status DIR --checkpoint FILE [options] -- CMD ARGS...
+       leaderboard-runner keep --log FILE [--log-limit BYTES] -- CMD ARGS...
        leaderboard-runner --version | --help
 
-Runs CMD as one container of a simulator-agent pair and speaks the status-file protocol in DIR.
+Runs CMD as one container of a simulator-agent pair and speaks the status-file protocol in DIR; `keep` runs CMD and keeps its output.
 
 both:       --ready-seconds 3600   how long a server may take until its port answers
             --grace-seconds 20     between SIGTERM and SIGKILL
@@ -93,10 +94,22 @@ impl Job {
     }
 }
 
+/// A command whose output is kept, and nothing else.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Kept {
+    /// Where its output is kept, too.
+    pub log: PathBuf,
+    /// Bytes of it that are kept.
+    pub log_limit: u64,
+    /// The command and its arguments; never empty.
+    pub command: Vec<OsString>,
+}
+
 /// What the command line asks for.
 #[derive(Debug, PartialEq)]
 pub enum Request {
     Run(Box<Job>),
+    Keep(Kept),
     Version,
     Help,
 }
@@ -106,7 +119,7 @@ pub enum Request {
 pub enum UsageError {
     #[error("no arguments")]
     Nothing,
-    #[error("unknown subcommand {0:?}: simulator or agent")]
+    #[error("unknown subcommand {0:?}: simulator, agent or keep")]
     Subcommand(OsString),
     #[error("{0} is missing")]
     Missing(&'static str),
@@ -135,6 +148,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         Some("--help" | "-h" | "help") => return Ok(Request::Help),
         Some("simulator") => Side::Simulator,
         Some("agent") => Side::Agent,
+        Some("keep") => return keep(arguments).map(Request::Keep),
         _ => return Err(UsageError::Subcommand(first)),
     };
     let mut options = Options::collect(&mut arguments)?;
@@ -145,7 +159,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         ready: options.seconds("--ready-seconds", 3600)?,
         grace: options.seconds("--grace-seconds", 20)?,
         peer: options.seconds("--peer-seconds", 600)?,
-        log_limit: options.optional("--log-limit", "a number of bytes")?.unwrap_or(2 << 30),
+        log_limit: options.log_limit()?,
         termination_log: options
             .take("--termination-log")?
             .map_or_else(|| TERMINATION_LOG.into(), PathBuf::from),
@@ -158,6 +172,20 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         return Err(UsageError::NoCommand);
     }
     Ok(Request::Run(Box::new(job)))
+}
+
+fn keep(mut arguments: impl Iterator<Item = OsString>) -> Result<Kept, UsageError> {
+    let mut options = Options::collect(&mut arguments)?;
+    let kept = Kept {
+        log: options.path("--log")?,
+        log_limit: options.log_limit()?,
+        command: arguments.collect(),
+    };
+    options.finish()?;
+    if kept.command.is_empty() {
+        return Err(UsageError::NoCommand);
+    }
+    Ok(kept)
 }
 
 fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
@@ -211,6 +239,10 @@ impl Options {
             options.push((name, value));
         }
         Err(UsageError::NoCommand)
+    }
+
+    fn log_limit(&mut self) -> Result<u64, UsageError> {
+        Ok(self.optional("--log-limit", "a number of bytes")?.unwrap_or(2 << 30))
     }
 
     fn take(&mut self, option: &'static str) -> Result<Option<OsString>, UsageError> {
@@ -401,6 +433,30 @@ mod tests {
         for (line, message) in cases {
             assert_eq!(parse_line(line).unwrap_err().to_string(), message, "{line}");
         }
+    }
+
+    #[test]
+    fn a_command_may_be_kept_alone() {
+        let parsed = |line: &str| parse(line.split_whitespace().map(OsString::from));
+        let kept = |log_limit| Kept {
+            log: "/l/c.log".into(),
+            log_limit,
+            command: ["/bin/bash", "-c", "x"].map(OsString::from).to_vec(),
+        };
+        assert_eq!(
+            parsed("keep --log=/l/c.log -- /bin/bash -c x"),
+            Ok(Request::Keep(kept(2 << 30)))
+        );
+        assert_eq!(
+            parsed("keep --log /l/c.log --log-limit 9 -- /bin/bash -c x"),
+            Ok(Request::Keep(kept(9)))
+        );
+        assert_eq!(parsed("keep -- a"), Err(UsageError::Missing("--log")));
+        assert_eq!(parsed("keep --log=/l --"), Err(UsageError::NoCommand));
+        assert_eq!(
+            parsed("keep --log=/l --pair=1 -- a"),
+            Err(UsageError::Unknown("--pair".into()))
+        );
     }
 
     #[test]

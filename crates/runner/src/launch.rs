@@ -94,7 +94,8 @@ fn server(job: &Job) -> Result<Command, NoGraphics> {
     Ok(command)
 }
 
-fn teed(mut command: Command, log: PathBuf, limit: u64) -> io::Result<(Group, Option<Tee>)> {
+/// Starts the command with its output in a log, too.
+pub(crate) fn teed(mut command: Command, log: PathBuf, limit: u64) -> io::Result<(Group, Option<Tee>)> {
     let (tee, writer) = Tee::open(log, limit)?;
     command.stdin(no_input()).stdout(writer.try_clone()?).stderr(writer);
     Ok((Group::spawn(&mut command)?, Some(tee)))

@@ -1,4 +1,4 @@
-//! `leaderboard-runner`: PID 1 of every simulator and agent container. Parses its arguments and lives one life (`run`).
+//! `leaderboard-runner`: PID 1 of every simulator and agent container, and of the host's contents. Parses its arguments and lives one life (`run`).
 //!
 //! It runs inside any image: no shell, any uid, a read-only root. It has one thread and no heap growth with the output.
 
@@ -6,6 +6,7 @@ mod checkpoint;
 mod decide;
 mod group;
 mod keep;
+mod keep_output;
 mod launch;
 mod memory;
 mod report;
@@ -35,7 +36,8 @@ const CORE_BYTES: u64 = 1;
 
 fn main() -> ExitCode {
     match args::parse(std::env::args_os().skip(1)) {
-        Ok(Request::Run(job)) => run(*job),
+        Ok(Request::Run(job)) => run(|signals| Runner::new(*job, signals).run()),
+        Ok(Request::Keep(kept)) => run(|signals| keep_output::run(kept, signals)),
         Ok(Request::Version) => print(concat!("leaderboard-runner ", env!("CARGO_PKG_VERSION"), "\n")),
         Ok(Request::Help) => print(args::USAGE),
         Err(error) => {
@@ -45,7 +47,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(job: args::Job) -> ExitCode {
+fn run(live: impl FnOnce(Signals) -> i32) -> ExitCode {
     let signals = match Signals::open() {
         Ok(signals) => signals,
         Err(error) => {
@@ -65,8 +67,7 @@ fn run(job: args::Job) -> ExitCode {
             say(format_args!("{what}: {error}"));
         }
     }
-    let code = Runner::new(job, signals).run();
-    ExitCode::from(u8::try_from(code).unwrap_or(1))
+    ExitCode::from(u8::try_from(live(signals)).unwrap_or(1))
 }
 
 fn limit_core() -> nix::Result<()> {

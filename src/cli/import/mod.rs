@@ -10,6 +10,7 @@ mod rows;
 #[cfg(test)]
 mod samples;
 mod table;
+mod taint;
 
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -19,6 +20,7 @@ use clap::Args;
 use jiff::Timestamp;
 
 use self::entries::{Board, EVALAI, EntryError, TRACKS, Texts};
+use self::taint::Taint;
 use crate::services::aws::Aws;
 use crate::services::event_sources::{self, NotAQueue, QueueArn, Readers};
 use crate::services::token::secret_text;
@@ -65,6 +67,9 @@ pub(super) struct Import {
     /// A range of addresses that the Pods may reach at port 443, such as 10.0.1.10/32. May be given several times.
     #[arg(long, value_name = "CIDR")]
     egress: Vec<String>,
+    /// A taint of the GPU nodes, which every track is to tolerate, such as nvidia.com/gpu:NoSchedule. May be given several times.
+    #[arg(long, value_name = "KEY[=VALUE]:EFFECT", conflicts_with = "from_table")]
+    taint: Vec<Taint>,
     /// Print one of the two Leaderboards only.
     #[arg(long, value_enum)]
     only: Option<Board>,
@@ -141,7 +146,7 @@ impl Import {
     }
 
     async fn import(&self) -> Result<ExitCode, Failure> {
-        let aws = Aws::load().await;
+        let aws = Aws::load("import").await;
         match &self.from_table {
             Some(table) => Ok(table::import(&aws, self, table).await?),
             None => self.manifests(&aws).await.map(|()| ExitCode::SUCCESS),
@@ -193,6 +198,7 @@ impl Import {
             challenge: self.challenge.ok_or(Failure::NoChallenge)?,
             dead_letter: self.dead_letter.clone(),
             egress: self.egress.clone(),
+            taints: self.taint.clone(),
             two_operators: self.two_operators,
         })
     }

@@ -5,6 +5,7 @@ use leaderboard_api::{GROUP, Leaderboard, LeaderboardVersion, VERSION};
 use serde_json::{Map, Value, json};
 
 use super::entries::{BoardEntry, EVALAI, Entries, TrackEntry};
+use super::taint::Taint;
 use crate::services::event_sources::QueueArn;
 use crate::services::token::WARN_BEFORE;
 
@@ -31,6 +32,8 @@ pub(super) struct Options {
     pub(super) queue: Option<Queue>,
     pub(super) dead_letter: Option<String>,
     pub(super) egress: Vec<String>,
+    /// Of the GPU nodes.
+    pub(super) taints: Vec<Taint>,
     /// Each Leaderboard has a cluster and an operator of its own.
     pub(super) two_operators: bool,
 }
@@ -152,7 +155,7 @@ fn spec(entries: &Entries, board: &BoardEntry, options: &Options) -> Value {
         "leaderboardVersion": version,
         "pairs": 4, "routes": 20,
         "repetitions": if version == LeaderboardVersion::V1 { 5 } else { 1 },
-        "tracks": board.tracks.iter().map(|track| self::track(board, track)).collect::<Vec<_>>(),
+        "tracks": board.tracks.iter().map(|track| self::track(board, track, &options.taints)).collect::<Vec<_>>(),
         "contents": {"image": board.contents_image},
         "gpu": {"mode": "NodeIndex", "resourceName": GPU},
         "simulator": simulator(board),
@@ -160,7 +163,7 @@ fn spec(entries: &Entries, board: &BoardEntry, options: &Options) -> Value {
         "storage": {"bucket": board.bucket, "region": options.region},
         "table": {"name": board.table, "region": options.region},
         "network": {"egress": options.egress.iter().map(|cidr| json!({"cidr": cidr, "ports": [443]})).collect::<Vec<_>>()},
-        "deadlines": {"runSeconds": 0, "startSeconds": 3600},
+        "deadlines": {"runSeconds": 0},
         "concurrency": {"total": if version == LeaderboardVersion::V1 { 2 } else { 4 }},
     });
     if let Some(queue) = &options.queue {
@@ -210,7 +213,7 @@ fn queue(queue: &Queue, options: &Options) -> Value {
     Value::Object(fields)
 }
 
-fn track(board: &BoardEntry, track: &TrackEntry) -> Value {
+fn track(board: &BoardEntry, track: &TrackEntry, taints: &[Taint]) -> Value {
     let short = track.codename.to_ascii_lowercase().replace(['_', '.'], "-");
     let short = short.trim_matches('-');
     let same = board
@@ -233,6 +236,9 @@ fn track(board: &BoardEntry, track: &TrackEntry) -> Value {
         "routesFile": "/workspace/leaderboard/data/routes_testing.xml",
         "nodeSelector": {"node.kubernetes.io/instance-type": INSTANCE_TYPE},
     });
+    if !taints.is_empty() {
+        fields["tolerations"] = taints.iter().map(Taint::toleration).collect();
+    }
     if board.board.version() == LeaderboardVersion::V1 {
         fields["scenariosFile"] = json!("/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json");
     }
@@ -273,7 +279,7 @@ fn notes(board: &BoardEntry, options: &Options) -> Vec<(&'static str, String)> {
         (
             "deadlines",
             "As in the original, a run has no time limit, so an agent that does not end keeps its node until it is cancelled. \
-             startSeconds is for images of 10 to 30 GB on a fresh node."
+             Pulls of its images may take 90 minutes (pullSeconds), and the rest of its start 30 (startSeconds)."
                 .to_owned(),
         ),
         (
@@ -356,11 +362,19 @@ fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
         );
     }
     decide.extend([
+        "tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?".to_owned(),
         "concurrency: how many submissions may run at once, in all and of one team".to_owned(),
         "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else"
             .to_owned(),
         "deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original".to_owned(),
     ]);
+    if options.taints.is_empty() {
+        decide.push(
+            "tracks[].tolerations: do the GPU nodes have a taint (--taint)? The original's had none; with one that is not tolerated \
+             submissions stay Unschedulable"
+                .to_owned(),
+        );
+    }
     if options.two_operators {
         decide.push(
             "which cluster gets which Leaderboard: apply only one of the two in each (--only prints one)".to_owned(),

@@ -23,6 +23,7 @@ fn options() -> Options {
         }),
         dead_letter: None,
         egress: vec!["10.0.1.10/32".into()],
+        taints: Vec::new(),
         two_operators: false,
     }
 }
@@ -134,6 +135,36 @@ fn the_documentation_shows_what_is_printed() {
         .chain(import.dropped.iter().filter(|line| line.starts_with("leaderboard-20")))
     {
         assert!(page.contains(line.as_str()), "docs/import.md does not show: {line}");
+    }
+}
+
+#[test]
+fn every_track_tolerates_the_taints_that_are_given() {
+    let of = |taints: &[&str]| {
+        let taints = taints.iter().map(|taint| taint.parse().unwrap()).collect();
+        planned(&entries(), &Options { taints, ..options() })
+    };
+    let asks = |import: &Import| {
+        import
+            .decide
+            .iter()
+            .any(|line| line.starts_with("tracks[].tolerations:"))
+    };
+    let (none, two) = (of(&[]), of(&["nvidia.com/gpu:NoSchedule", "carla=2:NoExecute"]));
+    assert!(asks(&none) && !asks(&two));
+    for (import, wanted) in [
+        (&none, json!([])),
+        (
+            &two,
+            json!([
+                {"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"},
+                {"key": "carla", "operator": "Equal", "value": "2", "effect": "NoExecute"},
+            ]),
+        ),
+    ] {
+        for track in specs(import).iter().flat_map(|spec| &spec.tracks) {
+            assert_eq!(json!(track.tolerations), wanted);
+        }
     }
 }
 

@@ -18,6 +18,7 @@ use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
+use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::{act, observe};
 use crate::observability::metrics::Metrics;
@@ -35,6 +36,7 @@ pub struct Context {
     pub lookups: Lookups,
     pub images: Images,
     pub foreign_runs: ForeignRuns,
+    pub other_results: OtherResults,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
@@ -55,6 +57,7 @@ impl Context {
             lookups: &self.lookups,
             images: &self.images,
             foreign_runs: &self.foreign_runs,
+            other_results: &self.other_results,
             reruns: &self.reruns,
             external: &self.external,
         }
@@ -71,6 +74,7 @@ impl Context {
             archive: &self.archive,
             images: &self.images,
             foreign_runs: &self.foreign_runs,
+            other_results: &self.other_results,
             external: &self.external,
             metrics: &self.metrics,
         }
@@ -103,6 +107,7 @@ impl Context {
         self.archive.forget(&key.uid);
         self.images.forget(&key.uid);
         self.foreign_runs.forget(&key.uid);
+        self.other_results.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
         self.external.gone(key);
     }

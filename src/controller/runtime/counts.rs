@@ -131,14 +131,19 @@ fn repeating_teams(leaderboards: &[Arc<Leaderboard>]) -> usize {
 }
 
 /// Submissions by the reason of their comparison, those without one left out.
-fn observed(submissions: &[Arc<Submission>]) -> [(&'static str, usize); 3] {
+fn observed(submissions: &[Arc<Submission>]) -> [(&'static str, usize); 4] {
     let of = |submission: &&Arc<Submission>, reason: &str| {
         let status = submission.status.as_ref();
         let compared = status.and_then(|status| conditions::get(&status.conditions, conditions::COMPARED));
         compared.is_some_and(|compared| compared.reason == reason)
     };
-    [reasons::SAME_END, reasons::DIFFERENT_END, reasons::AWAITING_OTHER_END]
-        .map(|reason| (reason, submissions.iter().filter(|one| of(one, reason)).count()))
+    [
+        reasons::SAME_END,
+        reasons::DIFFERENT_END,
+        reasons::DIFFERENT_ROUTES,
+        reasons::AWAITING_OTHER_END,
+    ]
+    .map(|reason| (reason, submissions.iter().filter(|one| of(one, reason)).count()))
 }
 
 fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {

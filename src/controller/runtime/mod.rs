@@ -38,6 +38,7 @@ use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::node;
+use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history;
 use crate::kubernetes::objects::{Job, Node, Pod};
@@ -318,6 +319,7 @@ impl Parts {
             lookups: Lookups::start(client.clone(), tasks, answered()),
             images: Images::start(aws, client.clone(), tasks, answered()),
             foreign_runs: ForeignRuns::start(aws, tasks, answered()),
+            other_results: OtherResults::start(aws, tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),

@@ -14,7 +14,7 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 17] = [
+const TASKS: [&str; 18] = [
     "foreign runs",
     "gauges",
     "images",
@@ -22,6 +22,7 @@ const TASKS: [&str; 17] = [
     "lease",
     "lookups",
     "nodes",
+    "other results",
     "permissions",
     "policies",
     "reconciles",

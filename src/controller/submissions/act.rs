@@ -19,6 +19,7 @@ use super::foreign_runs::ForeignRuns;
 use super::images::Images;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
+use super::other_results::OtherResults;
 use super::significance::{Change, change, patience};
 use super::view::{LogPlace, ObservedTexts, View};
 use crate::controller::objects::uid_of;
@@ -47,6 +48,7 @@ pub struct Uses<'a> {
     pub archive: &'a ArchiveWorkers,
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
+    pub other_results: &'a OtherResults,
     pub external: &'a ExternalSystems,
     pub metrics: &'a Metrics,
 }
@@ -155,6 +157,7 @@ impl Actor<'_> {
             Action::JoinLine(place) => uses.slots.join(submission, place.clone()),
             Action::LookUpImage(question) => uses.images.want(submission, question.clone()),
             Action::LookForForeignRun(question) => uses.foreign_runs.want(submission, (**question).clone()),
+            Action::ReadOtherResults(question) => uses.other_results.want(submission, (**question).clone()),
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),

@@ -15,6 +15,7 @@ pub mod images;
 pub mod job_spec;
 pub mod memory;
 pub mod observe;
+pub mod other_results;
 mod pod_layout;
 pub mod pod_overlay;
 pub mod questions;

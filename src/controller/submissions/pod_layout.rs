@@ -24,6 +24,8 @@ pub(super) const SHM_VOLUME: &str = "shm-agent-";
 /// Where programs look for it.
 pub(super) const SHM: &str = "/dev/shm";
 
+/// The folder of its log, in `contents`.
+pub(super) const CONTENTS_LOG_FOLDER: &str = "/tmp/leaderboard-log";
 /// Status files, in simulators and agents.
 pub(super) const STATUS: &str = "/tmp/status";
 /// An agent's own folder of results and log.
@@ -61,6 +63,15 @@ pub(super) fn protected_mounts() -> impl Iterator<Item = &'static str> {
         .into_iter()
         .flat_map(|(_, written, read)| [written, read]);
     contents
-        .chain([LOGS, TOOLS, PODINFO, IDENTITY, STATUS, AGENT, SAVED])
+        .chain([
+            LOGS,
+            TOOLS,
+            PODINFO,
+            IDENTITY,
+            STATUS,
+            AGENT,
+            SAVED,
+            CONTENTS_LOG_FOLDER,
+        ])
         .chain(NAME_FILES)
 }

@@ -4,7 +4,7 @@ use leaderboard_results::{Format, metrics};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
-use crate::pod::report::{Report, ReportError, ReportPair};
+use crate::pod::report::{Logs, Report, ReportError, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
 
@@ -44,6 +44,8 @@ pub struct ReportDigest {
     pub why: Option<String>,
     /// The first warning.
     pub warning: Option<String>,
+    /// Whether the lines of the run come to CloudWatch.
+    pub logs: Option<Logs>,
     /// The metrics of a final report, for the table.
     pub metrics: Option<Box<Map<String, Value>>>,
 }
@@ -92,6 +94,10 @@ impl ReportDigest {
             stopped: report.stopped,
             why: report.why.as_deref().filter(|_| report.is_final).map(cut),
             warning: report.warnings.first().map(|warning| cut(warning)),
+            logs: report.logs.as_ref().map(|logs| match logs {
+                Logs::Sent => Logs::Sent,
+                Logs::Refused(why) => Logs::Refused(cut(why)),
+            }),
             metrics: report.is_final.then(|| accuracies(&report.results)).flatten(),
         }
     }

@@ -8,6 +8,7 @@ use leaderboard_runner::verdict::Verdict;
 
 pub use super::foreign_runs::ObservedTraces;
 pub use super::images::ObservedImage;
+pub use super::other_results::ObservedRoutes;
 use super::report_digest::{ReportDigest, ReportId};
 use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
@@ -27,6 +28,8 @@ pub struct View {
     pub image: ObservedImage,
     /// What another program has left of it.
     pub traces: ObservedTraces,
+    /// How many routes another program's run of it has; read only where a Leaderboard observes.
+    pub other_routes: ObservedRoutes,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,

@@ -55,6 +55,7 @@ pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&E
         stopped,
         why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
         warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
+        logs: None,
         results: gathered.files.results_json.clone(),
         partial_results: gathered.files.partial_json.clone().filter(|_| ending.is_none()),
         files: gathered.digests(),

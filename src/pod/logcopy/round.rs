@@ -17,7 +17,7 @@ use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
 use crate::pod::places::Setting;
-use crate::pod::report::{OWNER_KEY, Owner, REPORT_KEY, Report};
+use crate::pod::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
 use crate::pod::run::{STATUS_FOLDER, Stop};
 use crate::pod::tree::Tree;
 use crate::pod::upload::complaints::Why as Complaint;
@@ -55,6 +55,13 @@ struct Found {
     left_out: usize,
 }
 
+/// What the rounds hear of other tasks.
+pub(super) struct News {
+    pub(super) stop: watch::Receiver<Option<Stop>>,
+    /// What has become of the lines for CloudWatch.
+    pub(super) logs: watch::Receiver<Option<Logs>>,
+}
+
 /// The rounds of one life.
 pub(super) struct Rounds {
     setting: Setting,
@@ -63,6 +70,7 @@ pub(super) struct Rounds {
     gatherer: Arc<Mutex<Gatherer>>,
     uploader: Uploader,
     stop: watch::Receiver<Option<Stop>>,
+    logs: watch::Receiver<Option<Logs>>,
     judge: Judge,
     folders: Option<Arc<Watch>>,
     epoch: Instant,
@@ -88,7 +96,7 @@ impl Rounds {
         tree: Arc<Tree>,
         gatherer: Gatherer,
         uploader: Uploader,
-        stop: watch::Receiver<Option<Stop>>,
+        News { stop, logs }: News,
     ) -> Self {
         // A logcopy before this one may have come to the end already.
         let finished = StatusFile::Stored.exists(&setting.places.status());
@@ -99,6 +107,7 @@ impl Rounds {
             gatherer: Arc::new(Mutex::new(gatherer)),
             uploader,
             stop,
+            logs,
             judge: Judge::default(),
             folders: Watch::new(is_news).ok().map(Arc::new),
             epoch: Instant::now(),
@@ -356,6 +365,7 @@ impl Rounds {
     async fn report(&mut self, gathered: &Gathered) -> Result<(), ArchiveError> {
         let mut report = describe(&self.setting, gathered, self.ending.as_ref());
         report.round = self.round;
+        report.logs.clone_from(&self.logs.borrow());
         if self.reported.as_ref() == Some(&report) {
             return Ok(());
         }

@@ -128,7 +128,12 @@ impl Ecr {
             .build();
         let unsigned = || "the request to ECR could not be signed".to_owned();
         let params = params.map_err(|_| unsigned())?.into();
-        let own = [("content-type", CONTENT), ("x-amz-target", TARGET)];
+        let program = config.app_name().map_or_else(String::new, |name| format!("app/{name}"));
+        let own = [
+            ("content-type", CONTENT),
+            ("x-amz-target", TARGET),
+            ("x-amz-user-agent", &program),
+        ];
         let request = SignableRequest::new("POST", url, own.into_iter(), SignableBody::Bytes(b"{}"));
         let signed = request.and_then(|request| sign(request, &params));
         let (instructions, _) = signed.map_err(|_| unsigned())?.into_parts();

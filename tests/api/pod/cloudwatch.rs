@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use leaderboard_operator::pod::ownlog::WORKSPACE_LOG;
+use leaderboard_operator::pod::ownlog::{CONTENTS_LOG, WORKSPACE_LOG};
+use leaderboard_operator::pod::report::Logs;
 use leaderboard_operator::services::logs::LogsError;
 use tokio::sync::watch;
 
@@ -128,18 +129,43 @@ async fn what_cloudwatch_throttles_is_sent_later_and_the_end_waits_for_it() {
     throttle.refuse(3);
     // The run is over: no round follows.
     let (_sender, is_over) = watch::channel(true);
-    shipper.run(Duration::from_secs(1), is_over).await;
+    let (told, _) = watch::channel(None);
+    shipper.run(Duration::from_secs(1), is_over, told).await;
     assert_eq!(throttle.refused(), 5);
     assert_eq!(all(&logs, &group, "77/agent-1").await, ["one", "two", "no end"]);
     assert_eq!(all(&logs, &group, "77/agent-2").await, ["of another"]);
 }
 
 #[tokio::test]
-async fn the_workspaces_log_has_a_stream_of_its_own() {
+async fn what_becomes_of_the_lines_is_told() {
+    let (mut pod, group) = pod_with_logs().await;
+    pod.append("agent/agent1/leaderboard.log", b"one\n");
+    for (name, sent) in [(group, true), ("no-such-group".to_owned(), false)] {
+        pod.setting.run.log_group.as_mut().unwrap().name = name;
+        let (done, is_over) = watch::channel(false);
+        let (told, mut heard) = watch::channel(None);
+        let shipper = shipper(&pod, ship::STREAM_A_DAY);
+        let listening = async {
+            let logs = heard.wait_for(Option::is_some).await.unwrap().clone();
+            done.send_replace(true);
+            logs
+        };
+        let ((), logs) = tokio::join!(shipper.run(Duration::from_secs(1), is_over, told), listening);
+        match logs.unwrap() {
+            Logs::Sent => assert!(sent),
+            Logs::Refused(why) => assert!(!sent && why.contains("no-such-group"), "{why}"),
+        }
+    }
+}
+
+#[tokio::test]
+async fn workspace_and_contents_have_streams_of_their_own() {
     let (pod, group) = pod_with_logs().await;
     let logs = pod.aws.logs(None, None);
     pod.append(WORKSPACE_LOG, b"{\"message\":\"restored what was stored\"}\n");
+    pod.append(CONTENTS_LOG, b"copied 20 routes\n");
     shipper(&pod, ship::STREAM_A_DAY).pass(true).await.unwrap();
+    assert_eq!(all(&logs, &group, "77/contents").await, ["copied 20 routes"]);
     let sent = all(&logs, &group, "77/workspace").await;
     assert_eq!(sent, ["{\"message\":\"restored what was stored\"}"]);
 }

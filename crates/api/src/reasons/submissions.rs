@@ -294,11 +294,16 @@ reasons! {
     }
     Comparison {
         SAME_END = "SameEnd",
-            "EvalAI shows the same end as this run (condition `Compared`, only with `evalai.mode: Observe`).",
+            "EvalAI shows the same end as this run, and the other program's results have as many routes, if they were found: the message \
+             says so (condition `Compared`, only with `evalai.mode: Observe`).",
             "Nothing. Scores are not compared: runs are not deterministic.";
         DIFFERENT_END = "DifferentEnd",
             "EvalAI shows another end than this run (condition `Compared`, only with `evalai.mode: Observe`).",
             "Compare `status.failure` and the logs of this run with those of the other program.";
+        DIFFERENT_ROUTES = "DifferentRoutes",
+            "Both runs have the same end, and the other program's results have another number of routes (condition `Compared`, only \
+             with `evalai.mode: Observe`).",
+            "Compare `routes`, `repetitions` and the contents image of the Leaderboard with what the other program runs.";
         AWAITING_OTHER_END = "AwaitingOtherEnd",
             "This run has ended, and EvalAI shows no end of the other program's yet (condition `Compared`).",
             "Nothing. EvalAI is read until it does.";
@@ -310,6 +315,16 @@ reasons! {
             "Look at the checkpoint before you trust the score (docs/results.md). `verify: Refuse` refuses such results.";
         SCORES_EXPLAINED = "ScoresExplained",
             "The scores follow from the infractions again.",
+            "Nothing.";
+    }
+    CloudWatch {
+        LOGS_REFUSED = "LogsRefused",
+            "CloudWatch refuses the lines of the run. Results do not depend on it, and the logs are in S3.",
+            "Check that `logGroup` of the Leaderboard exists (`logGroup.retentionDays` has the controller make it) and that the Pods' role has \
+             logs:CreateLogStream, logs:PutLogEvents and logs:GetLogEvents for it; on a cluster that enforces policies also that \
+             `network.egress` names CloudWatch's endpoint.";
+        LOGS_SENT = "LogsSent",
+            "CloudWatch takes the lines of the run.",
             "Nothing.";
     }
     Event {

@@ -15,6 +15,7 @@ const CLASSES: [Class; 12] = [
     Class::System,
     Class::Comparison,
     Class::Scores,
+    Class::CloudWatch,
     Class::Event,
     Class::Leaderboard,
     Class::Isolation,

@@ -165,7 +165,8 @@ fn of_start(status: &SubmissionStatus) -> [Finding; 4] {
         Some(to.duration_since(from).as_secs().max(0))
     };
     let has_started = times.started.is_some();
-    let is_copied = has_started || is_of_sidecars(message(status));
+    // It starts behind the contents.
+    let is_copied = has_started || message(status).to_ascii_lowercase().starts_with("logcopy ");
     let node = match (&status.node_name, seconds(&times.accepted, &times.scheduled)) {
         (Some(node), Some(seconds)) => format!("{node}, after {seconds} s"),
         (Some(node), None) => node.clone(),
@@ -262,13 +263,28 @@ fn table(status: &SubmissionStatus) -> Finding {
     }
 }
 
-/// The Pod sends its lines by itself, and no status says whether they came.
+/// The Pod sends its lines by itself, and reports whether CloudWatch takes them.
 fn logs(leaderboard: &Leaderboard, status: &SubmissionStatus) -> Option<Finding> {
     let group = leaderboard.spec.log_group.as_ref()?;
     let run = status.plan.as_ref().filter(|_| status.times.started.is_some());
     let Some(run) = run else {
         return Some(finding_of(Part::Logs, Mark::Open, NOT_REACHED));
     };
+    let logged = conditions::get(&status.conditions, conditions::LOGGED);
+    match logged.map(|logged| logged.status.as_str()) {
+        Some("True") => {
+            let found = format!("takes the lines, {}: {}/…", group.name, run.run_id);
+            return Some(finding_of(Part::Logs, Mark::Works, found));
+        }
+        Some(_) => {
+            let found = logged.map_or_else(String::new, |logged| sentence(&logged.message));
+            return Some(Finding {
+                step: step_of(reasons::LOGS_REFUSED),
+                ..finding_of(Part::Logs, Mark::Broken, found)
+            });
+        }
+        None => {}
+    }
     let flag = |name: &str, value: Option<&String>| value.map(|v| format!(" {name} {v}")).unwrap_or_default();
     let command = format!(
         "aws logs describe-log-streams --log-group-name {} --log-stream-name-prefix {}/{}{}",
@@ -283,7 +299,7 @@ fn logs(leaderboard: &Leaderboard, status: &SubmissionStatus) -> Option<Finding>
         ..finding_of(
             Part::Logs,
             Mark::Open,
-            "not known here: the Pod sends its logs by itself",
+            "not known: the Pod has not told whether CloudWatch takes its lines",
         )
     })
 }

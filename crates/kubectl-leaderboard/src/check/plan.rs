@@ -38,7 +38,7 @@ pub fn submission(leaderboard: &Leaderboard, wanted: Wanted<'_>) -> Result<Value
     let Some(image) = wanted.image.or(named) else {
         return Err(format!(
             "Leaderboard {name} names no image for a check. Give the image of an agent of your own with --image, or set \
-             spec.check.image"
+             spec.check.image; examples/check-agent/Dockerfile makes one of the Leaderboard's NPC agent"
         ));
     };
     let short: String = name.chars().take(LONGEST).collect();

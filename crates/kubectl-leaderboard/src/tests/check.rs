@@ -60,6 +60,7 @@ fn passed() -> Value {
             condition("Accepted", "True", "Accepted", ""), condition("Finished", "True", "Finished", ""),
             condition("Archived", "True", "Stored", ""), condition("Published", "False", "NotRequired", ""),
             condition("Recorded", "True", "Recorded", "The table would take a row; a check writes none."),
+            condition("Logged", "True", "LogsSent", ""),
         ],
     })
 }
@@ -122,9 +123,7 @@ const PASSED: &str = "\
 ✔ Bucket         has the results, s3://results/v2/check-carla-20-x7k2p
 ✔ Route          1/1 done, driving score 98.00
 ✔ Table          would take a row; a check writes none
-– CloudWatch     not known here: the Pod sends its logs by itself
-                 → See whether the streams are there:
-                   aws logs describe-log-streams --log-group-name /carla --log-stream-name-prefix check-carla-20-x7k2p/
+✔ CloudWatch     takes the lines, /carla: check-carla-20-x7k2p/…
 
 The check passed.";
 
@@ -138,6 +137,34 @@ fn a_good_leaderboard_has_every_part_proved() {
         docs.contains(PASSED),
         "docs/check.md shows another table than\n{PASSED}"
     );
+}
+
+/// The results of both are good.
+#[test]
+fn lines_that_cloudwatch_refuses_fail_the_check_and_silence_does_not() {
+    let logged = |logged: Option<Value>| {
+        let mut status = passed();
+        let conditions = status["conditions"].as_array_mut().unwrap();
+        conditions.retain(|condition| condition["type"] != "Logged");
+        conditions.extend(logged);
+        printed(&good_leaderboard(), &status, None, &Readers::Nobody)
+    };
+    let refused = "writing to /carla/check-carla-20-x7k2p/agent-1 in CloudWatch Logs: denied";
+    let (text, has_passed) = logged(Some(condition("Logged", "False", "LogsRefused", refused)));
+    assert!(!has_passed, "{text}");
+    for part in [
+        "✘ CloudWatch     Writing to /carla/",
+        "→ Check that `logGroup`",
+        "✔ Route          1/1 done",
+    ] {
+        assert!(text.replace('`', "").contains(&part.replace('`', "")), "{text}");
+    }
+    let (text, has_passed) = logged(None);
+    assert!(has_passed, "{text}");
+    assert!(text.contains("– CloudWatch     not known:"), "{text}");
+    let command =
+        "aws logs describe-log-streams --log-group-name /carla --log-stream-name-prefix check-carla-20-x7k2p/";
+    assert!(text.contains(command), "{text}");
 }
 
 #[test]

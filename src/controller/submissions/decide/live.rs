@@ -10,6 +10,7 @@ use super::{accept, crashes, end, failure, interruption, isolation, line, readin
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
+use crate::pod::report::Logs;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, PairStatus, Progress, Score, reasons};
@@ -314,6 +315,7 @@ pub(super) fn take_report(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
         })
         .collect();
     note_scores(draft, report);
+    note_logs(draft, report);
 }
 
 /// Says that scores do not follow from the infractions, and that they do again.
@@ -327,6 +329,21 @@ fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
         None => (Truth::True, reasons::SCORES_EXPLAINED, String::new()),
     };
     draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
+}
+
+/// Says that CloudWatch refuses the lines of the run, and that it takes them again; of a check, whether it takes them at all.
+fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+    let is_known = conditions::get(&draft.status.conditions, conditions::LOGGED).is_some();
+    match &report.logs {
+        Some(Logs::Refused(why)) => {
+            let why = sentence(why);
+            draft.condition(conditions::LOGGED, Truth::False, reasons::LOGS_REFUSED, &why);
+        }
+        Some(Logs::Sent) if is_known || draft.spec().check => {
+            draft.condition(conditions::LOGGED, Truth::True, reasons::LOGS_SENT, "");
+        }
+        _ => {}
+    }
 }
 
 /// Limits of a run under way: disk, crashes, time.

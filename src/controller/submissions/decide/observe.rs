@@ -1,11 +1,15 @@
-//! The end of a run that is not published, next to the end that EvalAI shows of another program's run of the same submission.
+//! The end of a run that is not published, next to the end that EvalAI shows of another program's run of the same submission, and the
+//! number of their routes.
 
 use jiff::{SignedDuration, Timestamp};
 
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
+use crate::controller::submissions::other_results::{Answer, Question, Routes};
+use crate::controller::submissions::view::ObservedRoutes;
 use leaderboard_api::conditions::{self, Truth};
-use leaderboard_api::{State, reasons};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{State, SubmissionStatus, reasons};
 
 /// EvalAI is read again when what is known of the other run is older than this.
 const OLD: SignedDuration = SignedDuration::from_mins(5);
@@ -31,8 +35,25 @@ pub(super) fn awaits_end(draft: &mut PlanBuilder<'_>) -> bool {
         }
         return waits(draft);
     };
-    show(draft, theirs);
+    let Some(routes) = routes_of_other(draft) else {
+        return waits(draft);
+    };
+    show(draft, theirs, &routes);
     false
+}
+
+/// How many routes the other run has; none while that is read.
+fn routes_of_other(draft: &mut PlanBuilder<'_>) -> Option<Answer> {
+    let attempt = draft.status.attempt.unwrap_or(1);
+    let Some(plan) = &draft.status.plan else {
+        return Some(Err("this run has no plan".to_owned()));
+    };
+    let question = Question::of(plan, attempt);
+    if let ObservedRoutes::Answered(answer) = &draft.view.other_routes {
+        return Some(answer.as_ref().clone());
+    }
+    draft.act(Action::ReadOtherResults(Box::new(question)));
+    None
 }
 
 fn waits(draft: &mut PlanBuilder<'_>) -> bool {
@@ -40,19 +61,45 @@ fn waits(draft: &mut PlanBuilder<'_>) -> bool {
     true
 }
 
-fn show(draft: &mut PlanBuilder<'_>, theirs: State) {
+fn show(draft: &mut PlanBuilder<'_>, theirs: State, routes: &Answer) {
     let ours = draft.status.state_of_conditions();
-    let is_same = ours == theirs;
-    let reason = if is_same {
-        reasons::SAME_END
-    } else {
-        reasons::DIFFERENT_END
+    let own = own_routes(&draft.status);
+    let has_same_routes = routes.as_ref().is_ok_and(|other| !differs(ours, own, *other));
+    let reason = match routes {
+        _ if ours != theirs => reasons::DIFFERENT_END,
+        Ok(_) if !has_same_routes => reasons::DIFFERENT_ROUTES,
+        _ => reasons::SAME_END,
     };
-    let message = format!("This run is {}; EvalAI shows {}.", ours.as_str(), theirs.as_str());
+    let of_routes = match routes {
+        Ok(other) => format!(
+            "This run has {} of {} routes, and the other program's results have {} of {}.",
+            own.done, own.total, other.done, other.total
+        ),
+        Err(why) => format!("The numbers of routes were not compared: {}", sentence(why)),
+    };
+    let (ends, is_same) = ((ours.as_str(), theirs.as_str()), reason == reasons::SAME_END);
+    let message = format!("This run is {}; EvalAI shows {}. {of_routes}", ends.0, ends.1);
     draft.condition(conditions::COMPARED, Truth::from(is_same), reason, &message);
     if !is_same {
         draft.event(true, reason, message);
     }
+}
+
+/// A run that ends early may have reported no progress; how many routes it has is in its plan.
+fn own_routes(status: &SubmissionStatus) -> Routes {
+    let total = status
+        .plan
+        .as_ref()
+        .map(|plan| plan.routes.saturating_mul(plan.repetitions));
+    Routes {
+        done: status.progress.as_ref().map_or(0, |progress| progress.done),
+        total: total.unwrap_or_default(),
+    }
+}
+
+/// How far a run comes that does not finish is no matter of the program that drives it.
+fn differs(end: State, own: Routes, other: Routes) -> bool {
+    own.total != other.total || (end == State::Finished && own.done != other.done)
 }
 
 /// The end that a status of EvalAI's is; none while the other run goes on.

@@ -5,6 +5,7 @@ use std::time::Duration;
 use crate::controller::slots::turns::InLine;
 use crate::controller::submissions::foreign_runs;
 use crate::controller::submissions::images::Question;
+use crate::controller::submissions::other_results;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
@@ -35,6 +36,8 @@ pub enum Action {
     LookUpImage(Question),
     /// Look whether another program runs the submission.
     LookForForeignRun(Box<foreign_runs::Question>),
+    /// Read how many routes another program's run of the submission has.
+    ReadOtherResults(Box<other_results::Question>),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

@@ -174,12 +174,12 @@ fn stage(pod: &PodView) -> &'static str {
     };
     if pod.logcopy_running {
         "images are pulled, simulators and agents start"
-    } else if ended(names::CONTAINER_WORKSPACE) {
-        "logcopy starts"
     } else if ended(names::CONTAINER_CONTENTS) {
-        "the workspace is filled"
+        "logcopy starts"
+    } else if ended(names::CONTAINER_WORKSPACE) {
+        "contents are pulled and copied"
     } else {
-        "images are pulled and contents copied"
+        "the operator's image is pulled and the workspace is filled"
     }
 }
 

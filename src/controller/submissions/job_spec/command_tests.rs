@@ -92,6 +92,20 @@ fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args:
     (*job, command)
 }
 
+/// The command that the runner keeps the output of, as it starts it.
+fn behind_keeper(words: &[String]) -> Vec<String> {
+    assert_eq!(words[0], "/leaderboard-tools/leaderboard-runner");
+    let args::Request::Keep(kept) = args::parse(words[1..].iter().map(OsString::from)).unwrap() else {
+        panic!("{words:?} keeps nothing");
+    };
+    assert_eq!(kept.log.to_str(), Some("/tmp/leaderboard-log/contents.log"));
+    assert_eq!(kept.log_limit, 16 << 20);
+    kept.command
+        .into_iter()
+        .map(|word| word.into_string().unwrap())
+        .collect()
+}
+
 /// A home folder and a `bin` with one fake program that writes its arguments, and for python3 its variables, as lines.
 struct Image {
     folder: PathBuf,
@@ -373,10 +387,8 @@ fn a_hosts_command_stands_behind_the_same_runner() {
     let (words, mut env) = started(container(&job, "simulator-2"), &[]);
     let (_, command) = behind_runner(&words, &mut env);
     assert_eq!(command, ["/sim", "2100", "$(RESUME)", "$(date) $ $HOME"]);
-    assert_eq!(
-        container(&job, "contents")["command"],
-        json!(["/fill", "$(RESUME)", "$$(date) $$ $HOME"])
-    );
+    let (words, _) = started(container(&job, "contents"), &[]);
+    assert_eq!(behind_keeper(&words), ["/fill", "", "$(date) $ $HOME"]);
 }
 
 #[test]
@@ -396,7 +408,7 @@ fn the_contents_are_copied_as_the_original_does() {
     let variables: Vec<(&str, &str)> = names.into_iter().zip(roots.iter().map(String::as_str)).collect();
     let job = Case::new("V2", json!({})).json();
     let (command, env) = started(container(&job, "contents"), &variables);
-    let output = image.run(&command, &env);
+    let output = image.run(&behind_keeper(&command), &env);
     let [lb, sr, carla] = &roots;
     let expected = format!(
         "-r {lb}/data {lb}/leaderboard /tmp/leaderboard/\n-r {sr}/srunner /tmp/scenario_runner/\n-r {carla}/PythonAPI /tmp/CARLA/\n"
@@ -414,6 +426,7 @@ fn contents_that_are_missing_or_not_copied_end_the_container() {
         container(&job, "contents"),
         &[("LEADERBOARD_ROOT", "/a"), ("SCENARIO_RUNNER_ROOT", "")],
     );
+    let command = behind_keeper(&command);
     let output = image.run(&command, &env);
     assert!(!output.status.success());
     assert!(output.stdout.is_empty(), "the whole file system would have been copied");

@@ -8,13 +8,18 @@ use k8s_openapi::api::core::v1::{
 
 use super::security::{confined, context, resources};
 use super::{JobInput, commands, resume, run_document, variable, volumes};
-use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
+use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
+use crate::pod::ownlog::CONTENTS_LOG;
+use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
 use leaderboard_api::names;
 
 /// `workspace` and `logcopy` run as nobody in particular: with every capability dropped root could read no more than any
 /// other uid, and all that they write to is a volume (0777) or a folder that the kubelet or they themselves made there.
 /// Files they restore are 0666 in folders of 0777, so that the agents' uids, whatever they are, can go on with them.
 const OWN_UID: i64 = 65532;
+
+/// Copying prints little; what floods must not fill the disk. In bytes.
+const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
 
 /// Copies the private contents into their volumes.
 pub(super) fn contents(input: &JobInput<'_>) -> Container {
@@ -26,13 +31,26 @@ pub(super) fn contents(input: &JobInput<'_>) -> Container {
     Container {
         name: names::CONTAINER_CONTENTS.into(),
         image: Some(input.plan.contents_image.clone()),
-        command: Some(host.unwrap_or_else(commands::contents)),
+        command: Some(kept(host.unwrap_or_else(commands::contents))),
         env: Some(contents_env(input)),
         resources: spec.resources.clone(),
         security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_contents()),
         ..Container::default()
     }
+}
+
+/// What it prints is in a file too, from which `logcopy` sends it to CloudWatch.
+fn kept(command: Vec<String>) -> Vec<String> {
+    let file = CONTENTS_LOG.rsplit('/').next().unwrap_or(CONTENTS_LOG);
+    let flags = [
+        format!("{TOOLS}/{RUNNER}"),
+        "keep".into(),
+        format!("--log={CONTENTS_LOG_FOLDER}/{file}"),
+        format!("--log-limit={CONTENTS_LOG_LIMIT}"),
+        "--".into(),
+    ];
+    flags.into_iter().chain(command).collect()
 }
 
 /// What the contents of the old pipeline were given; a command of the host's may read it. The host's own variables replace ours of the

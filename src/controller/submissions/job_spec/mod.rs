@@ -276,8 +276,9 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
     PodSpec {
         restart_policy: Some("OnFailure".into()),
         init_containers: Some(vec![
-            init::contents(input),
+            // First, since it makes the folders and the runner that the other one has.
             init::workspace(input),
+            init::contents(input),
             init::logcopy(input),
         ]),
         containers: pairs

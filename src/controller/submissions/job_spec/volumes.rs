@@ -8,7 +8,8 @@ use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
 use super::{JobInput, display};
 use crate::controller::submissions::pod_layout::{
-    AGENT, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
+    AGENT, CONTENTS_LOG_FOLDER, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, SHM, SHM_VOLUME,
+    STATUS, TOOLS_VOLUME,
 };
 use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
 use leaderboard_api::{ByteQuantity, names};
@@ -119,12 +120,14 @@ fn identity() -> Volume {
     }
 }
 
-/// Where `contents` writes.
+/// Where `contents` writes, and the runner that keeps what it prints.
 pub(super) fn of_contents() -> Vec<VolumeMount> {
-    CONTENTS_VOLUMES
-        .into_iter()
-        .map(|(volume, written, _)| mount(volume, written))
-        .collect()
+    let written = CONTENTS_VOLUMES.map(|(volume, written, _)| mount(volume, written));
+    let own = [
+        read_only(mount(TOOLS_VOLUME, TOOLS)),
+        mount_part(LOGS_VOLUME, "contents".into(), CONTENTS_LOG_FOLDER),
+    ];
+    written.into_iter().chain(own).collect()
 }
 
 /// What `workspace` prepares.

@@ -18,6 +18,7 @@ use super::external::ExternalSystems;
 use super::foreign_runs::ForeignRuns;
 use super::images::Images;
 use super::memory::Memory;
+use super::other_results::OtherResults;
 use super::reruns::Reruns;
 use super::team_history::{self, TeamHistory};
 use super::view::{NodeView, ObservedJob, PodView, View};
@@ -45,6 +46,7 @@ pub struct Uses<'a> {
     pub lookups: &'a Lookups,
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
+    pub other_results: &'a OtherResults,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
@@ -75,6 +77,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
         image: uses.images.observe(&submission),
         traces: uses.foreign_runs.observe(&submission),
+        other_routes: uses.other_results.observe(&submission),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,
         leaving: node.leaving,

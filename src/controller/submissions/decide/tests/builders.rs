@@ -14,8 +14,8 @@ use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
-    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, ObservedTraces, PodView, RecordView, Stage,
-    Standing, Texts, Turn, View,
+    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
+    RecordView, Stage, Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -115,6 +115,8 @@ impl World {
                 image: ObservedImage::NotAsked,
                 // Nobody else runs it; the tests of foreign runs say otherwise.
                 traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
+                // The results of another program; the tests of one that observes say otherwise.
+                other_routes: ObservedRoutes::NotAsked,
                 turn: Turn::Go,
                 job: ObservedJob::Absent,
                 pod: None,
@@ -423,6 +425,7 @@ pub fn report(done: u32) -> Report {
         stopped: None,
         why: None,
         warnings: Vec::new(),
+        logs: None,
         results: "[]".into(),
         partial_results: None,
         files: std::collections::BTreeMap::new(),

@@ -1,9 +1,12 @@
-//! Runs that are not published: EvalAI is read, and the ends are compared.
+//! Runs that are not published: EvalAI is read, and ends and numbers of routes are compared.
+
+use std::sync::Arc;
 
 use super::builders::*;
 use crate::controller::submissions::decide::observe::end_of;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::view::{ObservedReport, ObservedTraces};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan};
+use crate::controller::submissions::other_results::{Answer, Routes};
+use crate::controller::submissions::view::{ObservedReport, ObservedRoutes, ObservedTraces};
 use leaderboard_api::State::{self, Cancelled, Failed, Finished, Pending};
 use leaderboard_api::conditions::{COMPARED, PUBLISHED, STALLED};
 use leaderboard_api::{EvalaiMode, reasons};
@@ -16,7 +19,13 @@ fn observed() -> World {
     spec.storage.prefix = Some("observe/".into());
     spec.table = None;
     world.view.record = None;
+    other_has(&mut world, Ok(Routes { done: 4, total: 4 }));
     world
+}
+
+/// The routes in the other program's results.
+fn other_has(world: &mut World, routes: Answer) {
+    world.view.other_routes = ObservedRoutes::Answered(Arc::new(routes));
 }
 
 /// The other program's run, as EvalAI shows it at this second.
@@ -101,6 +110,65 @@ fn the_other_end_is_waited_for_and_read_again() {
     world.in_evalai().info = Some(info());
     shows(&mut world, "finished", 391);
     assert_eq!(condition(&world.pass(), COMPARED).0, "True");
+}
+
+#[test]
+fn routes_are_read_once_and_compared_where_the_ends_are_the_same() {
+    let has = |done, total| Ok(Routes { done, total });
+    let missing: Answer = Err("there is no s3://results/1/agent/agent_results.json".into());
+    let cases = [
+        (
+            finished as fn() -> World,
+            "finished",
+            has(4, 4),
+            reasons::SAME_END,
+            "has 4 of 4",
+        ),
+        (
+            finished,
+            "finished",
+            has(3, 4),
+            reasons::DIFFERENT_ROUTES,
+            "have 3 of 4",
+        ),
+        (
+            finished,
+            "finished",
+            has(20, 20),
+            reasons::DIFFERENT_ROUTES,
+            "have 20 of 20",
+        ),
+        (failed, "failed", has(0, 4), reasons::SAME_END, "have 0 of 4"),
+        (failed, "failed", has(4, 5), reasons::DIFFERENT_ROUTES, "have 4 of 5"),
+        (failed, "finished", has(4, 4), reasons::DIFFERENT_END, "have 4 of 4"),
+        (
+            finished,
+            "finished",
+            missing,
+            reasons::SAME_END,
+            "were not compared: There is no s3://",
+        ),
+    ];
+    for (end, theirs, routes, reason, words) in cases {
+        let mut world = end();
+        world.view.other_routes = ObservedRoutes::NotAsked;
+        shows(&mut world, theirs, 10);
+        world.pass();
+        let plan = world.pass();
+        assert!(has_action(&plan), "{theirs} {routes:?}");
+        assert_eq!(condition(&plan, COMPARED).1, reasons::AWAITING_OTHER_END);
+        other_has(&mut world, routes.clone());
+        let plan = world.pass();
+        assert!(!has_action(&plan));
+        assert_eq!(condition(&plan, COMPARED).1, reason, "{theirs} {routes:?}");
+        let shown = plan.status.conditions.iter().find(|c| c.type_ == COMPARED).unwrap();
+        assert!(shown.message.contains(words), "{}", shown.message);
+        assert_eq!(events(&plan).contains(&reason), reason != reasons::SAME_END);
+    }
+}
+
+fn has_action(plan: &Plan) -> bool {
+    has(plan, |action| matches!(action, Action::ReadOtherResults(_)))
 }
 
 #[test]

@@ -3,11 +3,11 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{ObservedJob, ObservedReport, PodView, Stage};
-use crate::pod::report::Report;
+use crate::pod::report::{Logs, Report};
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Resumed, Running};
-use leaderboard_api::conditions::{self, PLAUSIBLE, RUNNING, STALLED};
+use leaderboard_api::conditions::{self, LOGGED, PLAUSIBLE, RUNNING, STALLED};
 use leaderboard_api::reasons;
 
 #[test]
@@ -65,6 +65,34 @@ fn scores_without_reason_are_a_condition_and_no_failure() {
     world.report(warned(final_report()));
     let plan = world.pass_to(Finished, reasons::FINISHED);
     assert_eq!(condition(&plan, PLAUSIBLE).0, "False");
+}
+
+#[test]
+fn lines_that_cloudwatch_refuses_are_a_condition_and_a_check_shows_that_it_takes_them() {
+    let with = |report: Report, logs: &Logs| Report {
+        logs: Some(logs.clone()),
+        ..report
+    };
+    let refused = Logs::Refused("creating g/77/agent-1 in CloudWatch Logs: no such group".into());
+    let mut world = World::local().running();
+    world.report(with(report(1), &Logs::Sent));
+    assert_eq!(condition(&world.pass_to(Running, reasons::RUNNING), LOGGED).0, "");
+    world.report(with(report(2), &refused));
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!(condition(&plan, LOGGED), ("False".into(), reasons::LOGS_REFUSED.into()));
+    let found = conditions::get(&plan.status.conditions, LOGGED).unwrap();
+    assert!(found.message.starts_with("Creating g/77/agent-1"), "{}", found.message);
+    world.complete();
+    world.report(with(final_report(), &Logs::Sent));
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(condition(&plan, LOGGED).0, "True");
+
+    let mut world = World::local().running();
+    world.submission().spec.check = true;
+    world.complete();
+    world.report(with(final_report(), &Logs::Sent));
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(condition(&plan, LOGGED), ("True".into(), reasons::LOGS_SENT.into()));
 }
 
 #[test]

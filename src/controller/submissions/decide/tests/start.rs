@@ -45,7 +45,7 @@ fn a_silent_node_is_told_in_steps() {
         world.go_to(second);
         world.pass_to(Pending, reasons::PREPARING).status.message.unwrap()
     };
-    assert!(said(&mut world, 61).contains("on node-a: images are pulled and contents copied."));
+    assert!(said(&mut world, 61).contains("on node-a: the operator's image is pulled and the workspace is filled."));
     assert!(said(&mut world, 130).contains("for over 2 min."));
     let five = said(&mut world, 300);
     assert!(five.contains("for over 5 min."));

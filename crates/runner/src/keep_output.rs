@@ -1,0 +1,88 @@
+//! A command whose output goes to a file too, and that is all: no peer, no status files, no verdict. Called by `main` for the host's
+//! private contents.
+
+use std::io;
+use std::os::fd::AsFd;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::signal::Signal;
+
+use crate::group::{self, Status, spawn_code};
+use crate::launch::teed;
+use crate::say;
+use crate::tee::Tee;
+use crate::wake::Signals;
+use leaderboard_runner::args::Kept;
+
+/// Behind the signal of a child's end.
+const SLOW_POLL: Duration = Duration::from_secs(1);
+/// For output whose writer outlives the command: then the rest is given up.
+const LAST_WAIT: Duration = Duration::from_secs(10);
+/// What a shell adds to the number of a signal.
+const BY_SIGNAL: i32 = 128;
+
+/// Runs the command to its end; its exit code, as a shell would give it.
+pub(crate) fn run(kept: Kept, mut signals: Signals) -> i32 {
+    let started = teed(group::command(&kept.command, &[]), kept.log, kept.log_limit);
+    let (mut group, mut tee) = match started {
+        Ok((group, Some(tee))) => (group, tee),
+        Ok((_, None)) => return BY_SIGNAL,
+        Err(error) => {
+            say(format_args!("the command cannot be started: {error}"));
+            return spawn_code(&error);
+        }
+    };
+    let mut ended: Option<Instant> = None;
+    loop {
+        group.reap();
+        if group.status().is_some() && ended.is_none() {
+            ended = Some(Instant::now());
+        }
+        let is_late = ended.is_some_and(|ended| ended.elapsed() >= LAST_WAIT);
+        if let Some(status) = group.status().filter(|_| tee.finished() || is_late) {
+            return code(status);
+        }
+        if wait(&tee, &signals) {
+            tee.read();
+        }
+        tee.write();
+        if signals.drain() {
+            group.signal(Signal::SIGTERM);
+        }
+    }
+}
+
+fn code(status: Status) -> i32 {
+    match status {
+        Status::Exited(code) => code,
+        Status::Killed(signal) => BY_SIGNAL + signal.unwrap_or_default(),
+    }
+}
+
+/// Waits until something may have changed; whether the output is readable.
+fn wait(tee: &Tee, signals: &Signals) -> bool {
+    let stdout = io::stdout();
+    let mut descriptors: Vec<_> = signals
+        .fds()
+        .into_iter()
+        .map(|fd| PollFd::new(fd, PollFlags::POLLIN))
+        .collect();
+    let input = tee.input();
+    if let Some(input) = input {
+        descriptors.push(PollFd::new(input, PollFlags::POLLIN));
+    } else if tee.wants_stdout() {
+        descriptors.push(PollFd::new(stdout.as_fd(), PollFlags::POLLOUT));
+    }
+    let milliseconds = u16::try_from(SLOW_POLL.as_millis()).unwrap_or(u16::MAX);
+    match poll(&mut descriptors, PollTimeout::from(milliseconds)) {
+        Ok(_) | Err(Errno::EINTR) => {}
+        Err(error) => {
+            say(format_args!("cannot wait for events: {error}"));
+            std::thread::sleep(SLOW_POLL);
+            return false;
+        }
+    }
+    input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true)
+}
