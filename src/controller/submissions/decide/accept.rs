@@ -57,21 +57,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if restored::ends(draft, leaderboard, track, info.as_ref()) {
         return false;
     }
-    let (image, fault) = match named_image(draft, info.as_ref()) {
-        Image::Named(image) => {
-            let fault = image::not_allowed(draft, leaderboard, &image);
-            (image, fault)
-        }
-        Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
-        Image::Unknown => {
-            let message = image_unread(draft);
-            draft.stall_with(reasons::IMAGE_MISSING, &message);
-            return refuse(draft, reasons::IMAGE_MISSING, &message);
-        }
+    let Some(image) = allowed_image(draft, leaderboard, track, info.as_ref()) else {
+        return false;
     };
-    if let Some(found) = fault {
-        return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
-    }
     if let Some(message) = not_ready(draft) {
         return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
     }
@@ -109,6 +97,33 @@ pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(track) = track else { return false };
     take_team(draft, Some(info));
     foreign::look(draft, leaderboard, Some(info)).is_none() || restored::ends(draft, leaderboard, track, Some(info))
+}
+
+/// The image, if one is named that the Leaderboard allows. Otherwise the draft says why not.
+fn allowed_image(
+    draft: &mut PlanBuilder<'_>,
+    leaderboard: &LeaderboardSpec,
+    track: &Track,
+    info: Option<&EvalaiInfo>,
+) -> Option<String> {
+    let (image, fault) = match named_image(draft, info) {
+        Image::Named(image) => {
+            let fault = image::not_allowed(draft, leaderboard, &image);
+            (image, fault)
+        }
+        Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
+        Image::Unknown => {
+            let message = image_unread(draft);
+            draft.stall_with(reasons::IMAGE_MISSING, &message);
+            refuse(draft, reasons::IMAGE_MISSING, &message);
+            return None;
+        }
+    };
+    if let Some(found) = fault {
+        refuse_image(draft, leaderboard, track, image, info, found);
+        return None;
+    }
+    Some(image)
 }
 
 /// Ends a submission whose image can never run. The plan makes it a row of the table, as any other failure.
