@@ -71,9 +71,8 @@ impl Season {
         let finished = world.submit("lb", 1).await;
         local_submission(&world, LOCAL_FINISHED).await;
         finish(&world, [finished.1.as_str(), LOCAL_FINISHED]).await;
-        let (failed, cancelled) = (world.submit("lb", 1).await, world.submit("lb", 1).await);
+        let (failed, cancelled) = (world.submit("lb", 1).await, world.submit("held", 2).await);
         world.run_that_crashes(failed.0, &failed.1).await;
-        world.job(&cancelled.1, 0).await;
         let cancel = Patch::Merge(json!({"spec": {"cancel": true}}));
         let submissions = world.api::<Submission>();
         submissions
@@ -81,7 +80,9 @@ impl Season {
             .await
             .unwrap();
         for name in [&failed.1, &cancelled.1] {
-            world.until(name, "every system has its end", is_settled).await;
+            world
+                .until(name, &format!("{name} has its end everywhere"), is_settled)
+                .await;
         }
         let (running, unread) = (world.submit("lb", 1).await, world.submit("lb", 1).await);
         local_submission(&world, LOCAL_RUNNING).await;
@@ -188,7 +189,9 @@ async fn finish(world: &World, names: [&str; 2]) {
     }
     player.fall_the_curtain();
     for name in names {
-        world.until(name, "every system has its end", is_settled).await;
+        world
+            .until(name, &format!("{name} has its end everywhere"), is_settled)
+            .await;
     }
 }
 

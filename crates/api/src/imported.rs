@@ -51,21 +51,21 @@ impl SubmissionStatus {
     /// The status of a submission that ended before it was imported. Every system has its end, so nothing is written anywhere.
     pub fn of_imported(spec: &SubmissionSpec, end: ImportedEnd, generation: i64, now: &Time) -> Self {
         let what = format!("Imported from the table {}, where it has ended.", end.table);
-        Self::of_ended(spec, end, what, generation, now)
+        Self::of_ended(spec, end, &what, generation, now)
     }
 
     /// The status of a submission whose end every system has, for a cause that `what` says.
-    pub fn of_ended(spec: &SubmissionSpec, end: ImportedEnd, what: String, generation: i64, now: &Time) -> Self {
+    pub fn of_ended(spec: &SubmissionSpec, end: ImportedEnd, what: &str, generation: i64, now: &Time) -> Self {
         let (reason, failure) = match end.state {
             ImportedState::Finished => (reasons::FINISHED, None),
-            ImportedState::Failed => (reasons::IMPORTED_FAILURE, Some(failure(&what))),
+            ImportedState::Failed => (reasons::IMPORTED_FAILURE, Some(failure(what))),
             ImportedState::Cancelled => (reasons::CANCELLED, None),
         };
         let mut status = Self {
             observed_generation: Some(generation),
             attempt: Some(spec.attempt),
             reason: Some(reason.to_owned()),
-            message: Some(what.clone()),
+            message: Some(what.to_owned()),
             team: spec.team.clone().map(TeamStatus::from),
             track: Some(end.track),
             progress: end.progress,
@@ -80,7 +80,7 @@ impl SubmissionStatus {
             ..end.times
         };
         for (type_, truth, reason, message) in [
-            (FINISHED, Truth::True, reason, what.as_str()),
+            (FINISHED, Truth::True, reason, what),
             (PUBLISHED, Truth::False, reasons::NOT_REQUIRED, ""),
             (RECORDED, Truth::True, reasons::RECORDED, ""),
         ] {

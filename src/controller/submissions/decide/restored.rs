@@ -241,7 +241,7 @@ fn show_end(
     let generation = draft.submission().metadata.generation.unwrap_or_default();
     let team = draft.status.team.take();
     let now = draft.time();
-    draft.status = SubmissionStatus::of_ended(draft.spec(), end, what.to_owned(), generation, &now);
+    draft.status = SubmissionStatus::of_ended(draft.spec(), end, what, generation, &now);
     draft.status.team = team;
     draft.requeue_in(Duration::ZERO);
 }
