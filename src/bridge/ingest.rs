@@ -259,6 +259,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
             priority: 0,
             attempt: 1,
             cancel: false,
+            requeue: None,
         },
         status: None,
     }

@@ -179,6 +179,7 @@ fn submission(row: &StoredRow, place: &Place<'_>, attempt: i64) -> Result<Submis
             priority: 0,
             attempt,
             cancel: false,
+            requeue: None,
         },
         status: None,
     })

@@ -218,6 +218,12 @@ reasons! {
              `retries.infrastructure`.",
             "Nothing. If it happens often, give the track nodes that stay.",
             after_failure: "Resume the submission.";
+        REQUEUED = "Requeued",
+            "A host has put the submission back in line (`spec.requeue`). A Job that ran was stopped, its results were stored, and a new \
+             Job resumes from them; this uses up neither an attempt nor `retries.infrastructure`, and what was counted in \
+             `status.infrastructureFailures` is forgiven.",
+            "Nothing.",
+            after_failure: "Resume the submission.";
         START_DEADLINE = "StartDeadline",
             "No agent started within `deadlines.startSeconds` after the Pod was scheduled and its images were pulled, or the images were \
              not pulled within `deadlines.pullSeconds`.",

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, crashes, failure, interruption, reading};
+use super::{allowance, crashes, failure, interruption, reading, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage, View};
 use leaderboard_api::conditions::{self, Truth};
@@ -60,6 +60,11 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
             "It was cancelled; what it had reached is kept."
         };
         return cancelled(draft, reason, message);
+    }
+    // Whatever ended it meanwhile is forgiven.
+    if requeue::is_requested(draft) {
+        let found = requeue::failure(draft);
+        return retry(draft, &found);
     }
     let recorded = draft.status.failure.clone();
     let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
@@ -203,7 +208,7 @@ fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
 
 fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     let failures = interruption::other_failures(&draft.status);
-    let (delay, next) = if interruption::is_one(found) {
+    let (delay, next) = if interruption::is_one(found) || requeue::is_one(found) {
         let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
         (0, next.to_owned())
     } else {
@@ -214,6 +219,8 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
     if interruption::is_one(found) {
         interruption::note(draft);
+    } else if requeue::is_one(found) {
+        requeue::note(draft, 1);
     }
     draft.status.retry += 1;
     draft.status.job_name = None;

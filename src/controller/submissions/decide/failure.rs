@@ -146,6 +146,8 @@ pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
     match failure.map(|failure| failure.reason.as_str()) {
         Some(reasons::TIME_LIMIT) => Stop::RunDeadline,
         Some(reasons::NODE_INTERRUPTED) => Stop::Interruption,
+        // A host ends it, as by a cancel.
+        Some(reasons::REQUEUED) => Stop::Cancel,
         _ => Stop::Retries,
     }
 }

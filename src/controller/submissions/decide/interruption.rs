@@ -55,10 +55,11 @@ pub(super) fn is_one(found: &Failure) -> bool {
     found.reason == reasons::NODE_INTERRUPTED
 }
 
-/// Jobs of the attempt that ended otherwise, because of the infrastructure.
+/// Jobs of the attempt that ended otherwise, because of the infrastructure, since a host has last requeued it.
 pub(super) fn other_failures(status: &SubmissionStatus) -> i32 {
     let interruptions = status.interruptions.as_ref().map_or(0, |past| past.number);
-    status.retry.saturating_sub(interruptions)
+    let forgiven = status.requeued.as_ref().map_or(0, |requeued| requeued.retries);
+    status.retry.saturating_sub(interruptions).saturating_sub(forgiven)
 }
 
 /// One more.

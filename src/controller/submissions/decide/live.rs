@@ -6,7 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate, job_name};
 use super::plan_builder::{PlanBuilder, after};
-use super::{accept, crashes, end, failure, interruption, isolation, line, reading, start, stop};
+use super::{accept, crashes, end, failure, interruption, isolation, line, reading, requeue, start, stop};
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
@@ -89,6 +89,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
         };
         return end::cancelled(draft, reason, &format!("{what} {when}."));
     }
+    requeue::take_up(draft);
     if !accept::decide(draft) {
         return draft.requeue_in(BACKSTOP);
     }
@@ -247,6 +248,9 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
     if let Some(lost) = stop::lost_pod(draft) {
         return stop::leave_lost_pod(draft, job, lost);
+    }
+    if !draft.is_to_stop() {
+        requeue::notice(draft);
     }
     if !draft.is_to_stop() {
         watch_run(draft);

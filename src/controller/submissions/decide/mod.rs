@@ -2,7 +2,7 @@
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `interruption` is a
-//! node that is taken away, `pulls` bounds a start, `blame` decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `retention` deletes what
+//! node that is taken away, `requeue` a host who puts a run back in line, `pulls` bounds a start, `blame` decides whose fault a crash was, `crashes` counts them, `allowance` bounds those of a team's simulators, `retention` deletes what
 //! has ended long ago, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
@@ -25,6 +25,7 @@ mod plan;
 mod plan_builder;
 mod pulls;
 mod reading;
+mod requeue;
 mod retention;
 mod start;
 mod stop;

@@ -9,7 +9,7 @@ use super::plan::{Action, Event, Plan};
 use crate::controller::submissions::view::{ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
+    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Requeued, Retries, Score, State, Submission, SubmissionSpec,
     SubmissionStatus, effective, names, reasons,
 };
 
@@ -177,6 +177,8 @@ impl<'a> PlanBuilder<'a> {
             results_url: old.results_url,
             rerun_of: old.rerun_of,
             infrastructure_failures: old.infrastructure_failures,
+            // Retries are counted anew.
+            requeued: old.requeued.map(|requeued| Requeued { retries: 0, ..requeued }),
             usage: old.usage,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,

@@ -21,6 +21,7 @@ mod nodes;
 mod observe;
 mod properties;
 mod reading;
+mod requeue;
 mod resume;
 mod retention;
 mod rules;

@@ -41,6 +41,7 @@ enum Change {
     },
     Cancel,
     Resume,
+    Requeue,
     Delete,
     StatusLost,
 }
@@ -319,6 +320,7 @@ fn change() -> impl Strategy<Value = Change> {
         }),
         1 => Just(Change::Cancel),
         3 => Just(Change::Resume),
+        2 => Just(Change::Requeue),
         1 => Just(Change::Delete),
         1 => Just(Change::StatusLost),
     ]
@@ -390,6 +392,7 @@ fn apply(world: &mut World, change: Change) {
             spec.attempt += 1;
             spec.cancel = false;
         }
+        Change::Requeue => world.requeue(None),
         Change::Delete => world.submission().metadata.deletion_timestamp = Some(Time(world.view.now)),
         Change::StatusLost => world.submission().status = None,
     }
