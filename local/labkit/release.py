@@ -71,7 +71,7 @@ def platform(release: str, base: str, name: str, sums: Mapping[str, str]) -> dic
         "uri": f"{base}/{file}",
         "sha256": sums[file],
         "bin": program,
-        "files": [{"from": program, "to": "."}, {"from": "LICENSE", "to": "."}],
+        "files": [{"from": name, "to": "."} for name in (program, "LICENSE")] + [{"from": "man1/*", "to": "man1"}],
     }
 
 

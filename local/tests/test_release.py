@@ -51,6 +51,8 @@ class Krew(unittest.TestCase):
         self.assertEqual(windows["selector"]["matchLabels"], {"os": "windows", "arch": "amd64"})
         self.assertEqual(windows["uri"], "https://x.example/v1.2.3/kubectl-leaderboard-1.2.3-windows-amd64.tar.gz")
         self.assertEqual((windows["bin"], windows["sha256"]), ("kubectl-leaderboard.exe", "0" * 64))
+        files = [file["from"] for file in windows["files"]]
+        self.assertEqual(files, ["kubectl-leaderboard.exe", "LICENSE", "man1/*"])
 
     def test_a_missing_archive_is_named(self) -> None:
         sums = {name: digest for name, digest in SUMS.items() if "darwin-arm64" not in name}
@@ -83,6 +85,12 @@ class Workflows(unittest.TestCase):
         name = re.search(r"ARCHIVE: (.+)", self.release)
         expected = release.archive("${{ needs.plan.outputs.version }}", "${{ matrix.name }}")
         self.assertEqual(name[1] if name else "", expected)
+
+    def test_the_archives_hold_the_manual_pages_that_the_program_writes(self) -> None:
+        self.assertIn("--package kubectl-leaderboard -- man man1\n", self.release)
+        self.assertRegex(self.release, r"name: manual\n +path: man1/\*\.1\n")
+        self.assertRegex(self.release, r"name: manual\n +path: archive/man1\n")
+        self.assertRegex(self.release, r"tar --create .+ --directory archive \"\$PROGRAM\" LICENSE man1\n")
 
     def test_the_bases_that_are_resolved_are_those_of_the_dockerfile(self) -> None:
         dockerfile = (REPOSITORY / "Dockerfile").read_text()

@@ -4,6 +4,8 @@
 
 mod checks;
 mod daily;
+mod logs;
+mod requeue;
 mod rights;
 mod terminal;
 

@@ -1,20 +1,22 @@
-//! Whether a submission can be cancelled or resumed, the patch that does it, and what happens then.
+//! Whether a submission can be cancelled, resumed or requeued, the patch that does it, and what happens then.
 //!
-//! Called by `main`. Pure; the API server's own rules decide in the end.
+//! Called by `commands`. Pure; the API server's own rules decide in the end.
 
 use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
-use super::text::{Page, when};
-use super::why::{command, has_ended, is_attempt_requested, state};
+use super::facts::{command, has_ended, is_attempt_requested, is_requeue_requested, state};
+use super::text::{Frame, when};
 use leaderboard_api::{Deadlines, State, Submission, reasons};
 
 /// What a person asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request {
+pub enum Request<'a> {
     Cancel,
     Resume,
+    /// With the reason, for people.
+    Requeue(Option<&'a str>),
 }
 
 /// How a request is carried out.
@@ -30,30 +32,33 @@ pub struct Change {
 
 /// How to carry out a request, or why that is impossible, with the next step.
 pub fn plan(
-    request: Request,
+    request: Request<'_>,
     submission: &Submission,
     leaderboard: Observed<'_>,
-    now: jiff::Timestamp,
+    frame: Frame,
 ) -> Result<Change, String> {
     match request {
-        Request::Cancel => cancel(submission, leaderboard, now),
-        Request::Resume => resume(submission, leaderboard),
+        Request::Cancel => cancel(submission, leaderboard, frame),
+        Request::Resume => resume(submission, leaderboard, frame),
+        Request::Requeue(why) => requeue(submission, why, frame),
     }
 }
 
-fn cancel(submission: &Submission, leaderboard: Observed<'_>, now: jiff::Timestamp) -> Result<Change, String> {
+fn cancel(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Result<Change, String> {
     let name = submission.name_any();
     let status = submission.status.as_ref();
     if has_ended(submission) {
         let shown = status.and_then(state).map_or("ended", State::as_str);
         let at = status.and_then(|s| s.times.finished.as_ref());
-        let at = at.map(|at| format!(" since {}", when(at.0, now))).unwrap_or_default();
+        let at = at
+            .map(|at| format!(" since {}", when(at.0, frame.now)))
+            .unwrap_or_default();
         return Err(format!(
             "{name} is {shown}{at}, so there is nothing to cancel. See `{}`",
             command("why", submission)
         ));
     }
-    let mut page = Page::default();
+    let mut page = frame.page();
     let is_requested = submission.spec.cancel;
     if is_requested {
         page.paragraph(&format!("{name} is already being cancelled."));
@@ -103,13 +108,46 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
     )
 }
 
-fn resume(submission: &Submission, leaderboard: Observed<'_>) -> Result<Change, String> {
+/// In few words, since there may be many.
+fn requeue(submission: &Submission, why: Option<&str>, frame: Frame) -> Result<Change, String> {
+    let name = submission.name_any();
+    if is_requeue_requested(submission) {
+        return Err(format!(
+            "{name} is already requeued and has not stopped yet. See `{}`",
+            command("why", submission)
+        ));
+    }
+    let number = submission.spec.requeue.as_ref().map_or(0, |requeue| requeue.number);
+    let mut spec = json!({"requeue": {"number": number.saturating_add(1), "reason": why}});
+    let mut attempt = submission.spec.attempt;
+    let line = if submission.status.as_ref().is_some_and(|s| s.job_name.is_some()) && !has_ended(submission) {
+        format!("Requeued {name}: its run stops and continues in attempt {attempt}, when its turn comes.")
+    } else {
+        if let Some(why_not) = not_resumable(submission) {
+            return Err(why_not);
+        }
+        attempt = attempt.saturating_add(1);
+        spec["attempt"] = json!(attempt);
+        spec["cancel"] = json!(false);
+        format!("Requeued {name}: attempt {attempt} begins when its turn comes.")
+    };
+    let mut page = frame.page();
+    page.paragraph(&line);
+    Ok(Change {
+        // It may end at the same time: then the patch conflicts.
+        patch: Some(json!({"metadata": {"resourceVersion": submission.resource_version()}, "spec": spec})),
+        lines: page.into_lines(),
+        attempt,
+    })
+}
+
+fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Result<Change, String> {
     let name = submission.name_any();
     if let Some(why_not) = not_resumable(submission) {
         return Err(why_not);
     }
     let attempt = submission.spec.attempt.saturating_add(1);
-    let mut page = Page::default();
+    let mut page = frame.page();
     let results = submission.status.as_ref().and_then(|s| s.results_url.as_deref());
     page.paragraph(&format!("Requested attempt {attempt} of {name}."));
     match results {
@@ -173,9 +211,9 @@ fn not_resumable(submission: &Submission) -> Option<String> {
 }
 
 /// What to do when the API server refuses a patch.
-pub fn after_refusal(request: Request, submission: &Submission) -> String {
+pub fn after_refusal(request: Request<'_>, submission: &Submission) -> String {
     match (request, submission.spec.evalai) {
-        (Request::Resume, Some(evalai)) => format!(
+        (Request::Resume | Request::Requeue(_), Some(evalai)) => format!(
             "Resume submission {} in EvalAI (challenge {}): its message raises the attempt here",
             evalai.submission, evalai.challenge
         ),

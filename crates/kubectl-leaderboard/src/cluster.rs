@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use futures::{Stream, StreamExt};
+use futures::{Stream, StreamExt, TryFutureExt, TryStreamExt};
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{DeleteParams, ListParams, LogParams, PartialObjectMeta, Patch, PatchParams, PostParams};
@@ -136,21 +136,37 @@ impl Cluster {
             .max_by_key(|pod| pod.creation_timestamp().map(|time| time.0)))
     }
 
-    /// The log of a container, line by line.
+    /// The Pods of a submission, each time one of them changes.
+    pub fn pod_changes(&self, submission: &str) -> impl Stream<Item = Result<Pod, watcher::Error>> + use<> {
+        let config = watcher::Config::default().labels(&format!("{LABEL_SUBMISSION}={submission}"));
+        watcher::watcher(self.api::<Pod>(), config)
+            .default_backoff()
+            .applied_objects()
+            .boxed()
+    }
+
+    /// The log of a container so far, line by line.
     pub async fn log(
         &self,
         pod: &str,
         container: &str,
-        follow: bool,
     ) -> Result<impl Stream<Item = std::io::Result<String>> + use<>, Error> {
-        let params = LogParams {
-            container: Some(container.to_owned()),
-            follow,
-            ..LogParams::default()
-        };
         let api = self.api::<Pod>();
-        let reader = self.in_time(api.log_stream(pod, &params)).await??;
+        let reader = self
+            .in_time(api.log_stream(pod, &of_container(container, false)))
+            .await??;
         Ok(futures::io::AsyncBufReadExt::lines(Box::pin(reader)))
+    }
+
+    /// The log of a container from its beginning until it ends. One that prints nothing may not be answered before it does.
+    pub fn followed_log(&self, pod: &str, container: &str) -> impl Stream<Item = Result<String, Error>> + use<> {
+        let (api, pod, params) = (self.api::<Pod>(), pod.to_owned(), of_container(container, true));
+        let opened = async move {
+            let reader = api.log_stream(&pod, &params).await.map_err(Error::from)?;
+            let lines = futures::io::AsyncBufReadExt::lines(Box::pin(reader));
+            Ok(lines.map_err(|error| Error::Api(error.to_string())))
+        };
+        opened.try_flatten_stream()
     }
 
     /// A Leaderboard by its name.
@@ -253,7 +269,7 @@ impl Cluster {
         };
         let near = near::names(name, &known);
         let namespace = self.namespace.clone();
-        let elsewhere = self.namespaces_of(name).await;
+        let elsewhere = self.namespaces_of::<Submission>(name).await;
         let next = if let Some(other) = elsewhere.first() {
             format!("There is one in namespace {}: use -n {other}", elsewhere.join(", "))
         } else if near.is_empty() {
@@ -268,9 +284,18 @@ impl Cluster {
         })
     }
 
-    /// Namespaces that have a submission of this name; none if this person may not look.
-    async fn namespaces_of(&self, name: &str) -> Vec<String> {
-        let api: Api<PartialObjectMeta<Submission>> = Api::all(self.client.clone());
+    /// Namespaces that have a Leaderboard of this name; none if this person may not look.
+    pub async fn namespaces_of_leaderboard(&self, name: &str) -> Vec<String> {
+        self.namespaces_of::<Leaderboard>(name).await
+    }
+
+    /// Namespaces that have an object of this name; none if this person may not look.
+    async fn namespaces_of<K>(&self, name: &str) -> Vec<String>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + std::fmt::Debug,
+        K::DynamicType: Default,
+    {
+        let api: Api<PartialObjectMeta<K>> = Api::all(self.client.clone());
         let params = ListParams::default().fields(&format!("metadata.name={name}"));
         let found = match self.in_time(api.list(&params)).await {
             Ok(Ok(found)) => found.items,
@@ -282,6 +307,14 @@ impl Cluster {
     async fn in_time<T>(&self, request: impl Future<Output = T>) -> Result<T, Error> {
         let answer = tokio::time::timeout(LIMIT, request).await;
         answer.map_err(|_| Error::Silent(LIMIT.as_secs()))
+    }
+}
+
+fn of_container(container: &str, follow: bool) -> LogParams {
+    LogParams {
+        container: Some(container.to_owned()),
+        follow,
+        ..LogParams::default()
     }
 }
 

@@ -1,4 +1,8 @@
-//! `logs`: what the agents of a submission print, from its Pod, or where it is in S3 once the Pod is gone.
+//! `logs`: what the agents of a submission print, from its Pod, or from the bucket once the Pod is gone.
+
+mod follow;
+
+use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 use futures::StreamExt;
@@ -7,18 +11,19 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use leaderboard_api::{Submission, names};
 
-use crate::bucket;
+use crate::bucket_log::{Unread, read};
 use crate::cluster::Cluster;
 use crate::error::Error;
-use crate::output::print;
+use crate::output::{print, print_labelled};
 use crate::text::clean;
+use crate::{bucket, facts};
 
 /// Which logs.
 #[derive(Args, Debug)]
 pub struct Logs {
     /// Name of the submission.
     name: String,
-    /// Follow the log.
+    /// Follow the log until the submission has ended: into Pods that come later, and through crashes of agents.
     #[arg(short, long)]
     follow: bool,
     /// Only this pair, from 1.
@@ -58,20 +63,29 @@ impl Whose {
         }
     }
 
-    /// The keys of these logs below the run's prefix.
-    fn keys(self, pairs: usize, only: Option<usize>) -> Vec<String> {
+    /// The keys of these logs below the run's prefix, with their labels.
+    fn keys(self, pairs: usize, only: Option<usize>) -> Vec<(String, String)> {
         let pairs = (1..=pairs).filter(|pair| only.is_none_or(|only| only == *pair));
+        let of_pairs = |key: fn(usize) -> String| pairs.map(|pair| (pair.to_string(), key(pair))).collect();
         match self {
-            Self::Agent => pairs.map(|pair| format!("agent/agent{pair}/leaderboard.log")).collect(),
-            Self::Simulator => pairs.map(|pair| format!("simulator/console-{pair}.log")).collect(),
+            Self::Agent => of_pairs(|pair| format!("agent/agent{pair}/leaderboard.log")),
+            Self::Simulator => of_pairs(|pair| format!("simulator/console-{pair}.log")),
             Self::Start => Vec::new(),
-            Self::Logcopy => vec!["logcopy/logcopy.log".to_owned()],
+            Self::Logcopy => vec![("logcopy".to_owned(), "logcopy/logcopy.log".to_owned())],
         }
     }
 }
 
+/// A container whose log is shown, with its label and the number of its colour.
+#[derive(Clone, Debug)]
+struct Source {
+    stream: usize,
+    label: String,
+    container: String,
+}
+
 /// Prints the logs.
-pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<(), Error> {
+pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     let submission = cluster.submission(&wanted.name).await?;
     let pairs = pairs(&submission);
     if let Some(pair) = wanted.pair.filter(|pair| *pair == 0 || *pair > pairs.max(1)) {
@@ -80,13 +94,25 @@ pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<(), Error> {
             wanted.name
         )));
     }
+    if wanted.follow && !facts::has_ended(&submission) {
+        return follow::follow(cluster, wanted, submission).await;
+    }
     let Some(pod) = cluster.pod(&wanted.name).await? else {
-        let lines = in_bucket(&submission, &wanted.of.keys(pairs, wanted.pair)).map_err(Error::Unfit)?;
-        print(&lines);
-        return Ok(());
+        return from_bucket(&submission, wanted, pairs).await;
     };
-    let containers = wanted.of.containers(pairs, wanted.pair);
-    stream(cluster, &pod, &containers, wanted.follow).await
+    stream(cluster, &pod, &sources(wanted, pairs)).await?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn sources(wanted: &Logs, pairs: usize) -> Vec<Source> {
+    let containers = wanted.of.containers(pairs, wanted.pair).into_iter().enumerate();
+    let source = |(stream, (label, container)): (usize, (String, String))| Source {
+        // A pair has its colour also where it is shown alone.
+        stream: label.parse().unwrap_or(stream),
+        label,
+        container,
+    };
+    containers.map(source).collect()
 }
 
 fn pairs(submission: &Submission) -> usize {
@@ -94,33 +120,64 @@ fn pairs(submission: &Submission) -> usize {
     plan.map_or(0, |plan| plan.slices.len())
 }
 
-/// Prints the lines of several containers as they come, each with its label.
-async fn stream(cluster: &Cluster, pod: &Pod, containers: &[(String, String)], follow: bool) -> Result<(), Error> {
+/// Prints the lines of several containers so far, each with its label.
+async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<(), Error> {
     let name = pod.name_any();
     let mut streams = Vec::new();
-    for (label, container) in containers {
-        match cluster.log(&name, container, follow).await {
-            Ok(lines) => {
-                let label = label.clone();
-                streams.push(lines.map(move |line| (label.clone(), line)).boxed());
-            }
+    for source in sources {
+        let container = &source.container;
+        match cluster.log(&name, container).await {
+            Ok(lines) => streams.push(lines.map(move |line| (source, line)).boxed()),
             // One that has not started yet has no log, and the others may.
             Err(Error::Api(why)) => eprintln!("kubectl leaderboard: {container} has no log yet: {why}"),
             Err(error) => return Err(error),
         }
     }
     let mut all = select_all(streams);
-    while let Some((label, line)) = all.next().await {
+    while let Some((source, line)) = all.next().await {
         match line {
-            Ok(line) => print(&[format!("[{label}] {}", clean(&line))]),
+            Ok(line) => print_labelled(source.stream, &source.label, &clean(&line)),
             Err(error) => return Err(Error::Api(format!("the log of {name} ended: {error}"))),
         }
     }
     Ok(())
 }
 
+/// Prints the logs that are stored, or the commands that do so where there is no program for it.
+async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Result<ExitCode, Error> {
+    let keys = wanted.of.keys(pairs, wanted.pair);
+    let commands = in_bucket(submission, &keys).map_err(Error::Unfit)?;
+    let status = submission.status.as_ref();
+    let results = status
+        .and_then(|status| status.results_url.as_deref())
+        .unwrap_or_default();
+    let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
+    let mut is_unread = false;
+    for (stream, (label, key)) in keys.iter().enumerate() {
+        let stream = label.parse().unwrap_or(stream);
+        let show = |line: &str| print_labelled(stream, label, &clean(line));
+        match read(&format!("{results}/{key}"), storage, show).await {
+            Ok(()) => {}
+            Err(Unread::NoProgram) => {
+                print(&commands);
+                return Ok(ExitCode::SUCCESS);
+            }
+            Err(Unread::Failed(why)) => {
+                let next = "Check that it was stored, and that your AWS credentials may read the bucket";
+                eprintln!("kubectl leaderboard: cannot read {results}/{key}: {why}. {next}");
+                is_unread = true;
+            }
+        }
+    }
+    Ok(if is_unread {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    })
+}
+
 /// The commands that read the logs once the Pod is gone.
-fn in_bucket(submission: &Submission, keys: &[String]) -> Result<Vec<String>, String> {
+fn in_bucket(submission: &Submission, keys: &[(String, String)]) -> Result<Vec<String>, String> {
     let name = submission.name_any();
     let status = submission.status.as_ref();
     let results = status.and_then(|status| status.results_url.as_deref());
@@ -130,10 +187,13 @@ fn in_bucket(submission: &Submission, keys: &[String]) -> Result<Vec<String>, St
         ));
     };
     let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
-    let mut lines = vec!["The Pod is gone. Its logs are in the bucket, for those who may read it:".to_owned()];
+    let mut lines = vec![
+        "The Pod is gone. With the program aws on the PATH, this command shows its logs; without it, these do:"
+            .to_owned(),
+    ];
     lines.extend(
         keys.iter()
-            .map(|key| bucket::print(&format!("{results}/{key}"), storage)),
+            .map(|(_, key)| bucket::print(&format!("{results}/{key}"), storage)),
     );
     Ok(lines)
 }
@@ -154,7 +214,8 @@ mod tests {
     fn each_choice_has_its_containers_and_keys() {
         let names = |whose: Whose, only| {
             let found = whose.containers(2, only).into_iter().map(|(_, name)| name);
-            (found.collect::<Vec<_>>(), whose.keys(2, only))
+            let keys = whose.keys(2, only).into_iter().map(|(_, key)| key);
+            (found.collect::<Vec<_>>(), keys.collect::<Vec<_>>())
         };
         let two = |a: &str, b: &str| vec![a.to_owned(), b.to_owned()];
         assert_eq!(
@@ -176,7 +237,7 @@ mod tests {
     #[test]
     fn no_part_of_an_imported_address_is_a_command() {
         let hostile = submission(&json!({"resultsURL": "s3://b/$(reboot)';reboot;#"}));
-        let lines = in_bucket(&hostile, &["a.log".to_owned()]).unwrap();
+        let lines = in_bucket(&hostile, &[("1".to_owned(), "a.log".to_owned())]).unwrap();
         assert_eq!(lines[1], r"aws s3 cp 's3://b/$(reboot)'\'';reboot;#/a.log' -");
     }
 

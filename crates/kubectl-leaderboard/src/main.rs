@@ -1,21 +1,28 @@
 //! `kubectl leaderboard`: explains why a submission waits, runs or failed, and cancels or resumes it.
 //!
-//! `why`, `overview`, `change` and `transitions` are pure and hold what is printed and decided; `cluster` talks to the API
-//! server. It shows what the status holds, and contacts neither EvalAI nor AWS.
+//! `why`, `status`, `overview`, `top`, `change`, `requeue` and `transitions` are pure and hold what is printed and decided; `cluster` talks to
+//! the API server; `commands` and `changes` bring both together. It shows what the status holds, and contacts neither EvalAI nor AWS;
+//! where that helps, it starts the person's own `aws` program.
 
 mod board;
 mod bucket;
+mod bucket_log;
 mod change;
+mod changes;
 mod check;
 mod checking;
 mod cluster;
+mod commands;
 mod complete;
 mod error;
+mod facts;
 mod logs;
+mod manual;
 mod near;
 mod output;
 mod overview;
 mod report;
+mod requeue;
 mod rerun;
 mod status;
 mod submit;
@@ -28,27 +35,18 @@ mod why;
 #[cfg(test)]
 mod tests;
 
-use std::pin::pin;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, CommandFactory, Parser, Subcommand};
-use futures::StreamExt;
-use jiff::Timestamp;
 use kube::ResourceExt;
-use serde_json::Value;
 
 use self::change::Request;
 use self::cluster::{Cluster, Scope, Target};
 use self::complete::Offer;
 use self::error::Error;
-use self::output::{Colour, Format, Output, print};
-use self::transitions::Waiting;
-use leaderboard_api::client_errors::watch as watch_error;
-use leaderboard_api::{State, Submission};
+use self::output::{Colour, Output, print};
 
-/// How often a change is tried again after a conflict with somebody else's.
-const TRIES: usize = 4;
 /// How long a shell waits for names.
 const COMPLETION: Duration = Duration::from_secs(3);
 
@@ -103,6 +101,13 @@ enum Command {
     /// Resume all submissions that failed because of the infrastructure.
     #[command(after_help = "Exit code 0: all are requested; 1: one was refused, or an error.")]
     Rerun(rerun::Rerun),
+    /// Put submissions back in line at nobody's cost: what a broken simulator image has failed, what runs on a node to be upgraded.
+    #[command(
+        after_help = "Without --state, only Failed ones are chosen, charged or not. Completed routes are kept; a run is stopped and continued. \
+                      `rerun` resumes only what is not charged anyway.\n\nExit code 0: all are requested, or nobody was asked for; 1: one was \
+                      refused, or an error."
+    )]
+    Requeue(requeue::Requeue),
     /// Write what a person who helps needs into one archive, without secrets, routes and names of teams.
     Report(report::Report),
     /// Print the program with which kubectl completes these commands in a shell.
@@ -110,6 +115,9 @@ enum Command {
         after_help = "Example: kubectl leaderboard completion > ~/bin/kubectl_complete-leaderboard; chmod +x ~/bin/kubectl_complete-leaderboard"
     )]
     Completion,
+    /// Write a manual page of each command.
+    #[command(after_help = "Example: kubectl leaderboard man ~/.local/share/man/man1; man kubectl-leaderboard-why")]
+    Man(manual::Man),
     /// What fits in place of the last word.
     #[command(hide = true)]
     Complete {
@@ -175,6 +183,7 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
             Box::pin(complete(&words)).await;
             Ok(ExitCode::SUCCESS)
         }
+        Command::Man(wanted) => manual::write(Cli::command(), &wanted),
         command => carry_out_there(command, &Cluster::connect(cli.target).await?).await,
     }
 }
@@ -182,26 +191,27 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
 /// Carries out what needs a cluster.
 async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode, Error> {
     match command {
-        Command::Completion | Command::Complete { .. } => Ok(ExitCode::SUCCESS),
+        Command::Completion | Command::Complete { .. } | Command::Man(_) => Ok(ExitCode::SUCCESS),
         Command::Why(Show {
             name: Some(name),
             output,
             ..
-        }) => explain(cluster, &name, output.format).await,
+        }) => commands::explain(cluster, &name, output.format).await,
         Command::Why(Show {
             name: None,
             scope,
             output,
-        }) => survey(cluster, &scope, output.format).await,
-        Command::Status(Watched { show, watch }) => Box::pin(show_status(cluster, &show, watch)).await,
-        Command::Top { scope, output } => top(cluster, &scope, output.format).await,
-        Command::Submit(wanted) => submit(cluster, &wanted).await,
-        Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await.map(|()| ExitCode::SUCCESS),
+        }) => commands::survey(cluster, &scope, output.format).await,
+        Command::Status(Watched { show, watch }) => Box::pin(commands::show_status(cluster, &show, watch)).await,
+        Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
+        Command::Submit(wanted) => commands::submit(cluster, &wanted).await,
+        Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await,
         Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
-        Command::Rerun(wanted) => rerun(cluster, &wanted).await,
+        Command::Requeue(wanted) => Box::pin(changes::requeue(cluster, &wanted)).await,
+        Command::Rerun(wanted) => changes::rerun(cluster, &wanted).await,
         Command::Check(wanted) => Box::pin(checking::check(cluster, &wanted)).await,
-        Command::Cancel(target) => change(cluster, Request::Cancel, &target).await,
-        Command::Resume(target) => change(cluster, Request::Resume, &target).await,
+        Command::Cancel(target) => changes::change(cluster, Request::Cancel, &target).await,
+        Command::Resume(target) => changes::change(cluster, Request::Resume, &target).await,
     }
 }
 
@@ -240,232 +250,4 @@ async fn names_of(target: Target, offered: &Offer) -> Result<Vec<String>, Error>
             .map(ResourceExt::name_any)
             .collect()
     })
-}
-
-async fn explain(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCode, Error> {
-    let submission = cluster.submission(name).await?;
-    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-    let value = why::value(&submission, leaderboard.observed());
-    let lines = output::document(format, &value);
-    print(&lines.unwrap_or_else(|| why::explain(&submission, leaderboard.observed(), Timestamp::now())));
-    Ok(ExitCode::SUCCESS)
-}
-
-async fn survey(cluster: &Cluster, scope: &Scope, format: Format) -> Result<ExitCode, Error> {
-    let submissions = cluster.submissions(scope).await?;
-    let leaderboards = cluster.leaderboards(scope).await?;
-    let value = Value::Array(submissions.iter().map(status::value).collect());
-    if let Some(lines) = output::document(format, &value) {
-        print(&lines);
-        return Ok(ExitCode::SUCCESS);
-    }
-    if submissions.is_empty() {
-        print(&nothing(cluster, scope).await);
-    } else {
-        let place = overview::Place {
-            namespace: &cluster.namespace,
-            is_all: scope.all_namespaces,
-        };
-        print(&overview::lines(
-            place,
-            &submissions,
-            leaderboards.as_deref(),
-            Timestamp::now(),
-        ));
-    }
-    Ok(ExitCode::SUCCESS)
-}
-
-/// The message where no submission is found: most often the namespace is another one.
-async fn nothing(cluster: &Cluster, scope: &Scope) -> Vec<String> {
-    let elsewhere = if scope.all_namespaces {
-        Vec::new()
-    } else {
-        cluster.elsewhere().await
-    };
-    overview::nothing(&cluster.namespace, scope.selector.as_deref(), &elsewhere)
-}
-
-async fn show_status(cluster: &Cluster, show: &Show, watch: bool) -> Result<ExitCode, Error> {
-    let format = show.output.format;
-    let Some(name) = &show.name else {
-        let submissions = cluster.submissions(&show.scope).await?;
-        let value = Value::Array(submissions.iter().map(status::value).collect());
-        let lines = match output::document(format, &value) {
-            Some(lines) => lines,
-            None if submissions.is_empty() => nothing(cluster, &show.scope).await,
-            None => status::lines(
-                &submissions,
-                show.scope.all_namespaces,
-                format == Format::Wide,
-                Timestamp::now(),
-            ),
-        };
-        print(&lines);
-        return Ok(ExitCode::SUCCESS);
-    };
-    let submission = cluster.submission(name).await?;
-    if !watch {
-        return screen(cluster, &submission, format).await;
-    }
-    let mut changes = pin!(cluster.changes(name));
-    while let Some(change) = changes.next().await {
-        match change {
-            Ok(Some(submission)) => {
-                output::begin_screen();
-                screen(cluster, &submission, format).await?;
-                if why::has_ended(&submission) {
-                    return Ok(ExitCode::SUCCESS);
-                }
-            }
-            Ok(None) => return Err(Error::Gone(name.clone())),
-            Err(error) => {
-                if let Some(permanent) = error::permanent(error) {
-                    return Err(permanent);
-                }
-            }
-        }
-    }
-    Ok(ExitCode::SUCCESS)
-}
-
-async fn screen(cluster: &Cluster, submission: &Submission, format: Format) -> Result<ExitCode, Error> {
-    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-    let lines = output::document(format, &status::value(submission));
-    print(&lines.unwrap_or_else(|| status::screen(submission, leaderboard.observed(), Timestamp::now())));
-    Ok(ExitCode::SUCCESS)
-}
-
-async fn top(cluster: &Cluster, scope: &Scope, format: Format) -> Result<ExitCode, Error> {
-    let submissions = cluster.submissions(scope).await?;
-    let leaderboards = cluster.leaderboards(scope).await?.unwrap_or_default();
-    let lines = output::document(format, &top::value(&submissions));
-    print(&lines.unwrap_or_else(|| top::lines(&submissions, &leaderboards)));
-    Ok(ExitCode::SUCCESS)
-}
-
-async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCode, Error> {
-    let created = cluster.create(&submit::object(wanted)).await?;
-    let name = created.name_any();
-    print(&[format!(
-        "Submitted {name}. `kubectl leaderboard status {name} -n {} -w` follows it.",
-        cluster.namespace
-    )]);
-    if !wanted.wait {
-        return Ok(ExitCode::SUCCESS);
-    }
-    let end = wait(cluster, &name, 1).await?;
-    Ok(if end == State::Finished {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
-}
-
-async fn rerun(cluster: &Cluster, wanted: &rerun::Rerun) -> Result<ExitCode, Error> {
-    let scope = Scope {
-        selector: wanted.selector.clone(),
-        ..Scope::default()
-    };
-    let names = rerun::chosen(&cluster.submissions(&scope).await?, wanted.reason.as_deref());
-    if names.is_empty() {
-        print(&["No submission has failed so because of the infrastructure.".to_owned()]);
-    }
-    let mut is_refused = false;
-    for name in names {
-        if wanted.dry_run {
-            print(&[format!("Would resume {name}.")]);
-        } else if let Err(error) = send(cluster, Request::Resume, &name).await {
-            eprintln!("kubectl leaderboard: {error}");
-            is_refused = true;
-        }
-    }
-    Ok(if is_refused {
-        ExitCode::FAILURE
-    } else {
-        ExitCode::SUCCESS
-    })
-}
-
-async fn change(cluster: &Cluster, request: Request, target: &Change) -> Result<ExitCode, Error> {
-    let attempt = send(cluster, request, &target.name).await?;
-    if !target.wait {
-        return Ok(ExitCode::SUCCESS);
-    }
-    let end = wait(cluster, &target.name, attempt).await?;
-    // A cancel succeeds with any end, a resume only with a result.
-    let is_fulfilled = request == Request::Cancel || end == State::Finished;
-    Ok(if is_fulfilled {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
-}
-
-/// Sends a request to the API server; returns the attempt whose end fulfils it.
-async fn send(cluster: &Cluster, request: Request, name: &str) -> Result<i64, Error> {
-    for _ in 0..TRIES {
-        let submission = cluster.submission(name).await?;
-        let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-        let plan =
-            change::plan(request, &submission, leaderboard.observed(), Timestamp::now()).map_err(Error::Unfit)?;
-        if let Some(patch) = &plan.patch {
-            match cluster.patch(name, patch).await? {
-                Ok(_) => {}
-                Err(kube::Error::Api(status)) if status.is_conflict() => continue,
-                Err(error) => return Err(refusal(request, &submission, error)),
-            }
-        }
-        print(&plan.lines);
-        return Ok(plan.attempt);
-    }
-    Err(Error::Conflict(name.to_owned()))
-}
-
-/// The next step after a refusal by the API server's rules, or for lack of a right where EvalAI is another way.
-fn refusal(request: Request, submission: &Submission, error: kube::Error) -> Error {
-    let kube::Error::Api(status) = &error else {
-        return error.into();
-    };
-    let has_other_way = status.is_forbidden() && submission.spec.evalai.is_some();
-    if has_other_way || status.is_invalid() || status.code == 400 {
-        return Error::Refused {
-            message: error::phrase(&status.message),
-            next: change::after_refusal(request, submission),
-        };
-    }
-    if status.is_not_found() {
-        return Error::Gone(submission.name_any());
-    }
-    error.into()
-}
-
-/// Waits for the end of an attempt, and prints each state until then.
-async fn wait(cluster: &Cluster, name: &str, attempt: i64) -> Result<State, Error> {
-    let mut waiting = Waiting::new(attempt);
-    let mut changes = pin!(cluster.changes(name));
-    let mut printed = String::new();
-    while let Some(change) = changes.next().await {
-        match change {
-            Ok(Some(submission)) => {
-                let update = waiting.observe(&submission, Timestamp::now());
-                print(&update.lines);
-                if let Some(end) = update.end {
-                    return Ok(end);
-                }
-            }
-            Ok(None) => return Err(Error::Gone(name.to_owned())),
-            Err(error) => {
-                let message = error::phrase(&watch_error(&error));
-                if let Some(permanent) = error::permanent(error) {
-                    return Err(permanent);
-                }
-                if message != printed {
-                    eprintln!("kubectl leaderboard: {message}; retrying.");
-                    printed = message;
-                }
-            }
-        }
-    }
-    Err(Error::Api("the watch has ended".to_owned()))
 }

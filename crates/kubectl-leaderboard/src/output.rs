@@ -8,6 +8,12 @@ use std::sync::OnceLock;
 use clap::{Args, ValueEnum};
 use serde_json::Value;
 
+use super::text::WIDTH;
+
+/// The narrowest and the widest page. A text in longer lines is hard to read.
+const NARROWEST: usize = 60;
+const WIDEST: usize = 120;
+
 /// Whether lines are coloured; set once at the start.
 static COLOURS: OnceLock<bool> = OnceLock::new();
 
@@ -96,36 +102,138 @@ fn nested(start: &str, value: &Value, indent: usize, lines: &mut Vec<String>) {
     }
 }
 
-/// Begins a screen anew: on a terminal in its first line, elsewhere below an empty line.
-pub fn begin_screen() {
-    let start = if std::io::stdout().is_terminal() {
-        "\u{1b}[H\u{1b}[2J"
-    } else {
-        ""
-    };
-    print(&[start.to_owned()]);
+/// Columns of a page of text: those of the terminal, within reason.
+pub fn width() -> usize {
+    let columns = terminal().map(|(columns, _)| columns);
+    columns.map_or(WIDTH, |columns| columns.clamp(NARROWEST, WIDEST))
 }
 
-/// Prints lines.
-pub fn print(lines: &[String]) {
-    let has_colours = COLOURS.get().copied().unwrap_or(false);
-    let mut out = std::io::stdout().lock();
-    for line in lines {
-        let written = if has_colours {
-            writeln!(out, "{}", painted(line))
-        } else {
-            writeln!(out, "{line}")
-        };
-        if let Err(error) = written {
-            // Ignore a closed pipe.
-            if error.kind() != ErrorKind::BrokenPipe {
-                eprintln!("kubectl leaderboard: cannot write the output: {error}. Check where it is redirected to");
+/// Columns and rows of the terminal, if it is written to.
+fn terminal() -> Option<(usize, usize)> {
+    let (columns, rows) = terminal_size::terminal_size_of(std::io::stdout())?;
+    Some((columns.0.into(), rows.0.into()))
+}
+
+/// A screen that is drawn again and again.
+#[derive(Debug, Default)]
+pub struct Screen {
+    is_drawn: bool,
+}
+
+impl Screen {
+    /// Whether it can be drawn over: then the times on it go on.
+    pub fn is_live() -> bool {
+        terminal().is_some()
+    }
+
+    /// Shows these lines: on a terminal over those before, elsewhere below an empty line.
+    pub fn draw(&mut self, lines: &[String]) {
+        match terminal() {
+            Some(size) => {
+                let text = redrawn(lines, size, has_colours(), self.is_drawn);
+                self.is_drawn = true;
+                write_all(&text);
             }
-            return;
+            None => {
+                print(&[String::new()]);
+                print(lines);
+            }
         }
     }
 }
 
+/// What draws lines over those before. Nothing is erased but what they leave, so the screen is never empty for a moment.
+fn redrawn(lines: &[String], (columns, rows): (usize, usize), is_coloured: bool, is_drawn: bool) -> String {
+    let mut text = if is_drawn {
+        HOME.to_owned()
+    } else {
+        format!("{CLEAR}{HOME}")
+    };
+    let mut left = rows.saturating_sub(1);
+    for line in lines {
+        let needed = crate::text::columns(line).div_ceil(columns.max(1)).max(1);
+        if needed > left {
+            break;
+        }
+        left -= needed;
+        let line = if is_coloured { painted(line) } else { line.clone() };
+        text.push_str(&line);
+        text.push_str(END_OF_LINE);
+    }
+    text.push_str(REST);
+    text
+}
+
+/// Prints lines.
+pub fn print(lines: &[String]) {
+    let is_coloured = has_colours();
+    for line in lines {
+        if is_coloured {
+            write_all(&format!("{}\n", painted(line)));
+        } else {
+            write_all(&format!("{line}\n"));
+        }
+    }
+}
+
+/// Prints a line of the stream of this number behind its label. Each stream has its colour.
+pub fn print_labelled(stream: usize, label: &str, line: &str) {
+    let colour = STREAMS.get(stream % STREAMS.len()).copied().unwrap_or(PLAIN);
+    if has_colours() {
+        write_all(&format!("{colour}[{label}]{PLAIN} {line}\n"));
+    } else {
+        write_all(&format!("[{label}] {line}\n"));
+    }
+}
+
+/// Asks a person at a terminal; elsewhere there is nobody to ask, and the command is the answer.
+pub fn is_confirmed(question: &str) -> bool {
+    let is_asked = std::io::stdin().is_terminal() && std::io::stdout().is_terminal();
+    if !is_asked {
+        return true;
+    }
+    let mut out = std::io::stdout().lock();
+    if write!(out, "{question} [y/N] ").and_then(|()| out.flush()).is_err() {
+        return false;
+    }
+    let mut answer = String::new();
+    let is_read = std::io::stdin().read_line(&mut answer).is_ok();
+    is_read && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str())
+}
+
+fn has_colours() -> bool {
+    COLOURS.get().copied().unwrap_or(false)
+}
+
+fn write_all(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let written = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    // Ignore a closed pipe.
+    if let Err(error) = written
+        && error.kind() != ErrorKind::BrokenPipe
+    {
+        eprintln!("kubectl leaderboard: cannot write the output: {error}. Check where it is redirected to");
+    }
+}
+
+/// To the first line.
+const HOME: &str = "\u{1b}[H";
+/// Erases the whole screen.
+const CLEAR: &str = "\u{1b}[2J";
+/// Erases what a longer line has left, and goes to the next one.
+const END_OF_LINE: &str = "\u{1b}[K\r\n";
+/// Erases all lines below.
+const REST: &str = "\u{1b}[J";
+
+/// Colours of streams, one after the other.
+const STREAMS: [&str; 6] = [
+    "\u{1b}[36m",
+    "\u{1b}[33m",
+    "\u{1b}[32m",
+    "\u{1b}[35m",
+    "\u{1b}[34m",
+    "\u{1b}[31m",
+];
 const RED: &str = "\u{1b}[31m";
 const GREEN: &str = "\u{1b}[32m";
 const YELLOW: &str = "\u{1b}[33m";
@@ -134,7 +242,7 @@ const DIM: &str = "\u{1b}[2m";
 const PLAIN: &str = "\u{1b}[0m";
 
 /// A line with colours: the mark at its start, and the first state in it.
-fn painted(line: &str) -> String {
+pub(super) fn painted(line: &str) -> String {
     let marks = [('✔', GREEN), ('✘', RED), ('!', YELLOW), ('–', DIM)];
     let first = line.chars().next();
     if let Some((mark, colour)) = marks.into_iter().find(|(mark, _)| first == Some(*mark)) {
@@ -185,6 +293,22 @@ mod tests {
                 "  - []",
                 "\"name\": \"a: b\"",
             ]
+        );
+    }
+
+    #[test]
+    fn a_screen_is_drawn_over_the_one_before_without_being_erased() {
+        let lines = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
+        let first = redrawn(&lines(&["one", "two"]), (80, 24), false, false);
+        assert_eq!(first, "\u{1b}[2J\u{1b}[Hone\u{1b}[K\r\ntwo\u{1b}[K\r\n\u{1b}[J");
+        let again = redrawn(&lines(&["a Running b"]), (80, 24), true, true);
+        assert_eq!(again, "\u{1b}[Ha \u{1b}[36mRunning\u{1b}[0m b\u{1b}[K\r\n\u{1b}[J");
+        assert!(!again.contains(CLEAR));
+        // The last row stays free: a line below it would scroll the first one away.
+        let tall = redrawn(&lines(&["1", &"2".repeat(15), "3", "4"]), (10, 4), false, true);
+        assert_eq!(
+            tall,
+            format!("{HOME}1{END_OF_LINE}{}{END_OF_LINE}{REST}", "2".repeat(15))
         );
     }
 

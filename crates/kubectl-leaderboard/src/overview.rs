@@ -9,10 +9,10 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::ResourceExt;
 
 use super::board::{self, Observed};
-use super::text::{Page, WIDTH, clean, join, span};
-use super::why;
+use super::facts;
+use super::table::table;
+use super::text::{Frame, clean, join, span};
 use leaderboard_api::conditions;
-use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 
 /// How long an end may wait for another system before that is a problem.
@@ -46,8 +46,8 @@ impl Place<'_> {
 }
 
 /// What is printed where there is no submission. `elsewhere` are the namespaces that have some, with their number.
-pub fn nothing(namespace: &str, selector: Option<&str>, elsewhere: &[(String, usize)]) -> Vec<String> {
-    let mut page = Page::default();
+pub fn nothing(namespace: &str, selector: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
+    let mut page = frame.page();
     if let Some(selector) = selector {
         page.paragraph(&format!("No submission has the labels {selector}."));
         return page.into_lines();
@@ -72,9 +72,10 @@ pub fn lines(
     place: Place<'_>,
     submissions: &[Submission],
     leaderboards: Option<&[Leaderboard]>,
-    now: Timestamp,
+    frame: Frame,
 ) -> Vec<String> {
-    let mut page = Page::default();
+    let now = frame.now;
+    let mut page = frame.page();
     for text in of_leaderboards(place, submissions, leaderboards) {
         page.paragraph(&text);
     }
@@ -94,7 +95,11 @@ pub fn lines(
         return page.into_lines();
     }
     let mut lines = page.into_lines();
-    lines.extend(table(&rows));
+    let rows: Vec<Vec<String>> = rows
+        .into_iter()
+        .map(|row| vec![row.name, row.state.to_owned(), row.since, row.why])
+        .collect();
+    lines.extend(table(&["NAME", "STATE", "SINCE", "WHY"], &rows, frame.width));
     lines.push(String::new());
     lines.push("`kubectl leaderboard why NAME` has the details and the next step.".to_owned());
     lines
@@ -106,7 +111,7 @@ fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: O
         return vec!["You have no right to read Leaderboards; one may be paused or not Ready.".to_owned()];
     };
     let mut observed: BTreeMap<String, Observed<'_>> = BTreeMap::new();
-    let live = submissions.iter().filter(|s| !why::has_ended(s));
+    let live = submissions.iter().filter(|s| !facts::has_ended(s));
     let board_of = |s: &Submission| match s.namespace().filter(|_| place.is_all) {
         Some(namespace) => format!("{namespace}/{}", s.spec.leaderboard_name),
         None => s.spec.leaderboard_name.clone(),
@@ -130,17 +135,17 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
     }
     let deleting = if is_deleting { "Being deleted." } else { "" };
     let doubt = doubt.map(|c| format!("{}.", c.reason)).unwrap_or_default();
-    let since = why::since(submission);
+    let since = facts::since(submission);
     let age = since.map_or(0, |at| now.duration_since(at).as_secs());
     let position = status.waiting.as_ref().map(|w| i64::from(w.position));
     Some(Row {
-        order: match why::state(status) {
+        order: match facts::state(status) {
             Some(State::Running | State::Resumed) => (0, age),
             None | Some(State::Pending) => (1, position.unwrap_or(0)),
             Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
         },
         name: clean(&place.name_of(submission)),
-        state: why::state(status).map_or("(new)", State::as_str),
+        state: facts::state(status).map_or("(new)", State::as_str),
         since: since.map(|_| span(age)).unwrap_or_default(),
         why: join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
     })
@@ -150,13 +155,13 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
 fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
     let reason = status.reason.as_deref().unwrap_or_default();
     let message = status.message.as_deref().unwrap_or_default();
-    if why::is_attempt_requested(submission) {
+    if facts::is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
         return Some(format!(
             "Attempt {wanted} is requested; the operator has not processed it yet."
         ));
     }
-    match why::state(status) {
+    match facts::state(status) {
         None => Some("The operator has not processed it yet.".to_owned()),
         Some(State::Pending) => Some(match &status.waiting {
             Some(waiting) => {
@@ -177,7 +182,7 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
             }
         }
         Some(State::Failed) => {
-            let class = status.failure.as_ref().map(|f| format!(" ({})", why::class(f.class)));
+            let class = status.failure.as_ref().map(|f| format!(" ({})", facts::class(f.class)));
             Some(format!("{reason}{}: {message}", class.unwrap_or_default()))
         }
         Some(State::Finished | State::Cancelled) => None,
@@ -204,24 +209,4 @@ fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
 
 fn is_false<'a>(status: &'a SubmissionStatus, type_: &str) -> Option<&'a Condition> {
     conditions::get(&status.conditions, type_).filter(|c| c.status == "False")
-}
-
-fn table(rows: &[Row]) -> Vec<String> {
-    let width = |head: &str, cell: fn(&Row) -> &str| {
-        let cells = rows.iter().map(|row| cell(row).chars().count());
-        cells.chain([head.len()]).max().unwrap_or(0) + 2
-    };
-    let (name, state, since) = (
-        width("NAME", |row| &row.name),
-        width("STATE", |row| row.state),
-        width("SINCE", |row| &row.since),
-    );
-    let left = WIDTH.saturating_sub(name + state + since);
-    let line = |a: &str, b: &str, c: &str, d: &str| {
-        let line = format!("{a:<name$}{b:<state$}{c:<since$}{}", one_line(d, left));
-        line.trim_end().to_owned()
-    };
-    let mut lines = vec![line("NAME", "STATE", "SINCE", "WHY")];
-    lines.extend(rows.iter().map(|row| line(&row.name, row.state, &row.since, &row.why)));
-    lines
 }

@@ -1,10 +1,10 @@
-//! `rerun`: which of many submissions are resumed because the infrastructure failed them. Pure.
+//! `rerun`: which of many submissions are resumed because the infrastructure failed them. Pure. What a host forgives is `requeue`.
 
 use clap::Args;
 use kube::ResourceExt;
 use leaderboard_api::{FailureClass, Submission};
 
-use crate::why;
+use crate::facts;
 
 /// Which submissions.
 #[derive(Args, Debug)]
@@ -32,7 +32,7 @@ pub fn chosen(submissions: &[Submission], reason: Option<&str>) -> Vec<String> {
             let is_uncharged = failure.class == FailureClass::Infrastructure && !failure.charged;
             is_uncharged && reason.is_none_or(|reason| reason == failure.reason)
         });
-        is_hosts && why::has_ended(one) && one.metadata.deletion_timestamp.is_none() && !one.spec.check
+        is_hosts && facts::has_ended(one) && one.metadata.deletion_timestamp.is_none() && !one.spec.check
     };
     let mut names: Vec<String> = submissions
         .iter()

@@ -7,62 +7,88 @@ use leaderboard_api::{PairState, PairStatus, State, Submission, SubmissionStatus
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
+use super::facts;
 use super::table::{bar, table};
-use super::text::{Page, join, span};
-use super::why;
+use super::text::{Frame, Page, join, span};
 
 /// Columns of the bar of a run, and of one pair's.
 const BAR: usize = 20;
 
 /// One screen of a submission.
-pub fn screen(submission: &Submission, leaderboard: Observed<'_>, now: Timestamp) -> Vec<String> {
+pub fn screen(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
     let nothing = SubmissionStatus::default();
     let status = submission.status.as_ref().unwrap_or(&nothing);
-    let mut page = Page::default();
-    page.paragraph(&why::headline(submission, now));
+    let now = frame.now;
+    let mut page = frame.page();
+    page.paragraph(&facts::headline(submission, now));
     for problem in board::problems(&submission.spec.leaderboard_name, leaderboard) {
         page.paragraph(&problem.text);
     }
     page.gap();
-    page.row("Track", &why::track(submission));
+    page.row("Track", &facts::track(submission));
     let reason = status.reason.as_deref().unwrap_or_default();
     let message = sentence(status.message.as_deref().unwrap_or_default());
     page.row("Reason", join(&[&format!("{reason}:"), &message]).trim_matches(':'));
-    if let Some(waiting) = &status.waiting {
-        let eta = waiting
-            .eta()
-            .map(|eta| format!("; starts in about {eta}"))
-            .unwrap_or_default();
-        page.row("In line", &format!("position {}{eta}.", waiting.position));
-    }
+    page.row("In line", &in_line(status));
     if let Some(progress) = &status.progress {
-        let score = status
-            .score
-            .as_ref()
-            .map(|score| format!(", driving score {}", score.text));
         let bar = bar(progress.done, progress.total, BAR);
-        page.row(
-            "Routes",
-            &format!("{bar} {}{}", progress.text, score.unwrap_or_default()),
-        );
+        page.row("Routes", &format!("{bar} {}", progress.text));
     }
     for each in &status.pairs {
         page.row(&format!("Pair {}", each.id), &pair(each, now));
     }
+    page.row("Scores", &scores(status));
     page.row("Times", &times(submission, &status.times, now));
-    let node = status
-        .node_name
-        .as_ref()
-        .map(|node| format!("on node {node}"))
-        .unwrap_or_default();
+    let node = status.node_name.as_ref();
+    let node = node.map(|node| format!("on node {node}")).unwrap_or_default();
     page.row("Job", &join(&[status.job_name.as_deref().unwrap_or_default(), &node]));
+    page.row("Systems", &systems(status));
+    page.gap();
+    links(&mut page, submission, status, leaderboard);
+    page.into_lines()
+}
+
+fn in_line(status: &SubmissionStatus) -> String {
+    let Some(waiting) = &status.waiting else {
+        return String::new();
+    };
+    let eta = waiting.eta().map(|eta| format!("; starts in about {eta}"));
+    format!("position {}{}.", waiting.position, eta.unwrap_or_default())
+}
+
+/// The scores, of the routes so far until the run has finished.
+fn scores(status: &SubmissionStatus) -> String {
+    let Some(score) = &status.score else {
+        return String::new();
+    };
+    let completion = score.route_completion.as_ref();
+    let penalty = score.infraction_penalty.as_ref();
+    let parts = [
+        Some(format!("driving {}", score.text)),
+        completion.map(|percent| format!("route completion {percent} %")),
+        penalty.map(|factor| format!("infraction penalty {factor}")),
+    ];
+    let parts: Vec<String> = parts.into_iter().flatten().collect();
+    let so_far = if score.is_final { "" } else { ", of the routes so far" };
+    format!("{}{so_far}.", parts.join(", "))
+}
+
+/// Where its results are, its challenge, and what to call next.
+fn links(page: &mut Page, submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) {
     if let Some(results) = &status.results_url {
         page.whole("Results", results);
     }
-    page.row("Systems", &systems(status));
-    page.gap();
-    page.whole("Next", &why::command("why", submission));
-    page.into_lines()
+    let server = leaderboard.leaderboard().and_then(|board| board.spec.evalai.as_ref());
+    if let Some((server, evalai)) = server.zip(submission.spec.evalai) {
+        let server = server.api_server.trim_end_matches('/');
+        let link = format!(
+            "{server}/web/challenges/challenge-page/{}/leaderboard",
+            evalai.challenge
+        );
+        page.whole("EvalAI", &link);
+    }
+    page.whole("Logs", &facts::command("logs", submission));
+    page.whole("Next", &facts::command("why", submission));
 }
 
 fn pair(pair: &PairStatus, now: Timestamp) -> String {
@@ -132,7 +158,8 @@ fn systems(status: &SubmissionStatus) -> String {
 }
 
 /// One line of each submission: running ones first, then waiting ones by place, then ended ones, the latest first.
-pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, now: Timestamp) -> Vec<String> {
+pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, frame: Frame) -> Vec<String> {
+    let now = frame.now;
     let mut all: Vec<&Submission> = submissions.iter().collect();
     all.sort_by_key(|one| order(one, now));
     let mut head = vec!["NAME", "STATE", "REASON", "ROUTES", "SCORE", "QUEUE", "SINCE"];
@@ -146,18 +173,19 @@ pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, now:
         .into_iter()
         .map(|one| row(one, is_qualified, is_wide, now))
         .collect();
-    table(&head, &rows)
+    // Who asks for more columns has the space for them, or takes what the terminal makes of it.
+    table(&head, &rows, if is_wide { usize::MAX } else { frame.width })
 }
 
 fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
     let nothing = SubmissionStatus::default();
     let status = submission.status.as_ref().unwrap_or(&nothing);
-    let since = why::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
+    let since = facts::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
     let place = status
         .waiting
         .as_ref()
         .map_or(i64::MAX, |waiting| waiting.position.into());
-    let (class, within) = match why::state(status) {
+    let (class, within) = match facts::state(status) {
         Some(State::Running | State::Resumed) => (0, -since),
         None | Some(State::Pending) => (1, place),
         Some(_) => (2, since),
@@ -169,11 +197,11 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
     let nothing = SubmissionStatus::default();
     let status = submission.status.as_ref().unwrap_or(&nothing);
     let text = |text: Option<&str>| text.unwrap_or_default().to_owned();
-    let since = why::since(submission).or_else(|| submission.creation_timestamp().map(|made| made.0));
+    let since = facts::since(submission).or_else(|| submission.creation_timestamp().map(|made| made.0));
     let since = since.map(|at| span(now.duration_since(at).as_secs()));
     let mut row = vec![
         submission.name_any(),
-        why::state(status).map_or("(new)", State::as_str).to_owned(),
+        facts::state(status).map_or("(new)", State::as_str).to_owned(),
         text(status.reason.as_deref()),
         text(status.progress.as_ref().map(|progress| progress.text.as_str())),
         text(status.score.as_ref().map(|score| score.text.as_str())),
@@ -188,7 +216,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         row.extend([
             submission.spec.leaderboard_name.clone(),
             text(status.track.as_deref().or(submission.spec.track.as_deref())),
-            why::team(submission).unwrap_or_default(),
+            facts::team(submission).unwrap_or_default(),
             status.attempt.map(|attempt| attempt.to_string()).unwrap_or_default(),
             crashes.to_string(),
             text(status.node_name.as_deref()),

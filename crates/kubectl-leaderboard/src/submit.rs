@@ -4,6 +4,8 @@ use clap::Args;
 use leaderboard_api::names;
 use serde_json::{Value, json};
 
+use crate::board::Observed;
+
 /// What is submitted.
 #[derive(Args, Debug)]
 pub struct Submit {
@@ -31,6 +33,34 @@ pub struct Submit {
     /// Wait for the end, and print each state until then.
     #[arg(long)]
     pub wait: bool,
+}
+
+/// Whether the Leaderboard is there and has the track; the text has the next step. `elsewhere` are the namespaces that have one of its name.
+pub fn fits(wanted: &Submit, leaderboard: Observed<'_>, namespace: &str, elsewhere: &[String]) -> Result<(), String> {
+    let name = &wanted.leaderboard;
+    let found = match leaderboard {
+        Observed::Found(found) => found,
+        Observed::Missing => {
+            let next = match elsewhere.first() {
+                Some(other) => format!("There is one in namespace {}: use -n {other}", elsewhere.join(", ")),
+                None => format!("`kubectl get leaderboards -n {namespace}` lists all; use -n for another namespace"),
+            };
+            return Err(format!(
+                "there is no Leaderboard {name} in namespace {namespace}. {next}"
+            ));
+        }
+        // The operator will know.
+        Observed::Forbidden => return Ok(()),
+    };
+    let tracks: Vec<&str> = found.spec.tracks.iter().map(|track| track.name.as_str()).collect();
+    if tracks.contains(&wanted.track.as_str()) {
+        return Ok(());
+    }
+    Err(format!(
+        "Leaderboard {name} has no track {}. It has {}",
+        wanted.track,
+        tracks.join(", ")
+    ))
 }
 
 /// Characters of the Leaderboard's name in the name of a submission: with the API server's five letters at most 52.

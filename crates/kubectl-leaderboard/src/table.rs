@@ -1,28 +1,56 @@
 //! Columns of text, as kubectl prints them. Pure.
 
-use crate::text::clean;
+use crate::text::{clean, columns, cut, padded};
 
-/// Lines of a table with its head. Each cell is cleaned: many were written by strangers.
-pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> Vec<String> {
+/// Columns between two cells.
+const GAP: usize = 2;
+/// The fewest columns to which a cell is cut.
+const LEAST: usize = 8;
+/// What is copied from a table, so it is not cut.
+const WHOLE: [&str; 2] = ["NAMESPACE", "NAME"];
+
+/// Lines of a table with its head, of at most `width` columns as far as cutting its widest cells can help. Each cell is cleaned: many were
+/// written by strangers.
+pub(super) fn table(head: &[&str], rows: &[Vec<String>], width: usize) -> Vec<String> {
     let head: Vec<String> = head.iter().map(|title| (*title).to_owned()).collect();
     let rows: Vec<Vec<String>> = rows
         .iter()
         .map(|row| row.iter().map(|cell| clean(cell)).collect())
         .collect();
-    let widths: Vec<usize> = (0..head.len())
-        .map(|column| {
-            let cells = std::iter::once(&head).chain(&rows);
-            let widths = cells.filter_map(|row| row.get(column)).map(|cell| cell.chars().count());
-            widths.max().unwrap_or(0) + 2
-        })
-        .collect();
+    let widths = widths(&head, &rows, width);
     std::iter::once(&head)
         .chain(&rows)
         .map(|row| {
-            let cells = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}"));
+            let cells = row.iter().zip(&widths);
+            let cells = cells.map(|(cell, width)| padded(&cut(cell, *width), width + GAP));
             cells.collect::<String>().trim_end().to_owned()
         })
         .collect()
+}
+
+/// The columns of each cell: the widest ones are made narrower until all fit.
+fn widths(head: &[String], rows: &[Vec<String>], width: usize) -> Vec<usize> {
+    let widest = |column: usize| {
+        let cells = rows.iter().filter_map(|row| row.get(column));
+        cells.map(|cell| columns(cell)).max().unwrap_or(0)
+    };
+    let mut widths: Vec<usize> = head
+        .iter()
+        .enumerate()
+        .map(|(column, title)| widest(column).max(columns(title)))
+        .collect();
+    let total = |widths: &[usize]| widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1);
+    while total(&widths) > width {
+        let can_shrink = |(title, width): &(&String, &mut usize)| {
+            !WHOLE.contains(&title.as_str()) && **width > columns(title).max(LEAST)
+        };
+        let candidates = head.iter().zip(&mut widths).filter(can_shrink);
+        match candidates.max_by_key(|(_, width)| **width) {
+            Some((_, widest)) => *widest -= 1,
+            None => break,
+        }
+    }
+    widths
 }
 
 /// `██████░░░░` for a part of a whole.
@@ -43,8 +71,26 @@ mod tests {
             vec!["long-name".to_owned(), "x\u{1b}[2J".to_owned()],
         ];
         assert_eq!(
-            table(&["NAME", "WHY"], &rows),
+            table(&["NAME", "WHY"], &rows, 80),
             ["NAME       WHY", "a", "long-name  x\u{fffd}[2J"]
+        );
+    }
+
+    #[test]
+    fn a_narrow_table_cuts_its_widest_cells_and_never_a_name() {
+        let row = ["submission-4711", "WaitingForPreviousController", "チーム自動運転"];
+        let rows = [row.map(str::to_owned).to_vec()];
+        let head = ["NAME", "REASON", "TEAM"];
+        assert_eq!(
+            table(&head, &rows, 50),
+            [
+                "NAME             REASON             TEAM",
+                "submission-4711  WaitingForPrevio…  チーム自動運転",
+            ]
+        );
+        assert_eq!(
+            table(&head, &rows, 10),
+            ["NAME             REASON    TEAM", "submission-4711  Waiting…  チーム…"]
         );
     }
 

@@ -4,32 +4,52 @@
 
 use jiff::Timestamp;
 use leaderboard_api::text::one_line;
+use unicode_width::{UnicodeWidthChar as _, UnicodeWidthStr as _};
 
-/// Columns of a line. Only an address or a command that is to be copied may be longer.
+/// Columns of a line where no terminal has a number of its own. Only an address or a command that is to be copied may be longer.
 pub(super) const WIDTH: usize = 100;
 /// Columns of a label, and of what is below it.
 const INDENT: usize = 13;
 
+/// When something is shown, and in how many columns.
+#[derive(Clone, Copy, Debug)]
+pub struct Frame {
+    pub now: Timestamp,
+    pub width: usize,
+}
+
+impl Frame {
+    /// A page of this width.
+    pub(super) fn page(self) -> Page {
+        Page {
+            lines: Vec::new(),
+            width: self.width,
+        }
+    }
+}
+
 /// Lines that are being written.
-#[derive(Default)]
-pub(super) struct Page(Vec<String>);
+pub(super) struct Page {
+    lines: Vec<String>,
+    width: usize,
+}
 
 impl Page {
     /// A paragraph.
     pub(super) fn paragraph(&mut self, text: &str) {
-        self.0.extend(wrap(text, WIDTH));
+        self.lines.extend(wrap(text, self.width));
     }
 
     /// An empty line, unless there is one.
     pub(super) fn gap(&mut self) {
-        if self.0.last().is_some_and(|last| !last.is_empty()) {
-            self.0.push(String::new());
+        if self.lines.last().is_some_and(|last| !last.is_empty()) {
+            self.lines.push(String::new());
         }
     }
 
     /// A label and a text; without a label, more text below the row before. No text, no row.
     pub(super) fn row(&mut self, label: &str, text: &str) {
-        self.labelled(label, wrap(text, WIDTH - INDENT));
+        self.labelled(label, wrap(text, self.width.saturating_sub(INDENT)));
     }
 
     /// A label and what is to be copied, so it is not broken.
@@ -39,7 +59,7 @@ impl Page {
 
     /// The lines.
     pub(super) fn into_lines(self) -> Vec<String> {
-        self.0
+        self.lines
     }
 
     fn labelled(&mut self, label: &str, lines: Vec<String>) {
@@ -49,7 +69,7 @@ impl Page {
             format!("{label}:")
         };
         for line in lines {
-            self.0.push(format!("{label:<INDENT$}{line}"));
+            self.lines.push(format!("{label:<INDENT$}{line}"));
             label.clear();
         }
     }
@@ -59,18 +79,57 @@ impl Page {
 pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in clean(text).split_whitespace() {
-        let letters: Vec<char> = word.chars().collect();
-        for piece in letters.chunks(width.max(1)) {
+        for piece in pieces(word, width.max(2)) {
             match lines.last_mut() {
-                Some(last) if last.chars().count() + 1 + piece.len() <= width => {
+                Some(last) if columns(last) + 1 + columns(&piece) <= width => {
                     last.push(' ');
-                    last.extend(piece);
+                    last.push_str(&piece);
                 }
-                _ => lines.push(piece.iter().collect()),
+                _ => lines.push(piece),
             }
         }
     }
     lines
+}
+
+/// A word in pieces of at most `width` columns.
+fn pieces(word: &str, width: usize) -> Vec<String> {
+    let mut pieces = vec![String::new()];
+    for letter in word.chars() {
+        let used = pieces.last().map_or(0, |piece| columns(piece));
+        if used > 0 && used + letter.width().unwrap_or(0) > width {
+            pieces.push(String::new());
+        }
+        if let Some(piece) = pieces.last_mut() {
+            piece.push(letter);
+        }
+    }
+    pieces
+}
+
+/// Columns of a text on a terminal: letters of East Asia and most emoji take two.
+pub(super) fn columns(text: &str) -> usize {
+    text.width()
+}
+
+/// A text of at most so many columns.
+pub(super) fn cut(text: &str, width: usize) -> String {
+    if columns(text) <= width {
+        return text.to_owned();
+    }
+    let mut kept = String::new();
+    for letter in text.chars() {
+        if columns(&kept) + letter.width().unwrap_or(0) + 1 > width {
+            break;
+        }
+        kept.push(letter);
+    }
+    format!("{}…", kept.trim_end())
+}
+
+/// A text with blanks up to so many columns.
+pub(super) fn padded(text: &str, width: usize) -> String {
+    format!("{text}{}", " ".repeat(width.saturating_sub(columns(text))))
 }
 
 /// A text of any length: much of what is printed was written by strangers.
@@ -110,9 +169,23 @@ pub(super) fn span(seconds: i64) -> String {
 mod tests {
     use super::*;
 
+    fn frame(width: usize) -> Frame {
+        let now = Timestamp::UNIX_EPOCH;
+        Frame { now, width }
+    }
+
+    #[test]
+    fn wide_letters_take_two_columns() {
+        assert_eq!(wrap("自動運転 隊", 8), ["自動運転", "隊"]);
+        assert_eq!(wrap("自動運転隊", 4), ["自動", "運転", "隊"]);
+        assert_eq!(cut("自動運転隊", 7), "自動運…");
+        assert_eq!(cut("short", 5), "short");
+        assert_eq!(padded("隊", 4), "隊  ");
+    }
+
     #[test]
     fn rows_hang_below_their_label_and_stay_within_the_width() {
-        let mut page = Page::default();
+        let mut page = frame(WIDTH).page();
         page.row("Reason", &"word ".repeat(60));
         page.row("", &"x".repeat(250));
         page.row("Empty", " ");
@@ -127,7 +200,7 @@ mod tests {
 
     #[test]
     fn what_is_to_be_copied_is_not_broken() {
-        let mut page = Page::default();
+        let mut page = frame(WIDTH).page();
         let address = format!("s3://bucket/{}", "a/".repeat(80));
         page.whole("Results", &address);
         let lines = page.into_lines();

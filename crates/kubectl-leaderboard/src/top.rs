@@ -6,8 +6,9 @@ use kube::ResourceExt;
 use leaderboard_api::{Leaderboard, State, Submission};
 use serde_json::{Value, json};
 
+use super::facts;
 use super::table::table;
-use super::why;
+use super::text::Frame;
 
 /// Leaderboard and team.
 type Key = (String, String, String);
@@ -30,7 +31,7 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
         let team = if one.spec.check {
             "(check)".to_owned()
         } else {
-            why::team(one).unwrap_or_else(|| "(none)".to_owned())
+            facts::team(one).unwrap_or_else(|| "(none)".to_owned())
         };
         let key = (
             one.namespace().unwrap_or_default(),
@@ -39,7 +40,7 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
         );
         let each = uses.entry(key).or_default();
         let status = one.status.as_ref();
-        match status.and_then(why::state) {
+        match status.and_then(facts::state) {
             Some(State::Running | State::Resumed) => each.running += 1,
             None | Some(State::Pending) => each.waiting += 1,
             Some(State::Finished) => each.finished += 1,
@@ -82,7 +83,7 @@ fn slots(leaderboards: &[Leaderboard], namespace: &str, name: &str, running: usi
 }
 
 /// The table, and above it the slots of each Leaderboard.
-pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard]) -> Vec<String> {
+pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Frame) -> Vec<String> {
     let uses = uses(submissions);
     let mut boards: BTreeMap<(String, String), (usize, usize)> = BTreeMap::new();
     for board in leaderboards {
@@ -103,10 +104,7 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard]) -> Vec<St
             ]
         })
         .collect();
-    if rows.is_empty() {
-        return vec!["There is no Leaderboard and no submission.".to_owned()];
-    }
-    let mut lines = table(&["NAMESPACE", "LEADERBOARD", "SLOTS", "WAITING"], &rows);
+    let mut lines = table(&["NAMESPACE", "LEADERBOARD", "SLOTS", "WAITING"], &rows, frame.width);
     lines.push(String::new());
     let rows: Vec<Vec<String>> = uses.iter().map(|(key, each)| row(key, each)).collect();
     let head = [
@@ -120,7 +118,7 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard]) -> Vec<St
         "CANCELLED",
         "CRASHES",
     ];
-    lines.extend(table(&head, &rows));
+    lines.extend(table(&head, &rows, frame.width));
     lines
 }
 

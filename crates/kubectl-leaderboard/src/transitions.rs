@@ -5,7 +5,7 @@
 use jiff::Timestamp;
 use kube::ResourceExt;
 
-use super::text::wrap;
+use super::text::{WIDTH, wrap};
 use leaderboard_api::conditions;
 use leaderboard_api::{State, Submission};
 
@@ -15,6 +15,7 @@ const INDENT: usize = 10;
 /// A wait for the end of an attempt.
 pub struct Waiting {
     attempt: i64,
+    width: usize,
     last: Option<(State, String)>,
 }
 
@@ -30,7 +31,17 @@ pub struct Update {
 impl Waiting {
     /// Waits for the end of this attempt, or of a later one.
     pub fn new(attempt: i64) -> Self {
-        Self { attempt, last: None }
+        Self {
+            attempt,
+            width: WIDTH,
+            last: None,
+        }
+    }
+
+    /// The same in lines of this width.
+    #[must_use]
+    pub fn within(self, width: usize) -> Self {
+        Self { width, ..self }
     }
 
     /// Takes the object as it is now.
@@ -56,14 +67,14 @@ impl Waiting {
         let text = format!("{name} is {} ({reason}){colon} {message}", state.as_str());
         self.last = Some((state, reason));
         Update {
-            lines: hang(&now.strftime("%H:%M:%S").to_string(), &text),
+            lines: hang(&now.strftime("%H:%M:%S").to_string(), &text, self.width),
             end,
         }
     }
 }
 
-fn hang(label: &str, text: &str) -> Vec<String> {
-    let lines = wrap(text, super::text::WIDTH - INDENT);
+fn hang(label: &str, text: &str, width: usize) -> Vec<String> {
+    let lines = wrap(text, width.saturating_sub(INDENT));
     let labels = std::iter::once(label).chain(std::iter::repeat(""));
     labels
         .zip(lines)

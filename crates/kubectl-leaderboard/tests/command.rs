@@ -9,6 +9,22 @@
 
 use std::process::{Command, Output};
 
+const COMMANDS: [&str; 13] = [
+    "why",
+    "status",
+    "top",
+    "submit",
+    "logs",
+    "check",
+    "cancel",
+    "resume",
+    "rerun",
+    "requeue",
+    "report",
+    "completion",
+    "man",
+];
+
 fn plugin(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_kubectl-leaderboard"))
         .args(arguments)
@@ -22,7 +38,7 @@ fn the_help_names_every_command() {
     let output = plugin(&["--help"]);
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success());
-    for command in ["why", "cancel", "resume"] {
+    for command in COMMANDS {
         assert!(
             text.contains(&format!("\n  {command} ")),
             "{command} is missing in:\n{text}"
@@ -36,4 +52,31 @@ fn a_missing_kubeconfig_is_named() {
     let text = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1), "{text}");
     assert!(text.contains("/nonexistent/config"), "{text}");
+}
+
+#[test]
+fn every_command_has_a_manual_page_with_its_flags() {
+    let folder = std::env::temp_dir().join(format!("leaderboard-man-{}", std::process::id()));
+    let man = folder.join("man1");
+    let output = plugin(&["man", man.to_str().unwrap()]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let page = |name: &str| std::fs::read_to_string(man.join(format!("{name}.1"))).unwrap();
+    for command in COMMANDS {
+        let text = page(&format!("kubectl-leaderboard-{command}"));
+        assert!(
+            text.contains(".SH DESCRIPTION") && text.contains("\\-\\-namespace"),
+            "{command}: {text}"
+        );
+    }
+    assert!(page("kubectl-leaderboard-requeue").contains("\\-\\-simulator"));
+    assert!(page("kubectl-leaderboard").contains("requeue"));
+    let hidden = man.join("kubectl-leaderboard-complete.1");
+    assert!(!hidden.exists(), "what only shells call has no page");
+    std::fs::remove_dir_all(folder).unwrap();
+    let output = plugin(&["man", "/dev/null/man1"]);
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        text.contains("cannot write /dev/null/man1") && text.contains("Name another"),
+        "{text}"
+    );
 }

@@ -1,4 +1,4 @@
-//! `status`, `top`, `submit`, `logs`, `rerun`, `report` and completion against a real API server.
+//! `status`, `top`, `submit`, `rerun`, `report` and completion against a real API server.
 
 use kube::ResourceExt;
 use kube::api::ListParams;
@@ -45,9 +45,17 @@ async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
 async fn a_wrong_namespace_is_answered_with_the_right_one() {
     let (empty, full) = (Terminal::new().await, Terminal::new().await);
     full.submission("submission-4711", &json!({}), &waiting()).await;
-    for command in ["status", "why"] {
-        let text = empty.run(&[command]).await.well().replace('\n', " ");
+    for command in [
+        &["status"][..],
+        &["why"],
+        &["top"],
+        &["rerun", "--all"],
+        &["requeue", "--all"],
+    ] {
+        let text = empty.run(command).await.well().replace('\n', " ");
         assert_has(&text, &["has no submissions. There are some in ", &full.namespace]);
+    }
+    for command in ["status", "why", "logs", "cancel", "resume", "requeue"] {
         let text = empty.run(&[command, "submission-4711"]).await.refused();
         assert_has(
             &text,
@@ -84,6 +92,20 @@ async fn submit_creates_and_waits() {
     assert_eq!(waits.code().await, Some(0));
     let again = terminal.run(&[&["submit"], &flags[..]].concat()).await.refused();
     assert_has(&again, &["already exists"]);
+    let elsewhere = Terminal::new().await;
+    let text = elsewhere.run(&[&["submit"], &flags[..]].concat()).await.refused();
+    assert_has(
+        &text,
+        &[
+            "there is no Leaderboard local in namespace ",
+            &terminal.namespace,
+            "use -n ",
+        ],
+    );
+    let mut wrong = flags;
+    wrong[3] = "map";
+    let text = terminal.run(&[&["submit"], &wrong[..]].concat()).await.refused();
+    assert_has(&text, &["Leaderboard local has no track map. It has "]);
 }
 
 #[tokio::test]
@@ -119,22 +141,6 @@ async fn only_what_the_infrastructure_failed_is_resumed() {
     terminal.run(&["rerun", "--all"]).await.well();
     assert_eq!(terminal.requested("lost").await, (2, false));
     assert_eq!(terminal.requested("crashed").await, (1, false));
-}
-
-#[tokio::test]
-async fn logs_of_a_pod_that_is_gone_are_in_the_bucket() {
-    let terminal = Terminal::new().await;
-    let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-                      "slices": [{"first": 0, "last": 0}, {"first": 1, "last": 1}], "routes": 2, "repetitions": 1,
-                      "storage": {"bucket": "results"}, "image": "a", "contentsImage": "c", "simulatorImage": "s"});
-    let mut status = finished();
-    status["plan"] = plan;
-    terminal.submission("mine", &json!({}), &status).await;
-    let text = terminal.run(&["logs", "mine", "--pair", "2"]).await.well();
-    assert_has(&text, &["aws s3 cp s3://results/42/agent/agent2/leaderboard.log -"]);
-    assert!(!text.contains("agent1"), "{text}");
-    let text = terminal.run(&["logs", "mine", "--pair", "3"]).await.refused();
-    assert_has(&text, &["mine has no pair 3. It has 2, counted from 1"]);
 }
 
 #[tokio::test]
@@ -184,7 +190,7 @@ async fn a_shell_gets_names_from_the_cluster() {
     let here = &terminal.namespace;
     assert_eq!(complete(&["why", "-n", here, "sub"]).await, "submission-7\n:4\n");
     assert_eq!(complete(&["check", "-n", here, ""]).await, "local\n:4\n");
-    assert_eq!(complete(&["re"]).await, "report\nrerun\nresume\n:4\n");
+    assert_eq!(complete(&["re"]).await, "report\nrequeue\nrerun\nresume\n:4\n");
 }
 
 /// A screen without any of the optional parts.

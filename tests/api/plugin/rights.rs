@@ -137,6 +137,16 @@ async fn the_documented_rights_are_enough() {
     assert_eq!(waits.code().await, Some(0));
 }
 
+/// A person who may only look at submissions.
+pub async fn reader(terminal: &Terminal) -> (TempDir, PathBuf) {
+    let name = format!("reader-of-{}", terminal.namespace);
+    let known = person(terminal, &json!({"as": name}));
+    let read_only = |rule: &mut Value| rule["verbs"] = json!(["get", "list"]);
+    give_changed(terminal, &name, "submissions", read_only);
+    until_allowed(terminal, &name, "submissions").await;
+    known
+}
+
 /// The kubeconfig of a person whose context names the namespace.
 fn person(terminal: &Terminal, user: &Value) -> (TempDir, PathBuf) {
     let text = std::fs::read_to_string(&terminal.kubeconfig).unwrap();
@@ -158,14 +168,21 @@ fn person(terminal: &Terminal, user: &Value) -> (TempDir, PathBuf) {
 
 /// Gives a person the rights on one kind that docs/plugin.md lists.
 fn give(terminal: &Terminal, person: &str, resource: &str) {
+    give_changed(terminal, person, resource, |_| {});
+}
+
+/// The same with the rule changed.
+fn give_changed(terminal: &Terminal, person: &str, resource: &str, change: impl FnOnce(&mut Value)) {
     let (_, rest) = DOCS.split_once("```yaml\n").unwrap();
     let (role, _) = rest.split_once("```").unwrap();
     let role: Value = serde_saphyr::from_str(role).unwrap();
     let rules = role["rules"].as_array().unwrap();
-    let rule = rules
+    let mut rule = rules
         .iter()
         .find(|rule| rule["resources"] == json!([resource]))
-        .unwrap();
+        .unwrap()
+        .clone();
+    change(&mut rule);
     let meta = json!({"name": resource, "namespace": terminal.namespace});
     let role = json!({"apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role", "metadata": meta, "rules": [rule]});
     let binding = json!({

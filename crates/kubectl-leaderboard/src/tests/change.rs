@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, crashed, finished, leaderboard, node_lost, now, running, submission, waiting, with,
+    assert_width, cancelled, crashed, finished, frame, leaderboard, node_lost, now, running, submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::change::{Change, Request, after_refusal, plan};
@@ -11,7 +11,7 @@ use crate::transitions::Waiting;
 use leaderboard_api::{State, Submission};
 
 fn planned(request: Request, submission: &Submission) -> Result<Change, String> {
-    let plan = plan(request, submission, Observed::Found(&leaderboard()), now());
+    let plan = plan(request, submission, Observed::Found(&leaderboard()), frame());
     if let Ok(plan) = &plan {
         assert_width(&plan.lines);
     }
@@ -54,7 +54,7 @@ fn the_grace_is_the_leaderboards_of_this_moment() {
         (Observed::Missing, "After 120 s the Job"),
         (Observed::Forbidden, "After deadlines.cancelSeconds the Job"),
     ] {
-        let plan = plan(Request::Cancel, &submission(&running()), leaderboard, now()).unwrap();
+        let plan = plan(Request::Cancel, &submission(&running()), leaderboard, frame()).unwrap();
         assert!(text(&plan).contains(expected), "{}", text(&plan));
     }
 }
@@ -155,7 +155,7 @@ fn a_resume_names_what_keeps_the_leaderboard_from_it() {
         Request::Resume,
         &submission(&crashed()),
         Observed::Found(&paused),
-        now(),
+        frame(),
     )
     .unwrap();
     assert!(

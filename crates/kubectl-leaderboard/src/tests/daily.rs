@@ -4,7 +4,8 @@ use clap::Parser;
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
+    assert_width, cancelled, crashed, finished, frame, leaderboard, named, node_lost, running, submission, waiting,
+    with,
 };
 use crate::board::Observed;
 use crate::submit::{Submit, object};
@@ -33,6 +34,7 @@ fn driving() -> Value {
                 {"id": 2, "done": 3, "total": 10, "crashes": 1, "state": "Running",
                  "last": {"reason": "SimulatorCrashed", "time": "2026-11-01T11:40:00Z"}},
             ],
+            "score": {"driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20"},
             "times": {"submitted": "2026-11-01T10:00:00Z", "accepted": "2026-11-01T10:00:02Z",
                       "scheduled": "2026-11-01T10:56:00Z", "started": "2026-11-01T11:00:00Z"},
         }),
@@ -42,7 +44,7 @@ fn driving() -> Value {
 #[test]
 fn one_screen_has_progress_crashes_times_and_links() {
     let board = leaderboard();
-    let lines = status::screen(&submission(&driving()), Observed::Found(&board), now());
+    let lines = status::screen(&submission(&driving()), Observed::Found(&board), frame());
     assert_width(&lines);
     assert_eq!(
         shown(&lines),
@@ -51,14 +53,17 @@ submission-42 is Running since 2026-11-01 11:00:00 UTC (60 min ago).
 
 Track:       sensors of Leaderboard carla-20, by Team Seven; EvalAI submission 42, phase 7
 Reason:      Running: 12/20 routes done.
-Routes:      ████████████░░░░░░░░ 12/20, driving score ~41.20
+Routes:      ████████████░░░░░░░░ 12/20
 Pair 1:      ██████████████████░░ 9/10 running
 Pair 2:      ██████░░░░░░░░░░░░░░ 3/10 running, 1 crash; last end SimulatorCrashed 20 min ago
+Scores:      driving ~41.20, route completion 80.00 %, infraction penalty 0.515, of the routes so
+             far.
 Times:       submitted 2026-11-01 10:00:00 UTC (2 h ago), accepted after 2 s, on a node after 55
              min, started after 4 min.
 Job:         submission-42-1 on node gpu-3
-Results:     s3://results/v2/42
 
+Results:     s3://results/v2/42
+Logs:        kubectl leaderboard logs submission-42 -n carla
 Next:        kubectl leaderboard why submission-42 -n carla"
     );
 }
@@ -74,7 +79,7 @@ fn a_screen_exists_for_every_state() {
         finished(),
         cancelled(),
     ] {
-        let lines = status::screen(&submission(&state), Observed::Missing, now());
+        let lines = status::screen(&submission(&state), Observed::Missing, frame());
         assert_width(&lines);
         let text = lines.join("\n");
         assert!(
@@ -83,12 +88,12 @@ fn a_screen_exists_for_every_state() {
         );
         assert!(!text.contains("Reason:      :"), "{text}");
     }
-    let text = status::screen(&submission(&waiting()), Observed::Missing, now()).join("\n");
+    let text = status::screen(&submission(&waiting()), Observed::Missing, frame()).join("\n");
     assert!(
         text.contains("In line:     position 3; starts in about 20-35 min."),
         "{text}"
     );
-    let text = status::screen(&submission(&finished()), Observed::Missing, now()).join("\n");
+    let text = status::screen(&submission(&finished()), Observed::Missing, frame()).join("\n");
     assert!(
         text.contains("Systems:     S3 Stored, EvalAI Published, DynamoDB Recorded."),
         "{text}"
@@ -117,7 +122,7 @@ fn some() -> Vec<leaderboard_api::Submission> {
 
 #[test]
 fn every_submission_has_a_line_those_that_run_first() {
-    let lines = status::lines(&some(), false, false, now());
+    let lines = status::lines(&some(), false, false, frame());
     assert_eq!(
         shown(&lines),
         "\
@@ -130,7 +135,7 @@ submission-38  Finished  Finished        20/20   43.13                   3 min
 submission-39  Failed    NodeLost                                        3 min
 submission-42  Failed    AgentCrashed    12/20   ~41.20                  3 min"
     );
-    let wide = status::lines(&some(), true, true, now());
+    let wide = status::lines(&some(), true, true, frame());
     assert!(
         wide[0].starts_with("NAMESPACE  NAME") && wide[0].contains("TEAM        ATTEMPT  CRASHES"),
         "{}",
@@ -145,7 +150,7 @@ submission-42  Failed    AgentCrashed    12/20   ~41.20                  3 min"
 
 #[test]
 fn top_shows_slots_and_teams() {
-    let lines = top::lines(&some(), &[leaderboard()]);
+    let lines = top::lines(&some(), &[leaderboard()], frame());
     assert_eq!(
         shown(&lines),
         "\
@@ -157,7 +162,6 @@ carla-20     Team Seven  1        1        #3    1         1       0          5
 carla-20     (none)      0        1        -     0         0       0          0
 carla-20     Team Eight  0        1        #1    0         1       0          0"
     );
-    assert_eq!(top::lines(&[], &[]), ["There is no Leaderboard and no submission."]);
     let value = top::value(&some());
     assert_eq!(
         (&value[0]["team"], &value[0]["crashes"]),

@@ -4,11 +4,12 @@ use jiff::Timestamp;
 use serde_json::json;
 
 use super::{
-    cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
+    cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
 use crate::error::Error;
+use crate::requeue;
 use crate::transitions::Waiting;
 use crate::{overview, why};
 use leaderboard_api::Submission;
@@ -21,7 +22,7 @@ fn assert_shown(lines: &[String]) {
 }
 
 fn planned(request: Request, submission: &Submission) -> Result<Vec<String>, String> {
-    let plan = plan(request, submission, Observed::Found(&leaderboard()), now());
+    let plan = plan(request, submission, Observed::Found(&leaderboard()), frame());
     plan.map(|plan| plan.lines)
 }
 
@@ -29,7 +30,7 @@ fn planned(request: Request, submission: &Submission) -> Result<Vec<String>, Str
 fn why() {
     for status in [crashed(), waiting()] {
         let board = leaderboard();
-        assert_shown(&why::explain(&submission(&status), Observed::Found(&board), now()));
+        assert_shown(&why::explain(&submission(&status), Observed::Found(&board), frame()));
     }
 }
 
@@ -63,7 +64,7 @@ fn why_of_all() {
         namespace: "carla",
         is_all: false,
     };
-    let lines = overview::lines(place, &submissions, Some(&[paused]), now());
+    let lines = overview::lines(place, &submissions, Some(&[paused]), frame());
     assert_shown(&lines);
 }
 
@@ -89,4 +90,27 @@ fn the_states_on_the_way() {
         lines.extend(wait.observe(&submission(&status), now).lines);
     }
     assert_shown(&lines);
+}
+
+#[test]
+fn requeue() {
+    let simulator = "registry.example/carla/simulator:0.9.15-3";
+    let of = |name: &str, status: serde_json::Value, id: &str, team: &str| {
+        let plan = json!({"runId": name, "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
+                          "slices": [{"first": 0, "last": 9}], "routes": 10, "repetitions": 1,
+                          "storage": {"bucket": "results"}, "image": "a", "contentsImage": "c", "simulatorImage": simulator});
+        named(
+            name,
+            &with(
+                status,
+                &json!({"plan": plan, "nodeName": "gpu-3", "team": {"id": id, "name": team}}),
+            ),
+        )
+    };
+    let crashed = of("submission-42", crashed(), "7", "Team Seven");
+    let lost = of("submission-39", node_lost(), "8", "Team Eight");
+    let mut lines = requeue::lines(&[&lost, &crashed], frame());
+    lines.extend([String::new(), format!("Would requeue {}.", requeue::counted(2))]);
+    assert_shown(&lines);
+    assert_shown(&planned(Request::Requeue(None), &submission(&running())).unwrap());
 }

@@ -5,17 +5,27 @@ mod check;
 mod daily;
 mod docs;
 mod overview;
+mod requeue;
+mod shown;
 mod why;
 
 use jiff::Timestamp;
 use serde_json::{Value, json};
 
-use super::text::WIDTH;
+use super::text::{Frame, WIDTH};
 use leaderboard_api::{Leaderboard, Submission};
 
 /// The moment of every test.
 fn now() -> Timestamp {
     "2026-11-01T12:00:00Z".parse().unwrap()
+}
+
+/// The same on a page of the usual width.
+fn frame() -> Frame {
+    Frame {
+        now: now(),
+        width: WIDTH,
+    }
 }
 
 /// A submission of EvalAI with this status; made two hours ago.

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, waiting, with,
+    assert_width, cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, waiting, with,
 };
 use crate::overview::{Place, lines, nothing};
 use leaderboard_api::{Leaderboard, Submission};
@@ -13,7 +13,7 @@ fn printed(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> 
         namespace: "carla",
         is_all: false,
     };
-    let lines = lines(place, submissions, leaderboards, now());
+    let lines = lines(place, submissions, leaderboards, frame());
     assert_width(&lines);
     lines.join("\n")
 }
@@ -79,7 +79,7 @@ Namespace carla has 1 submission. It is not waiting, failed or stuck."
         !text.contains("There is no Leaderboard"),
         "what has ended needs none: {text}"
     );
-    let text = |selector, elsewhere: &[(String, usize)]| nothing("carla", selector, elsewhere).join("\n");
+    let text = |selector, elsewhere: &[(String, usize)]| nothing("carla", selector, elsewhere, frame()).join("\n");
     assert!(text(None, &[]).starts_with("Namespace carla has no submissions. `kubectl get submissions -A`"));
     assert_eq!(
         text(None, &[("carla-20".to_owned(), 12), ("test".to_owned(), 1)]),

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission,
+    assert_width, cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, submission,
     waiting, with,
 };
 use crate::board::Observed;
@@ -11,7 +11,7 @@ use crate::why::explain;
 use leaderboard_api::{Leaderboard, Submission, reasons};
 
 fn printed(submission: &Submission, leaderboard: Observed<'_>) -> String {
-    let lines = explain(submission, leaderboard, now());
+    let lines = explain(submission, leaderboard, frame());
     assert_width(&lines);
     lines.join("\n")
 }
@@ -326,7 +326,7 @@ fn the_log_is_read_where_the_run_was_stored() {
                       "routes": 10, "repetitions": 1, "storage": storage, "image": "a:1", "contentsImage": "c:1",
                       "simulatorImage": "s:1"});
     let status = with(crashed(), &json!({"plan": plan}));
-    let lines = explain(&submission(&status), Observed::Forbidden, now());
+    let lines = explain(&submission(&status), Observed::Forbidden, frame());
     let command = "             aws s3 cp s3://results/v2/42/evalai/environment_log.txt - --region eu-west-1 \
                    --endpoint-url http://127.0.0.1:4566";
     assert!(

@@ -3,21 +3,22 @@
 //! Called by `main` for `why NAME`. Pure: knows no client, and the time is handed in. Meanings and next steps are those of
 //! `leaderboard_api::reasons`.
 
+mod next;
+
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::ResourceExt;
 use serde_json::{Value, json};
 
+use self::next::{next_steps, of_pair, verb};
 use super::board::{self, Observed};
 use super::bucket;
-use super::text::{Page, join, span, when};
+use super::facts::{class, command, has_ended, headline, is_attempt_requested, state, track};
+use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{
-    EndReason, Failure, FailureClass, LastEnd, PairStatus, Rerun, State, Submission, SubmissionStatus, TeamStatus,
-    reasons,
-};
+use leaderboard_api::{EndReason, LastEnd, PairStatus, Rerun, Submission, SubmissionStatus, reasons};
 
 /// What is known, and the lines about it so far.
 struct Explanation<'a> {
@@ -48,20 +49,21 @@ pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
 }
 
 /// All that is known of a submission.
-pub fn explain(submission: &Submission, leaderboard: Observed<'_>, now: Timestamp) -> Vec<String> {
+pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
     let empty = SubmissionStatus::default();
     let mut explanation = Explanation {
         submission,
         status: submission.status.as_ref().unwrap_or(&empty),
         leaderboard,
-        now,
-        page: Page::default(),
+        now: frame.now,
+        page: frame.page(),
     };
     explanation.headline();
     explanation.page.gap();
     explanation.belongs_to();
     explanation.reason();
     explanation.rerun();
+    explanation.requeued();
     explanation.failure();
     explanation.repeated();
     explanation.line();
@@ -71,104 +73,6 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, now: Timestam
     explanation.log();
     explanation.next();
     explanation.page.into_lines()
-}
-
-/// The state of a submission; none before the operator has processed it.
-pub(super) fn state(status: &SubmissionStatus) -> Option<State> {
-    status.attempt.map(|_| status.state_of_conditions())
-}
-
-/// Since when a submission is in its state.
-pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
-    let status = submission.status.as_ref()?;
-    let moved = |type_: &str, truth: &str| {
-        let found = conditions::get(&status.conditions, type_).filter(|c| c.status == truth);
-        found.map(|c| c.last_transition_time.0)
-    };
-    let time = |time: &Option<Time>| time.as_ref().map(|t| t.0);
-    let times = &status.times;
-    let found = match state(status)? {
-        State::Finished | State::Failed | State::Cancelled => {
-            time(&times.finished).or_else(|| moved(conditions::FINISHED, "True"))
-        }
-        State::Running | State::Resumed if times.stopping.is_some() => time(&times.stopping),
-        State::Running | State::Resumed => moved(conditions::RUNNING, "True")
-            .or_else(|| moved(conditions::RUNNING, "False"))
-            .or_else(|| time(&times.started)),
-        // The attempt begins with this condition.
-        State::Pending => moved(conditions::FINISHED, "False").or_else(|| time(&times.accepted)),
-    };
-    found.or_else(|| submission.creation_timestamp().map(|t| t.0))
-}
-
-/// The state of a submission in a sentence.
-pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
-    let name = submission.name_any();
-    let since = since(submission).map(|at| when(at, now));
-    match (submission.status.as_ref().and_then(state), since) {
-        (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
-        (Some(state), None) => format!("{name} is {}.", state.as_str()),
-        (None, _) => {
-            let made = submission.creation_timestamp().map(|made| when(made.0, now));
-            let made = made.map(|made| format!(", created {made}")).unwrap_or_default();
-            format!("{name} is new{made}: the operator has not processed it yet.")
-        }
-    }
-}
-
-/// Name of the team, else its id.
-pub(super) fn team(submission: &Submission) -> Option<String> {
-    let given = submission.spec.team.clone().map(TeamStatus::from);
-    let accepted = submission.status.as_ref().and_then(|status| status.team.as_ref());
-    let team = accepted.or(given.as_ref())?;
-    team.name.clone().or_else(|| team.id.clone())
-}
-
-/// Track, Leaderboard, team and submission in EvalAI.
-pub(super) fn track(submission: &Submission) -> String {
-    let spec = &submission.spec;
-    let found = submission.status.as_ref().and_then(|status| status.track.as_deref());
-    let mut text = match found.or(spec.track.as_deref()) {
-        Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
-        None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
-    };
-    if let Some(team) = team(submission) {
-        text = format!("{text}, by {team}");
-    }
-    if let Some(evalai) = spec.evalai {
-        text = format!(
-            "{text}; EvalAI submission {}, phase {}",
-            evalai.submission, evalai.phase
-        );
-    }
-    text
-}
-
-/// Whether the attempt has ended and no higher one is requested.
-pub(super) fn has_ended(submission: &Submission) -> bool {
-    let status = submission.status.as_ref();
-    status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED))
-        && !is_attempt_requested(submission)
-}
-
-/// Whether a higher attempt is requested than the operator has started.
-pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
-    let started = submission.status.as_ref().and_then(|s| s.attempt);
-    started.is_some_and(|started| submission.spec.attempt > started)
-}
-
-/// A command of this plugin for a submission, to be copied.
-pub(super) fn command(verb: &str, submission: &Submission) -> String {
-    let namespace = submission.namespace().map(|n| format!(" -n {n}")).unwrap_or_default();
-    format!("kubectl leaderboard {verb} {}{namespace}", submission.name_any())
-}
-
-/// The class of a failure.
-pub(super) fn class(class: FailureClass) -> &'static str {
-    match class {
-        FailureClass::Participant => "participant failure",
-        FailureClass::Infrastructure => "infrastructure failure",
-    }
 }
 
 impl Explanation<'_> {
@@ -221,6 +125,22 @@ impl Explanation<'_> {
         for text in [of, again].into_iter().flatten() {
             self.page.row("Re-run", &text);
         }
+    }
+
+    /// That a host has put it back in line, or has asked for it.
+    fn requeued(&mut self) {
+        let wanted = self.submission.spec.requeue.as_ref();
+        let done = self.status.requeued.as_ref();
+        let when = match (wanted, done) {
+            (Some(wanted), done) if done.is_none_or(|done| done.number < wanted.number) => {
+                "requested by a host; not carried out yet".to_owned()
+            }
+            (_, Some(done)) => format!("by a host {}", when(done.time.0, self.now)),
+            (_, None) => return,
+        };
+        let why = wanted.and_then(|wanted| wanted.reason.as_deref());
+        let why = why.map(|why| format!(": {why}")).unwrap_or_default();
+        self.page.row("Requeued", &sentence(&format!("{when}{why}")));
     }
 
     fn failure(&mut self) {
@@ -400,12 +320,6 @@ pub(super) fn meaning(reason: &str) -> String {
     reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.meaning))
 }
 
-/// A text of the table of reasons about the pair that failed.
-fn of_pair(text: &str, pair: Option<i32>) -> String {
-    let text = reasons::plain(text);
-    pair.map_or(text.clone(), |pair| text.replace("<n>", &pair.to_string()))
-}
-
 /// How a pair crashed. The message of a failure has the count at which the pair failed; its containers may end once more before
 /// the Job is gone, so that the count is left out where both are shown.
 fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
@@ -437,57 +351,4 @@ fn system_text(condition: &Condition, system: &str, now: Timestamp) -> String {
     };
     let message = sentence(&condition.message);
     join(&[&format!("{}:", condition.reason), &meaning, &message, &since])
-}
-
-/// What to do next; the step of the reason comes first.
-fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
-    let mut reasons: Vec<&str> = status.reason.as_deref().into_iter().collect();
-    // While the run is being stopped, the reason is that of the stop.
-    reasons.extend(status.failure.as_ref().map(|failure| failure.reason.as_str()));
-    let doubt = conditions::get(&status.conditions, conditions::PLAUSIBLE).filter(|c| c.status == "False");
-    reasons.extend(doubt.map(|c| c.reason.as_str()));
-    let problems = if has_ended(submission) {
-        Vec::new()
-    } else {
-        board::problems(&submission.spec.leaderboard_name, leaderboard)
-    };
-    reasons.extend(problems.iter().filter_map(|problem| problem.reason.as_deref()));
-    let pair = status.failure.as_ref().and_then(|failure| failure.pair);
-    let mut steps: Vec<String> = Vec::new();
-    let next = |reason| next_step(status.failure.as_ref(), reason);
-    for next in reasons.into_iter().filter_map(next).map(|next| of_pair(next, pair)) {
-        if !steps.contains(&next) {
-            steps.push(next);
-        }
-    }
-    if state(status).is_none() && problems.is_empty() {
-        steps.push("Nothing. If it lasts for a minute, check that the operator runs.".to_owned());
-    }
-    steps
-}
-
-/// The next step of a reason: of an infrastructure failure the one that hosts do after it.
-fn next_step(failure: Option<&Failure>, reason: &str) -> Option<&'static str> {
-    let is_of_host = failure.is_some_and(|f| f.reason == reason && f.class == FailureClass::Infrastructure);
-    if is_of_host {
-        reasons::after_failure(reason)
-    } else {
-        reasons::of(reason).map(|reason| reason.next_step)
-    }
-}
-
-/// The command of this plugin for the next step.
-fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static str> {
-    if submission.metadata.deletion_timestamp.is_some() {
-        return None;
-    }
-    let reason = status.reason.as_deref().unwrap_or_default();
-    if has_ended(submission) {
-        let is_infrastructure = |f: &Failure| f.class == FailureClass::Infrastructure;
-        let is_resumable = status.failure.as_ref().is_some_and(is_infrastructure);
-        return (is_resumable || reason == reasons::CANCELLED).then_some("resume");
-    }
-    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]
-        .contains(&reason)
-        .then_some("cancel")
 }

@@ -1,0 +1,121 @@
+//! Logs in the bucket, read with the person's own `aws` program and credentials: the plugin has no client of S3.
+//!
+//! Called by `logs` once the Pod is gone. A person without the program gets its commands.
+
+use std::process::Stdio;
+
+use leaderboard_api::Storage;
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, BufReader};
+use tokio::process::Command;
+
+use crate::text::clean;
+
+/// Bytes of the program's errors that are read.
+const LONGEST_ERROR: u64 = 64 * 1024;
+
+/// Why a log was not read.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Unread {
+    /// There is no program `aws`.
+    NoProgram,
+    /// It has failed, and why.
+    Failed(String),
+}
+
+/// What `aws` is called with.
+fn arguments(object: &str, storage: Option<&Storage>) -> Vec<String> {
+    let mut arguments = ["s3", "cp", "--only-show-errors"].map(str::to_owned).to_vec();
+    let places = [
+        ("--region", storage.and_then(|storage| storage.region.as_ref())),
+        ("--endpoint-url", storage.and_then(|storage| storage.endpoint.as_ref())),
+    ];
+    for (flag, value) in places {
+        arguments.extend(value.map(|value| format!("{flag}={value}")));
+    }
+    arguments.extend([object.to_owned(), "-".to_owned()]);
+    arguments
+}
+
+/// Hands each line of an object to `show`.
+pub async fn read(object: &str, storage: Option<&Storage>, mut show: impl FnMut(&str)) -> Result<(), Unread> {
+    // An imported address is a text of a table's row: it must not become a flag, nor name a file of this machine.
+    if !object.starts_with("s3://") {
+        return Err(Unread::Failed(format!("{} is no address in a bucket", clean(object))));
+    }
+    let mut child = match Command::new("aws")
+        .args(arguments(object, storage))
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .kill_on_drop(true)
+        .spawn()
+    {
+        Ok(child) => child,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Err(Unread::NoProgram),
+        Err(error) => return Err(Unread::Failed(format!("aws cannot be run: {error}"))),
+    };
+    let failed = |error: std::io::Error| Unread::Failed(format!("aws was interrupted: {error}"));
+    let (out, errors) = (child.stdout.take(), child.stderr.take());
+    let lines = async {
+        let Some(out) = out else { return Ok(()) };
+        let mut out = BufReader::new(out);
+        let mut line = Vec::new();
+        // A log is bytes: one that is no UTF-8 is shown all the same.
+        while out.read_until(b'\n', &mut line).await.map_err(failed)? > 0 {
+            show(&String::from_utf8_lossy(&line));
+            line.clear();
+        }
+        Ok(())
+    };
+    let complaint = async {
+        let mut text = Vec::new();
+        if let Some(errors) = errors {
+            // What cannot be read is not shown; the exit status says that it failed.
+            let _ = errors.take(LONGEST_ERROR).read_to_end(&mut text).await;
+        }
+        text
+    };
+    let (shown, complaint) = tokio::join!(lines, complaint);
+    shown?;
+    let status = child.wait().await.map_err(failed)?;
+    if status.success() {
+        return Ok(());
+    }
+    let complaint = String::from_utf8_lossy(&complaint);
+    let last = complaint.lines().rfind(|line| !line.trim().is_empty());
+    let why = last.map_or_else(|| status.to_string(), clean);
+    Err(Unread::Failed(why.trim_end_matches('.').to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn the_place_of_the_bucket_is_handed_on_and_no_part_of_an_address_is_a_flag() {
+        let storage = json!({"bucket": "b", "region": "eu-west-1", "endpoint": "https://s3.example"});
+        let storage: Storage = serde_json::from_value(storage).unwrap();
+        assert_eq!(
+            arguments("s3://b/1/a.log", Some(&storage)),
+            [
+                "s3",
+                "cp",
+                "--only-show-errors",
+                "--region=eu-west-1",
+                "--endpoint-url=https://s3.example",
+                "s3://b/1/a.log",
+                "-"
+            ]
+        );
+    }
+
+    #[tokio::test]
+    async fn what_is_no_address_in_a_bucket_is_not_read() {
+        for object in ["/etc/passwd", "--endpoint-url=https://x", "https://s3/b"] {
+            let why = read(object, None, |_| unreachable!()).await.unwrap_err();
+            assert_eq!(why, Unread::Failed(format!("{object} is no address in a bucket")));
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! The commands that show something, and `submit`: asks the cluster, and prints what the pure modules make of it.
+
+use std::pin::pin;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use futures::StreamExt;
+use jiff::Timestamp;
+use kube::ResourceExt;
+use serde_json::Value;
+
+use crate::changes::wait;
+use crate::cluster::{Cluster, Fetched, Scope};
+use crate::error::{self, Error};
+use crate::output::{self, Format, Screen, print};
+use crate::text::Frame;
+use crate::{Show, facts, overview, status, submit, top, why};
+use leaderboard_api::client_errors::watch as watch_error;
+use leaderboard_api::{State, Submission};
+
+/// How often the times on a screen go on.
+const TICK: Duration = Duration::from_secs(1);
+
+/// This moment, on this terminal.
+pub fn frame() -> Frame {
+    Frame {
+        now: Timestamp::now(),
+        width: output::width(),
+    }
+}
+
+/// `why NAME`.
+pub async fn explain(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCode, Error> {
+    let submission = cluster.submission(name).await?;
+    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
+    let value = why::value(&submission, leaderboard.observed());
+    let lines = output::document(format, &value);
+    print(&lines.unwrap_or_else(|| why::explain(&submission, leaderboard.observed(), frame())));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// `why` of all.
+pub async fn survey(cluster: &Cluster, scope: &Scope, format: Format) -> Result<ExitCode, Error> {
+    let submissions = cluster.submissions(scope).await?;
+    let leaderboards = cluster.leaderboards(scope).await?;
+    let value = Value::Array(submissions.iter().map(status::value).collect());
+    if let Some(lines) = output::document(format, &value) {
+        print(&lines);
+        return Ok(ExitCode::SUCCESS);
+    }
+    if submissions.is_empty() {
+        print(&nothing(cluster, scope).await);
+    } else {
+        let place = overview::Place {
+            namespace: &cluster.namespace,
+            is_all: scope.all_namespaces,
+        };
+        print(&overview::lines(place, &submissions, leaderboards.as_deref(), frame()));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The message where no submission is found: most often the namespace is another one.
+pub async fn nothing(cluster: &Cluster, scope: &Scope) -> Vec<String> {
+    let elsewhere = if scope.all_namespaces {
+        Vec::new()
+    } else {
+        cluster.elsewhere().await
+    };
+    overview::nothing(&cluster.namespace, scope.selector.as_deref(), &elsewhere, frame())
+}
+
+/// `status`.
+pub async fn show_status(cluster: &Cluster, show: &Show, watch: bool) -> Result<ExitCode, Error> {
+    let format = show.output.format;
+    let Some(name) = &show.name else {
+        let submissions = cluster.submissions(&show.scope).await?;
+        let value = Value::Array(submissions.iter().map(status::value).collect());
+        let (is_all, is_wide) = (show.scope.all_namespaces, format == Format::Wide);
+        let lines = match output::document(format, &value) {
+            Some(lines) => lines,
+            None if submissions.is_empty() => nothing(cluster, &show.scope).await,
+            None => status::lines(&submissions, is_all, is_wide, frame()),
+        };
+        print(&lines);
+        return Ok(ExitCode::SUCCESS);
+    };
+    let submission = cluster.submission(name).await?;
+    if watch {
+        return follow(cluster, name, format).await;
+    }
+    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
+    print(&screen(&submission, &leaderboard, format));
+    Ok(ExitCode::SUCCESS)
+}
+
+fn screen(submission: &Submission, leaderboard: &Fetched, format: Format) -> Vec<String> {
+    let lines = output::document(format, &status::value(submission));
+    lines.unwrap_or_else(|| status::screen(submission, leaderboard.observed(), frame()))
+}
+
+/// Draws the screen of a submission each time it changes, until it has ended; on a terminal its times go on in between.
+async fn follow(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCode, Error> {
+    let mut drawn = Screen::default();
+    let mut last: Option<(Submission, Fetched)> = None;
+    let mut changes = pin!(cluster.changes(name));
+    let mut ticks = tokio::time::interval(TICK);
+    loop {
+        let change = tokio::select! {
+            change = changes.next() => change,
+            _ = ticks.tick(), if Screen::is_live() => {
+                if let Some((submission, leaderboard)) = &last {
+                    drawn.draw(&screen(submission, leaderboard, format));
+                }
+                continue;
+            }
+        };
+        match change {
+            Some(Ok(Some(submission))) => {
+                let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
+                drawn.draw(&screen(&submission, &leaderboard, format));
+                if facts::has_ended(&submission) {
+                    return Ok(ExitCode::SUCCESS);
+                }
+                last = Some((submission, leaderboard));
+            }
+            Some(Ok(None)) => return Err(Error::Gone(name.to_owned())),
+            Some(Err(error)) => {
+                if let Some(permanent) = error::permanent(error) {
+                    return Err(permanent);
+                }
+            }
+            None => return Ok(ExitCode::SUCCESS),
+        }
+    }
+}
+
+/// `top`.
+pub async fn top(cluster: &Cluster, scope: &Scope, format: Format) -> Result<ExitCode, Error> {
+    let submissions = cluster.submissions(scope).await?;
+    let leaderboards = cluster.leaderboards(scope).await?.unwrap_or_default();
+    let lines = match output::document(format, &top::value(&submissions)) {
+        Some(lines) => lines,
+        None if submissions.is_empty() && leaderboards.is_empty() => nothing(cluster, scope).await,
+        None => top::lines(&submissions, &leaderboards, frame()),
+    };
+    print(&lines);
+    Ok(ExitCode::SUCCESS)
+}
+
+/// `submit`.
+pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCode, Error> {
+    let leaderboard = cluster.leaderboard(&wanted.leaderboard).await?;
+    let elsewhere = match leaderboard {
+        Fetched::Missing => cluster.namespaces_of_leaderboard(&wanted.leaderboard).await,
+        Fetched::Found(_) | Fetched::Forbidden => Vec::new(),
+    };
+    submit::fits(wanted, leaderboard.observed(), &cluster.namespace, &elsewhere).map_err(Error::Unfit)?;
+    let created = cluster.create(&submit::object(wanted)).await?;
+    let name = created.name_any();
+    print(&[format!(
+        "Submitted {name}. `kubectl leaderboard status {name} -n {} -w` follows it.",
+        cluster.namespace
+    )]);
+    if !wanted.wait {
+        return Ok(ExitCode::SUCCESS);
+    }
+    let end = wait(cluster, &name, 1).await?;
+    Ok(if end == State::Finished {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
+
+/// Says that a watch was interrupted, and goes on, unless going on does not help.
+pub fn note_interruption(error: kube::runtime::watcher::Error, printed: &mut String) -> Result<(), Error> {
+    let message = error::phrase(&watch_error(&error));
+    if let Some(permanent) = error::permanent(error) {
+        return Err(permanent);
+    }
+    if message != *printed {
+        eprintln!("kubectl leaderboard: {message}; retrying.");
+        *printed = message;
+    }
+    Ok(())
+}

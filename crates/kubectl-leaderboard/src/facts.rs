@@ -1,0 +1,117 @@
+//! What is read off one Submission, and how it is called: its state, since when, its team and track.
+//!
+//! Called by every module that shows or changes submissions. Pure: the time is handed in.
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::ResourceExt;
+
+use super::text::when;
+use leaderboard_api::{FailureClass, State, Submission, SubmissionStatus, TeamStatus, conditions};
+
+/// The state of a submission; none before the operator has processed it.
+pub(super) fn state(status: &SubmissionStatus) -> Option<State> {
+    status.attempt.map(|_| status.state_of_conditions())
+}
+
+/// Since when a submission is in its state.
+pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
+    let status = submission.status.as_ref()?;
+    let moved = |type_: &str, truth: &str| {
+        let found = conditions::get(&status.conditions, type_).filter(|c| c.status == truth);
+        found.map(|c| c.last_transition_time.0)
+    };
+    let time = |time: &Option<Time>| time.as_ref().map(|t| t.0);
+    let times = &status.times;
+    let found = match state(status)? {
+        State::Finished | State::Failed | State::Cancelled => {
+            time(&times.finished).or_else(|| moved(conditions::FINISHED, "True"))
+        }
+        State::Running | State::Resumed if times.stopping.is_some() => time(&times.stopping),
+        State::Running | State::Resumed => moved(conditions::RUNNING, "True")
+            .or_else(|| moved(conditions::RUNNING, "False"))
+            .or_else(|| time(&times.started)),
+        // The attempt begins with this condition.
+        State::Pending => moved(conditions::FINISHED, "False").or_else(|| time(&times.accepted)),
+    };
+    found.or_else(|| submission.creation_timestamp().map(|t| t.0))
+}
+
+/// The state of a submission in a sentence.
+pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
+    let name = submission.name_any();
+    let since = since(submission).map(|at| when(at, now));
+    match (submission.status.as_ref().and_then(state), since) {
+        (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
+        (Some(state), None) => format!("{name} is {}.", state.as_str()),
+        (None, _) => {
+            let made = submission.creation_timestamp().map(|made| when(made.0, now));
+            let made = made.map(|made| format!(", created {made}")).unwrap_or_default();
+            format!("{name} is new{made}: the operator has not processed it yet.")
+        }
+    }
+}
+
+/// Name of the team, else its id.
+pub(super) fn team(submission: &Submission) -> Option<String> {
+    let given = submission.spec.team.clone().map(TeamStatus::from);
+    let accepted = submission.status.as_ref().and_then(|status| status.team.as_ref());
+    let team = accepted.or(given.as_ref())?;
+    team.name.clone().or_else(|| team.id.clone())
+}
+
+/// Track, Leaderboard, team and submission in EvalAI.
+pub(super) fn track(submission: &Submission) -> String {
+    let spec = &submission.spec;
+    let found = submission.status.as_ref().and_then(|status| status.track.as_deref());
+    let mut text = match found.or(spec.track.as_deref()) {
+        Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
+        None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
+    };
+    if let Some(team) = team(submission) {
+        text = format!("{text}, by {team}");
+    }
+    if let Some(evalai) = spec.evalai {
+        text = format!(
+            "{text}; EvalAI submission {}, phase {}",
+            evalai.submission, evalai.phase
+        );
+    }
+    text
+}
+
+/// Whether the attempt has ended and no higher one is requested.
+pub(super) fn has_ended(submission: &Submission) -> bool {
+    let status = submission.status.as_ref();
+    status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED))
+        && !is_attempt_requested(submission)
+}
+
+/// Whether a higher attempt is requested than the operator has started.
+pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
+    let started = submission.status.as_ref().and_then(|s| s.attempt);
+    started.is_some_and(|started| submission.spec.attempt > started)
+}
+
+/// Whether a host has asked to put it back in line, and the operator has not done so.
+pub(super) fn is_requeue_requested(submission: &Submission) -> bool {
+    let wanted = submission.spec.requeue.as_ref().map_or(0, |requeue| requeue.number);
+    let status = submission.status.as_ref();
+    let done = status.and_then(|status| status.requeued.as_ref());
+    // One that has ended takes a request up with its next attempt.
+    wanted > done.map_or(0, |done| done.number) && !has_ended(submission)
+}
+
+/// A command of this plugin for a submission, to be copied.
+pub(super) fn command(verb: &str, submission: &Submission) -> String {
+    let namespace = submission.namespace().map(|n| format!(" -n {n}")).unwrap_or_default();
+    format!("kubectl leaderboard {verb} {}{namespace}", submission.name_any())
+}
+
+/// The class of a failure.
+pub(super) fn class(class: FailureClass) -> &'static str {
+    match class {
+        FailureClass::Participant => "participant failure",
+        FailureClass::Infrastructure => "infrastructure failure",
+    }
+}

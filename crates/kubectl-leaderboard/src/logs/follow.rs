@@ -1,0 +1,151 @@
+//! `logs -f`: each container's log from its beginning to its end, in whichever Pod, until the submission has ended.
+
+use std::collections::BTreeSet;
+use std::pin::pin;
+use std::process::ExitCode;
+
+use futures::stream::{BoxStream, SelectAll};
+use futures::{Stream, StreamExt};
+use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
+use kube::ResourceExt;
+use kube::runtime::watcher;
+use leaderboard_api::Submission;
+
+use super::{Logs, Source, pairs, sources};
+use crate::cluster::Cluster;
+use crate::commands::note_interruption;
+use crate::error::Error;
+use crate::facts;
+use crate::output::print_labelled;
+use crate::text::clean;
+
+/// A life of a container: one that crashes begins another one, with a log of its own.
+type Life = (String, String, i32);
+type Lines = BoxStream<'static, (Source, Result<String, Error>)>;
+
+/// What is shown, and what was shown.
+struct Following<'a> {
+    cluster: &'a Cluster,
+    wanted: &'a Logs,
+    submission: Submission,
+    begun: BTreeSet<Life>,
+    lines: SelectAll<Lines>,
+    printed: String,
+}
+
+/// Prints the lines as they come.
+pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submission) -> Result<ExitCode, Error> {
+    if submission
+        .status
+        .as_ref()
+        .is_none_or(|status| status.job_name.is_none())
+    {
+        let shown = submission.status.as_ref().and_then(facts::state);
+        let shown = shown.map_or("new", leaderboard_api::State::as_str);
+        eprintln!(
+            "kubectl leaderboard: {} is {shown}. Its log follows once its Pod runs.",
+            wanted.name
+        );
+    }
+    let mut changes = pin!(cluster.changes(&wanted.name));
+    let mut pods = pin!(cluster.pod_changes(&wanted.name));
+    let mut following = Following {
+        cluster,
+        wanted,
+        submission,
+        begun: BTreeSet::new(),
+        lines: SelectAll::new(),
+        printed: String::new(),
+    };
+    while !following.is_over() {
+        following.step(&mut changes, &mut pods).await?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+impl Following<'_> {
+    /// Whether the submission has ended and all that was begun is shown.
+    fn is_over(&self) -> bool {
+        facts::has_ended(&self.submission) && self.lines.is_empty()
+    }
+
+    /// Takes whichever comes first: a line, a change of the submission, or one of a Pod.
+    async fn step(
+        &mut self,
+        changes: &mut (impl Stream<Item = Result<Option<Submission>, watcher::Error>> + Unpin),
+        pods: &mut (impl Stream<Item = Result<Pod, watcher::Error>> + Unpin),
+    ) -> Result<(), Error> {
+        tokio::select! {
+            line = self.lines.next(), if !self.lines.is_empty() => match line {
+                // The last log has ended.
+                None => {}
+                Some((source, Ok(line))) => print_labelled(source.stream, &source.label, &clean(&line)),
+                Some((_, Err(error @ (Error::Forbidden(_) | Error::Credentials(_))))) => return Err(error),
+                Some((source, Err(error))) => eprintln!("kubectl leaderboard: the log of {} was interrupted: {error}", source.container),
+            },
+            Some(change) = changes.next() => match change {
+                Ok(Some(submission)) => self.submission = submission,
+                Ok(None) => return Err(Error::Gone(self.wanted.name.clone())),
+                Err(error) => note_interruption(error, &mut self.printed)?,
+            },
+            Some(pod) = pods.next() => match pod {
+                Ok(pod) => self.begin(&pod),
+                Err(error) => note_interruption(error, &mut self.printed)?,
+            },
+            else => return Err(Error::Api("the watch has ended".to_owned())),
+        }
+        Ok(())
+    }
+
+    /// Begins the logs of containers that have one and were not begun.
+    fn begin(&mut self, pod: &Pod) {
+        for source in sources(self.wanted, pairs(&self.submission).max(self.wanted.pair.unwrap_or(0))) {
+            let Some(restarts) = life(pod, &source.container) else {
+                continue;
+            };
+            let life = (pod.uid().unwrap_or_default(), source.container.clone(), restarts);
+            if self.begun.contains(&life) {
+                continue;
+            }
+            self.begun.insert(life);
+            let lines = self.cluster.followed_log(&pod.name_any(), &source.container);
+            self.lines.push(lines.map(move |line| (source.clone(), line)).boxed());
+        }
+    }
+}
+
+/// The restarts of a container that runs or has run; none of one that has no log yet.
+fn life(pod: &Pod, container: &str) -> Option<i32> {
+    let status = pod.status.as_ref()?;
+    let all = [&status.container_statuses, &status.init_container_statuses];
+    let mut all = all.into_iter().flatten().flatten();
+    let found: &ContainerStatus = all.find(|status| status.name == container)?;
+    let state = found.state.as_ref()?;
+    (state.running.is_some() || state.terminated.is_some()).then_some(found.restart_count)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    #[test]
+    fn each_life_of_a_container_has_a_log_once_it_has_begun() {
+        let pod = |kind: &str, state: &Value, restarts: i32| -> Pod {
+            let status = json!({"name": "agent-1", "image": "a", "imageID": "", "ready": false,
+                                "restartCount": restarts, "state": state});
+            serde_json::from_value(json!({"metadata": {"name": "p"}, "status": {kind: [status]}})).unwrap()
+        };
+        let (running, waiting) = (
+            json!({"running": {}}),
+            json!({"waiting": {"reason": "CrashLoopBackOff"}}),
+        );
+        let ended = json!({"terminated": {"exitCode": 1}});
+        assert_eq!(life(&pod("containerStatuses", &running, 0), "agent-1"), Some(0));
+        assert_eq!(life(&pod("initContainerStatuses", &ended, 2), "agent-1"), Some(2));
+        assert_eq!(life(&pod("containerStatuses", &waiting, 1), "agent-1"), None);
+        assert_eq!(life(&pod("containerStatuses", &running, 0), "agent-2"), None);
+        assert_eq!(life(&Pod::default(), "agent-1"), None);
+    }
+}

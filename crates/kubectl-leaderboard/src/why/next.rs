@@ -1,0 +1,65 @@
+//! The next steps of one submission: those of the table of reasons, and the command of this plugin that takes one.
+
+use leaderboard_api::{Failure, FailureClass, Submission, SubmissionStatus, conditions, reasons};
+
+use crate::board::{self, Observed};
+use crate::facts::{has_ended, state};
+
+/// A text of the table of reasons about the pair that failed.
+pub(super) fn of_pair(text: &str, pair: Option<i32>) -> String {
+    let text = reasons::plain(text);
+    pair.map_or(text.clone(), |pair| text.replace("<n>", &pair.to_string()))
+}
+
+/// What to do next; the step of the reason comes first.
+pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
+    let mut reasons: Vec<&str> = status.reason.as_deref().into_iter().collect();
+    // While the run is being stopped, the reason is that of the stop.
+    reasons.extend(status.failure.as_ref().map(|failure| failure.reason.as_str()));
+    let doubt = conditions::get(&status.conditions, conditions::PLAUSIBLE).filter(|c| c.status == "False");
+    reasons.extend(doubt.map(|c| c.reason.as_str()));
+    let problems = if has_ended(submission) {
+        Vec::new()
+    } else {
+        board::problems(&submission.spec.leaderboard_name, leaderboard)
+    };
+    reasons.extend(problems.iter().filter_map(|problem| problem.reason.as_deref()));
+    let pair = status.failure.as_ref().and_then(|failure| failure.pair);
+    let mut steps: Vec<String> = Vec::new();
+    let next = |reason| next_step(status.failure.as_ref(), reason);
+    for next in reasons.into_iter().filter_map(next).map(|next| of_pair(next, pair)) {
+        if !steps.contains(&next) {
+            steps.push(next);
+        }
+    }
+    if state(status).is_none() && problems.is_empty() {
+        steps.push("Nothing. If it lasts for a minute, check that the operator runs.".to_owned());
+    }
+    steps
+}
+
+/// The next step of a reason: of an infrastructure failure the one that hosts do after it.
+fn next_step(failure: Option<&Failure>, reason: &str) -> Option<&'static str> {
+    let is_of_host = failure.is_some_and(|f| f.reason == reason && f.class == FailureClass::Infrastructure);
+    if is_of_host {
+        reasons::after_failure(reason)
+    } else {
+        reasons::of(reason).map(|reason| reason.next_step)
+    }
+}
+
+/// The command of this plugin for the next step.
+pub(super) fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static str> {
+    if submission.metadata.deletion_timestamp.is_some() {
+        return None;
+    }
+    let reason = status.reason.as_deref().unwrap_or_default();
+    if has_ended(submission) {
+        let is_infrastructure = |f: &Failure| f.class == FailureClass::Infrastructure;
+        let is_resumable = status.failure.as_ref().is_some_and(is_infrastructure);
+        return (is_resumable || reason == reasons::CANCELLED).then_some("resume");
+    }
+    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]
+        .contains(&reason)
+        .then_some("cancel")
+}
