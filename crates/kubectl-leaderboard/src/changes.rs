@@ -63,10 +63,12 @@ pub async fn requeue(cluster: &Cluster, wanted: &requeue::Requeue) -> Result<Exi
     let chosen = wanted.chosen(&submissions, frame.now);
     if chosen.is_empty() {
         let all = requeue::counted(submissions.len());
-        print(&[format!(
+        let mut page = frame.page();
+        page.paragraph(&format!(
             "None of {all} fits, or can be requeued. `kubectl leaderboard status -n {}` lists them.",
             cluster.namespace
-        )]);
+        ));
+        print(&page.into_lines());
         return Ok(ExitCode::SUCCESS);
     }
     print(&requeue::lines(&chosen, frame));

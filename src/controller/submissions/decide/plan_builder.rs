@@ -9,8 +9,8 @@ use super::plan::{Action, Event, Plan};
 use crate::controller::submissions::view::{ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Requeued, Retries, Score, State, Submission, SubmissionSpec,
-    SubmissionStatus, effective, names, reasons,
+    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Requeued, Retries, Score, State, Submission,
+    SubmissionSpec, SubmissionStatus, effective, names, reasons,
 };
 
 /// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
