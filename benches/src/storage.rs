@@ -184,6 +184,7 @@ fn report(is_final: bool) -> Report {
         stopped: None,
         why: None,
         warnings: Vec::new(),
+        logs: None,
         results: RESULTS.into(),
         partial_results: (!is_final).then(|| RESULTS.into()),
         files,

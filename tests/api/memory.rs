@@ -89,6 +89,7 @@ fn report(submission_uid: String, text: &str) -> String {
         stopped: None,
         why: None,
         warnings: Vec::new(),
+        logs: None,
         results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
         partial_results: None,
         files: [(METADATA.to_owned(), file)].into(),

@@ -52,10 +52,10 @@ async fn check(scene: &Scene, board: &str, agent: &str) -> (Option<i32>, String)
 /// The streams of a log group, without the run before the slash.
 async fn streams(logs: &aws_sdk_cloudwatchlogs::Client, group: &str) -> Vec<String> {
     let found = logs.describe_log_streams().log_group_name(group).send().await.unwrap();
-    let names = found.log_streams().iter().filter_map(|stream| stream.log_stream_name());
-    names
-        .filter_map(|name| Some(name.split_once('/')?.1.to_owned()))
-        .collect()
+    let name = |stream: &aws_sdk_cloudwatchlogs::types::LogStream| {
+        Some(stream.log_stream_name()?.split_once('/')?.1.to_owned())
+    };
+    found.log_streams().iter().filter_map(name).collect()
 }
 
 fn has(text: &str, expected: &[&str]) {

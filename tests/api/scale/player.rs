@@ -270,6 +270,7 @@ fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
         stopped: None,
         why: None,
         warnings: Vec::new(),
+        logs: None,
         results: String::new(),
         partial_results: None,
         files: BTreeMap::new(),

@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use super::*;
 
 const STATES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/states.md");
-const CLASSES: [Class; 12] = [
+const CLASSES: [Class; 13] = [
     Class::Pending,
     Class::Running,
     Class::End,
