@@ -46,6 +46,7 @@ pub(crate) fn run() -> Run {
         cancel_seconds: 20,
         log_group: None,
         isolation: None,
+        addresses: None,
     }
 }
 

@@ -16,7 +16,11 @@ use leaderboard_api::effective::key_prefix;
 
 /// The way to AWS for this Pod.
 pub async fn aws(setting: &Setting) -> Aws {
-    for_run(Aws::load().await, setting)
+    let base = match &setting.run.addresses {
+        Some(addresses) => Aws::load_with(addresses.clone()).await,
+        None => Aws::load().await,
+    };
+    for_run(base, setting)
 }
 
 /// The same from a way to AWS that is there already.

@@ -12,6 +12,7 @@ use crate::controller::objects::Wake;
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
+use crate::controller::submissions::addresses::Addresses;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
@@ -35,6 +36,7 @@ pub struct Context {
     pub lookups: Lookups,
     pub images: Images,
     pub foreign_runs: ForeignRuns,
+    pub addresses: Addresses,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
@@ -55,6 +57,7 @@ impl Context {
             lookups: &self.lookups,
             images: &self.images,
             foreign_runs: &self.foreign_runs,
+            addresses: &self.addresses,
             reruns: &self.reruns,
             external: &self.external,
         }
@@ -71,6 +74,7 @@ impl Context {
             archive: &self.archive,
             images: &self.images,
             foreign_runs: &self.foreign_runs,
+            addresses: &self.addresses,
             external: &self.external,
             metrics: &self.metrics,
         }
@@ -103,6 +107,7 @@ impl Context {
         self.archive.forget(&key.uid);
         self.images.forget(&key.uid);
         self.foreign_runs.forget(&key.uid);
+        self.addresses.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
         self.external.gone(key);
     }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
+pub use super::addresses::ObservedAddresses;
 pub use super::foreign_runs::ObservedTraces;
 pub use super::images::ObservedImage;
 use super::report_digest::{ReportDigest, ReportId};
@@ -27,6 +28,8 @@ pub struct View {
     pub image: ObservedImage,
     /// What another program has left of it.
     pub traces: ObservedTraces,
+    /// Where the names lead that its Pod cannot look up.
+    pub addresses: ObservedAddresses,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,

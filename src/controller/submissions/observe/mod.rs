@@ -12,6 +12,7 @@ use jiff::{SignedDuration, Timestamp};
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
+use super::addresses::Addresses;
 use super::archive::ArchiveWorkers;
 use super::decide::job_name;
 use super::external::ExternalSystems;
@@ -45,6 +46,7 @@ pub struct Uses<'a> {
     pub lookups: &'a Lookups,
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
+    pub addresses: &'a Addresses,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
@@ -75,6 +77,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
         image: uses.images.observe(&submission),
         traces: uses.foreign_runs.observe(&submission),
+        addresses: uses.addresses.observe(&submission),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,
         leaving: node.leaving,
