@@ -48,7 +48,7 @@ async fn an_agent_that_always_crashes_fails_in_every_system() {
 }
 
 #[tokio::test]
-async fn an_image_that_declares_a_volume_fails_before_a_job_is_made() {
+async fn an_image_that_declares_a_volume_gains_no_job() {
     scenario("volume", async |scene: &Scene| {
         // The registry by a way on loopback, where the controller asks one without TLS.
         let registry = scene.gate.url.trim_start_matches("http://");

@@ -24,7 +24,7 @@ fn told(pod: &Pod, text: &str) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn a_run_is_stored_under_names_that_no_resolver_of_its_pod_knows() {
+async fn an_agent_gains_no_resolver_where_its_run_is_stored_by_names() {
     scenario("names", async |scene: &Scene| {
         let (_, port) = scene.cloud.endpoint.rsplit_once(':').unwrap();
         let at = |name: &str| format!("http://{name}:{port}");

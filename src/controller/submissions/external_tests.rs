@@ -14,8 +14,8 @@ use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts,
-    ObservedTraces, Turn,
+    ObservedAddresses, ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
+    ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::State;
 
@@ -102,6 +102,7 @@ async fn bench(state: State) -> Bench {
         is_policy_in_place: true,
         image: ObservedImage::NotAsked,
         traces: ObservedTraces::NotAsked,
+        addresses: ObservedAddresses::NotAsked,
         turn: Turn::Go,
         job: ObservedJob::Absent,
         evalai_waited: std::time::Duration::ZERO,
