@@ -32,6 +32,7 @@ mod api {
     mod leader;
     mod log_groups;
     mod memory;
+    mod names;
     mod objects;
     mod operator;
     mod plugin;

@@ -55,6 +55,7 @@ class ImageSpec:
     cmd: tuple[str, ...]
     user: str
     workdir: str
+    volumes: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -101,7 +102,12 @@ class Reader:
         return value
 
     def path(self, key: str) -> str:
-        value = self.text(key)
+        return self.checked(key, self.text(key))
+
+    def paths(self, key: str) -> tuple[str, ...]:
+        return tuple(self.checked(key, value) for value in self.texts(key))
+
+    def checked(self, key: str, value: str) -> str:
         if not value.startswith("/") or ".." in PurePosixPath(value).parts or value != str(PurePosixPath(value)):
             raise LabError(f"{self.place}: {key} = {value!r} must be an absolute path in its shortest form")
         return value
@@ -162,6 +168,7 @@ def parse_image(table: object, place: str) -> ImageSpec:
         cmd=reader.texts("cmd"),
         user=reader.text("user", ""),
         workdir=reader.text("workdir", ""),
+        volumes=reader.paths("volumes"),
     )
     reader.done()
     return spec

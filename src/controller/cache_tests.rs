@@ -67,6 +67,7 @@ fn job(number: usize) -> Value {
         number: JobNumber::first(1),
         settings: &settings(),
         without_gpu: &[],
+        addresses: None,
         now: jiff::Timestamp::now(),
     }));
     object["status"] = json!({"active": 1, "ready": 1, "startTime": "2026-01-01T00:00:00Z"});

@@ -25,6 +25,7 @@ use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
 use crate::controller::settings::Settings;
 use crate::controller::stores::{Stores, owner_uid};
+use crate::controller::submissions::addresses::Addresses;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
@@ -112,6 +113,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
         foreign_runs: ForeignRuns::start(&aws, &tasks, noting(&answering)),
         other_results: OtherResults::start(&aws, &tasks, noting(&answering)),
+        addresses: Addresses::start(aws.names(), None, &tasks, noting(&answering)),
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),

@@ -87,7 +87,7 @@ fn egress(leaderboard: &Leaderboard) -> Vec<NetworkPolicyEgressRule> {
     let network = &leaderboard.spec.network;
     let names = match network.dns {
         Dns::Cluster => Some(dns(&network.dns_servers)),
-        Dns::None => None,
+        Dns::Pinned | Dns::None => None,
     };
     names
         .into_iter()
@@ -213,6 +213,16 @@ mod tests {
         assert_eq!(
             policy(&json!({"dns": "None", "dnsServers": ["10.0.0.10"]}))["spec"]["egress"],
             json!([])
+        );
+    }
+
+    #[test]
+    fn where_the_operator_looks_names_up_no_pod_asks_any_server() {
+        let network =
+            json!({"dns": "Pinned", "dnsServers": ["10.0.0.10"], "egress": [{"cidr": "10.1.2.3/32", "ports": [443]}]});
+        assert_eq!(
+            policy(&network)["spec"]["egress"],
+            json!([{"to": [{"ipBlock": {"cidr": "10.1.2.3/32"}}], "ports": [{"protocol": "TCP", "port": 443}]}])
         );
     }
 

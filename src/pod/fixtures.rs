@@ -47,6 +47,7 @@ pub(crate) fn run() -> Run {
         cancel_seconds: 20,
         log_group: None,
         isolation: None,
+        addresses: None,
     }
 }
 

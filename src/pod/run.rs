@@ -5,6 +5,7 @@
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 
+use crate::services::names::Addresses;
 use leaderboard_api::{Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
 use leaderboard_results::Format;
 
@@ -87,6 +88,9 @@ pub struct Run {
     /// How `workspace` measures whether the Pod's NetworkPolicy is enforced; absent: not at all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub isolation: Option<Isolation>,
+    /// Where names lead that nobody in the Pod can look up; absent: they are looked up as usual.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub addresses: Option<Addresses>,
 }
 
 /// What is to be measured, and what follows.

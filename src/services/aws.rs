@@ -3,6 +3,7 @@
 //! Called by everything that talks to AWS. An endpoint that a Leaderboard names goes before one of the environment.
 //! Endpoints with a bare host name get path-style buckets.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use aws_config::retry::RetryConfig;
@@ -10,8 +11,11 @@ use aws_config::{AppName, BehaviorVersion, Region, SdkConfig};
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
 use super::meter::Meter;
+use super::names::{Addresses, Given, Names};
 use leaderboard_api::names::OPERATOR;
 
+/// Where nothing says which region.
+pub const USUAL_REGION: &str = "us-east-1";
 /// Time an AWS call may take, with its retries.
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);
 /// Time one try may take.
@@ -34,14 +38,26 @@ macro_rules! own {
 pub struct Aws {
     base: SdkConfig,
     meter: Meter,
+    names: Names,
 }
 
 impl Aws {
     /// Reads region and credentials from where AWS's SDKs look for them. Each request names the program, which CloudTrail then shows.
     pub async fn load(program: &str) -> Self {
-        let http = aws_smithy_http_client::Builder::new()
-            .tls_provider(Provider::Rustls(CryptoMode::Ring))
-            .build_https();
+        Self::load_by(program, None).await
+    }
+
+    /// The same, asking no resolver: only these names have addresses. A certificate is compared with the name all the same.
+    pub async fn load_with(program: &str, addresses: Addresses) -> Self {
+        Self::load_by(program, Some(Given(Arc::new(addresses)))).await
+    }
+
+    async fn load_by(program: &str, names: Option<Given>) -> Self {
+        let https = aws_smithy_http_client::Builder::new().tls_provider(Provider::Rustls(CryptoMode::Ring));
+        let http = match names {
+            Some(names) => https.build_with_resolver(names),
+            None => https.build_https(),
+        };
         let timeouts = aws_config::timeout::TimeoutConfig::builder()
             .connect_timeout(Duration::from_secs(5))
             .operation_attempt_timeout(ATTEMPT_TIMEOUT)
@@ -61,7 +77,19 @@ impl Aws {
         Self {
             base,
             meter: Meter::default(),
+            names: Names::default(),
         }
+    }
+
+    /// The same way, with names that are looked up in another way for Pods.
+    #[must_use]
+    pub fn naming_by(self, names: Names) -> Self {
+        Self { names, ..self }
+    }
+
+    /// Looks names up for Pods.
+    pub fn names(&self) -> &Names {
+        &self.names
     }
 
     /// The same way, whose calls are counted.
@@ -86,7 +114,7 @@ impl Aws {
         if let Some(region) = region {
             builder = builder.region(Region::new(region.to_owned()));
         } else if self.base.region().is_none() {
-            builder = builder.region(Region::new("us-east-1"));
+            builder = builder.region(Region::new(USUAL_REGION));
         }
         builder.build()
     }

@@ -3,6 +3,7 @@
 
 pub mod archive;
 pub mod aws;
+pub mod endpoints;
 pub mod evalai;
 pub mod event_sources;
 pub mod fault;
@@ -10,6 +11,7 @@ pub mod held_text;
 pub mod log_groups;
 pub mod logs;
 pub mod meter;
+pub mod names;
 pub mod public;
 pub mod queue;
 pub mod registry;

@@ -27,14 +27,14 @@ const POLICY: &str = "leaderboard-carla";
 const POLL: Duration = Duration::from_millis(50);
 
 /// A namespace and a place in S3, before there is a Leaderboard or a controller.
-struct World {
-    client: Client,
-    namespace: String,
-    aws: StandIn,
+pub(super) struct World {
+    pub(super) client: Client,
+    pub(super) namespace: String,
+    pub(super) aws: StandIn,
 }
 
 impl World {
-    async fn new() -> Self {
+    pub(super) async fn new() -> Self {
         let server = server().await;
         Self {
             client: server.client(),
@@ -43,7 +43,7 @@ impl World {
         }
     }
 
-    fn api<K>(&self) -> Api<K>
+    pub(super) fn api<K>(&self) -> Api<K>
     where
         K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
         K::DynamicType: Default,
@@ -60,7 +60,7 @@ impl World {
     }
 
     /// A Leaderboard whose bucket is at this endpoint.
-    async fn leaderboard_at(&self, endpoint: &str, network: &Value) {
+    pub(super) async fn leaderboard_at(&self, endpoint: &str, network: &Value) {
         let storage = json!({"bucket": self.aws.name("bucket"), "endpoint": endpoint});
         let patch = json!({"spec": {"storage": storage, "network": network}});
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
@@ -76,13 +76,13 @@ impl World {
         roles.patch("operator", &PatchParams::default(), &patch).await.unwrap();
     }
 
-    async fn change(&self, network: &Value) {
+    pub(super) async fn change(&self, network: &Value) {
         let patch = Patch::Merge(json!({"spec": {"network": network}}));
         let api = self.api::<Leaderboard>();
         api.patch(NAME, &PatchParams::default(), &patch).await.unwrap();
     }
 
-    async fn submit(&self, name: &str) {
+    pub(super) async fn submit(&self, name: &str) {
         let api = Kind::Submission.api(&self.client, &self.namespace);
         let patch = json!({"spec": {"leaderboardName": NAME}});
         create(&api, Kind::Submission.object(name, &[&patch]), false)
@@ -91,7 +91,7 @@ impl World {
     }
 
     /// Waits until an object is so.
-    async fn until<K>(&self, name: &str, what: &str, holds: impl Fn(&K) -> bool) -> K
+    pub(super) async fn until<K>(&self, name: &str, what: &str, holds: impl Fn(&K) -> bool) -> K
     where
         K: kube::Resource<Scope = kube::core::NamespaceResourceScope>
             + Clone
@@ -108,7 +108,7 @@ impl World {
         found.unwrap().unwrap()
     }
 
-    async fn job(&self, submission: &str) -> Job {
+    pub(super) async fn job(&self, submission: &str) -> Job {
         let name = format!("{submission}-1");
         self.until(&name, "its Job is made", |_: &Job| true).await
     }
@@ -171,21 +171,20 @@ fn egress(policy: &NetworkPolicy) -> Value {
 
 /// What a Pod receives about its isolation.
 fn told(job: &Job) -> Value {
+    run(job, "workspace").unwrap()["isolation"].clone()
+}
+
+/// What a container is told of its run; none if it is told nothing.
+pub(super) fn run(job: &Job, container: &str) -> Option<Value> {
     let pod = job.spec.as_ref().unwrap().template.spec.as_ref().unwrap();
-    let workspace = pod
-        .init_containers
-        .iter()
-        .flatten()
-        .find(|c| c.name == "workspace")
-        .unwrap();
-    let run = workspace
+    let mut all = pod.init_containers.iter().flatten().chain(&pod.containers);
+    let found = all.find(|found| found.name == container).unwrap();
+    let run = found
         .env
         .iter()
         .flatten()
-        .find(|v| v.name == "LEADERBOARD_RUN")
-        .unwrap();
-    let run: Value = serde_json::from_str(run.value.as_deref().unwrap()).unwrap();
-    run["isolation"].clone()
+        .find(|variable| variable.name == "LEADERBOARD_RUN")?;
+    Some(serde_json::from_str(run.value.as_deref().unwrap()).unwrap())
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -274,6 +274,7 @@ fn run(bucket: &str) -> Run {
         cancel_seconds: 20,
         log_group: None,
         isolation: None,
+        addresses: None,
     }
 }
 

@@ -418,6 +418,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         number: JobNumber::first(1),
         settings,
         without_gpu: &[],
+        addresses: None,
         now: Timestamp::now(),
     }))
 }

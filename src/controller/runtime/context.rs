@@ -12,6 +12,7 @@ use crate::controller::objects::Wake;
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
+use crate::controller::submissions::addresses::Addresses;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
@@ -37,6 +38,7 @@ pub struct Context {
     pub images: Images,
     pub foreign_runs: ForeignRuns,
     pub other_results: OtherResults,
+    pub addresses: Addresses,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
@@ -58,6 +60,7 @@ impl Context {
             images: &self.images,
             foreign_runs: &self.foreign_runs,
             other_results: &self.other_results,
+            addresses: &self.addresses,
             reruns: &self.reruns,
             external: &self.external,
         }
@@ -75,6 +78,7 @@ impl Context {
             images: &self.images,
             foreign_runs: &self.foreign_runs,
             other_results: &self.other_results,
+            addresses: &self.addresses,
             external: &self.external,
             metrics: &self.metrics,
         }
@@ -108,6 +112,7 @@ impl Context {
         self.images.forget(&key.uid);
         self.foreign_runs.forget(&key.uid);
         self.other_results.forget(&key.uid);
+        self.addresses.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
         self.external.gone(key);
     }

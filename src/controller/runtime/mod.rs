@@ -31,6 +31,7 @@ use super::leaderboards::{isolation, operator};
 use super::objects::children_selector;
 use super::settings::Settings;
 use super::stores::{Nodes, Stores, owner_uid};
+use crate::controller::submissions::addresses::Addresses;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
@@ -320,6 +321,7 @@ impl Parts {
             images: Images::start(aws, client.clone(), tasks, answered()),
             foreign_runs: ForeignRuns::start(aws, tasks, answered()),
             other_results: OtherResults::start(aws, tasks, answered()),
+            addresses: Addresses::start(aws.names(), self.settings.region.clone(), tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),

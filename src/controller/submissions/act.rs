@@ -11,6 +11,7 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 
+use super::addresses::{self, Addresses};
 use super::archive::ArchiveWorkers;
 use super::decide::{Action, Event, Plan, pinned};
 use super::external::ExternalSystems;
@@ -49,6 +50,7 @@ pub struct Uses<'a> {
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
     pub other_results: &'a OtherResults,
+    pub addresses: &'a Addresses,
     pub external: &'a ExternalSystems,
     pub metrics: &'a Metrics,
 }
@@ -158,6 +160,7 @@ impl Actor<'_> {
             Action::LookUpImage(question) => uses.images.want(submission, question.clone()),
             Action::LookForForeignRun(question) => uses.foreign_runs.want(submission, (**question).clone()),
             Action::ReadOtherResults(question) => uses.other_results.want(submission, (**question).clone()),
+            Action::LookUpNames(question) => uses.addresses.want(submission, (**question).clone()),
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
@@ -278,6 +281,7 @@ impl Actor<'_> {
             image: pinned(&plan.image, status.image.as_ref()),
             ..plan.clone()
         };
+        let addresses = addresses::of_pod(&self.view.addresses, &leaderboard.spec.network);
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
@@ -285,6 +289,7 @@ impl Actor<'_> {
             number,
             settings: self.uses.settings,
             without_gpu: &status.nodes_without_gpu,
+            addresses: addresses.as_ref(),
             now: self.view.now,
         });
         let name = names::job(&self.name(), number);

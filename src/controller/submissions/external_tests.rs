@@ -14,7 +14,7 @@ use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
+    ObservedAddresses, ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
     ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::State;
@@ -103,6 +103,7 @@ async fn bench(state: State) -> Bench {
         image: ObservedImage::NotAsked,
         traces: ObservedTraces::NotAsked,
         other_routes: ObservedRoutes::NotAsked,
+        addresses: ObservedAddresses::NotAsked,
         turn: Turn::Go,
         job: ObservedJob::Absent,
         evalai_waited: std::time::Duration::ZERO,

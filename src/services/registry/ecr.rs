@@ -2,8 +2,8 @@
 //! ECR, whose client would be the largest crate of the program.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use aws_credential_types::provider::ProvideCredentials;
 use aws_sigv4::http_request::{SignableBody, SignableRequest, SigningSettings, sign};
@@ -14,8 +14,12 @@ use tokio::time::Instant;
 use super::auth::Credentials;
 use crate::services::aws::Aws;
 
-/// A password holds for twelve hours.
+/// How long a password is kept at most; it usually holds for twelve hours.
 const HOLDS: Duration = Duration::from_hours(6);
+/// A new one is fetched so long before the old one ends.
+const MARGIN: Duration = Duration::from_mins(5);
+/// One that is refused, and is younger than this, would be refused again.
+const FRESH: Duration = Duration::from_secs(10);
 /// Largest answer that is read.
 const LARGEST: usize = 64 << 10;
 /// Regions whose passwords are kept: participants may choose the region.
@@ -42,16 +46,21 @@ fn place(registry: &str) -> Option<Place<'_>> {
     (is_account && is_region && is_amazons).then_some(Place { region, domain })
 }
 
-/// Whether a registry is Amazon's.
-pub(super) fn is_ecr(registry: &str) -> bool {
-    place(registry).is_some()
+/// A password, from when on it is known, and until when it is used.
+#[derive(Clone)]
+struct Kept {
+    credentials: Credentials,
+    since: Instant,
+    until: Instant,
 }
 
 /// The passwords, by region.
 pub(super) struct Ecr {
     aws: Aws,
     http: reqwest::Client,
-    kept: Mutex<HashMap<String, (Credentials, Instant)>>,
+    kept: Mutex<HashMap<String, Kept>>,
+    /// Which registries are Amazon's, and where.
+    place: for<'a> fn(&'a str) -> Option<Place<'a>>,
 }
 
 impl Ecr {
@@ -60,38 +69,59 @@ impl Ecr {
             aws,
             http,
             kept: Mutex::default(),
+            place,
         }
+    }
+
+    /// Whether a registry is Amazon's.
+    pub(super) fn is_ecr(&self, registry: &str) -> bool {
+        (self.place)(registry).is_some()
     }
 
     /// Credentials for a registry; an error says what AWS has answered, for hosts.
     pub(super) async fn credentials(&self, registry: &str) -> Result<Credentials, String> {
-        let place = place(registry).ok_or("it is not a registry of Amazon")?;
+        let place = (self.place)(registry).ok_or("it is not a registry of Amazon")?;
         if let Some(known) = self.known(place.region) {
             return Ok(known);
         }
         let found = self.ask(&place).await?;
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.retain(|_, (_, at)| at.elapsed() < HOLDS);
+        let mut kept = self.kept();
+        let now = Instant::now();
+        kept.retain(|_, kept| now < kept.until);
         if kept.len() < MOST_KEPT {
-            kept.insert(place.region.to_owned(), (found.clone(), Instant::now()));
+            kept.insert(place.region.to_owned(), found.clone());
         }
-        Ok(found)
+        Ok(found.credentials)
+    }
+
+    /// Drops the password that a registry has refused. False if a new one would be refused as well.
+    pub(super) fn refused(&self, registry: &str) -> bool {
+        let Some(place) = (self.place)(registry) else {
+            return false;
+        };
+        let mut kept = self.kept();
+        let is_old = kept.get(place.region).is_some_and(|kept| kept.since.elapsed() >= FRESH);
+        is_old && kept.remove(place.region).is_some()
+    }
+
+    fn kept(&self) -> MutexGuard<'_, HashMap<String, Kept>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn known(&self, region: &str) -> Option<Credentials> {
-        let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let (known, at) = kept.get(region)?;
-        (at.elapsed() < HOLDS).then(|| known.clone())
+        let kept = self.kept();
+        let known = kept.get(region).filter(|known| Instant::now() < known.until)?;
+        Some(known.credentials.clone())
     }
 
-    async fn ask(&self, place: &Place<'_>) -> Result<Credentials, String> {
+    async fn ask(&self, place: &Place<'_>) -> Result<Kept, String> {
         let running = self.aws.meter().begin("ecr", "GetAuthorizationToken");
         let answer = self.send(place).await;
         running.end(if answer.is_ok() { "ok" } else { "refused" });
         answer
     }
 
-    async fn send(&self, place: &Place<'_>) -> Result<Credentials, String> {
+    async fn send(&self, place: &Place<'_>) -> Result<Kept, String> {
         let config = self.aws.config(Some(place.region));
         let usual = || format!("https://api.ecr.{}.{}/", place.region, place.domain);
         let url = config.endpoint_url().map_or_else(usual, ToOwned::to_owned);
@@ -110,7 +140,15 @@ impl Ecr {
             return Err(format!("ECR gives no token ({status}); {step}"));
         }
         let body = super::body(answer, LARGEST).await?;
-        password(&body).ok_or_else(|| "ECR's answer has no token".to_owned())
+        let (credentials, ends) = password(&body).ok_or_else(|| "ECR's answer has no token".to_owned())?;
+        let since = Instant::now();
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let until = since + used_for(ends, now);
+        Ok(Kept {
+            credentials,
+            since,
+            until,
+        })
     }
 
     /// The headers of the request, its signature among them.
@@ -145,10 +183,18 @@ impl Ecr {
     }
 }
 
-fn password(body: &[u8]) -> Option<Credentials> {
+/// A password, and when it ends, in time since 1970.
+fn password(body: &[u8]) -> Option<(Credentials, Option<Duration>)> {
     let body: Value = serde_json::from_slice(body).ok()?;
     let first = body.get("authorizationData")?.get(0)?;
-    Credentials::decode(first.get("authorizationToken")?.as_str()?)
+    let ends = first.get("expiresAt").and_then(Value::as_f64);
+    let ends = ends.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    Some((Credentials::decode(first.get("authorizationToken")?.as_str()?)?, ends))
+}
+
+/// How long a password is used from now on.
+fn used_for(ends: Option<Duration>, now: Duration) -> Duration {
+    ends.map_or(HOLDS, |ends| ends.saturating_sub(now).saturating_sub(MARGIN).min(HOLDS))
 }
 
 #[cfg(test)]
@@ -173,10 +219,32 @@ mod tests {
 
     #[test]
     fn a_password_is_found_in_ecrs_answer() {
+        let aws = || Credentials::new("AWS", "p").unwrap();
         let body = br#"{"authorizationData": [{"authorizationToken": "QVdTOnA=", "proxyEndpoint": "https://x"}]}"#;
-        assert_eq!(password(body), Credentials::new("AWS", "p"));
+        assert!(password(body) == Some((aws(), None)));
+        let body = br#"{"authorizationData": [{"authorizationToken": "QVdTOnA=", "expiresAt": 1.5}]}"#;
+        assert!(password(body) == Some((aws(), Some(Duration::from_millis(1500)))));
         for body in [b"{}".as_slice(), b"[]", br#"{"authorizationData": []}"#] {
-            assert_eq!(password(body), None);
+            assert!(password(body).is_none());
+        }
+    }
+
+    #[test]
+    fn a_password_is_renewed_before_it_ends() {
+        let (now, hours) = (Duration::from_secs(1_800_000_000), Duration::from_hours);
+        for (ends, expected) in [
+            (None, HOLDS),
+            (Some(now + hours(12)), HOLDS),
+            (Some(now + hours(1)), Duration::from_mins(55)),
+            (Some(now + MARGIN), Duration::ZERO),
+            (Some(now - hours(1)), Duration::ZERO),
+            (Some(Duration::MAX), HOLDS),
+        ] {
+            assert_eq!(used_for(ends, now), expected, "{ends:?}");
         }
     }
 }
+
+#[cfg(test)]
+#[path = "ecr_tests.rs"]
+mod stand_in;

@@ -155,8 +155,13 @@ impl Registries {
 
     async fn ask(&self, image: &Image, credentials: Option<Credentials>) -> Result<Facts, Fault> {
         let clients = self.clients.as_ref().map_err(|why| Fault::Unreachable(why.clone()))?;
-        let session = Session::new(clients, image, credentials).await?;
-        session.facts().await
+        let is_ecrs = credentials.is_none() && clients.ecr.is_ecr(&image.registry);
+        let answer = Session::new(clients, image, credentials).await?.facts().await;
+        // A password may end early, with the role that fetched it for example.
+        if is_ecrs && answer == Err(Fault::Denied) && clients.ecr.refused(&image.registry) {
+            return Session::new(clients, image, None).await?.facts().await;
+        }
+        answer
     }
 }
 
@@ -202,7 +207,7 @@ impl<'a> Session<'a> {
         let parse = |scheme: &str| Url::parse(&format!("{scheme}://{host}/v2/{}/", image.path)).map_err(|_| strange());
         let url = parse("https")?;
         let is_local = image.may_be_local && address::ip(&url).is_some_and(|ip| ip.is_loopback());
-        let is_ecr = ecr::is_ecr(&image.registry);
+        let is_ecr = clients.ecr.is_ecr(&image.registry);
         let credentials = match credentials {
             None if is_ecr => Some(
                 clients

@@ -6,7 +6,7 @@ use super::*;
 use images::{ImageRegistry, config, digest};
 
 #[path = "../../../tests/support/images.rs"]
-mod images;
+pub(super) mod images;
 
 /// Nobody listens at the endpoint: no test here needs AWS.
 async fn registries() -> Registries {

@@ -8,7 +8,7 @@ use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
-use super::{end, foreign, image, isolation, restored};
+use super::{addresses, end, foreign, image, isolation, restored};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::check::first_route;
 use leaderboard_api::conditions::{self, Truth};
@@ -65,6 +65,11 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     }
     if let Some(missing) = isolation::missing(draft) {
         return wait_for_policy(draft, &missing);
+    }
+    match addresses::decide(draft, leaderboard) {
+        addresses::Step::Go => {}
+        addresses::Step::Wait => return false,
+        addresses::Step::Refuse(message) => return refuse(draft, reasons::NAME_NOT_RESOLVED, &message),
     }
     let note = match image::decide(draft, leaderboard, &image) {
         image::Step::Go(note) => note,

@@ -6,7 +6,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate, job_name};
 use super::plan_builder::{PlanBuilder, after};
-use super::{accept, crashes, end, failure, interruption, isolation, line, reading, requeue, start, stop};
+use super::{
+    accept, addresses, crashes, end, failure, interruption, isolation, line, reading, requeue, start, stop,
+};
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
@@ -186,16 +188,21 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         draft.fail(failure::job_expired());
         return end::decide(draft, None);
     }
-    if draft.leaderboard().is_none() {
+    let Some(leaderboard) = draft.leaderboard() else {
         let message = accept::no_leaderboard(draft);
         let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
         draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
         return draft.requeue_in(BACKSTOP);
-    }
+    };
     if let Some(missing) = isolation::missing(draft) {
         draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
         draft.show(reasons::NOT_ISOLATED, missing.message);
         return draft.requeue_in(BACKSTOP);
+    }
+    match addresses::decide(draft, leaderboard) {
+        addresses::Step::Go => {}
+        addresses::Step::Wait => return,
+        addresses::Step::Refuse(message) => return draft.show(reasons::NAME_NOT_RESOLVED, message),
     }
     if let Some(left) = reading::requested_fence_left(draft) {
         return draft.requeue_in(left);

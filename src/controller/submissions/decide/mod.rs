@@ -7,6 +7,7 @@
 //! has ended long ago, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
+mod addresses;
 mod after;
 mod allowance;
 mod blame;

@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
-use crate::controller::submissions::foreign_runs;
 use crate::controller::submissions::images::Question;
 use crate::controller::submissions::other_results;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
+use crate::controller::submissions::{addresses, foreign_runs};
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
 
@@ -38,6 +38,8 @@ pub enum Action {
     LookForForeignRun(Box<foreign_runs::Question>),
     /// Read how many routes another program's run of the submission has.
     ReadOtherResults(Box<other_results::Question>),
+    /// Look the names up that its Pod cannot look up.
+    LookUpNames(Box<addresses::Question>),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

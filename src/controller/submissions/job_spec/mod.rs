@@ -41,6 +41,7 @@ use crate::controller::gpu_claims::source;
 use crate::controller::objects::owner_reference;
 use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
+use crate::services::names::Addresses;
 pub use gpu_count::gpus;
 use leaderboard_api::{
     Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan, Submission,
@@ -73,6 +74,8 @@ pub struct JobInput<'a> {
     pub settings: &'a Settings,
     /// Nodes that gave it no GPU.
     pub without_gpu: &'a [NodeWithoutGpu],
+    /// Where the names lead that the Pod's own containers need; none: they look them up themselves.
+    pub addresses: Option<&'a Addresses>,
     /// When it is made.
     pub now: Timestamp,
 }
@@ -154,6 +157,7 @@ fn run_document(input: &JobInput<'_>) -> Run {
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
         log_group: spec.log_group.clone(),
         isolation: isolation(input.leaderboard, input.now),
+        addresses: input.addresses.cloned(),
     }
 }
 

@@ -20,6 +20,7 @@ pub(super) struct Case {
     pub(super) number: JobNumber,
     pub(super) settings: Settings,
     pub(super) without_gpu: Vec<NodeWithoutGpu>,
+    pub(super) addresses: Option<Addresses>,
 }
 
 impl Case {
@@ -73,6 +74,7 @@ impl Case {
                 concurrency: 16,
             },
             without_gpu: Vec::new(),
+            addresses: None,
         }
     }
 
@@ -84,6 +86,7 @@ impl Case {
             number: self.number,
             settings: &self.settings,
             without_gpu: &self.without_gpu,
+            addresses: self.addresses.as_ref(),
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }
     }
@@ -110,6 +113,13 @@ pub(super) fn container<'a>(job: &'a Value, name: &str) -> &'a Value {
 
 pub(super) fn role() -> Value {
     json!({"serviceAccountName": "submission-worker", "roleARN": "arn:aws:iam::123456789012:role/results"})
+}
+
+/// What a Pod of a Leaderboard with `network.dns: Pinned` is given.
+pub(super) fn addresses() -> Addresses {
+    let found = ["10.0.4.10", "10.0.5.10"].map(|text| text.parse().unwrap()).to_vec();
+    let hosts = ["logs", "results.s3", "sts"].map(|host| format!("{host}.eu-west-1.amazonaws.com"));
+    hosts.into_iter().map(|host| (host, found.clone())).collect()
 }
 
 fn golden(name: &str, case: &Case) {
@@ -152,6 +162,7 @@ fn the_job_of_leaderboard_2_is_as_committed() {
     );
     case.number.attempt = 3;
     case.number.retry = 1;
+    case.addresses = Some(addresses());
     golden("v2.json", &case);
 }
 

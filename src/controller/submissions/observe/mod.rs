@@ -12,6 +12,7 @@ use jiff::{SignedDuration, Timestamp};
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
+use super::addresses::Addresses;
 use super::archive::ArchiveWorkers;
 use super::decide::job_name;
 use super::external::ExternalSystems;
@@ -47,6 +48,7 @@ pub struct Uses<'a> {
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
     pub other_results: &'a OtherResults,
+    pub addresses: &'a Addresses,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
@@ -78,6 +80,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         image: uses.images.observe(&submission),
         traces: uses.foreign_runs.observe(&submission),
         other_routes: uses.other_results.observe(&submission),
+        addresses: uses.addresses.observe(&submission),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,
         leaving: node.leaving,

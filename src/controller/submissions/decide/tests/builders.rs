@@ -13,8 +13,8 @@ use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
-    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedAddresses, ObservedFence,
+    ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
     RecordView, Stage, Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
@@ -117,6 +117,7 @@ impl World {
                 traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
                 // The results of another program; the tests of one that observes say otherwise.
                 other_routes: ObservedRoutes::NotAsked,
+                addresses: ObservedAddresses::NotAsked,
                 turn: Turn::Go,
                 job: ObservedJob::Absent,
                 pod: None,

@@ -1,6 +1,7 @@
 //! Tables and properties of `decide`, by stage of life. Every pass of every table also obeys `rules`.
 
 mod accept;
+mod addresses;
 mod after;
 mod allowance;
 mod blame;
