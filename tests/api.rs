@@ -47,6 +47,7 @@ mod api {
     mod switch;
     mod table;
     mod token;
+    mod traces;
     mod two_operators;
     mod watches;
     mod world;

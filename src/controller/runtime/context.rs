@@ -21,6 +21,7 @@ use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::{act, observe};
 use crate::observability::metrics::Metrics;
+use crate::observability::traces::Traces;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
@@ -42,6 +43,7 @@ pub struct Context {
     pub aws: Aws,
     pub recorder: Recorder,
     pub metrics: Arc<Metrics>,
+    pub traces: Traces,
     pub wake: Wake<Leaderboard>,
 }
 
@@ -73,6 +75,7 @@ impl Context {
             foreign_runs: &self.foreign_runs,
             external: &self.external,
             metrics: &self.metrics,
+            traces: &self.traces,
         }
     }
 
@@ -83,6 +86,7 @@ impl Context {
             slots: &self.slots,
             external: &self.external,
             aws: &self.aws,
+            metrics: &self.metrics,
         }
     }
 
