@@ -176,6 +176,7 @@ impl Sending {
     }
 
     #[cfg(not(feature = "otel"))]
+    #[allow(clippy::unnecessary_wraps, reason = "with traces it can fail")]
     fn start(telemetry: Observability) -> Result<(Observability, Self), String> {
         if std::env::var_os("OTEL_EXPORTER_OTLP_ENDPOINT").is_some() {
             tracing::warn!(
@@ -185,6 +186,7 @@ impl Sending {
         Ok((telemetry, Self()))
     }
 
+    #[cfg_attr(not(feature = "otel"), allow(clippy::unused_async, reason = "with traces it waits"))]
     async fn finish(self) {
         #[cfg(feature = "otel")]
         if let Some(sending) = self.0 {

@@ -8,7 +8,6 @@ use super::builders::*;
 use crate::controller::submissions::decide::{Plan, decide};
 use crate::controller::submissions::phases::{self, Ended};
 use crate::controller::submissions::spans;
-use crate::controller::submissions::view::JobEnd;
 use crate::observability::trace_id::TraceId;
 use crate::observability::traces::{Kind, Span, Value};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
@@ -143,16 +142,9 @@ fn spans_of(world: &mut World) -> Vec<Span> {
 #[test]
 fn the_spans_of_a_failed_attempt_are_one_tree_that_names_the_reason() {
     let mut world = World::local().running();
-    world.see_alone(ended("agent-1", 3, "exited", 1, 100));
-    world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 100));
-    world.go_to(221);
+    world.see(ended("agent-1", 3, "exited", 1, 100));
     assert_eq!(spans_of(&mut world), [], "it is told to stop");
-    world.job().end = Some(JobEnd::Failed {
-        at: Some(at(300)),
-        reason: "BackoffLimitExceeded".into(),
-        message: String::new(),
-    });
-    world.go_to(301);
+    world.complete();
     let spans = spans_of(&mut world);
     assert_eq!(world.status().state, Some(Failed));
     let [run, attempt] = &spans[..] else {
