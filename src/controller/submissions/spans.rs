@@ -48,7 +48,7 @@ fn id(uid: &str, phase: Phase, number: i64) -> u64 {
     u64::from_be_bytes(std::array::from_fn(|at| digest[at]))
 }
 
-/// A phase that may come more than once is told apart by its beginning.
+/// Phases that come more than once differ by their beginning.
 fn leaf(uid: &str, ended: &Ended) -> u64 {
     id(uid, ended.phase, ended.start.as_millisecond())
 }

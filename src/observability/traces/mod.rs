@@ -14,7 +14,7 @@ use super::trace_id::TraceId;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Span {
     pub trace: TraceId,
-    /// The same for the same span, whoever sends it.
+    /// The same span has the same id in every process.
     pub id: u64,
     /// None: the first of its trace.
     pub parent: Option<u64>,

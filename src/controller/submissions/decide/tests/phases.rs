@@ -143,7 +143,7 @@ fn spans_of(world: &mut World) -> Vec<Span> {
 fn the_spans_of_a_failed_attempt_are_one_tree_that_names_the_reason() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    assert_eq!(spans_of(&mut world), [], "it is told to stop");
+    assert_eq!(spans_of(&mut world), [], "it is asked to stop");
     world.complete();
     let spans = spans_of(&mut world);
     assert_eq!(world.status().state, Some(Failed));
