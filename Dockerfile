@@ -15,7 +15,7 @@ COPY . .
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/src/target \
     triple="$(rustc -vV | sed -n 's/^host: //p')" \
     && LEADERBOARD_REVISION="$REVISION" \
-       cargo build --locked --release -p leaderboard-operator --bin leaderboard-operator \
+       cargo build --locked --release --features otel -p leaderboard-operator --bin leaderboard-operator \
     && RUSTFLAGS="-C target-feature=+crt-static" \
        cargo build --locked --release --target "$triple" -p leaderboard-runner \
     && install -D -t /out target/release/leaderboard-operator "target/$triple/release/leaderboard-runner"

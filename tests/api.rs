@@ -50,6 +50,7 @@ mod api {
     mod switch;
     mod table;
     mod token;
+    mod traces;
     mod two_operators;
     mod watches;
     mod world;

@@ -286,6 +286,22 @@ PROGRAMS = [
             ],
         ),
     ),
+    case(
+        {"traces": {"endpoint": "http://collector.example:4318", "ratio": 0.25, "headersSecret": "collector"}},
+        (
+            CONTROLLER,
+            f"{CONTAINER}.env",
+            [
+                env("OTEL_EXPORTER_OTLP_ENDPOINT", "http://collector.example:4318"),
+                env("OTEL_TRACES_SAMPLER", "traceidratio"),
+                env("OTEL_TRACES_SAMPLER_ARG", "0.25"),
+                {
+                    "name": "OTEL_EXPORTER_OTLP_HEADERS",
+                    "valueFrom": {"secretKeyRef": {"name": "collector", "key": "OTEL_EXPORTER_OTLP_HEADERS"}},
+                },
+            ],
+        ),
+    ),
     case({"controller.concurrency": 32}, (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CONCURRENCY", "32")])),
     case({"controller.extraEnv": [env("A", "1")]}, (CONTROLLER, f"{CONTAINER}.env", [env("A", "1")])),
     case({"bridge.extraEnv": [env("A", "1")]}, (BRIDGE, f"{CONTAINER}.env", [env("A", "1")])),

@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 use thiserror::Error;
 
 use crate::kubernetes::{CallError, call_within};
+use crate::observability::trace_id::TraceId;
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
 use leaderboard_api::{
@@ -306,7 +307,10 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
                 let record = record(existing.as_ref(), incoming, attempt);
                 let spec = json!({ "attempt": attempt, "cancel": false });
                 let bumped = note(api, &name, &resource_version, &record, &spec).await?;
-                bumped.then_some(Outcome::Bumped(attempt))
+                bumped.map(|bumped| {
+                    log(&bumped, "resumed");
+                    Outcome::Bumped(attempt)
+                })
             }
             Ingest::Refuse {
                 attempt,
@@ -323,7 +327,7 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
                     &json!({}),
                 )
                 .await?;
-                noted.then_some(Outcome::Refused)
+                noted.map(|_| Outcome::Refused)
             }
             Ingest::NotNew => Some(Outcome::NotNew),
             Ingest::Repeat => Some(Outcome::Repeat),
@@ -345,17 +349,33 @@ async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result
         ..PostParams::default()
     };
     let request = api.create(&params, fresh);
-    unless_lost(&[409], name, "the creation", request).await
+    let created = unless_lost(&[409], name, "the creation", request).await?;
+    if let Some(created) = &created {
+        log(created, "created");
+    }
+    Ok(created.is_some())
 }
 
-/// Writes the annotation, and with it what changes of the spec. False if the object is no longer what the decision was made on.
+/// The first line of each attempt: all later ones have the same names.
+fn log(submission: &Submission, what: &'static str) {
+    let meta = &submission.metadata;
+    tracing::info!(
+        submission = %format_args!("{}/{}", meta.namespace.as_deref().unwrap_or_default(), meta.name.as_deref().unwrap_or_default()),
+        leaderboard = submission.spec.leaderboard_name,
+        attempt = submission.spec.attempt,
+        trace_id = %TraceId::of(meta.uid.as_deref().unwrap_or_default()),
+        "{what}"
+    );
+}
+
+/// Writes the annotation, and with it what changes of the spec. None if the object is no longer what the decision was made on.
 async fn note(
     api: &Api<Submission>,
     name: &str,
     resource_version: &str,
     record: &Ingested,
     spec: &Value,
-) -> Result<bool, IngestError> {
+) -> Result<Option<Submission>, IngestError> {
     let (key, text) = annotation(record);
     let patch = json!({
         "metadata": { "resourceVersion": resource_version, "annotations": { key: text } },
@@ -370,16 +390,16 @@ async fn note(
     unless_lost(&[404, 409], name, "the update", api.patch(name, &params, &patch)).await
 }
 
-/// True if the request was carried out, false if it lost a race, which these statuses show.
+/// The answer of a request that was carried out; none if it lost a race, which these statuses show.
 async fn unless_lost<T>(
     lost: &[u16],
     name: &str,
     what: &'static str,
     request: impl Future<Output = kube::Result<T>>,
-) -> Result<bool, IngestError> {
+) -> Result<Option<T>, IngestError> {
     match call(name, what, request).await {
-        Err(IngestError::Call(error)) if error.status().is_some_and(|status| lost.contains(&status.code)) => Ok(false),
-        other => other.map(|_| true),
+        Err(IngestError::Call(error)) if error.status().is_some_and(|status| lost.contains(&status.code)) => Ok(None),
+        other => other.map(Some),
     }
 }
 

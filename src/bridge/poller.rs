@@ -223,8 +223,11 @@ impl Poller {
             return None;
         };
         match &outcome {
-            Ok(Outcome::Created) => tracing::info!(submission, leaderboard, "created"),
-            Ok(Outcome::Bumped(attempt)) => tracing::info!(submission, leaderboard, attempt, "resumed"),
+            Ok(Outcome::Created | Outcome::Bumped(_)) => {
+                let waited = now_ms().saturating_sub(incoming.sent_ms);
+                let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
+                self.shared.telemetry.metrics.sqs_message_waited(waited);
+            }
             Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => {
                 tracing::debug!(submission, leaderboard, "a repeat");
             }

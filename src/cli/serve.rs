@@ -18,6 +18,8 @@ use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
 use crate::observability::metrics::Program;
 use crate::observability::shutdown::on_signals;
+#[cfg(feature = "otel")]
+use crate::observability::traces::otlp;
 use crate::observability::{Observability, REVISION};
 use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
@@ -103,6 +105,7 @@ where
 
 async fn lead(options: Controller) -> Result<(), String> {
     let telemetry = Observability::new(on_signals().map_err(|e| e.to_string())?);
+    let (telemetry, sending) = Sending::start(telemetry)?;
     let health = HealthServer::start(options.server.http, telemetry.clone())
         .await
         .map_err(|e| e.to_string())?;
@@ -126,6 +129,7 @@ async fn lead(options: Controller) -> Result<(), String> {
         concurrency: options.concurrency,
     };
     let result = run::run(clients, lease, settings, aws, telemetry).await;
+    sending.finish().await;
     health.close().await;
     result.map_err(|e| e.to_string())
 }
@@ -154,4 +158,39 @@ pub(super) async fn cluster(program: &str) -> Result<Config, String> {
     let agent = HeaderValue::try_from(agent).map_err(|e| format!("the program's name is no header: {e}"))?;
     config.headers.push((USER_AGENT, agent));
     Ok(config)
+}
+
+/// The task that sends traces, where the environment names a collector.
+struct Sending(#[cfg(feature = "otel")] Option<otlp::Sending>);
+
+impl Sending {
+    #[cfg(feature = "otel")]
+    fn start(mut telemetry: Observability) -> Result<(Observability, Self), String> {
+        if !otlp::is_wanted(|name| std::env::var(name).ok()) {
+            return Ok((telemetry, Self(None)));
+        }
+        let started = otlp::start(None, &telemetry.metrics, &telemetry.tasks);
+        let (traces, sending) = started.map_err(|e| e.to_string())?;
+        telemetry.traces = traces;
+        Ok((telemetry, Self(Some(sending))))
+    }
+
+    #[cfg(not(feature = "otel"))]
+    #[allow(clippy::unnecessary_wraps, reason = "with traces it can fail")]
+    fn start(telemetry: Observability) -> Result<(Observability, Self), String> {
+        if std::env::var_os("OTEL_EXPORTER_OTLP_ENDPOINT").is_some() {
+            tracing::warn!(
+                "OTEL_EXPORTER_OTLP_ENDPOINT is set, but this program was built without traces (feature otel)"
+            );
+        }
+        Ok((telemetry, Self()))
+    }
+
+    #[cfg_attr(not(feature = "otel"), allow(clippy::unused_async, reason = "with traces it waits"))]
+    async fn finish(self) {
+        #[cfg(feature = "otel")]
+        if let Some(sending) = self.0 {
+            sending.finish().await;
+        }
+    }
 }

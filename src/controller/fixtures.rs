@@ -40,6 +40,7 @@ use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Store, Synced};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
+use crate::observability::traces::Traces;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options};
 use crate::services::table::Recorder;
@@ -120,6 +121,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         external: external(&aws, &tasks),
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
         metrics: Arc::default(),
+        traces: Traces::default(),
         wake: noting(&waking),
         client,
         aws,

@@ -43,7 +43,11 @@ pub fn init(format: Format, filter: Option<&str>) -> Result<(), LoggingError> {
     subscriber.try_init().map_err(|_| LoggingError::Twice)
 }
 
-fn subscriber<W>(
+/// Writes lines in this format.
+///
+/// # Errors
+/// If the filter cannot be read.
+pub fn subscriber<W>(
     format: Format,
     filter: Option<&str>,
     writer: W,

@@ -10,6 +10,8 @@ pub mod metrics;
 pub mod readiness;
 pub mod shutdown;
 pub mod tasks;
+pub mod trace_id;
+pub mod traces;
 
 use std::sync::Arc;
 
@@ -18,6 +20,7 @@ use metrics::{Metrics, Program};
 use readiness::Readiness;
 use shutdown::Stop;
 use tasks::Tasks;
+use traces::Traces;
 
 /// The commit that was built; empty where the build was given none.
 pub const REVISION: &str = match option_env!("LEADERBOARD_REVISION") {
@@ -33,6 +36,7 @@ pub struct Observability {
     pub readiness: Readiness,
     pub stop: Stop,
     pub tasks: Tasks,
+    pub traces: Traces,
 }
 
 impl Observability {
@@ -48,6 +52,7 @@ impl Observability {
             liveness: Liveness::default(),
             readiness: Readiness::default(),
             tasks: Tasks::new(stop.clone()),
+            traces: Traces::default(),
             stop,
         }
     }

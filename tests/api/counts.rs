@@ -4,7 +4,7 @@
 //! The whole controller runs on the real API server; Job controller, kubelet and logcopy are played, so that nothing but the
 //! controller decides what is asked and written.
 
-mod lifecycle;
+pub mod lifecycle;
 
 use std::collections::BTreeMap;
 use std::path::Path;

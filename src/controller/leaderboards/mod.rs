@@ -34,6 +34,7 @@ use crate::controller::stores::Stores;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::{team_history, team_use};
 use crate::kubernetes::CallError;
+use crate::observability::metrics::{LimitsState, Metrics};
 use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
@@ -50,6 +51,7 @@ pub struct Uses<'a> {
     pub slots: &'a SlotAllocator,
     pub external: &'a ExternalSystems,
     pub aws: &'a Aws,
+    pub metrics: &'a Metrics,
 }
 
 /// What a reconcile came to.
@@ -90,6 +92,7 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         refusal,
         ..observe(uses, &leaderboard, policy, &probe, now)
     };
+    show_limits(uses, &view, &probe);
     let plan = decide(&view);
     if let Some(wanted) = plan.finalizer {
         set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
@@ -104,6 +107,19 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
     let next = probed.map_or(policy, |probed| probed.min(policy));
     Ok(next.max(SOONEST).min(again))
+}
+
+/// Shows what it has left, in metrics.
+fn show_limits(uses: Uses<'_>, view: &LeaderboardView, probe: &Probe) {
+    let key = key_of(view.leaderboard.as_ref());
+    let total = view.leaderboard.spec.concurrency.total;
+    let state = LimitsState {
+        slots_in_use: view.in_use,
+        slots: total.and_then(|total| usize::try_from(total).ok()),
+        ..probe.limits()
+    };
+    let name = format!("{}/{}", key.namespace, key.name);
+    uses.metrics.set_limits(&name, state);
 }
 
 /// What was tried of it. Where it names what it may not, nothing is asked, and EvalAI is no longer spoken to.

@@ -22,14 +22,21 @@ const LIMIT: Duration = Duration::from_secs(10);
 /// A run that nobody has: the list below it is empty, and costs nothing.
 const NO_RUN: &str = "none/";
 
-/// Asks what is due; the queue also if it is in question. Hands back what was read of the queue, if it was asked.
+/// What was read of the queues that were asked.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Readings {
+    pub(super) queue: Option<Reading>,
+    pub(super) dead_letters: Option<Reading>,
+}
+
+/// Asks what is due; the queue also if it is in question.
 pub(super) async fn look(
     aws: &Aws,
     leaderboard: &Leaderboard,
     mut reach: Reach,
     is_queue_due: bool,
     now: Timestamp,
-) -> (Reach, Option<Reading>) {
+) -> (Reach, Readings) {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
     let named = named(leaderboard);
     let places: Vec<Place> = named.iter().map(|(place, _)| *place).collect();
@@ -47,15 +54,19 @@ pub(super) async fn look(
             (place, address, found, read)
         }
     });
-    let mut reading = None;
+    let mut readings = Readings::default();
     for (place, address, found, read) in join_all(asked).await {
-        reading = reading.or(read.filter(|_| place == Place::Queue));
+        match place {
+            Place::Queue => readings.queue = read,
+            Place::DeadLetterQueue => readings.dead_letters = read,
+            Place::Bucket | Place::Table | Place::LogGroup => {}
+        }
         if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
             tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table, queue or log group cannot be reached");
         }
         reach.take(place, &address, generation, found, now);
     }
-    (reach, reading)
+    (reach, readings)
 }
 
 /// What a Leaderboard names, each with its address in words.

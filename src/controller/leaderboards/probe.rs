@@ -12,7 +12,7 @@ use leaderboard_results::metrics;
 
 use super::Uses;
 use super::claims::{self, Claims};
-use super::places;
+use super::places::{self, Readings};
 use super::pod_notes::{TrackPods, notes};
 use super::priority::{self, Asked};
 use super::queue_readers;
@@ -23,6 +23,7 @@ use crate::controller::settings::Settings;
 use crate::controller::submissions::job_spec::{self, JobInput};
 use crate::controller::submissions::pod_overlay;
 use crate::kubernetes::call;
+use crate::observability::metrics::LimitsState;
 use crate::pod::run::results_format;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
@@ -44,6 +45,9 @@ pub(super) struct Probe {
     reach: Reach,
     /// Whether somebody else reads its queue.
     queue: Option<SharedQueue>,
+    /// Messages of the queue, visible and in flight, and of its dead-letter queue.
+    messages: Option<(u64, u64)>,
+    dead_letters: Option<u64>,
     /// The way to EvalAI that follows.
     target: Option<Arc<Target>>,
     /// Generation whose Pods were tried, and what was found.
@@ -99,10 +103,33 @@ impl Probe {
         // A bucket that hangs must not keep EvalAI waiting.
         let is_queue_due = self.queue.as_ref().is_some_and(|queue| queue.is_due(now));
         let places = places::look(uses.aws, leaderboard, reach, is_queue_due, now);
-        let reading;
-        ((self.reach, reading), ()) = tokio::join!(places, self.refresh_token(uses, leaderboard, now));
-        self.refresh_queue(uses, leaderboard, reading, now).await;
+        let readings;
+        ((self.reach, readings), ()) = tokio::join!(places, self.refresh_token(uses, leaderboard, now));
+        self.note_messages(leaderboard, &readings);
+        self.refresh_queue(uses, leaderboard, readings.queue, now).await;
         self
+    }
+
+    /// Keeps what SQS last said of the queues that the Leaderboard still names.
+    fn note_messages(&mut self, leaderboard: &Leaderboard, readings: &Readings) {
+        let queue = leaderboard.spec.queue.as_ref();
+        let read = readings.queue.as_ref();
+        let messages = read.map(|read| (read.visible, read.in_flight)).or(self.messages);
+        self.messages = messages.filter(|_| queue.is_some());
+        let dead = readings.dead_letters.as_ref().map(|read| read.visible);
+        let has_dead = queue.is_some_and(|queue| queue.dead_letter_url.is_some());
+        self.dead_letters = dead.or(self.dead_letters).filter(|_| has_dead);
+    }
+
+    /// For metrics.
+    pub(super) fn limits(&self) -> LimitsState {
+        let token = self.token.as_ref().and_then(|token| token.as_ref().ok());
+        LimitsState {
+            token_ends: token.and_then(|token| token.expires()),
+            queue: self.messages,
+            dead_letters: self.dead_letters,
+            ..LimitsState::default()
+        }
     }
 
     async fn refresh_priority(&mut self, client: &Client, now: Timestamp) {

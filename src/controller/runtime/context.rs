@@ -23,6 +23,7 @@ use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::{act, observe};
 use crate::observability::metrics::Metrics;
+use crate::observability::traces::Traces;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
@@ -46,6 +47,7 @@ pub struct Context {
     pub aws: Aws,
     pub recorder: Recorder,
     pub metrics: Arc<Metrics>,
+    pub traces: Traces,
     pub wake: Wake<Leaderboard>,
 }
 
@@ -81,6 +83,7 @@ impl Context {
             addresses: &self.addresses,
             external: &self.external,
             metrics: &self.metrics,
+            traces: &self.traces,
         }
     }
 
@@ -91,6 +94,7 @@ impl Context {
             slots: &self.slots,
             external: &self.external,
             aws: &self.aws,
+            metrics: &self.metrics,
         }
     }
 

@@ -329,6 +329,7 @@ impl Parts {
             aws: aws.clone(),
             recorder: events(client),
             metrics: Arc::clone(&self.telemetry.metrics),
+            traces: self.telemetry.traces.clone(),
             wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
         };
         context.stores.fill(&context.slots);

@@ -24,6 +24,7 @@ use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
 use crate::observability::tasks::panic_message;
+use crate::observability::trace_id::TraceId;
 use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
@@ -159,8 +160,17 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
     let Some(result) = result.transpose() else {
         return After::WithPermit;
     };
-    let result = result.map_err(|error| (error, urgency::of_submission(&submission)));
-    finish(SUBMISSION, &turn, submission.as_ref(), started, &shared, result)
+    let result = result.map_err(|error| {
+        tracing::warn!(
+            submission = %turn.key,
+            leaderboard = submission.spec.leaderboard_name,
+            attempt = submission.spec.attempt,
+            trace_id = %TraceId::of(&uid_of(submission.as_ref())),
+            "{error}"
+        );
+        (error, urgency::of_submission(&submission))
+    });
+    finish(SUBMISSION, submission.as_ref(), started, &shared, result)
 }
 
 /// A reconcile within its limit of time; a panic of it is its own error.
@@ -200,14 +210,16 @@ async fn reconcile_leaderboard(turn: Turn, shared: Arc<Shared>) -> After {
             return After::In(wait, Class::Refresh);
         }
         Ok(Reconciled::Done(wait)) => Ok((Some(wait), Class::Refresh)),
-        Err(error) => Err((error, Class::Refresh)),
+        Err(error) => {
+            tracing::warn!(leaderboard = %turn.key, "{error}");
+            Err((error, Class::Refresh))
+        }
     };
-    finish(LEADERBOARD, &turn, leaderboard.as_ref(), started, &shared, result)
+    finish(LEADERBOARD, leaderboard.as_ref(), started, &shared, result)
 }
 
 fn finish(
     kind: &'static str,
-    turn: &Turn,
     object: &impl Resource,
     started: Instant,
     shared: &Shared,
@@ -223,7 +235,6 @@ fn finish(
         Err((error, class)) => {
             metrics.reconciled(kind, "error", started.elapsed());
             metrics.reconcile_failed(kind, error.label());
-            tracing::warn!(kind, object = %turn.key, "{error}");
             After::In(shared.backoff.failed(&uid), class)
         }
     }

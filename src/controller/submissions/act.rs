@@ -21,7 +21,9 @@ use super::images::Images;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::other_results::OtherResults;
+use super::phases::{self, Ended, Phase};
 use super::significance::{Change, change, patience};
+use super::spans;
 use super::view::{LogPlace, ObservedTexts, View};
 use crate::controller::objects::uid_of;
 use crate::controller::settings::Settings;
@@ -31,6 +33,8 @@ use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use crate::observability::metrics::{FailedAttempt, Metrics};
+use crate::observability::trace_id::TraceId;
+use crate::observability::traces::Traces;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, conditions, names, reasons};
 
@@ -53,6 +57,7 @@ pub struct Uses<'a> {
     pub addresses: &'a Addresses,
     pub external: &'a ExternalSystems,
     pub metrics: &'a Metrics,
+    pub traces: &'a Traces,
 }
 
 /// A create that an admission webhook holds up keeps a permit that others wait for.
@@ -221,6 +226,7 @@ impl Actor<'_> {
         self.log_transition(status);
         self.count_use(&old, status);
         self.count_failure(&old, status);
+        self.note_phases(status);
         Ok(None)
     }
 
@@ -237,11 +243,45 @@ impl Actor<'_> {
             submission = %format_args!("{}/{}", self.namespace, self.name()),
             leaderboard = self.submission().spec.leaderboard_name,
             attempt = new.attempt,
+            trace_id = %self.trace(),
             from = old.map_or("none", |status| status.state_of_conditions().as_str()),
             to = new.state_of_conditions().as_str(),
             reason = new.reason,
             "{}", new.message.as_deref().unwrap_or("the submission's state has changed")
         );
+    }
+
+    /// What other systems have of an end is a line as well: it changes no state.
+    fn log_delivery(&self, new: &SubmissionStatus, ended: &Ended) {
+        let by = match ended.phase {
+            Phase::Record => "the table has the end",
+            Phase::Publish => "EvalAI has the end",
+            _ => return,
+        };
+        tracing::info!(
+            submission = %format_args!("{}/{}", self.namespace, self.name()),
+            leaderboard = self.submission().spec.leaderboard_name,
+            attempt = new.attempt,
+            trace_id = %self.trace(),
+            "{by}"
+        );
+    }
+
+    fn trace(&self) -> TraceId {
+        TraceId::of(&uid_of(self.submission()))
+    }
+
+    /// Metrics, log and trace of what has ended with the status that is stored now.
+    fn note_phases(&self, new: &SubmissionStatus) {
+        let ended = phases::ended(self.view, new);
+        for one in &ended {
+            let took = one.end.duration_since(one.start).unsigned_abs();
+            self.uses.metrics.phase_ended(one.phase.as_str(), took);
+            self.log_delivery(new, one);
+        }
+        if !ended.is_empty() {
+            self.uses.traces.send(|| spans::of(self.view, new, &ended));
+        }
     }
 
     /// Once it is stored, so that a write that fails counts nothing twice.
@@ -347,8 +387,13 @@ impl Actor<'_> {
             Err(error) if error.is_gone() || error.is_conflict() => return Ok(()),
             other => other.map(|_| ())?,
         }
-        let submission = format_args!("{}/{name}", self.namespace);
-        tracing::info!(%submission, "the Submission is deleted: retention.finishedSeconds have passed since its end");
+        tracing::info!(
+            submission = %format_args!("{}/{name}", self.namespace),
+            leaderboard = self.submission().spec.leaderboard_name,
+            attempt = self.submission().spec.attempt,
+            trace_id = %self.trace(),
+            "the Submission is deleted: retention.finishedSeconds have passed since its end"
+        );
         Ok(())
     }
 

@@ -64,6 +64,16 @@ pub struct View {
     pub evalai_writes_from: Option<Timestamp>,
 }
 
+impl View {
+    /// When the run of the present Job ended, by the Job or by its Pod.
+    pub fn ended_at(&self) -> Option<Timestamp> {
+        match self.job.ours()?.end.as_ref() {
+            Some(end) => end.at(),
+            None => self.pod.as_ref()?.run_ended,
+        }
+    }
+}
+
 /// The Job that the present attempt should have.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ObservedJob {

@@ -69,5 +69,6 @@ impl Metrics {
         self.boards.ready.remove(&of);
         self.boards.pending.remove(&of);
         self.boards.unpublished.remove(&of);
+        self.limits.forget(&of);
     }
 }

@@ -90,3 +90,14 @@ pub(super) struct Build {
     pub version: &'static str,
     pub revision: &'static str,
 }
+
+/// Of a submission's life.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(super) struct OfPhase {
+    pub phase: &'static str,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(super) struct SpanOutcome {
+    pub outcome: &'static str,
+}

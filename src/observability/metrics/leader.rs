@@ -34,6 +34,7 @@ impl Metrics {
         } else {
             self.submissions.leave_to_the_leader();
             self.boards.leave_to_the_leader();
+            self.limits.leave_to_the_leader();
             self.set_evalai_load(0, 0, 0);
         }
     }

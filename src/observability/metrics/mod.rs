@@ -6,6 +6,8 @@
 mod boards;
 mod labels;
 mod leader;
+mod limits;
+mod phases;
 mod process;
 mod reconciles;
 mod services;
@@ -25,6 +27,7 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Metric, Registry};
 
 pub use boards::BoardState;
+pub use limits::LimitsState;
 pub use reconciles::QueueMetrics;
 pub use submissions::FailedAttempt;
 pub use watches::WatchMetrics;
@@ -33,6 +36,8 @@ use super::REVISION;
 use boards::Boards;
 use labels::Build;
 use leader::Leader;
+use limits::Limits;
+use phases::Phases;
 use process::Process;
 use reconciles::Reconciles;
 use services::{Cloud, Evalai, Messages};
@@ -62,7 +67,9 @@ pub struct Metrics {
     watches: Watches,
     leader: Leader,
     submissions: Submissions,
+    phases: Phases,
     boards: Boards,
+    limits: Limits,
     evalai: Evalai,
     cloud: Cloud,
     messages: Messages,
@@ -126,7 +133,9 @@ impl Metrics {
             watches,
             leader: Leader::new(controller),
             submissions: Submissions::new(controller),
+            phases: Phases::new(controller),
             boards: Boards::new(controller),
+            limits: Limits::new(controller),
             evalai: Evalai::new(controller),
             cloud,
             messages: Messages::new(bridge),

@@ -5,6 +5,7 @@ use std::time::Duration;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
 use super::labels::{Call, MessageOutcome, Op, OpOutcome, ServiceOp};
@@ -62,12 +63,19 @@ impl Cloud {
 #[derive(Debug)]
 pub(super) struct Messages {
     total: Family<MessageOutcome, Counter>,
+    wait: Histogram,
 }
 
 impl Messages {
     pub(super) fn new(r: &mut Registry) -> Self {
         Self {
             total: zero(r, "sqs_messages", "Messages by outcome"),
+            wait: add(
+                r,
+                "sqs_message_wait_duration_seconds",
+                "Time from sending a message to the Submission that it made or resumed",
+                Histogram::new([0.1, 0.5, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3600.0, 14400.0, 86400.0]),
+            ),
         }
     }
 }
@@ -97,5 +105,10 @@ impl Metrics {
     /// What became of a message.
     pub fn sqs_message(&self, outcome: &'static str) {
         self.messages.total.get_or_create(&MessageOutcome { outcome }).inc();
+    }
+
+    /// A message has made or resumed a Submission, so long after it was sent.
+    pub fn sqs_message_waited(&self, wait: Duration) {
+        self.messages.wait.observe(wait.as_secs_f64());
     }
 }

@@ -32,11 +32,26 @@ fn all(program: Program) -> Metrics {
         oldest_unpublished: Duration::from_secs(4),
     };
     metrics.set_leaderboard("ns/board", state);
+    metrics.set_limits("ns/board", limits());
+    metrics.phase_ended("run", Duration::from_mins(50));
+    metrics.spans("sent", 12);
     metrics.evalai_request("put_finished", "ok", Duration::from_millis(20));
     metrics.set_evalai_load(50, 54, 1);
     metrics.cloud_call("s3", "GetObject", "ok", Duration::from_secs(1));
     metrics.sqs_message("created");
+    metrics.sqs_message_waited(Duration::from_secs(2));
     metrics
+}
+
+/// A Leaderboard with everything that has a limit.
+fn limits() -> LimitsState {
+    LimitsState {
+        slots_in_use: 3,
+        slots: Some(8),
+        token_ends: Some(jiff::Timestamp::from_second(1_800_000_000).unwrap()),
+        queue: Some((5, 2)),
+        dead_letters: Some(1),
+    }
 }
 
 #[test]
@@ -61,6 +76,15 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_ready{leaderboard=\"ns/board\"} 1",
         "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9.0",
         "leaderboard_oldest_unpublished_seconds{leaderboard=\"ns/board\"} 4.0",
+        "leaderboard_slots_in_use{leaderboard=\"ns/board\"} 3",
+        "leaderboard_slots_limit{leaderboard=\"ns/board\"} 8",
+        "leaderboard_evalai_token_expiry_timestamp_seconds{leaderboard=\"ns/board\"} 1800000000.0",
+        "leaderboard_queue_visible_messages{leaderboard=\"ns/board\"} 5",
+        "leaderboard_queue_in_flight_messages{leaderboard=\"ns/board\"} 2",
+        "leaderboard_dead_letter_queue_messages{leaderboard=\"ns/board\"} 1",
+        "leaderboard_submission_phase_duration_seconds_bucket{le=\"3600.0\",phase=\"run\"} 1",
+        "leaderboard_submission_phase_duration_seconds_bucket{le=\"1800.0\",phase=\"run\"} 0",
+        "leaderboard_trace_spans_total{outcome=\"sent\"} 12",
         "leaderboard_evalai_requests_total{op=\"put_finished\",outcome=\"ok\"} 1",
         "leaderboard_evalai_request_duration_seconds_bucket{le=\"0.025\",op=\"put_finished\"} 1",
         "leaderboard_evalai_budget_used 50",
@@ -109,6 +133,7 @@ fn a_bridge_exports_what_it_counts_and_nothing_of_a_controller() {
         "leaderboard_cloud_calls",
         "leaderboard_cloud_call_duration_seconds",
         "leaderboard_sqs_messages",
+        "leaderboard_sqs_message_wait_duration_seconds",
     ];
     assert_eq!(bridge, expected);
     let controller = families(&all(Program::Controller).text().unwrap());
@@ -145,6 +170,10 @@ fn who_does_not_lead_shows_nothing_that_only_the_leader_counts() {
         "leaderboard_ready{",
         "leaderboard_oldest_pending_seconds{",
         "leaderboard_oldest_unpublished_seconds{",
+        "leaderboard_slots_in_use{",
+        "leaderboard_evalai_token_expiry_timestamp_seconds{",
+        "leaderboard_queue_visible_messages{",
+        "leaderboard_dead_letter_queue_messages{",
     ] {
         assert!(!text.contains(sample), "{sample} in\n{text}");
     }
@@ -167,6 +196,29 @@ fn a_leaderboard_that_is_gone_has_no_samples() {
         !text.contains("leaderboard_ready{") && !text.contains("_oldest_pending_seconds{"),
         "{text}"
     );
+    assert!(!text.contains("{leaderboard=\"ns/board\"}"), "{text}");
+}
+
+#[test]
+fn what_a_leaderboard_no_longer_has_is_no_longer_shown() {
+    let metrics = all(Program::Controller);
+    let state = LimitsState {
+        slots_in_use: 1,
+        ..LimitsState::default()
+    };
+    metrics.set_limits("ns/board", state);
+    let text = metrics.text().unwrap();
+    assert!(
+        text.contains("leaderboard_slots_in_use{leaderboard=\"ns/board\"} 1\n"),
+        "{text}"
+    );
+    for gone in [
+        "slots_limit{",
+        "token_expiry_timestamp_seconds{",
+        "_messages{leaderboard",
+    ] {
+        assert!(!text.contains(gone), "{gone} in\n{text}");
+    }
 }
 
 #[test]

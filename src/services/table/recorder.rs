@@ -16,6 +16,7 @@ use super::ledger::{Ledger, RowState, RowUpdate, TableId};
 use super::{Row, Table, TableError, Written};
 use crate::backoff::Backoff;
 use crate::observability::tasks::Tasks;
+use crate::observability::trace_id::TraceId;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api as api;
@@ -167,7 +168,7 @@ impl Worker {
         let result = self.shared.store.write(&self.table, update.row.clone()).await;
         let is_sick = result.as_ref().is_err_and(TableError::is_of_the_table);
         if let Err(error) = &result {
-            tracing::warn!(submission = %key, %error, "the row is not in the table");
+            tracing::warn!(submission = %key, trace_id = %TraceId::of(&key.uid), %error, "the row is not in the table");
         }
         if self.shared.ledger().report(&key, &update, result, Instant::now()) {
             // Nobody listens any more once the controller has ended.

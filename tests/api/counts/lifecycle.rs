@@ -17,10 +17,12 @@ use kube::{Client, Resource};
 use leaderboard_api::{Leaderboard, State, Submission, conditions, names, reasons};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::traces::Traces;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep, timeout};
+use tracing::Dispatch;
 
 use super::super::bridge::StandIn;
 use super::super::objects::{Kind, create};
@@ -62,6 +64,9 @@ impl Scenario {
         Self::of("EvalAI and table, limited", true, true),
     ];
 
+    /// One that EvalAI and a table get.
+    pub const PUBLISHED: Self = Self::ALL[2];
+
     const fn of(name: &'static str, has_evalai: bool, has_limits: bool) -> Self {
         Self {
             name,
@@ -82,7 +87,7 @@ impl Scenario {
 
     async fn run(self, has_submission: bool) -> Cost {
         let world = World::new(self).await;
-        let controller = Controller::start(&world).await;
+        let controller = Controller::start(&world, Watched::default()).await;
         world.ready().await;
         controller.quiet().await;
         let before = (
@@ -125,10 +130,17 @@ impl Scenario {
     }
 }
 
+/// Where a controller's spans and log lines go.
+#[derive(Clone, Default)]
+pub struct Watched {
+    pub traces: Traces,
+    pub log: Option<Dispatch>,
+}
+
 /// What is around a controller.
-struct World {
-    client: Client,
-    namespace: String,
+pub struct World {
+    pub client: Client,
+    pub namespace: String,
     aws: StandIn,
     /// Between the controller and S3.
     s3: ministack::Proxy,
@@ -138,7 +150,7 @@ struct World {
 }
 
 impl World {
-    async fn new(scenario: Scenario) -> Self {
+    pub async fn new(scenario: Scenario) -> Self {
         let _ = rustls::crypto::ring::default_provider().install_default();
         let aws = StandIn::start().await;
         let client = server().await.client();
@@ -225,7 +237,7 @@ impl World {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
-    async fn ready(&self) {
+    pub async fn ready(&self) {
         let ready = |found: Option<&Leaderboard>| {
             let status = found.and_then(|board| board.status.as_ref());
             status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::READY))
@@ -236,7 +248,7 @@ impl World {
 
     /// A submission from its creation until every system has its end. The controller comes to rest in between, so that it
     /// makes no difference how fast it is: with a Job, with a running Pod, and with an end.
-    async fn live(&self, controller: &Controller) {
+    pub async fn live(&self, controller: &Controller) {
         let mut spec = json!({"leaderboardName": BOARD});
         let mut metadata = json!({});
         if let Some(evalai) = &self.evalai {
@@ -305,7 +317,7 @@ fn is_settled(submission: &Submission) -> bool {
 }
 
 /// A controller on a thread of its own.
-struct Controller {
+pub struct Controller {
     user: String,
     telemetry: Observability,
     measured: oneshot::Sender<()>,
@@ -313,13 +325,18 @@ struct Controller {
 }
 
 impl Controller {
-    async fn start(world: &World) -> Self {
+    pub async fn start(world: &World, watched: Watched) -> Self {
         let (config, user) = server().await.counted();
         let (stop, signal) = Stop::new();
-        let telemetry = Observability::new(signal);
+        let telemetry = Observability {
+            traces: watched.traces,
+            ..Observability::new(signal)
+        };
         let (measured, until) = oneshot::channel::<()>();
         let (namespace, endpoint, of_thread) = (world.namespace.clone(), world.aws.endpoint.clone(), telemetry.clone());
+        let log = watched.log.unwrap_or_else(Dispatch::none);
         let thread = std::thread::spawn(move || {
+            let _log = tracing::dispatcher::set_default(&log);
             let mut running = None;
             let memory = allocation_counter::measure(|| {
                 let runtime = tokio::runtime::Builder::new_current_thread()
@@ -370,7 +387,7 @@ impl Controller {
     }
 
     /// Waits until it has nothing more to write.
-    async fn quiet(&self) {
+    pub async fn quiet(&self) {
         let quiet = async {
             let mut known = self.writes().await;
             let mut since = Instant::now();
@@ -386,7 +403,7 @@ impl Controller {
     }
 
     /// Ends it, and gives what it has allocated until now.
-    async fn end(self) -> AllocationInfo {
+    pub async fn end(self) -> AllocationInfo {
         self.measured.send(()).expect("the controller had ended by itself");
         let ended = tokio::task::spawn_blocking(|| self.thread.join().unwrap());
         timeout(LIMIT, ended)

@@ -8,7 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan_builder::{PlanBuilder, after};
 use super::{allowance, crashes, failure, interruption, reading, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage, View};
+use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, MAX_NODES_WITHOUT_GPU, NodeWithoutGpu, reasons};
@@ -322,14 +322,5 @@ fn duration(seconds: i64) -> String {
         (0, 0, minutes) => format!("{minutes}m"),
         (0, hours, minutes) => format!("{hours}h{minutes}m"),
         (days, hours, _) => format!("{days}d{hours}h"),
-    }
-}
-
-impl View {
-    fn ended_at(&self) -> Option<Timestamp> {
-        match self.job.ours()?.end.as_ref() {
-            Some(end) => end.at(),
-            None => self.pod.as_ref()?.run_ended,
-        }
     }
 }

@@ -20,6 +20,7 @@ mod line;
 mod log;
 mod nodes;
 mod observe;
+mod phases;
 mod properties;
 mod reading;
 mod requeue;
