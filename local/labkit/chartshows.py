@@ -13,6 +13,7 @@ ABSENT = "(absent)"
 MONITORING = "monitoring.coreos.com/v1"
 CONTROLLER = f"Deployment/{RELEASE}-controller"
 BRIDGE = f"Deployment/{RELEASE}-bridge"
+TEST, TESTED, HOOK = f"Pod/{RELEASE}-test", "spec.containers.0", "helm.sh/hook"
 CRD = "CustomResourceDefinition/submissions.leaderboard.carla.org"
 ROLE = "arn:aws:iam::123456789012:role/one"
 POD = "spec.template.spec"
@@ -359,7 +360,10 @@ NETWORK = [
         (f"Service/{RELEASE}-controller", "spec.selector", selector("controller")),
         (f"Service/{RELEASE}-bridge", "metadata", {"labels": {"a": "b"}, "annotations": {"c": "d"}}),
     ),
-    case({"service.enabled": False}, (f"Service/{RELEASE}-controller", "", ABSENT)),
+    case({"service.enabled": False}, (f"Service/{RELEASE}-controller", "", ABSENT), (TEST, f"{TESTED}.args", ABSENT)),
+    case({"bridge.enabled": False}, (TEST, f"{TESTED}.args", [f"--ready={RELEASE}-controller"])),
+    case({}, (TEST, f"{TESTED}.args", [f"--ready={RELEASE}-bridge"]), (TEST, "metadata.annotations", {HOOK: "test"})),
+    case({"allNamespaces": True}, (TEST, f"{TESTED}.env", [env("LEADERBOARD_NAMESPACES", "")])),
     case({}, (f"NetworkPolicy/{RELEASE}", "", ABSENT)),
     case(
         {"networkPolicy.enabled": True},
@@ -382,7 +386,10 @@ NETWORK = [
             "networkPolicy.egress.services": {"cidrs": ["10.1.0.0/16", "fd00::/8"], "ports": [443]},
             "networkPolicy.egress.extra": [{"to": [{"ipBlock": {"cidr": "10.2.0.1/32"}}], "ports": [{"port": 3128}]}],
         },
-        (f"NetworkPolicy/{RELEASE}", "spec.ingress.0.from", [{"podSelector": {}}]),
+        (f"NetworkPolicy/{RELEASE}", "spec.ingress.0.from.0", {"podSelector": {}}),
+        # `helm test` gets in too, and is not held by the policy itself.
+        (f"NetworkPolicy/{RELEASE}", "spec.ingress.0.from.1.podSelector.matchLabels", selector("test")),
+        (f"NetworkPolicy/{RELEASE}", "spec.podSelector.matchExpressions.0.values", ["controller", "bridge"]),
         (f"NetworkPolicy/{RELEASE}", "spec.egress.0.to", [{"namespaceSelector": {}}]),
         (f"NetworkPolicy/{RELEASE}", "spec.egress.1.to", [{"ipBlock": {"cidr": "10.0.0.1/32"}}]),
         (f"NetworkPolicy/{RELEASE}", "spec.egress.1.ports", [{"port": 6443, "protocol": "TCP"}]),
