@@ -1,6 +1,7 @@
 """Owns what exists in the AWS stand-in, as a challenge's account would hold it; creates what is missing, changes nothing else.
 
-Runs in the lab's virtual environment (boto3), as a program: `base CERTIFICATE_AUTHORITY API_SERVER` or `repositories NAME…`.
+Runs in the lab's virtual environment (boto3), as a program: `base CERTIFICATE_AUTHORITY API_SERVER` or `repositories NAME…`;
+`quickstart` is for the one in a Pod of examples/quickstart.yaml.
 """
 
 import json
@@ -107,10 +108,16 @@ def main(arguments: list[str]) -> None:
             tables()
             secrets(authority, api_server)
             log_group()
+        case ["quickstart"]:
+            queues()
+            tables()
+            log_group()
+            # Last: that it is there shows that all is.
+            bucket()
         case ["repositories", *names]:
             repositories(names)
         case _:
-            raise SystemExit("usage: base CERTIFICATE_AUTHORITY API_SERVER | repositories NAME...")
+            raise SystemExit("usage: base CERTIFICATE_AUTHORITY API_SERVER | quickstart | repositories NAME...")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from .image import target_folder
 from .settings import Settings
 
 PROFILE = "local"
+# From nothing on two cores.
+PROGRAMS_SECONDS, RUNNER_SECONDS, STAND_INS_SECONDS = 420, 45, 30
 # The test program that costs nearly nothing on top of what is built anyway.
 CHEAPEST_TEST = "programs"
 STATIC = "-C target-feature=+crt-static"
@@ -36,17 +38,24 @@ def check_cargo() -> None:
 def programs(settings: Settings) -> None:
     """Builds every program of the workspace: the operator and the stand-in of EvalAI among them."""
     selection = ["--workspace", "--bins", "--test", CHEAPEST_TEST]
-    cargo(settings, ["build", *selection, "--profile", PROFILE], "building the programs", 420)
+    cargo(settings, ["build", *selection, "--profile", PROFILE], "building the programs", PROGRAMS_SECONDS)
 
 
 def static_programs(settings: Settings) -> None:
     """Builds what goes into other images: the runner, small, the stand-ins of simulator and agent, and the probe."""
     env = {"RUSTFLAGS": STATIC}
     runner = ["build", "--release", "--target", triple(), "--package", "leaderboard-runner"]
-    cargo(settings, runner, "building the static runner", 45, env)
+    cargo(settings, runner, "building the static runner", RUNNER_SECONDS, env)
     challenge = ["build", "--profile", PROFILE, "--target", triple()]
     challenge += ["--package", "challenge-stand-in", "--package", "challenge-probe"]
-    cargo(settings, challenge, "building the static stand-ins", 30, env)
+    cargo(settings, challenge, "building the static stand-ins", STAND_INS_SECONDS, env)
+
+
+def cold_seconds(settings: Settings) -> int:
+    """About how long cargo takes: nothing of note where it has built here before."""
+    if (target_folder(settings.repository, os.environ) / PROFILE).is_dir():
+        return 0
+    return PROGRAMS_SECONDS + RUNNER_SECONDS + STAND_INS_SECONDS
 
 
 def program(settings: Settings, name: str) -> Path:
@@ -63,6 +72,7 @@ def cargo(
     """Runs cargo; `usual` is how many seconds it takes from nothing on two cores."""
     check_cargo()
     say(f"{what} (from nothing {usual} s, else a few)")
+    is_cold = cold_seconds(settings) > 0
     log = settings.logs / f"cargo-{'-'.join(what.split()[1:])}.log"
     run_long(
         ["cargo", *arguments],
@@ -71,6 +81,8 @@ def cargo(
         cwd=settings.repository,
         env={**os.environ, "CARGO_TERM_COLOR": "never", **(env or {})},
         progress=compiled,
+        # Where it has built before nobody knows how much is left.
+        usual=usual if is_cold else 0,
     )
 
 

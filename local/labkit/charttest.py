@@ -4,16 +4,27 @@ Called by `lab chart-test`. The API server is a throwaway one without nodes; it 
 """
 
 import json
-import re
 import shutil
 import tempfile
-import textwrap
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import apiserver, chartalerts, chartcases, chartdocs, chartrender, doccheck, metricdocs, release, schemas, tools
+from . import (
+    apiserver,
+    artifacthub,
+    chartalerts,
+    chartcases,
+    chartdocs,
+    chartrender,
+    doccheck,
+    kubeversions,
+    metricdocs,
+    release,
+    schemas,
+    tools,
+)
 from .chartcases import RELEASE, SYSTEM, Access
 from .chartrender import documents
 from .console import say, seconds
@@ -21,6 +32,8 @@ from .errors import LabError
 from .kube import Kube
 from .settings import Settings
 
+# The Jobs that the operator's tests hold its own against.
+JOBS = "src/controller/submissions/job_spec/golden"
 CRDS = ("leaderboards.leaderboard.carla.org", "submissions.leaderboard.carla.org")
 
 
@@ -28,6 +41,7 @@ def run(settings: Settings, update: bool) -> None:
     """All checks; raises with the first ones that fail."""
     chart = chartrender.folder(settings.repository)
     generated, copied = settings.repository / "crds", chart / "files" / "crds"
+    jobs = settings.repository / JOBS
     if update:
         copy_definitions(generated, copied)
     folder = tools.ensure(settings, [*apiserver.TOOLS, chartalerts.TOOL])
@@ -36,6 +50,7 @@ def run(settings: Settings, update: bool) -> None:
     check("values.yaml and the README's table", lambda: chartdocs.same_table(chart))
     check("values.yaml and its schema", lambda: chartdocs.same_schema(chart))
     check("metrics and their page", lambda: metricdocs.same(settings.repository))
+    check("what Artifact Hub reads", lambda: artifacthub.check(settings.repository))
     check("one version", lambda: release.version(settings.repository))
     check("a runbook for each alert", lambda: doccheck.runbooks(settings.repository))
     check("when each alert fires", lambda: chartalerts.fire(settings.repository, folder))
@@ -49,14 +64,17 @@ def run(settings: Settings, update: bool) -> None:
         check("what each value shows in the objects", lambda: chartrender.every_value(kube, chart))
         check("NOTES.txt", lambda: chartrender.notes(kube, chart))
         check("alerts and dashboard", lambda: chartrender.queries(kube, chart, settings.repository))
-        check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart))
+        check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart, own_document(kube), jobs))
+        for version in kubeversions.SUMS:
+            served = kubeversions.document(settings, version)
+            check(f"the same for Kubernetes {version}", lambda served=served: conform(kube, chart, served, jobs))
         check("server-side dry run", lambda: dry_run(kube, chart))
         check("one file without Helm", lambda: chartrender.applied(kube, chart))
         check("install, rights in one leaderboard's namespace", lambda: installed(kube, chart))
         check("rights of people", lambda: people(kube))
         check("examples of Chart.yaml", lambda: examples(kube, chart))
         check("values of examples/aws", lambda: aws_values(kube, chart, settings.repository / "examples" / "aws"))
-        check("the demo's manifests", lambda: demo_manifests(kube, settings.repository / "examples" / "demo"))
+        check("manifests of demo and quickstart", lambda: manifests(kube, settings.repository / "examples"))
         before = identities(kube)
         check("upgrade with roles, several leaderboards", lambda: upgraded(kube, chart))
         check("roll back", lambda: rolled_back(kube))
@@ -159,18 +177,25 @@ def render(kube: Kube, chart: Path, file: Path | None) -> str:
     return kube.run("helm", "template", RELEASE, str(chart), f"--namespace={SYSTEM}", *with_values(file))
 
 
-def conform(kube: Kube, chart: Path) -> str:
-    document = json.loads(kube.run("kubectl", "get", "--raw", "/openapi/v2"))
+def own_document(kube: Kube) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(kube.run("kubectl", "get", "--raw", "/openapi/v2"))
+    return document
+
+
+def conform(kube: Kube, chart: Path, document: dict[str, Any], jobs: Path) -> str:
+    """What the chart renders, and the Jobs as the controller makes them, are right by the schemas of a document."""
     objects = 0
     with tempfile.TemporaryDirectory(prefix="leaderboard-schemas-") as folder:
         for name, schema in schemas.files(document):
             (Path(folder) / name).write_text(json.dumps(schema))
         argv = ["kubeconform", "-strict", "-summary", "-output=json", f"-schema-location={folder}/{schemas.TEMPLATE}"]
-        for file in values_files(chart):
-            done = kube.attempt(*argv, given=render(kube, chart, file))
+        given = {str(file or "values.yaml"): render(kube, chart, file) for file in values_files(chart)}
+        given |= {file.name: file.read_text() for file in sorted(jobs.glob("*.json"))}
+        for name, manifests in given.items():
+            done = kube.attempt(*argv, given=manifests)
             answer = json.loads(done.stdout or "{}")
             if done.returncode != 0:
-                raise LabError(f"{file or 'values.yaml'}: {describe(answer) or done.stderr.strip()[-300:]}")
+                raise LabError(f"{name}: {describe(answer) or done.stderr.strip()[-300:]}")
             objects += answer["summary"]["valid"]
     return f"{objects} objects"
 
@@ -259,25 +284,18 @@ def examples(kube: Kube, chart: Path) -> str:
     """Artifact Hub shows them: the server must take them, and their kinds must be the definitions'. They stay for what follows."""
     text = (chart / "Chart.yaml").read_text()
     for name in CRDS:
-        if f"name: {name}\n" not in annotation(text, "crds"):
+        if f"name: {name}\n" not in artifacthub.block(text, "crds"):
             raise LabError(f"artifacthub.io/crds of Chart.yaml lacks {name}")
-    indented = "".join(f"  {line}\n" for line in annotation(text, "crdsExamples").splitlines())
+    indented = "".join(f"  {line}\n" for line in artifacthub.block(text, "crdsExamples").splitlines())
     argv = ["apply", "--server-side", "--validate=strict", "--namespace=leaderboard", "--filename=-"]
     taken = kube.run("kubectl", *argv, "--output=name", given=f"apiVersion: v1\nkind: List\nitems:\n{indented}")
     return f"{len(taken.splitlines())} objects"
 
 
-def annotation(text: str, name: str) -> str:
-    """The lines of an annotation of Artifact Hub, which is itself YAML."""
-    block = re.search(rf"^  artifacthub\.io/{name}: \|\n((?:    .*\n)+)", text, re.MULTILINE)
-    if block is None:
-        raise LabError(f"Chart.yaml has no annotation artifacthub.io/{name}")
-    return textwrap.dedent(block[1])
-
-
-def demo_manifests(kube: Kube, folder: Path) -> str:
-    """They are applied by the demo alone, which few run; the server must take them, without a word."""
-    files = [file for file in sorted(folder.glob("*.yaml")) if file.name != "values.yaml"]
+def manifests(kube: Kube, examples: Path) -> str:
+    """They are applied on clusters alone, which few have; the server must take them, without a word."""
+    demo = [file for file in sorted((examples / "demo").glob("*.yaml")) if file.name != "values.yaml"]
+    files = [*demo, examples / "quickstart.yaml"]
     for file in files:
         argv = ["apply", "--server-side", "--dry-run=server", "--validate=strict", f"--filename={file}"]
         done = kube.attempt("kubectl", *argv)

@@ -52,7 +52,7 @@ def up(settings: Settings) -> None:
     with exclusively(settings):
         tools.check_space(settings.state)
         packages.ensure(settings)
-        folder = tools.ensure(settings, tools_of(settings))
+        folder = tools.ensure(settings, tools_of(settings), tools.fitting_assets(os.environ))
         python = pythonenv.ensure(settings) / "python"
         pki.ensure(settings)
         network.up(settings)

@@ -1,5 +1,6 @@
 """Owns what a person sees while something runs: progress lines and heartbeats on stderr. stdout is for results only."""
 
+import shutil
 import subprocess
 import sys
 import time
@@ -9,6 +10,9 @@ from pathlib import Path
 from .errors import LabError
 
 HEARTBEAT_SECONDS = 30
+# On a terminal a bar moves that often.
+BAR_SECONDS = 1
+BAR_CELLS = 24
 NETWORK_WORDS = (
     "dial tcp",
     "no such host",
@@ -37,6 +41,14 @@ def seconds(value: float) -> str:
     return f"{int(value) // 60} min {int(value) % 60} s"
 
 
+def bar(what: str, spent: float, usual: float) -> str:
+    """How far something is that usually takes so long: one line for a terminal."""
+    part = min(spent / usual, 0.99)
+    cells = "#" * int(part * BAR_CELLS)
+    rest = f"of about {seconds(usual)}" if spent < usual else f"where {seconds(usual)} are usual"
+    return f"  {what} [{cells:.<{BAR_CELLS}}] {part:4.0%}  {seconds(spent)} {rest}"
+
+
 def network_failure(output: str) -> str | None:
     """The line of a registry client's output that says that the network failed, if there is one."""
     lines = [line.strip() for line in output.splitlines()]
@@ -52,14 +64,16 @@ def run_long(
     env: Mapping[str, str] | None = None,
     keep: Sequence[int] = (),
     progress: Callable[[str], str] | None = None,
+    usual: float = 0,
 ) -> None:
     """Runs a command that may take minutes: its output goes to `log`, a heartbeat to stderr; raises LabError if it fails.
 
-    `progress` makes of the log so far how far it is, for the heartbeat.
+    `progress` makes of the log so far how far it is, for the heartbeat. With `usual` seconds, a bar takes its place on a terminal.
     The command inherits the descriptors in `keep`: a lock among them is held as long as the command lives, even if we die.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
+    draws = usual > 0 and sys.stderr.isatty()
     with log.open("wb") as sink:
         child = subprocess.Popen(
             argv, cwd=cwd, env=env, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT, pass_fds=keep
@@ -67,17 +81,29 @@ def run_long(
         try:
             while True:
                 try:
-                    code = child.wait(timeout=HEARTBEAT_SECONDS)
+                    code = child.wait(timeout=BAR_SECONDS if draws else HEARTBEAT_SECONDS)
                     break
                 except subprocess.TimeoutExpired:
+                    if draws:
+                        draw(bar(what, time.monotonic() - started, usual))
+                        continue
                     far = progress(log.read_text(errors="replace")) if progress else "still running"
                     say(f"  {what}: {far} after {seconds(time.monotonic() - started)}")
         except BaseException:
             child.terminate()
             child.wait()
             raise
+        finally:
+            if draws:
+                draw("")
     if code != 0:
         raise LabError(failure_line(what, code, log))
+
+
+def draw(line: str) -> None:
+    """Puts one line in place of the last one on the terminal, cut to its width."""
+    width = shutil.get_terminal_size().columns - 1
+    print(f"\r\x1b[K{line[:width]}", end="", file=sys.stderr, flush=True)
 
 
 def failure_line(what: str, code: int, log: Path) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import aws, build, cluster, demo_check, evalai_server, image, packages, tools
+from . import aws, build, cluster, demo_check, evalai_server, image, packages, pythonenv, tools
 from .console import say, seconds
 from .demo_check import Findings
 from .errors import LabError
@@ -29,6 +29,8 @@ CONTENTS, SIMULATOR, AGENT = "challenge/contents:1", "challenge/simulator:1", "c
 OPERATOR = "leaderboard-operator:dev"
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 RUN_PATIENCE = 600
+# Of the steps that are taken each time.
+RUN_SECONDS = 90
 STEPS = 9
 
 
@@ -36,6 +38,7 @@ def run(settings: Settings) -> None:
     """The whole demo; raises if a step fails or the result is not the expected one."""
     started = time.monotonic()
     cluster.check_machine(settings)
+    say(forecast(settings))
     folder = prepare(settings)
     kube = of_lab(settings, folder)
     pinned = make_images(settings)
@@ -51,6 +54,24 @@ def run(settings: Settings) -> None:
     print(next_steps(settings, findings))
 
 
+def forecast(settings: Settings) -> str:
+    """How long it will take, and why."""
+    absent = tools.missing(settings, [*cluster.CLUSTER_TOOLS, "helm"], tools.fitting_assets(os.environ))
+    reasons = [
+        (
+            tools.cold_seconds(absent),
+            f"for {len(absent)} tools built from source, {tools.longest(absent)} first of all",
+        ),
+        (0 if pythonenv.home(settings).exists() else pythonenv.USUAL_SECONDS, "for the AWS stand-in's packages"),
+        (build.cold_seconds(settings), "for the operator and the stand-ins in Rust"),
+        (RUN_SECONDS, "for the cluster, the images and one submission"),
+    ]
+    parts = [f"{seconds(each)} {why}" for each, why in reasons if each]
+    total = seconds(sum(each for each, _ in reasons))
+    kept = "; what is built is kept, so that the next time takes a minute or two" if len(parts) > 1 else ""
+    return f"this takes about {total} on two cores: {', '.join(parts)}{kept}"
+
+
 def step(number: int, what: str, usual: str) -> None:
     say(f"[{number}/{STEPS}] {what} (usually {usual})")
 
@@ -60,7 +81,7 @@ def prepare(settings: Settings) -> Path:
     step(1, "pinned tools: Kubernetes, etcd, helm", "14 min the first time, then nothing")
     tools.check_space(settings.state)
     packages.ensure(settings)
-    folder = tools.ensure(settings, [*cluster.CLUSTER_TOOLS, "helm"])
+    folder = tools.ensure(settings, [*cluster.CLUSTER_TOOLS, "helm"], tools.fitting_assets(os.environ))
     step(2, "the operator and EvalAI's stand-in", "8 min the first time, then 1 s")
     build.programs(settings)
     step(3, "the programs that go into other images", "1 min the first time, then 1 s")

@@ -6,6 +6,7 @@ Called by `lab image` and by `lab up` (the pause image).
 import os
 import platform
 import subprocess
+import sysconfig
 import tempfile
 import urllib.error
 import urllib.request
@@ -13,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import elf, layer, tools
+from . import elf, layer, pythonenv, pythonimage, tools
 from .aws import create_repositories
 from .console import say
 from .errors import LabError
@@ -60,6 +61,11 @@ def make(settings: Settings, file: Path, search: Search, archive: Path | None) -
         built = build(settings, specs[0], search)
         archive.write_bytes(layer.archive(built, specs[0].name))
         return [f"{specs[0].name}@{built.digest}"]
+    return push_all(settings, specs, search)
+
+
+def push_all(settings: Settings, specs: Sequence[ImageSpec], search: Search) -> list[str]:
+    """Builds images and pushes those that the registry lacks; returns their references."""
     check_registry(settings)
     create_repositories(settings, sorted({spec.repository for spec in specs}))
     crane = tools.ensure(settings, ["crane"]) / "crane"
@@ -142,6 +148,10 @@ def file_entries(settings: Settings, item: FileSpec, search: Search, image: str)
         yield layer.Entry(
             item.to, 0o644 if item.mode is None else item.mode, item.value.encode(), uid=item.uid, gid=item.gid
         )
+        return
+    if item.kind == "python":
+        site = Path(sysconfig.get_path("purelib", vars={"base": str(pythonenv.ensure(settings).parent)}))
+        yield from pythonimage.entries(site, item.value.split(","), item.to)
         return
     source = locate(settings, item, search, image)
     if source.is_dir():

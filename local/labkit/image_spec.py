@@ -9,14 +9,14 @@ from typing import Any
 
 from .errors import LabError
 
-SOURCES = ("bin", "host", "repo", "text")
+SOURCES = ("bin", "host", "python", "repo", "text")
 REPOSITORY = re.compile(r"[a-z0-9]+(?:[._/-][a-z0-9]+)*")
 TAG = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}")
 
 
 @dataclass(frozen=True)
 class FileSpec:
-    """One entry of `files`: `kind` is bin, host, repo or text; `value` is what follows the colon."""
+    """One entry of `files`: `kind` is bin, host, python, repo or text; `value` is what follows the colon."""
 
     kind: str
     value: str

@@ -13,12 +13,13 @@ from .errors import LabError
 from .settings import Settings
 from .tools import lock
 
+USUAL_SECONDS = 40
+
 
 def ensure(settings: Settings) -> Path:
     """Makes the virtual environment if it is not there, and returns its folder of programs."""
     requirements = settings.local / "requirements.txt"
-    key = hashlib.sha256(requirements.read_bytes() + platform.python_version().encode()).hexdigest()[:16]
-    folder = settings.cache / f"python-{key}"
+    folder = home(settings)
     # Scripts in it hold its name, so it can't be renamed: the mark says that it is whole.
     mark = folder / ".complete"
     if not mark.exists():
@@ -29,8 +30,15 @@ def ensure(settings: Settings) -> Path:
     return folder / "bin"
 
 
+def home(settings: Settings) -> Path:
+    """Where this very environment is, or will be."""
+    requirements = (settings.local / "requirements.txt").read_bytes()
+    key = hashlib.sha256(requirements + platform.python_version().encode()).hexdigest()[:16]
+    return settings.cache / f"python-{key}"
+
+
 def build(folder: Path, requirements: Path, settings: Settings) -> None:
-    say("installing the AWS stand-in (ministack), boto3 and cfn-lint, usually 40 s")
+    say(f"installing the AWS stand-in (ministack), boto3 and cfn-lint, usually {USUAL_SECONDS} s")
     shutil.rmtree(folder, ignore_errors=True)
     made = subprocess.run([sys.executable, "-m", "venv", str(folder)], capture_output=True, text=True, check=False)
     if made.returncode != 0:
@@ -39,4 +47,10 @@ def build(folder: Path, requirements: Path, settings: Settings) -> None:
         )
     pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     log = settings.cache / f"{folder.name}.log"
-    run_long([*pip, "--requirement", str(requirements)], "installing Python packages", log, env=dict(os.environ))
+    run_long(
+        [*pip, "--requirement", str(requirements)],
+        "installing Python packages",
+        log,
+        env=dict(os.environ),
+        usual=USUAL_SECONDS,
+    )

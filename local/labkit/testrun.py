@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from . import awsrecorded, build, charttest, cluster, demo, gpus, kube, pythonenv, rights, tools
+from . import awsrecorded, build, charttest, cluster, demo, gpus, kube, pythonenv, quickstart, rights, tools
 from .console import say, seconds
 from .errors import LabError
 from .failures import Failure, Reader, Summary, failed_cases
@@ -166,6 +166,7 @@ def in_cluster(plan: Plan) -> None:
         "PATH": f"{folder}:{os.environ.get('PATH', '')}",
         # What Pods run next to the participant's image; the test starts controller and bridge itself, to kill them.
         "LEADERBOARD_OPERATOR_IMAGE": images[demo.OPERATOR],
+        "LEADERBOARD_QUICKSTART_IMAGES": " ".join(quickstart.images(plan.settings)),
         "LEADERBOARD_OPERATOR_BIN": str(build.program(plan.settings, OPERATOR)),
     }
     lines = plan.settings.logs / "matrix.tsv"

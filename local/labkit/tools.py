@@ -5,6 +5,7 @@ import hashlib
 import os
 import platform
 import shutil
+import subprocess
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from pathlib import Path
 from .console import run_long, say, seconds
 from .errors import LabError
 from .settings import Settings
-from .toolsets import ENVTEST_TOOLS, SETS, ToolSet, build_flags, cache_key, in_build_order
+from .toolsets import ENVTEST_TOOLS, KUBERNETES_VERSION, SETS, ToolSet, build_flags, cache_key, in_build_order
 
 LEAST_FREE_BYTES = 5 << 30
 
@@ -23,13 +24,44 @@ def ensure(settings: Settings, names: Iterable[str], assets: str | None = None) 
 
     `assets` is a folder of envtest binaries (KUBEBUILDER_ASSETS) whose etcd, kube-apiserver and kubectl win over ours.
     """
+    names = list(names)
     wanted = in_build_order(names)
     found = {name: place for _, name in wanted if (place := from_assets(assets, name)) is not None}
     places = {name: home(settings, tool_set) / name for tool_set, name in wanted if name not in found}
-    missing = [(tool_set, name) for tool_set, name in wanted if name in places and not places[name].exists()]
-    if missing:
-        build_all(settings, missing)
+    absent = missing(settings, names, assets)
+    if absent:
+        build_all(settings, absent)
     return gather(settings, {**places, **found})
+
+
+def missing(settings: Settings, names: Iterable[str], assets: str | None = None) -> list[tuple[ToolSet, str]]:
+    """Of the named tools those that must be built, in the order of building."""
+    ours = [(tool_set, name) for tool_set, name in in_build_order(names) if from_assets(assets, name) is None]
+    return [(tool_set, name) for tool_set, name in ours if not (home(settings, tool_set) / name).exists()]
+
+
+def cold_seconds(absent: Iterable[tuple[ToolSet, str]]) -> int:
+    """How long building these takes on two cores."""
+    return sum(tool_set.tools[name].seconds for tool_set, name in absent)
+
+
+def longest(absent: Iterable[tuple[ToolSet, str]]) -> str:
+    """The tool that takes longest to build."""
+    return max(((tool_set.tools[name].seconds, name) for tool_set, name in absent), default=(0, "none"))[1]
+
+
+def fitting_assets(env: Mapping[str, str]) -> str | None:
+    """KUBEBUILDER_ASSETS if its API server is of the minor version of our kubelet, which must fit it."""
+    assets = env.get("KUBEBUILDER_ASSETS")
+    server = from_assets(assets, "kube-apiserver")
+    if server is None:
+        return None
+    done = subprocess.run([str(server), "--version"], capture_output=True, text=True, check=False)
+    minor = KUBERNETES_VERSION.rpartition(".")[0]
+    if done.stdout.startswith(f"Kubernetes {minor}."):
+        return assets
+    say(f"KUBEBUILDER_ASSETS has {done.stdout.strip() or 'no API server that runs'}, not {minor}: ours is taken")
+    return None
 
 
 def from_assets(assets: str | None, name: str) -> Path | None:
@@ -70,20 +102,19 @@ def gather(settings: Settings, places: Mapping[str, Path]) -> Path:
     return folder
 
 
-def build_all(settings: Settings, missing: list[tuple[ToolSet, str]]) -> None:
+def build_all(settings: Settings, absent: list[tuple[ToolSet, str]]) -> None:
     """Builds the tools in order, one at a time, telling how far it is."""
     if shutil.which("go") is None:
-        names = " ".join(name for _, name in missing)
+        names = " ".join(name for _, name in absent)
         raise LabError(f"Go is missing, which builds {names}: install Go 1.26 or newer and put it on the PATH")
     check_space(settings.cache)
-    usual = sum(tool_set.tools[name].seconds for tool_set, name in missing)
-    count = "1 tool" if len(missing) == 1 else f"{len(missing)} tools"
-    say(f"{count} to build, once: about {seconds(usual)} on two cores, kept in {settings.cache}")
-    for number, (tool_set, name) in enumerate(missing, start=1):
+    count = "1 tool" if len(absent) == 1 else f"{len(absent)} tools"
+    say(f"{count} to build, once: about {seconds(cold_seconds(absent))} on two cores, kept in {settings.cache}")
+    for number, (tool_set, name) in enumerate(absent, start=1):
         folder = home(settings, tool_set)
         with lock(settings.cache / f"{folder.name}.lock", f"{tool_set.name} tools") as held:
             if not (folder / name).exists():
-                build_one(settings, tool_set, name, f"{name} ({number} of {len(missing)})", held)
+                build_one(settings, tool_set, name, f"{name} ({number} of {len(absent)})", held)
 
 
 def build_one(settings: Settings, tool_set: ToolSet, name: str, label: str, held: int) -> None:
@@ -104,7 +135,15 @@ def build_one(settings: Settings, tool_set: ToolSet, name: str, label: str, held
     env = {**os.environ, "CGO_ENABLED": "0", "GOFLAGS": "", "GOWORK": "off"}
     module = settings.local / "tools" / tool_set.name
     try:
-        run_long(nice + argv, f"building {name}", folder / f"{name}.log", cwd=module, env=env, keep=[held])
+        run_long(
+            nice + argv,
+            f"building {name}",
+            folder / f"{name}.log",
+            cwd=module,
+            env=env,
+            keep=[held],
+            usual=tool.seconds,
+        )
         temporary.rename(folder / name)
     finally:
         temporary.unlink(missing_ok=True)

@@ -4,8 +4,9 @@ import os
 import tempfile
 import unittest
 from pathlib import Path
+from unittest import mock
 
-from labkit import settings, tools
+from labkit import build, cluster, console, demo, pythonenv, settings, tools
 from labkit.errors import LabError
 from labkit.toolsets import SETS, build_flags, cache_key, in_build_order, kubernetes_ldflags
 
@@ -79,6 +80,52 @@ class Envtest(unittest.TestCase):
             place = tools.ensure(lab, ["etcd", "kubectl"], folder)
             self.assertEqual(os.readlink(place / "etcd"), f"{folder}/etcd")
             self.assertEqual(tools.ensure(lab, ["etcd", "kubectl"], folder), place)
+
+    def test_the_cluster_takes_them_only_if_the_node_fits_the_server(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            for says, taken in (("Kubernetes v1.35.9", True), ("Kubernetes v1.36.1", False), ("", False)):
+                with self.subTest(says):
+                    server = Path(folder) / "kube-apiserver"
+                    server.write_text(f"#!/bin/sh\necho {says}\n")
+                    server.chmod(0o755)
+                    found = tools.fitting_assets({"KUBEBUILDER_ASSETS": folder})
+                    self.assertEqual(found, folder if taken else None)
+            self.assertIsNone(tools.fitting_assets({}))
+
+
+class Forecast(unittest.TestCase):
+    def test_it_names_what_must_be_built_and_nothing_else(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            lab = settings.load(REPOSITORY, {"LEADERBOARD_TOOLS": f"{folder}/cache"})
+            with mock.patch.dict(os.environ, {"CARGO_TARGET_DIR": f"{folder}/target"}):
+                cold = demo.forecast(lab)
+                names = [*cluster.CLUSTER_TOOLS, "helm"]
+                for tool_set, name in tools.missing(lab, names):
+                    place = tools.home(lab, tool_set) / name
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    place.touch()
+                pythonenv.home(lab).mkdir()
+                (Path(folder) / "target" / build.PROFILE).mkdir(parents=True)
+                warm = demo.forecast(lab)
+        self.assertRegex(
+            cold, r"about 2\d min .* on two cores: 1\d min .* for 10 tools .*, kube-apiserver first of all"
+        )
+        self.assertIn("the operator and the stand-ins in Rust", cold)
+        self.assertIn("the next time takes", cold)
+        self.assertEqual(
+            warm, "this takes about 90 s on two cores: 90 s for the cluster, the images and one submission"
+        )
+
+
+class Bar(unittest.TestCase):
+    def test_it_grows_and_never_claims_to_be_done(self) -> None:
+        for spent, usual, shown in (
+            (0, 100, "  it [........................]   0%  0.0 s of about 100 s"),
+            (50, 100, "  it [############............]  50%  50 s of about 100 s"),
+            (300, 100, "  it [#######################.]  99%  5 min 0 s where 100 s are usual"),
+        ):
+            with self.subTest(spent):
+                self.assertEqual(console.bar("it", spent, usual), shown)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@
 mod import;
 mod labels;
 mod offline;
+mod preflight;
 mod serve;
 
 use std::process::ExitCode;
@@ -12,6 +13,7 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 
 use crate::allowed::Allowed;
+use crate::controller::runtime::leader::{self, Identity};
 use crate::observability::logging::Format;
 
 /// Runs the submissions of an AI challenge on Kubernetes.
@@ -28,6 +30,8 @@ enum Command {
     Controller(Controller),
     /// Create a Submission for each message of the Leaderboards' queues.
     Bridge(Server),
+    /// Say what an installed operator lacks: kinds, rights, ready programs. Exit code 1: something is missing.
+    Preflight(preflight::Preflight),
     /// Prepare the volumes of a submission's Pod (an init container).
     Workspace(InPod),
     /// Merge, upload and report the results of a submission's Pod (a sidecar).
@@ -74,6 +78,19 @@ struct Controller {
     /// Maximum concurrent reconciles.
     #[arg(long, env = "LEADERBOARD_CONCURRENCY", default_value_t = 16, value_parser = clap::value_parser!(u16).range(1..=256))]
     concurrency: u16,
+    #[command(flatten)]
+    scope: Scope,
+    /// Name of this replica.
+    #[arg(long, env = "POD_NAME", default_value = "leaderboard-operator")]
+    pod_name: String,
+    /// UID of this replica.
+    #[arg(long, env = "POD_UID", default_value = "")]
+    pod_uid: String,
+}
+
+/// What a controller has rights to besides its namespaces.
+#[derive(Args, Debug)]
+struct Scope {
     /// Whether the operator may read nodes, and Leases in all namespaces. Without it a lost node is noticed later, and another
     /// installation only where this one serves.
     #[arg(long, env = "LEADERBOARD_CLUSTER_RIGHTS", default_value_t = true, action = clap::ArgAction::Set)]
@@ -84,12 +101,13 @@ struct Controller {
     /// Name of the Lease.
     #[arg(long, env = "LEADERBOARD_LEASE", default_value = "leaderboard-operator")]
     lease: String,
-    /// Name of this replica.
-    #[arg(long, env = "POD_NAME", default_value = "leaderboard-operator")]
-    pod_name: String,
-    /// UID of this replica.
-    #[arg(long, env = "POD_UID", default_value = "")]
-    pod_uid: String,
+}
+
+impl Scope {
+    /// The Lease, for a replica of this name.
+    fn lease(&self, identity: Identity) -> leader::Settings {
+        leader::Settings::new(&self.lease_namespace, &self.lease, identity)
+    }
 }
 
 /// How to run a Pod's program outside of a Pod. Within a Pod the defaults are right.
@@ -113,6 +131,7 @@ pub fn run() -> ExitCode {
         Command::Labels(labels) => labels.run(),
         Command::Controller(options) => serve::controller(options),
         Command::Bridge(options) => serve::bridge(options),
+        Command::Preflight(options) => options.run(),
         Command::Workspace(options) => serve::workspace(&options),
         Command::Logcopy(options) => serve::logcopy(&options),
     }

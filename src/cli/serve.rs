@@ -64,7 +64,7 @@ fn setting(options: &InPod) -> Result<Setting, String> {
 }
 
 /// Sets up the log, then works until the end; an error is the last line of the log and the exit code.
-fn start<W>(program: &'static str, format: Format, work: impl FnOnce() -> W) -> ExitCode
+pub(super) fn start<W>(program: &'static str, format: Format, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
 {
@@ -116,7 +116,7 @@ async fn lead(options: Controller) -> Result<(), String> {
         lease: leader::lease_client(config).map_err(|e| client_errors::kube(&e))?,
     };
     let identity = Identity::of_pod(&options.pod_name, &options.pod_uid);
-    let lease = leader::Settings::new(&options.lease_namespace, &options.lease, identity);
+    let lease = options.scope.lease(identity);
     let aws = Aws::load("controller").await;
     let settings = Settings {
         image: options.image,
@@ -124,7 +124,7 @@ async fn lead(options: Controller) -> Result<(), String> {
         region: aws.region(),
         operator: lease.installation(),
         namespaces: Namespaces::of(options.server.namespaces),
-        has_cluster_rights: options.cluster_rights,
+        has_cluster_rights: options.scope.cluster_rights,
         allowed: options.server.allowed,
         concurrency: options.concurrency,
     };

@@ -90,7 +90,8 @@ pub async fn await_kinds(client: &Client, plurals: &[&str], telemetry: &Observab
     }
 }
 
-async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
+/// Which of our kinds the API server does not serve, as a sentence.
+pub async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> {
     let version = GroupVersion::gv(GROUP, VERSION);
     let served = match call_within(
         CALL_LIMIT,

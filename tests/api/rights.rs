@@ -3,11 +3,13 @@
 #![cfg(test)]
 
 use k8s_openapi::api::rbac::v1::{ClusterRole, ClusterRoleBinding, PolicyRule, Role, RoleBinding};
-use kube::api::{ListParams, PostParams};
+use kube::api::{DeleteParams, ListParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, Config};
 use leaderboard_api::{Leaderboard, conditions};
 use leaderboard_operator::allowed::Allowed;
+use leaderboard_operator::controller::runtime;
+use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::Namespaces;
 use serde_json::{Value, json};
@@ -137,6 +139,42 @@ async fn until_nothing_is_missing(operator: &Operator) {
     };
     let found = timeout(LIMIT, nothing).await;
     assert!(found.is_ok(), "{:?}", operator.telemetry.readiness.missing());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_preflight_lacks_nothing_with_the_charts_rights_and_names_what_is_taken_away() {
+    let world = World::new().await;
+    let release = world.namespace.as_str();
+    let config = installed(&world.client, release, &[release]).await;
+    until_known(&config, &[release]).await;
+    let client = Client::try_from(config).unwrap();
+    let served = Namespaces::of([release.to_owned()]);
+    let lease = leader::Settings::new(release, LEASE_NAME, Identity::of_pod("preflight", ""));
+    let missing = async || runtime::missing(&client, &served, true, &lease).await;
+    let granted = async {
+        while !missing().await.is_empty() {
+            tokio::time::sleep(POLL).await;
+        }
+    };
+    let found = timeout(LIMIT, granted).await;
+    assert!(found.is_ok(), "{:?}", missing().await);
+
+    let bindings: Api<RoleBinding> = Api::namespaced(world.client.clone(), release);
+    bindings.delete("lease", &DeleteParams::default()).await.unwrap();
+    let taken = async {
+        while missing().await.len() < 2 {
+            tokio::time::sleep(POLL).await;
+        }
+    };
+    timeout(LIMIT, taken).await.expect("the rights are taken away");
+    // Reading Leases is part of another role too.
+    let lines = ["create leases", "update leases"].map(|verb| format!("may not {verb} of coordination.k8s.io"));
+    for (line, begin) in missing().await.iter().zip(&lines) {
+        assert!(
+            line.starts_with(begin) && line.contains(&format!("in namespace {release}")),
+            "{line}"
+        );
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

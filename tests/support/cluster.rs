@@ -42,8 +42,8 @@ const TEST_LIMIT: Duration = Duration::from_mins(20);
 static SLOTS: Semaphore = Semaphore::const_new(4);
 /// Names the tests' own requests in the API server's audit log.
 pub const USER_AGENT: &str = "leaderboard-tests";
-/// Marks the tests' namespaces.
-const LABEL: &str = "leaderboard.carla.org/test";
+/// Marks the tests' namespaces, where no service account may write.
+pub const LABEL: &str = "leaderboard.carla.org/test";
 
 /// What the environment says about the cluster.
 pub struct Lab {

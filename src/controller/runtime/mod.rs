@@ -43,7 +43,7 @@ use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history;
 use crate::kubernetes::objects::{Job, Node, Pod};
-use crate::kubernetes::preflight::{self, await_kinds, watch_access};
+use crate::kubernetes::preflight::{self, access_missing, await_kinds, kinds_missing, watch_access};
 use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
@@ -62,6 +62,8 @@ use reconciles::Queues;
 /// Reconciles under way may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
 
+/// Plurals of the kinds that it works on.
+const KINDS: [&str; 2] = ["leaderboards", "submissions"];
 /// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
 const POLICIES_LIMIT: Duration = Duration::from_secs(5);
 
@@ -116,7 +118,7 @@ async fn work(
     telemetry: Observability,
 ) -> Result<(), RunError> {
     let client = &clients.api;
-    if !await_kinds(client, &["leaderboards", "submissions"], &telemetry).await {
+    if !await_kinds(client, &KINDS, &telemetry).await {
         return Ok(());
     }
     let rights = watch_rights(client.clone(), settings.clone(), lease.clone(), telemetry.clone());
@@ -138,6 +140,18 @@ async fn work(
         tracing::warn!("{error}");
     }
     result
+}
+
+/// What a controller of this scope lacks in the cluster, one sentence each.
+pub async fn missing(
+    client: &Client,
+    namespaces: &Namespaces,
+    has_cluster_rights: bool,
+    lease: &leader::Settings,
+) -> Vec<String> {
+    let kinds = kinds_missing(client, &KINDS).await;
+    let needs = needs::needs(namespaces, has_cluster_rights, lease);
+    kinds.into_iter().chain(access_missing(client, &needs).await).collect()
 }
 
 async fn watch_rights(client: Client, settings: Settings, lease: leader::Settings, telemetry: Observability) {
