@@ -33,6 +33,7 @@ mod api {
     mod memory;
     mod objects;
     mod operator;
+    mod page;
     mod plugin;
     mod pod;
     mod pod_security;

@@ -45,6 +45,7 @@ use crate::kubernetes::preflight::{self, await_kinds, watch_access};
 use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
+use crate::page::{Page, Reads};
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Arrived, Changed, Hub, Options, SweepRow, Timeouts, Timing};
@@ -94,11 +95,12 @@ pub async fn run(
     lease: leader::Settings,
     settings: Settings,
     aws: Aws,
+    page: Option<Page>,
     telemetry: Observability,
 ) -> Result<(), RunError> {
     preflight::register(&telemetry);
     let tasks = telemetry.tasks.clone();
-    let work = Box::pin(work(clients, lease, settings, aws, telemetry));
+    let work = Box::pin(work(clients, lease, settings, aws, page, telemetry));
     tokio::select! {
         biased;
         failed = tasks.failed() => Err(failed.into()),
@@ -111,6 +113,7 @@ async fn work(
     lease: leader::Settings,
     settings: Settings,
     aws: Aws,
+    page: Option<Page>,
     telemetry: Observability,
 ) -> Result<(), RunError> {
     let client = &clients.api;
@@ -122,6 +125,9 @@ async fn work(
     let watches = Watches::start(&clients.watch, &settings, &telemetry);
     telemetry.readiness.registered();
     let leader = leader::start(clients.lease, lease, &telemetry);
+    if let Some(page) = page {
+        page.start(watches.for_page(&leader), &telemetry);
+    }
     let parts = Parts {
         client: clients.api,
         settings,
@@ -208,6 +214,16 @@ impl Watches {
                 store: nodes.store.clone(),
                 synced: nodes.synced.clone(),
             }),
+        }
+    }
+
+    /// What the page reads: of a standby it is the same.
+    fn for_page(&self, leader: &Leader) -> Reads {
+        let leadership = leader.leadership();
+        Reads {
+            leaderboards: self.leaderboards.clone(),
+            submissions: self.submissions.clone(),
+            leads: Box::new(move || leadership.borrow().term().is_some()),
         }
     }
 
