@@ -10,6 +10,7 @@ mod check;
 mod checking;
 mod cluster;
 mod complete;
+mod dashboard;
 mod error;
 mod logs;
 mod near;
@@ -83,6 +84,8 @@ enum Command {
     },
     /// Submit an image to a track, without EvalAI.
     Submit(submit::Submit),
+    /// Open the operator's page for a browser on this machine, until Ctrl-C.
+    Dashboard(dashboard::Dashboard),
     /// Print what the agents of a submission print.
     Logs(logs::Logs),
     /// Drive one route with one pair, and show which parts of a Leaderboard work.
@@ -196,6 +199,9 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         Command::Status(Watched { show, watch }) => Box::pin(show_status(cluster, &show, watch)).await,
         Command::Top { scope, output } => top(cluster, &scope, output.format).await,
         Command::Submit(wanted) => submit(cluster, &wanted).await,
+        Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
+            .await
+            .map(|()| ExitCode::SUCCESS),
         Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await.map(|()| ExitCode::SUCCESS),
         Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
         Command::Rerun(wanted) => rerun(cluster, &wanted).await,
