@@ -10,5 +10,6 @@ pub mod controller;
 pub mod crds;
 pub mod kubernetes;
 pub mod observability;
+pub mod page;
 pub mod pod;
 pub mod services;

@@ -35,6 +35,7 @@ mod api {
     mod names;
     mod objects;
     mod operator;
+    mod page;
     mod plugin;
     mod pod;
     mod pod_security;

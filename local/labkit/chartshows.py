@@ -305,6 +305,16 @@ PROGRAMS = [
             ],
         ),
     ),
+    case(
+        {"controller.page.enabled": True},
+        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_DASHBOARD", "8081")]),
+        (CONTROLLER, f"{CONTAINER}.ports.1", {"name": "page", "containerPort": 8081}),
+        (BRIDGE, f"{CONTAINER}.ports.1", ABSENT),
+        # It is read through the API server alone, on loopback of its Pod.
+        (f"Service/{RELEASE}-controller", "spec.ports.1", ABSENT),
+        (f"Role/{RELEASE}-page", "metadata.namespace", SYSTEM),
+        (f"Role/{RELEASE}-page", "rules.1.resources", ["pods/portforward"]),
+    ),
     case({"controller.concurrency": 32}, (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CONCURRENCY", "32")])),
     case({"controller.extraEnv": [env("A", "1")]}, (CONTROLLER, f"{CONTAINER}.env", [env("A", "1")])),
     case({"bridge.extraEnv": [env("A", "1")]}, (BRIDGE, f"{CONTAINER}.env", [env("A", "1")])),

@@ -19,6 +19,7 @@ from . import (
     image,
     kube,
     metricdocs,
+    pagetest,
     pythonenv,
     release,
     testrun,
@@ -60,6 +61,8 @@ def parser() -> argparse.ArgumentParser:
     add_arguments_of_test(commands.add_parser("test", help="run the tests; prints what each layer took"))
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
+    page = commands.add_parser("page-test", help="test the operator's page in a headless Chromium")
+    page.add_argument("--pictures", action="store_true", help="take the pictures of docs/images too")
     commands.add_parser("chart-docs", help="write the tables of the chart's values and of the metrics")
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
@@ -119,6 +122,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             return 0 if testrun.run(settings, arguments.core, arguments.filter, arguments.only) else 1
         case "chart-test":
             charttest.run(settings, arguments.update)
+        case "page-test":
+            pagetest.run(settings, arguments.pictures)
         case "chart-docs":
             chartdocs.update(chartrender.folder(settings.repository))
             metricdocs.update(settings.repository)

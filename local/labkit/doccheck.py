@@ -24,6 +24,7 @@ RUST_TEST = re.compile(r"#\[(?:tokio::)?test[^\]]*\]((?:\s*#\[[^\]]*\])*)\s*(?:a
 PYTHON_TEST = re.compile(r"^    def (test_\w+)", re.MULTILINE)
 # The chart's test is no unittest: it checks by functions, each of which it names once.
 CHART_CHECK = re.compile(r"^ +check\(\".+\", lambda: (?:\w+\.)?(\w+)\(", re.MULTILINE)
+PAGE_CHECK = re.compile(r'^    "[^"]+": (\w+),$', re.MULTILINE)
 KINDS = ("held", "by policy", "inherent", "open")
 # How the sums are written in the text, so that it cannot contradict its table.
 SUMS = re.compile(
@@ -131,5 +132,5 @@ def test_faults(repository: Path, named: Sequence[tuple[str, str]]) -> Iterator[
 def tests_of(text: str, suffix: str) -> set[str]:
     """The names of the tests in a file that run without being asked for."""
     if suffix == ".py":
-        return {*PYTHON_TEST.findall(text), *CHART_CHECK.findall(text)}
+        return {*PYTHON_TEST.findall(text), *CHART_CHECK.findall(text), *PAGE_CHECK.findall(text)}
     return {name for attributes, name in RUST_TEST.findall(text) if "#[ignore" not in attributes}

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -46,6 +46,13 @@ def ensure(settings: Settings) -> None:
     packages = missing()
     if not packages:
         return
+    install(settings, packages)
+    if missing():
+        raise LabError(f"{' '.join(missing())} is still missing after apt-get: see {settings.logs}/apt-install.log")
+
+
+def install(settings: Settings, packages: Sequence[str]) -> None:
+    """Installs these Debian packages."""
     names = " ".join(packages)
     if shutil.which("apt-get") is None:
         raise LabError(
@@ -57,12 +64,8 @@ def ensure(settings: Settings) -> None:
         run_long(
             ["apt-get", "update", "--quiet"], "updating the package lists", settings.logs / "apt-update.log", env=env
         )
-        install = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
-        run_long(install, "installing packages", settings.logs / "apt-install.log", env=env)
-    if missing():
-        raise LabError(
-            f"apt-get installed {names}, but {' '.join(missing())} is still missing: see {settings.logs}/apt-install.log"
-        )
+        argv = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
+        run_long(argv, "installing packages", settings.logs / "apt-install.log", env=env)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from . import awsrecorded, build, charttest, cluster, demo, gpus, kube, pythonenv, quickstart, rights, tools
+from . import awsrecorded, build, charttest, cluster, demo, gpus, kube, pagetest, pythonenv, quickstart, rights, tools
 from .console import say, seconds
 from .errors import LabError
 from .failures import Failure, Reader, Summary, failed_cases
@@ -53,8 +53,8 @@ class Layer:
     about: str
     # Raises LabError if it fails.
     work: Callable[[Plan], None]
-    # Needs root and a node.
-    is_cluster: bool = False
+    # Needs root: for a node, or to install what is missing.
+    needs_root: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Result:
 
 def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -> bool:
     """Runs the layers in order, going on after a failure; returns whether all of them passed."""
-    chosen = [layer for layer in LAYERS if not (core and layer.is_cluster) and (not only or layer.name in only)]
+    chosen = [layer for layer in LAYERS if not (core and layer.needs_root) and (not only or layer.name in only)]
     if not chosen:
         raise LabError("no layer is left to run: the cluster's needs a node, so leave --core out")
     plan = Plan(settings, name_filter)
@@ -148,6 +148,13 @@ def chart(plan: Plan) -> None:
         say("no single test here has a name: left out because of --filter")
         return
     charttest.run(plan.settings, update=False)
+
+
+def page(plan: Plan) -> None:
+    if plan.filter:
+        say("no single test here has a name: left out because of --filter")
+        return
+    pagetest.run(plan.settings, pictures=False)
 
 
 def in_cluster(plan: Plan) -> None:
@@ -357,7 +364,8 @@ LAYERS = (
     Layer("build", "all tests, and the programs they run", compile_all),
     Layer("unit", "pure logic, mock clients, and processes on this machine", unit),
     Layer("api", "a real API server, without nodes", api),
+    Layer("page", "the operator's page, in a headless Chromium", page, needs_root=True),
     Layer("chart", "the Helm chart, against an API server", chart),
-    Layer("cluster", "a real node with containers", in_cluster, is_cluster=True),
+    Layer("cluster", "a real node with containers", in_cluster, needs_root=True),
 )
 NAMES = tuple(layer.name for layer in LAYERS)

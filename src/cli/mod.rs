@@ -16,6 +16,9 @@ use crate::allowed::Allowed;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::observability::logging::Format;
 
+/// The port that `--dashboard` alone stands for.
+const PAGE_PORT: &str = "8081";
+
 /// Runs the submissions of an AI challenge on Kubernetes.
 #[derive(Parser, Debug)]
 #[command(name = "leaderboard-operator", version, about, long_about = None)]
@@ -78,6 +81,9 @@ struct Controller {
     /// Maximum concurrent reconciles.
     #[arg(long, env = "LEADERBOARD_CONCURRENCY", default_value_t = 16, value_parser = clap::value_parser!(u16).range(1..=256))]
     concurrency: u16,
+    /// Serve the page of `kubectl leaderboard dashboard` on this port of 127.0.0.1: read-only, from the caches. Without it there is none.
+    #[arg(long, env = "LEADERBOARD_DASHBOARD", value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = PAGE_PORT)]
+    dashboard: Option<u16>,
     #[command(flatten)]
     scope: Scope,
     /// Name of this replica.

@@ -21,6 +21,7 @@ use crate::observability::shutdown::on_signals;
 #[cfg(feature = "otel")]
 use crate::observability::traces::otlp;
 use crate::observability::{Observability, REVISION};
+use crate::page::Page;
 use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
@@ -128,7 +129,11 @@ async fn lead(options: Controller) -> Result<(), String> {
         allowed: options.server.allowed,
         concurrency: options.concurrency,
     };
-    let result = run::run(clients, lease, settings, aws, telemetry).await;
+    let page = match options.dashboard {
+        Some(port) => Some(Page::bind(port, &options.pod_name).await.map_err(|e| e.to_string())?),
+        None => None,
+    };
+    let result = run::run(clients, lease, settings, aws, page, telemetry).await;
     sending.finish().await;
     health.close().await;
     result.map_err(|e| e.to_string())

@@ -101,7 +101,7 @@ fn run_with(
         watch: watch_client(config.clone()).unwrap(),
         lease: leader::lease_client(config).unwrap(),
     };
-    run::run(clients, lease, settings, aws, telemetry)
+    run::run(clients, lease, settings, aws, None, telemetry)
 }
 
 fn lease(namespace: &str) -> leader::Settings {

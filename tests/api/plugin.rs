@@ -4,6 +4,7 @@
 
 mod checks;
 mod daily;
+mod dashboard;
 mod logs;
 mod requeue;
 mod rights;

@@ -22,6 +22,7 @@ use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::page::Page;
 use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::verdict::{Verdict, What};
 use serde_json::{Map, Value, json};
@@ -113,6 +114,11 @@ impl World {
 
     /// The same with this Lease and this image.
     pub(super) fn installation(&self, lease: &str, image: &str) -> tokio::sync::watch::Sender<bool> {
+        self.replica(lease, image, None)
+    }
+
+    /// A replica of it, with a page or without.
+    pub(super) fn replica(&self, lease: &str, image: &str, page: Option<Page>) -> tokio::sync::watch::Sender<bool> {
         let (sender, stop) = Stop::new();
         let clients = Clients {
             api: self.client.clone(),
@@ -131,7 +137,7 @@ impl World {
             concurrency: 4,
         };
         let aws = self.aws.aws.clone();
-        tokio::spawn(run::run(clients, lease, settings, aws, Observability::new(stop)));
+        tokio::spawn(run::run(clients, lease, settings, aws, page, Observability::new(stop)));
         sender
     }
 

@@ -253,6 +253,11 @@ spec:
           ports:
             - name: http
               containerPort: 8080
+            {{- if and (eq .component "controller") $own.page.enabled }}
+            # On 127.0.0.1 alone: `kubectl leaderboard dashboard` finds it by this name.
+            - name: page
+              containerPort: 8081
+            {{- end }}
           # Liveness says that the program turns; what it waits for is readiness' to name.
           livenessProbe:
             httpGet: {path: /livez, port: http}

@@ -59,7 +59,7 @@ pub struct Scope {
 
 /// A namespace of a cluster.
 pub struct Cluster {
-    client: Client,
+    pub(super) client: Client,
     /// Its name.
     pub namespace: String,
 }

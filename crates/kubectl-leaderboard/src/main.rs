@@ -14,6 +14,7 @@ mod checking;
 mod cluster;
 mod commands;
 mod complete;
+mod dashboard;
 mod error;
 mod facts;
 mod logs;
@@ -81,6 +82,8 @@ enum Command {
     },
     /// Submit an image to a track, without EvalAI.
     Submit(submit::Submit),
+    /// Open the operator's page for a browser on this machine, until Ctrl-C.
+    Dashboard(dashboard::Dashboard),
     /// Print what the agents of a submission print.
     Logs(logs::Logs),
     /// Drive one route with one pair, and show which parts of a Leaderboard work.
@@ -205,6 +208,9 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         Command::Status(Watched { show, watch }) => Box::pin(commands::show_status(cluster, &show, watch)).await,
         Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
         Command::Submit(wanted) => commands::submit(cluster, &wanted).await,
+        Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
+            .await
+            .map(|()| ExitCode::SUCCESS),
         Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await,
         Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
         Command::Requeue(wanted) => Box::pin(changes::requeue(cluster, &wanted)).await,

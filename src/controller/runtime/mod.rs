@@ -47,6 +47,7 @@ use crate::kubernetes::preflight::{self, access_missing, await_kinds, kinds_miss
 use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
+use crate::page::{Page, Reads};
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Arrived, Changed, Hub, Options, SweepRow, Timeouts, Timing};
@@ -98,11 +99,12 @@ pub async fn run(
     lease: leader::Settings,
     settings: Settings,
     aws: Aws,
+    page: Option<Page>,
     telemetry: Observability,
 ) -> Result<(), RunError> {
     preflight::register(&telemetry);
     let tasks = telemetry.tasks.clone();
-    let work = Box::pin(work(clients, lease, settings, aws, telemetry));
+    let work = Box::pin(work(clients, lease, settings, aws, page, telemetry));
     tokio::select! {
         biased;
         failed = tasks.failed() => Err(failed.into()),
@@ -115,6 +117,7 @@ async fn work(
     lease: leader::Settings,
     settings: Settings,
     aws: Aws,
+    page: Option<Page>,
     telemetry: Observability,
 ) -> Result<(), RunError> {
     let client = &clients.api;
@@ -126,6 +129,9 @@ async fn work(
     let watches = Watches::start(&clients.watch, &settings, &telemetry);
     telemetry.readiness.registered();
     let leader = leader::start(clients.lease, lease, &telemetry);
+    if let Some(page) = page {
+        page.start(watches.for_page(&leader), &telemetry);
+    }
     let parts = Parts {
         client: clients.api,
         settings,
@@ -224,6 +230,16 @@ impl Watches {
                 store: nodes.store.clone(),
                 synced: nodes.synced.clone(),
             }),
+        }
+    }
+
+    /// What the page reads: of a standby it is the same.
+    fn for_page(&self, leader: &Leader) -> Reads {
+        let leadership = leader.leadership();
+        Reads {
+            leaderboards: self.leaderboards.clone(),
+            submissions: self.submissions.clone(),
+            leads: Box::new(move || leadership.borrow().term().is_some()),
         }
     }
 

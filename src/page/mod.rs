@@ -1,0 +1,125 @@
+//! The page: a read-only view of the line, the runs, their scores and failures, for people who look at it in a browser.
+//!
+//! Started by the controller's `runtime` with `--dashboard`. It reads the controller's caches and grants nothing: it sends no request to
+//! the API server, knows no credential and writes nothing. `model` (pure) makes of the cached objects what is shown, `hub` hands it to
+//! the viewers, `routes` are the few files and the stream of events, `connections` bounds what one of them can hold.
+//!
+//! It listens on 127.0.0.1 of its Pod alone, where no other Pod can reach it. A person comes in by `kubectl leaderboard dashboard`, a
+//! port-forward, which the API server authenticates and authorizes (`pods/portforward`).
+
+mod connections;
+mod hub;
+mod model;
+mod phases;
+mod routes;
+mod rows;
+
+#[cfg(test)]
+mod samples;
+
+use std::net::{Ipv4Addr, SocketAddr};
+
+use futures::StreamExt;
+use futures::stream::{self, BoxStream};
+use jiff::Timestamp;
+use tokio::net::TcpListener;
+
+use crate::kubernetes::Watch;
+use crate::observability::Observability;
+use connections::Bounded;
+use hub::{Hub, Source};
+use leaderboard_api::{Leaderboard, Submission};
+use model::{Replica, View};
+
+/// Why there is no page.
+#[derive(Debug, thiserror::Error)]
+pub enum PageError {
+    #[error("can't listen on {address} for the page: {source}; choose another port with --dashboard=PORT")]
+    Bind {
+        address: SocketAddr,
+        source: std::io::Error,
+    },
+}
+
+/// The page before anybody can look at it.
+#[derive(Debug)]
+pub struct Page {
+    listener: TcpListener,
+    address: SocketAddr,
+    name: String,
+}
+
+/// What the page reads.
+pub struct Reads {
+    pub leaderboards: Watch<Leaderboard>,
+    pub submissions: Watch<Submission>,
+    /// Whether this replica leads at present.
+    pub leads: Box<dyn Fn() -> bool + Send + Sync>,
+}
+
+impl Page {
+    /// Listens on loopback; port 0 takes a free one. `name` is the replica's.
+    ///
+    /// # Errors
+    /// If the port is taken.
+    pub async fn bind(port: u16, name: &str) -> Result<Self, PageError> {
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
+        let failed = |source| PageError::Bind { address, source };
+        let listener = TcpListener::bind(address).await.map_err(failed)?;
+        let address = listener.local_addr().map_err(failed)?;
+        Ok(Self {
+            listener,
+            address,
+            name: name.to_owned(),
+        })
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Serves it until the stop.
+    pub fn start(self, reads: Reads, telemetry: &Observability) {
+        let source = Caches { reads, name: self.name };
+        let hub = Hub::new();
+        let work = hub.clone().run(source, telemetry.stop.clone());
+        telemetry.tasks.stay("page's view", work);
+        let router = routes::router(hub, telemetry.stop.clone());
+        let stop = telemetry.stop.clone();
+        let listener = Bounded::new(self.listener);
+        telemetry.tasks.stay("page", async move {
+            let served = axum::serve(listener, router).with_graceful_shutdown(async move { stop.wait().await });
+            // It ends by the stop and by no error: one that can't accept a connection waits and continues.
+            let _ = served.await;
+        });
+        tracing::info!(address = %self.address, "serving the page");
+    }
+}
+
+/// The caches as the hub's source.
+struct Caches {
+    reads: Reads,
+    name: String,
+}
+
+impl Source for Caches {
+    fn changes(&self) -> BoxStream<'static, ()> {
+        let boards = self.reads.leaderboards.subscribe().map(|_| ());
+        let submissions = self.reads.submissions.subscribe().map(|_| ());
+        stream::select(boards, submissions).boxed()
+    }
+
+    fn view(&self) -> Vec<u8> {
+        let (boards, submissions) = (&self.reads.leaderboards, &self.reads.submissions);
+        let replica = Replica {
+            name: &self.name,
+            leads: (self.reads.leads)(),
+            is_complete: boards.is_complete() && submissions.is_complete(),
+        };
+        let (leaderboards, submissions) = (boards.store.state(), submissions.store.state());
+        let view = View::of(replica, &leaderboards, &submissions, Timestamp::now());
+        // Names as keys and plain values: serde_json has no error for them.
+        serde_json::to_vec(&view).unwrap_or_default()
+    }
+}

@@ -1,0 +1,267 @@
+//! One submission as a line of the page: in the line, running, ended, failed. Pure.
+//!
+//! Texts that a stranger had a part in are cut to one line of bounded length here, whatever the API server has let in.
+
+use jiff::Timestamp;
+use kube::ResourceExt;
+use leaderboard_api::text::{one_line, sentence};
+use leaderboard_api::{
+    EndReason, Failure, PairState, PairStatus, State, Submission, SubmissionStatus, TeamStatus, conditions, reasons,
+};
+use serde::Serialize;
+
+use super::phases::{Phases, seconds};
+
+/// Characters of a name of a stranger, and of a message.
+const NAME: usize = 80;
+const MESSAGE: usize = 300;
+
+/// Which submission it is.
+#[derive(Serialize, Clone, Debug, Default, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Who {
+    pub namespace: String,
+    pub name: String,
+    pub leaderboard: String,
+    pub track: Option<String>,
+    pub team: Option<String>,
+    pub is_check: bool,
+}
+
+/// One that waits.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Waits {
+    #[serde(flatten)]
+    pub who: Who,
+    pub position: Option<i32>,
+    /// How long it may take, for people.
+    pub eta: Option<String>,
+    pub reason: Option<String>,
+    pub message: String,
+    /// In seconds since 1970, as all times of the page.
+    pub since: Option<i64>,
+}
+
+/// One that runs.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Runs {
+    #[serde(flatten)]
+    pub who: Who,
+    pub reason: Option<String>,
+    pub attempt: Option<i64>,
+    pub node: Option<String>,
+    pub done: i32,
+    pub total: i32,
+    pub score: Option<String>,
+    pub pairs: Vec<Pair>,
+    pub phases: Phases,
+}
+
+/// One of its pairs.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+pub(super) struct Pair {
+    pub id: i32,
+    pub done: i32,
+    pub total: i32,
+    pub crashes: i32,
+    pub state: PairState,
+    /// What ended its last round, after a crash.
+    pub last: Option<EndReason>,
+}
+
+/// One that has ended.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Ended {
+    #[serde(flatten)]
+    pub who: Who,
+    pub state: &'static str,
+    pub reason: Option<String>,
+    pub score: Option<String>,
+    pub is_final: bool,
+    pub done: i32,
+    pub total: i32,
+    /// Where the end has not arrived yet.
+    pub open: Vec<&'static str>,
+    pub phases: Phases,
+}
+
+/// One that has failed.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Failed {
+    #[serde(flatten)]
+    pub who: Who,
+    pub class: &'static str,
+    pub reason: String,
+    pub is_charged: bool,
+    pub message: String,
+    pub time: Option<i64>,
+}
+
+/// The state of a submission; none before the operator has processed it.
+pub(super) fn state(submission: &Submission) -> Option<State> {
+    let status = submission.status.as_ref()?;
+    status.attempt.map(|_| status.state_of_conditions())
+}
+
+/// When it ended.
+pub(super) fn end(submission: &Submission) -> Option<Timestamp> {
+    let status = submission.status.as_ref()?;
+    let condition = || conditions::get(&status.conditions, conditions::FINISHED).map(|c| c.last_transition_time.0);
+    status.times.finished.as_ref().map(|time| time.0).or_else(condition)
+}
+
+impl Who {
+    fn of(submission: &Submission) -> Self {
+        let status = submission.status.as_ref();
+        let track = status.and_then(|status| status.track.as_ref());
+        Self {
+            namespace: submission.namespace().unwrap_or_default(),
+            name: submission.name_any(),
+            leaderboard: submission.spec.leaderboard_name.clone(),
+            track: track.or(submission.spec.track.as_ref()).map(|track| name(track)),
+            team: team(submission),
+            is_check: submission.spec.check,
+        }
+    }
+}
+
+fn name(text: &str) -> String {
+    one_line(text, NAME)
+}
+
+fn message(text: &str) -> String {
+    one_line(&sentence(text), MESSAGE)
+}
+
+/// Name of the team, else its id.
+fn team(submission: &Submission) -> Option<String> {
+    let given = submission.spec.team.clone().map(TeamStatus::from);
+    let accepted = submission.status.as_ref().and_then(|status| status.team.as_ref());
+    let team = accepted.or(given.as_ref())?;
+    team.name.as_deref().or(team.id.as_deref()).map(name)
+}
+
+/// What the status says, or nothing before there is one.
+fn with_status<T>(submission: &Submission, read: impl FnOnce(&SubmissionStatus) -> T) -> T {
+    match &submission.status {
+        Some(status) => read(status),
+        None => read(&SubmissionStatus::default()),
+    }
+}
+
+impl Waits {
+    pub(super) fn of(submission: &Submission) -> Self {
+        let created = submission.metadata.creation_timestamp.as_ref().map(|time| time.0);
+        with_status(submission, |status| {
+            // The attempt begins with this condition.
+            let began = conditions::get(&status.conditions, conditions::FINISHED);
+            let since = began.map(|c| c.last_transition_time.0).or(created);
+            let waiting = status.waiting.as_ref();
+            let meaning = status.reason.as_deref().and_then(reasons::of);
+            let meaning = meaning.map(|reason| reasons::plain(reason.meaning));
+            let own = status.message.as_deref().unwrap_or_default();
+            Self {
+                who: Who::of(submission),
+                position: waiting.map(|waiting| waiting.position),
+                eta: waiting
+                    .and_then(leaderboard_api::Waiting::eta)
+                    .map(|eta| eta.to_string()),
+                reason: status.reason.as_deref().map(name),
+                message: match meaning {
+                    Some(meaning) if own.is_empty() => message(&meaning),
+                    _ => message(own),
+                },
+                since: since.map(seconds),
+            }
+        })
+    }
+}
+
+impl Runs {
+    pub(super) fn of(submission: &Submission) -> Self {
+        with_status(submission, |status| {
+            let (done, total) = progress(status);
+            Self {
+                who: Who::of(submission),
+                reason: status.reason.as_deref().map(name),
+                attempt: status.attempt,
+                node: status.node_name.as_deref().map(name),
+                done,
+                total,
+                score: status.score.as_ref().map(|score| name(&score.text)),
+                pairs: status.pairs.iter().map(Pair::of).collect(),
+                phases: Phases::of(submission),
+            }
+        })
+    }
+}
+
+fn progress(status: &SubmissionStatus) -> (i32, i32) {
+    let progress = status.progress.as_ref();
+    progress.map_or((0, 0), |progress| (progress.done, progress.total))
+}
+
+impl Pair {
+    fn of(pair: &PairStatus) -> Self {
+        Self {
+            id: pair.id,
+            done: pair.done,
+            total: pair.total,
+            crashes: pair.crashes,
+            state: pair.state,
+            last: pair.last.as_ref().filter(|_| pair.crashes > 0).map(|last| last.reason),
+        }
+    }
+}
+
+impl Ended {
+    pub(super) fn of(submission: &Submission, state: State) -> Self {
+        with_status(submission, |status| {
+            let (done, total) = progress(status);
+            let score = status.score.as_ref();
+            Self {
+                who: Who::of(submission),
+                state: state.as_str(),
+                reason: status.reason.as_deref().map(name),
+                score: score.map(|score| name(&score.text)),
+                is_final: score.is_some_and(|score| score.is_final),
+                done,
+                total,
+                open: open(status),
+                phases: Phases::of(submission),
+            }
+        })
+    }
+}
+
+/// The systems that have not got the end yet, and need it.
+fn open(status: &SubmissionStatus) -> Vec<&'static str> {
+    let systems = [
+        (conditions::ARCHIVED, "S3"),
+        (conditions::PUBLISHED, "EvalAI"),
+        (conditions::RECORDED, "DynamoDB"),
+    ];
+    let is_open = |type_: &str| {
+        let condition = conditions::get(&status.conditions, type_);
+        condition.is_some_and(|condition| condition.status != "True" && condition.reason != reasons::NOT_REQUIRED)
+    };
+    let open = systems.into_iter().filter(|(type_, _)| is_open(type_));
+    open.map(|(_, system)| system).collect()
+}
+
+impl Failed {
+    pub(super) fn of(submission: &Submission, failure: &Failure) -> Self {
+        Self {
+            who: Who::of(submission),
+            class: failure.class.as_str(),
+            reason: name(&failure.reason),
+            is_charged: failure.charged,
+            message: message(&failure.message),
+            time: end(submission).map(seconds),
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Submissions and Leaderboards as an evening before a deadline has them, for the tests of the page and its pictures in the docs.
+
+use std::sync::Arc;
+
+use jiff::{SignedDuration, Timestamp};
+use leaderboard_api::{Leaderboard, Submission};
+use serde_json::{Value, json};
+
+pub(super) const NAMESPACE: &str = "leaderboard";
+const MINUTE: i64 = 60;
+const HOUR: i64 = 60 * MINUTE;
+
+/// The moment of all samples.
+pub(super) fn now() -> Timestamp {
+    "2026-11-01T12:00:00Z".parse().unwrap()
+}
+
+/// So many seconds before.
+pub(super) fn ago(seconds: i64) -> String {
+    (now() - SignedDuration::from_secs(seconds)).to_string()
+}
+
+fn condition(type_: &str, status: &str, reason: &str, seconds: i64) -> Value {
+    json!({"type": type_, "status": status, "reason": reason, "message": "", "lastTransitionTime": ago(seconds)})
+}
+
+pub(super) fn submission(name: &str, board: &str, team: &str, status: &Value) -> Arc<Submission> {
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+        "metadata": {"name": name, "namespace": NAMESPACE, "creationTimestamp": ago(12 * HOUR)},
+        "spec": {"leaderboardName": board, "track": "sensors", "image": "agent:1", "team": {"name": team}},
+        "status": status,
+    });
+    Arc::new(serde_json::from_value(object).unwrap())
+}
+
+pub(super) fn waiting(name: &str, team: &str, position: Option<i32>, reason: &str, message: &str) -> Arc<Submission> {
+    let place = position.map(|position| {
+        let eta = i64::from(position) * 20 * MINUTE;
+        json!({"position": position, "etaMinSeconds": eta, "etaMaxSeconds": eta + 15 * MINUTE, "text": ""})
+    });
+    let since = 10 * MINUTE * i64::from(position.unwrap_or(1));
+    let status = json!({
+        "attempt": 1, "reason": reason, "message": message, "track": "sensors", "waiting": place,
+        "conditions": [condition("Finished", "False", reason, since)],
+    });
+    submission(name, "carla-20", team, &status)
+}
+
+/// One that runs since so many hours, with what its pairs have done of 20 routes and how often each crashed.
+pub(super) fn running(name: &str, team: &str, attempt: i64, hours: i64, pairs: &[(i32, i32)]) -> Arc<Submission> {
+    let done: i32 = pairs.iter().map(|(done, _)| done).sum();
+    let total = 20 * i32::try_from(pairs.len()).unwrap();
+    let pairs: Vec<Value> = (1..)
+        .zip(pairs)
+        .map(|(id, (done, crashes))| pair(id, *done, *crashes))
+        .collect();
+    let started = hours * HOUR;
+    let status = json!({
+        "attempt": attempt, "reason": "Running", "track": "sensors", "nodeName": format!("gpu-{hours}"), "pairs": pairs,
+        "progress": {"done": done, "total": total, "text": format!("{done}/{total}")},
+        "score": {"driving": "41.20", "final": false, "text": format!("~4{hours}.20")},
+        "times": {"submitted": ago(started + hours * 20 * MINUTE), "scheduled": ago(started + 7 * MINUTE), "started": ago(started)},
+        "conditions": [condition("Running", "True", "Running", started)],
+    });
+    submission(name, "carla-20", team, &status)
+}
+
+fn pair(id: i32, done: i32, crashes: i32) -> Value {
+    let state = match (done, crashes) {
+        (20, _) => "Done",
+        (_, 2..) => "Crashed",
+        _ => "Running",
+    };
+    let last = (crashes > 0).then(|| json!({"reason": "SimulatorCrashed", "exitCode": 139}));
+    json!({"id": id, "done": done, "total": 20, "crashes": crashes, "state": state, "last": last})
+}
+
+/// One that finished so many minutes ago.
+pub(super) fn finished(name: &str, team: &str, score: &str, minutes: i64, hours: i64) -> Arc<Submission> {
+    let end = minutes * MINUTE;
+    let status = json!({
+        "attempt": 1, "reason": "Finished", "track": "sensors",
+        "progress": {"done": 80, "total": 80, "text": "80/80"},
+        "score": {"driving": score, "final": true, "text": score},
+        "times": {
+            "submitted": ago(end + 2 * hours * HOUR), "scheduled": ago(end + hours * HOUR + 6 * MINUTE),
+            "started": ago(end + hours * HOUR), "finished": ago(end), "published": ago(end - 20),
+        },
+        "conditions": [condition("Finished", "True", "Finished", end), condition("Published", "True", "Published", end - 20)],
+    });
+    submission(name, "carla-20", team, &status)
+}
+
+/// One that failed so many minutes ago.
+pub(super) fn failed(
+    name: &str,
+    team: &str,
+    class: &str,
+    (reason, message): (&str, &str),
+    minutes: i64,
+) -> Arc<Submission> {
+    let end = minutes * MINUTE;
+    let status = json!({
+        "attempt": 1, "reason": reason, "track": "sensors",
+        "progress": {"done": 22, "total": 80, "text": "22/80"},
+        "failure": {"class": class, "reason": reason, "message": message, "charged": class == "Participant"},
+        "times": {
+            "submitted": ago(end + 2 * HOUR), "scheduled": ago(end + HOUR), "started": ago(end + HOUR - 5 * MINUTE),
+            "finished": ago(end),
+        },
+        "conditions": [condition("Finished", "True", reason, end), condition("Published", "False", "Waiting", end)],
+    });
+    submission(name, "carla-20", team, &status)
+}
+
+pub(super) fn leaderboard(name: &str, spec: &Value, status: &Value) -> Arc<Leaderboard> {
+    let mut of = json!({
+        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2",
+        "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "storage": {"bucket": "results"},
+    });
+    of.as_object_mut().unwrap().extend(spec.as_object().unwrap().clone());
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
+        "metadata": {"name": name, "namespace": NAMESPACE}, "spec": of, "status": status,
+    });
+    Arc::new(serde_json::from_value(object).unwrap())
+}
+
+/// Two Leaderboards: a busy one, and one that is paused and not Ready.
+pub(super) fn leaderboards() -> Vec<Arc<Leaderboard>> {
+    let backlog = json!({"waiting": 3, "lastExpectedTime": ago(-4 * MINUTE)});
+    let busy = json!({
+        "evalai": {"requestsLastMinute": 41, "requestsPerMinute": 60, "backlog": backlog},
+        "conditions": [condition("Ready", "True", "Ready", HOUR)],
+    });
+    let mut denied = condition("Ready", "False", "AwsDenied", HOUR);
+    denied["message"] =
+        "s3:PutObject is denied for the bucket results-10; give the role the policy of docs/aws.md".into();
+    let broken = json!({"evalai": {"requestsLastMinute": 4, "requestsPerMinute": 30}, "conditions": [denied]});
+    vec![
+        leaderboard("carla-20", &json!({"concurrency": {"total": 4}}), &busy),
+        leaderboard("carla-10", &json!({"paused": true}), &broken),
+    ]
+}
+
+/// A full evening.
+pub(super) fn submissions() -> Vec<Arc<Submission>> {
+    let slot = "All four slots of the Leaderboard are taken";
+    let team = "Its team has one running, and concurrency.perTeam is 1";
+    let node = "0/3 nodes are available: 3 Insufficient nvidia.com/gpu; a node is on its way";
+    let agent = "The agent of pair 2 crashed 3 times, the last time with exit code 1; look at agent/agent2/leaderboard.log of the results";
+    let lost = "The node gpu-3 no longer reports; look at the node";
+    let mut all = vec![
+        running(
+            "submission-4200",
+            "Autobahn Labs",
+            1,
+            5,
+            &[(18, 0), (16, 0), (19, 0), (17, 0)],
+        ),
+        running(
+            "submission-4207",
+            "Team Seven",
+            2,
+            3,
+            &[(9, 0), (7, 1), (11, 0), (10, 0)],
+        ),
+        running(
+            "submission-4211",
+            "<b>Bobby</b> & <script>alert(1)</script>",
+            1,
+            2,
+            &[(6, 0), (3, 2), (5, 0), (20, 0)],
+        ),
+        running(
+            "submission-4213",
+            "Équipe Ñandú",
+            1,
+            1,
+            &[(2, 0), (1, 0), (0, 0), (3, 0)],
+        ),
+        waiting("submission-4214", "KIT Drivers", Some(1), "WaitingForSlot", slot),
+        waiting("submission-4215", "Team Seven", Some(2), "WaitingForSlot", team),
+        waiting("submission-4217", "Tübingen Vision", Some(3), "WaitingForSlot", slot),
+        waiting("submission-4218", "Autobahn Labs", Some(4), "WaitingForSlot", team),
+        waiting(
+            "submission-4220",
+            "Perception Group of the University of Nowhere, Institute of Things",
+            Some(5),
+            "WaitingForSlot",
+            slot,
+        ),
+        waiting("submission-4212", "Roach", None, "Unschedulable", node),
+        failed(
+            "submission-4198",
+            "KIT Drivers",
+            "Participant",
+            ("AgentCrashed", agent),
+            130,
+        ),
+        failed("submission-4190", "Roach", "Participant", ("AgentCrashed", agent), 400),
+        failed(
+            "submission-4193",
+            "Tübingen Vision",
+            "Infrastructure",
+            ("NodeLost", lost),
+            300,
+        ),
+        failed("submission-4100", "Roach", "Infrastructure", ("NodeLost", lost), 3000),
+    ];
+    let scores = ["68.05", "41.77", "55.30", "23.91", "61.18", "47.02"];
+    let teams = [
+        "Autobahn Labs",
+        "Interfuser",
+        "Team Seven",
+        "Équipe Ñandú",
+        "KIT Drivers",
+        "Roach",
+    ];
+    for (at, (score, team)) in (0_i64..).zip(scores.into_iter().zip(teams)) {
+        all.push(finished(
+            &format!("submission-{}", 4199 - at),
+            team,
+            score,
+            9 + 70 * at,
+            3 + at % 3,
+        ));
+    }
+    all
+}
