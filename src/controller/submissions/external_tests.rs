@@ -14,8 +14,8 @@ use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedAddresses, ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
-    ObservedTexts, ObservedTraces, Turn,
+    ObservedAddresses, ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
+    ObservedRoutes, ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::State;
 

@@ -6,9 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate, job_name};
 use super::plan_builder::{PlanBuilder, after};
-use super::{
-    accept, addresses, crashes, end, failure, interruption, isolation, line, reading, requeue, start, stop,
-};
+use super::{accept, addresses, crashes, end, failure, interruption, isolation, line, reading, requeue, start, stop};
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};

@@ -14,8 +14,8 @@ use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedAddresses, ObservedFence,
-    ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
-    RecordView, Stage, Standing, Texts, Turn, View,
+    ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts,
+    ObservedTraces, PodView, RecordView, Stage, Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
