@@ -100,7 +100,7 @@ pub(super) fn takes_up(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bo
 pub(super) fn attempts_ahead(draft: &PlanBuilder<'_>) -> i64 {
     let Some(traces) = traces(draft) else { return 0 };
     let row = traces.row.as_ref().filter(|row| row.is_ours);
-    let of_row = row.and_then(|row| Some(row.attempt? + i64::from(row_end(&row.status).is_some())));
+    let of_row = row.and_then(|row| Some(row.attempt?.saturating_add(i64::from(row_end(&row.status).is_some()))));
     let of_report = traces.report.as_ref().map(|report| report.digest.attempt);
     let latest = of_row.into_iter().chain(of_report).max();
     latest.map_or(0, |attempt| attempt.saturating_sub(draft.spec().attempt).max(0))
