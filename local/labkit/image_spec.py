@@ -55,7 +55,6 @@ class ImageSpec:
     cmd: tuple[str, ...]
     user: str
     workdir: str
-    volumes: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -102,12 +101,7 @@ class Reader:
         return value
 
     def path(self, key: str) -> str:
-        return self.checked(key, self.text(key))
-
-    def paths(self, key: str) -> tuple[str, ...]:
-        return tuple(self.checked(key, value) for value in self.texts(key))
-
-    def checked(self, key: str, value: str) -> str:
+        value = self.text(key)
         if not value.startswith("/") or ".." in PurePosixPath(value).parts or value != str(PurePosixPath(value)):
             raise LabError(f"{self.place}: {key} = {value!r} must be an absolute path in its shortest form")
         return value
@@ -168,7 +162,6 @@ def parse_image(table: object, place: str) -> ImageSpec:
         cmd=reader.texts("cmd"),
         user=reader.text("user", ""),
         workdir=reader.text("workdir", ""),
-        volumes=reader.paths("volumes"),
     )
     reader.done()
     return spec

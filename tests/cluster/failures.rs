@@ -46,23 +46,3 @@ async fn an_agent_that_always_crashes_fails_in_every_system() {
     })
     .await;
 }
-
-#[tokio::test]
-async fn an_image_that_declares_a_volume_gains_no_job() {
-    scenario("volume", async |scene: &Scene| {
-        // The registry by a way on loopback, where the controller asks one without TLS.
-        let registry = scene.gate.url.trim_start_matches("http://");
-        let change = json!({"agent": {"images": [format!("{registry}/challenge/agent")]}});
-        scene.leaderboard("lb", change).await;
-        let _controller = controller(scene);
-        let mut case = Case::open("image with a VOLUME", "Failed ImageVolumes (participant, charged)");
-        case.cause();
-        let spec =
-            json!({"leaderboardName": "lb", "track": "sensors", "image": format!("{registry}/challenge/agent:volume")});
-        scene.apply_submission("volume", spec).await;
-        case.ends(scene, "volume", Duration::from_mins(2)).await;
-        assert!(scene.jobs().await.is_empty());
-        case.close();
-    })
-    .await;
-}

@@ -55,8 +55,6 @@ struct Start {
     logs: PathBuf,
     arguments: Vec<String>,
     variables: Vec<(&'static str, OsString)>,
-    /// What it sees as `/etc/hosts`.
-    hosts: Option<PathBuf>,
 }
 
 /// Starts `leaderboard-operator controller`, and keeps it running.
@@ -72,15 +70,6 @@ pub fn controller_with_nodes(scene: &Scene) -> Kept {
         .iter()
         .position(|argument| argument == "--cluster-rights");
     "true".clone_into(&mut start.arguments[rights.unwrap() + 1]);
-    start.keep(scene)
-}
-
-/// Starts a controller that knows these names, as lines of `/etc/hosts`, which nobody else on this machine does, and keeps it running.
-pub fn controller_that_knows(scene: &Scene, hosts: &str) -> Kept {
-    let path = scene.logs.join("hosts");
-    fs::write(&path, hosts).unwrap();
-    let mut start = Start::controller(scene);
-    start.hosts = Some(path);
     start.keep(scene)
 }
 
@@ -152,7 +141,6 @@ impl Start {
             logs: scene.logs.clone(),
             arguments: Vec::new(),
             variables: Vec::new(),
-            hosts: None,
         }
     }
 
@@ -185,12 +173,8 @@ impl Start {
         let log = File::create(&path).unwrap();
         // A killed test drops nothing; the kernel ends its children all the same.
         let mut command = Command::new("setpriv");
-        command.args(["--pdeathsig", "KILL"]);
-        if let Some(hosts) = &self.hosts {
-            let script = r#"mount --bind "$0" /etc/hosts && exec "$@""#;
-            command.args(["unshare", "--mount", "sh", "-c", script]).arg(hosts);
-        }
         command
+            .args(["--pdeathsig", "KILL"])
             .arg(binary())
             .arg(self.program)
             .args(["--namespace", &self.namespace, "--http", "127.0.0.1:0"])

@@ -99,30 +99,6 @@ pub const ENDINGS: &[Ending] = &[
         )
     },
     ending(
-        "shut-status",
-        "shut the own status folder for everybody else",
-        Image::Root,
-        FINISHED,
-    ),
-    ending(
-        "removed-mark",
-        "remove the own mark of the start",
-        Image::User,
-        FINISHED,
-    ),
-    ending(
-        "shut-results",
-        "shut the folder of the own results for everybody else",
-        Image::Root,
-        INVALID,
-    ),
-    ending(
-        "shut-status-crash",
-        "shut the own status folder for everybody else and crash",
-        Image::Root,
-        CRASHED,
-    ),
-    ending(
         "replaced-log",
         "replace the log that is stored and shipped, again and again",
         Image::User,

@@ -21,7 +21,6 @@ use crate::call::{call, of};
 /// The honest agent of the image.
 pub const HONEST: &str = "/usr/bin/challenge-agent";
 const TERMINATION_LOG: &str = "/dev/termination-log";
-const RESULTS: &str = "/tmp/agent";
 const LOG: &str = "/tmp/agent/leaderboard.log";
 /// Outlives the container.
 const MARKER: &str = "/tmp/agent/probe-was-here";
@@ -77,13 +76,6 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         }
         "status-content" => first_life(|| fs::write(status("start1"), vec![b'x'; 1 << 20])),
         "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
-        "shut-status" => shut(&status_folder()),
-        "removed-mark" => fs::remove_file(status("start0")),
-        "shut-results" => shut(RESULTS),
-        "shut-status-crash" => {
-            shut(&status_folder())?;
-            exit(1)
-        }
         "growing-file" => background("grow"),
         "replaced-log" => background("replace"),
         // The honest agent's own knob.
@@ -112,17 +104,8 @@ pub fn honest(arguments: &[String], knobs: &str) -> io::Result<Infallible> {
     Err(command.args(arguments).exec())
 }
 
-fn status_folder() -> String {
-    format!("/tmp/status/agent-{}", pair())
-}
-
 fn status(mark: &str) -> String {
-    format!("{}/agent-{}.{mark}", status_folder(), pair())
-}
-
-/// Root of the container alone may read it from now on.
-fn shut(folder: &str) -> io::Result<()> {
-    fs::set_permissions(folder, Permissions::from_mode(0o700))
+    format!("/tmp/status/agent-{0}/agent-{0}.{mark}", pair())
 }
 
 /// Until nothing listens on the port of its simulator any more.
