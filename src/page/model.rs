@@ -91,14 +91,14 @@ struct Budget {
 #[derive(Serialize, Debug)]
 struct Failures {
     hours: i64,
-    classes: Vec<Class>,
+    classes: Vec<FailureCount>,
     #[serde(flatten)]
     list: List<Failed>,
 }
 
 /// How many failed for one reason.
 #[derive(Serialize, Debug, PartialEq, Eq)]
-struct Class {
+struct FailureCount {
     class: &'static str,
     reason: String,
     count: usize,
@@ -279,12 +279,12 @@ fn failures<'a>(ended: impl Iterator<Item = &'a Submission>, now: Timestamp) -> 
             .entry((failure.class.as_str(), failure.reason.as_str()))
             .or_default() += 1;
     }
-    let class = |((class, reason), count): ((&'static str, &str), usize)| Class {
+    let class = |((class, reason), count): ((&'static str, &str), usize)| FailureCount {
         class,
         reason: one_line(reason, 64),
         count,
     };
-    let mut classes: Vec<Class> = counts.into_iter().map(class).collect();
+    let mut classes: Vec<FailureCount> = counts.into_iter().map(class).collect();
     classes.sort_by_key(|class| std::cmp::Reverse(class.count));
     classes.truncate(FAILURES);
     Failures {

@@ -83,7 +83,7 @@ async fn no_address_is_no_answer() {
 /// A way to AWS by this name alone, whose client speaks to an endpoint of this scheme.
 async fn ask(scheme: &str, port: u16, addresses: &[&str]) -> String {
     let addresses = addresses.iter().copied().map(ip).collect();
-    let aws = Aws::load_with(Addresses::from([(NAME.to_owned(), addresses)])).await;
+    let aws = Aws::load_with("logcopy", Addresses::from([(NAME.to_owned(), addresses)])).await;
     let config = aws.config(None).into_builder();
     let keys = aws_credential_types::Credentials::new("test", "test", None, None, "tests");
     let provider = aws_credential_types::provider::SharedCredentialsProvider::new(keys);
@@ -106,7 +106,7 @@ async fn a_pod_reaches_a_service_by_a_name_that_no_resolver_knows() {
 
 #[tokio::test]
 async fn a_name_that_was_not_given_is_asked_of_nobody() {
-    let aws = Aws::load_with(Addresses::new()).await;
+    let aws = Aws::load_with("logcopy", Addresses::new()).await;
     let sts = aws
         .sts(None)
         .assume_role_with_web_identity()

@@ -11,7 +11,7 @@ use tokio::time::timeout;
 
 use super::world::World;
 
-const LIMIT: Duration = Duration::from_secs(60);
+const LIMIT: Duration = Duration::from_mins(1);
 
 /// Somebody who looks.
 struct Viewer {

@@ -245,6 +245,7 @@ async fn report(world: &World, run: &str, name: &str, done: u32) {
         stopped: None,
         why: None,
         warnings: Vec::new(),
+        logs: None,
         results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
         partial_results: None,
         files: BTreeMap::new(),

@@ -54,9 +54,11 @@ impl Collector {
         let all = self
             .spans
             .wait_for(|spans| names.iter().all(|name| spans.iter().any(|span| span.name == *name)));
-        let all = tokio::time::timeout(LIMIT, all).await;
-        all.map(|all| all.unwrap().clone())
-            .unwrap_or_else(|_| panic!("not all of {names:?}: {:?}", self.spans.borrow()))
+        let found = match tokio::time::timeout(LIMIT, all).await {
+            Ok(all) => Some(all.unwrap().clone()),
+            Err(_) => None,
+        };
+        found.unwrap_or_else(|| panic!("not all of {names:?}: {:?}", self.spans.borrow()))
     }
 }
 

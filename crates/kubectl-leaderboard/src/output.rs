@@ -128,16 +128,13 @@ impl Screen {
 
     /// Shows these lines: on a terminal over those before, elsewhere below an empty line.
     pub fn draw(&mut self, lines: &[String]) {
-        match terminal() {
-            Some(size) => {
-                let text = redrawn(lines, size, has_colours(), self.is_drawn);
-                self.is_drawn = true;
-                write_all(&text);
-            }
-            None => {
-                print(&[String::new()]);
-                print(lines);
-            }
+        if let Some(size) = terminal() {
+            let text = redrawn(lines, size, has_colours(), self.is_drawn);
+            self.is_drawn = true;
+            write_all(&text);
+        } else {
+            print(&[String::new()]);
+            print(lines);
         }
     }
 }

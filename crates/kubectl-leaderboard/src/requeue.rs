@@ -192,17 +192,17 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let failure = status.and_then(|status| status.failure.as_ref());
     let charged = failure.map_or("", |failure| if failure.charged { "yes" } else { "no" });
     let plan = status.and_then(|status| status.plan.as_ref());
-    // The registry is the same for all, and the tag tells them apart.
+    // The registry is the same for all, and the tag is what differs.
     let simulator = plan.and_then(|plan| plan.simulator_image.rsplit('/').next());
     let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
     vec![
         one.name_any(),
         facts::team(one).unwrap_or_default(),
         status.and_then(facts::state).map_or("", State::as_str).to_owned(),
-        text(status.and_then(|status| status.reason.as_ref())),
+        status.and_then(|status| status.reason.clone()).unwrap_or_default(),
         charged.to_owned(),
         since.unwrap_or_default(),
-        text(status.and_then(|status| status.node_name.as_ref())),
+        status.and_then(|status| status.node_name.clone()).unwrap_or_default(),
         simulator.unwrap_or_default().to_owned(),
     ]
 }

@@ -95,7 +95,7 @@ async fn leader() -> Process {
         concurrency: 4,
     };
     let aws = fixtures::aws("http://127.0.0.1:9").await;
-    let task = tokio::spawn(Box::pin(run(clients, lease, settings, aws, telemetry.clone())));
+    let task = tokio::spawn(Box::pin(run(clients, lease, settings, aws, None, telemetry.clone())));
     // Tasks have no event for their start.
     while !telemetry.tasks.names().contains(&"reconciles".to_owned()) {
         tokio::time::sleep(Duration::from_millis(10)).await;

@@ -149,10 +149,9 @@ pub(super) fn found(traces: &Traces, wanted: i64, info: Option<&EvalaiInfo>) -> 
         };
     };
     match (info.standing, state_of(&info.status)) {
-        // EvalAI resumes only what has failed: what is stored is of an earlier attempt.
-        (Standing::Resumed, _) => run,
         (Standing::Wanted, _) if has_end => Found::Stored,
-        (Standing::Wanted, _) => run,
+        // EvalAI resumes only what has failed: what is stored is of an earlier attempt.
+        (Standing::Resumed | Standing::Wanted, _) => run,
         (Standing::Ended, Some(ImportedState::Finished)) if is_complete && row.is_some() && row_end.is_none() => {
             Found::Stored
         }
