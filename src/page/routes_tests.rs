@@ -188,7 +188,7 @@ async fn the_viewer_after_the_last_place_is_asked_to_come_again() {
     timeout(LIMIT, again).await.unwrap();
     sender.send(true).unwrap();
     // The end of a chunked answer.
-    until(&mut viewers[0], "\r\n0\r\n\r\n").await;
+    until(&mut viewers[0], "0\r\n\r\n").await;
 }
 
 /// A view that no buffer of the system takes in whole, and a viewer that reads none of it.

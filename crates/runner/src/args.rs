@@ -384,7 +384,7 @@ mod tests {
     fn each_mistake_is_named() {
         let cases = [
             ("", "no arguments"),
-            ("monitor", "unknown subcommand \"monitor\": simulator or agent"),
+            ("monitor", "unknown subcommand \"monitor\": simulator, agent or keep"),
             ("simulator --status /s --port 1 -- a", "--pair is missing"),
             (
                 "simulator --pair 0 --status /s --port 1 -- a",

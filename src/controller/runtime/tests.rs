@@ -14,13 +14,14 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 18] = [
+const TASKS: [&str; 19] = [
     "foreign runs",
     "gauges",
     "images",
     "inbox",
     "lease",
     "lookups",
+    "names",
     "nodes",
     "other results",
     "permissions",

@@ -153,7 +153,7 @@ fn lines_that_cloudwatch_refuses_fail_the_check_and_silence_does_not() {
     let (text, has_passed) = logged(Some(condition("Logged", "False", "LogsRefused", refused)));
     assert!(!has_passed, "{text}");
     for part in [
-        "✘ CloudWatch     Writing to /carla/",
+        "✘ CloudWatch     writing to /carla/",
         "→ Check that `logGroup`",
         "✔ Route          1/1 done",
     ] {

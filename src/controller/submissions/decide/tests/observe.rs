@@ -146,7 +146,7 @@ fn routes_are_read_once_and_compared_where_the_ends_are_the_same() {
             "finished",
             missing,
             reasons::SAME_END,
-            "were not compared: There is no s3://",
+            "were not compared: there is no s3://",
         ),
     ];
     for (end, theirs, routes, reason, words) in cases {

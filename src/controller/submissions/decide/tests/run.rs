@@ -81,7 +81,7 @@ fn lines_that_cloudwatch_refuses_are_a_condition_and_a_check_shows_that_it_takes
     let plan = world.pass_to(Running, reasons::RUNNING);
     assert_eq!(condition(&plan, LOGGED), ("False".into(), reasons::LOGS_REFUSED.into()));
     let found = conditions::get(&plan.status.conditions, LOGGED).unwrap();
-    assert!(found.message.starts_with("Creating g/77/agent-1"), "{}", found.message);
+    assert!(found.message.starts_with("creating g/77/agent-1"), "{}", found.message);
     world.complete();
     world.report(with(final_report(), &Logs::Sent));
     let plan = world.pass_to(Finished, reasons::FINISHED);
