@@ -1,7 +1,8 @@
 """Owns the comparison of examples/aws/iam with the calls that the operator's programs made to the AWS stand-in in a run of the tests.
 
-Called by `lab test` after the cluster's tests. The policies name the resources of a host's account and the tests have their own: compared is
-the kind of a resource, such as the dead-letter queue, or the part of a key that a policy names. Pure but for reading log and policies.
+Called by `lab test` after the cluster's tests. The policies name the resources of a host's account and the tests have their own: what is
+compared is the kind of a resource, such as the dead-letter queue, or the part of a key that a policy names. Pure but for reading log and
+policies.
 """
 
 import json
@@ -42,11 +43,17 @@ S3: Mapping[tuple[str, str], str] = {
 QUERIES = ("list-type", "partNumber", "uploads", "uploadId", "delete")
 # Allowed and maybe not called in a run of the cluster's tests, and why it is allowed all the same.
 RARE: Mapping[tuple[str, str], str] = {
-    ("controller", "ecr:GetAuthorizationToken"): "only for a registry of Amazon, as src/services/registry/tests.rs has it",
+    (
+        "controller",
+        "ecr:GetAuthorizationToken",
+    ): "only for a registry of Amazon, as src/services/registry/tests.rs has it",
     ("log-groups", "logs:DescribeLogGroups"): "only with logGroup.retentionDays, as tests/api/log_groups.rs has it",
     ("log-groups", "logs:CreateLogGroup"): "only with logGroup.retentionDays, as tests/api/log_groups.rs has it",
     ("log-groups", "logs:PutRetentionPolicy"): "only with logGroup.retentionDays, as tests/api/log_groups.rs has it",
-    ("submission-worker", "logs:GetLogEvents"): "only after lines without an answer, as tests/api/pod/cloudwatch.rs has it",
+    (
+        "submission-worker",
+        "logs:GetLogEvents",
+    ): "only after lines without an answer, as tests/api/pod/cloudwatch.rs has it",
     ("submission-worker", "s3:AbortMultipartUpload"): "only for an upload in parts that fails, as tests/resume has it",
 }
 
@@ -160,7 +167,10 @@ def differences(policies: Path, calls: Iterable[Call]) -> list[str]:
         f"{policy} is allowed {action}, and no call was recorded that needs it (or say why in awsrecorded.py)"
         for policy, action in sorted(allowed - called - excused)
     ]
-    lines += [f"an exception of awsrecorded.py that no policy has: {policy} {action}" for policy, action in sorted(RARE.keys() - allowed)]
+    lines += [
+        f"an exception of awsrecorded.py that no policy has: {policy} {action}"
+        for policy, action in sorted(RARE.keys() - allowed)
+    ]
     return sorted(set(lines), key=lines.index)
 
 

@@ -200,7 +200,9 @@ def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
     def at_once(threads: int, harness: Sequence[str]) -> Outcome:
         return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
 
-    passed = settle(plan.summary, at_once(AT_ONCE_IN_CLUSTER, [plan.filter]), lambda names: at_once(1, ["--exact", *names]))
+    passed = settle(
+        plan.summary, at_once(AT_ONCE_IN_CLUSTER, [plan.filter]), lambda names: at_once(1, ["--exact", *names])
+    )
     alone = names_alone(ignored_tests(plan, target, env), plan.filter)
     if not alone and not plan.filter:
         raise LabError(

@@ -148,7 +148,10 @@ class Differences(unittest.TestCase):
     def test_a_call_that_its_programs_policy_does_not_allow_is_named(self) -> None:
         with policies(**SOME) as folder:
             for call, part in (
-                (Call("controller", "put_object", "object/one/77/evalai/stdout.txt"), "s3:PutObject is not allowed there"),
+                (
+                    Call("controller", "put_object", "object/one/77/evalai/stdout.txt"),
+                    "s3:PutObject is not allowed there",
+                ),
                 (Call("bridge", "receive_message", "dead letters"), "sqs:ReceiveMessage is not allowed there"),
                 (Call("bridge", "get_object", "object/k"), "s3:GetObject is not allowed there"),
                 (Call("logcopy", "list_objects_v2", "bucket"), "s3:ListBucket is not allowed there"),

@@ -174,7 +174,7 @@ fn told(job: &Job) -> Value {
     run(job, "workspace").unwrap()["isolation"].clone()
 }
 
-/// What a container is told of its run; none if it is told nothing.
+/// What a container knows of its run; none if it gets nothing.
 pub(super) fn run(job: &Job, container: &str) -> Option<Value> {
     let pod = job.spec.as_ref().unwrap().template.spec.as_ref().unwrap();
     let mut all = pod.init_containers.iter().flatten().chain(&pod.containers);

@@ -98,7 +98,7 @@ impl Season {
         world.until(&pending.1, "it is held", is_held).await;
         drop(controller);
         until_released(&world).await;
-        // Its Pod ends while nobody looks.
+        // The Pod ends while nobody looks.
         report(&world, &unread.0.to_string(), &unread.1, ROUTES).await;
         Self {
             world,
@@ -195,7 +195,7 @@ async fn finish(world: &World, names: [&str; 2]) {
     }
 }
 
-/// Its Pod runs and has stored some routes.
+/// A Pod runs and has stored some routes.
 async fn begin(world: &World, run: &str, name: &str) {
     let job = world.job(name, 0).await;
     world.pod(&job, &running()).await;
