@@ -20,6 +20,8 @@ fn manifests() -> Vec<PathBuf> {
         .unwrap()
         .map(|entry| entry.unwrap().path())
         .filter(|path| path.extension().is_some_and(|extension| extension == "yaml"))
+        // Helm's, not kubectl's.
+        .filter(|path| !path.to_string_lossy().ends_with("-values.yaml"))
         .collect();
     files.sort();
     files

@@ -169,7 +169,11 @@ async fn marks_behind_thousands_of_objects_are_found_with_four_requests() {
         4,
         "two pages of a thousand, and a list of each folder of marks"
     );
-    assert_eq!(resume(&world.job(&ours.1, 0).await), "", "what is there is its own");
+    assert_eq!(
+        resume(&world.job(&ours.1, 0).await),
+        "1",
+        "it takes up what it has stored itself"
+    );
     assert_eq!(looked(ours.0), 4);
     assert_eq!(jobs(&world).await, 1);
 }

@@ -187,10 +187,8 @@ fn in_bucket(submission: &Submission, keys: &[(String, String)]) -> Result<Vec<S
         ));
     };
     let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
-    let mut lines = vec![
-        "The Pod is gone. With the program aws on the PATH, this command shows its logs; without it, these do:"
-            .to_owned(),
-    ];
+    let mut lines =
+        vec!["The Pod is gone. With the program aws on the PATH, this command shows its logs. Without it:".to_owned()];
     lines.extend(
         keys.iter()
             .map(|(_, key)| bucket::print(&format!("{results}/{key}"), storage)),

@@ -137,11 +137,12 @@ async fn what_cloudwatch_throttles_is_sent_later_and_the_end_waits_for_it() {
 }
 
 #[tokio::test]
-async fn what_becomes_of_the_lines_is_told() {
+async fn what_becomes_of_the_lines_is_known() {
     let (mut pod, group) = pod_with_logs().await;
-    pod.append("agent/agent1/leaderboard.log", b"one\n");
     for (name, sent) in [(group, true), ("no-such-group".to_owned(), false)] {
         pod.setting.run.log_group.as_mut().unwrap().name = name;
+        // Without a new line nothing is sent, and nothing is known.
+        pod.append("agent/agent1/leaderboard.log", b"one\n");
         let (done, is_over) = watch::channel(false);
         let (told, mut heard) = watch::channel(None);
         let shipper = shipper(&pod, ship::STREAM_A_DAY);
