@@ -97,9 +97,8 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     let image = json!("r/team-a:1");
     world.object("short", 1, pk, &image).await;
     let uid = uid_of(&world, &name).await;
-    let ended = |s: &SubmissionStatus| {
-        s.state == Some(State::Failed) && s.reason.as_deref() == Some(reasons::IMPORTED_FAILURE)
-    };
+    let ended =
+        |s: &SubmissionStatus| s.state == Some(State::Failed) && s.reason.as_deref() == Some(reasons::IMPORTED_FAILURE);
     world.until(&name, "it shows its end", ended).await;
     until_deleted(&world, &name, &uid).await;
     let job = names::job(&name, JobNumber::first(1));
