@@ -205,6 +205,8 @@ async fn a_life_is_one_trace_and_one_line_for_each_transition() {
     let (traces, sending) = traces(&collector.url);
     let lines = Lines::default();
     let log = Some(lines.dispatch());
+    // With a single subscriber in the process, a line that a thread of another test reaches first is off for good.
+    let _second = Dispatch::new(tracing_subscriber::registry());
     let controller = Controller::start(&world, Watched { traces, log }).await;
     world.ready().await;
     controller.quiet().await;
