@@ -39,6 +39,7 @@ mod api {
     mod plugin;
     mod pod;
     mod pod_security;
+    mod process;
     mod queue;
     mod restore;
     mod retention;

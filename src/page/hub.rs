@@ -20,7 +20,7 @@ pub(super) const VIEWERS: usize = 32;
 const PACE: Duration = Duration::from_secs(1);
 /// Without a change a view is made again after so long: failures grow old, and this replica may have begun to lead.
 const REFRESH: Duration = Duration::from_secs(15);
-/// What tells an idle connection from a dead one, to programs in between too.
+/// What shows that an idle connection is not a dead one, to programs in between too.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const ALIVE: &[u8] = b":\n\n";
 

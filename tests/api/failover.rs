@@ -3,8 +3,7 @@
 #![cfg(test)]
 
 use std::fmt;
-use std::fs::{self, File};
-use std::process::Stdio;
+use std::fs;
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -19,6 +18,7 @@ use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
 
 use super::bridge::LIMIT;
+use super::process::operator;
 use super::world::World;
 use crate::support::apiserver::{Request, server};
 
@@ -115,41 +115,8 @@ impl Replica {
 fn command(user: &str, kubeconfig: &Value, namespace: &str, folder: &tempfile::TempDir) -> Command {
     let path = folder.path().join("kubeconfig");
     fs::write(&path, kubeconfig.to_string()).unwrap();
-    let log: File = File::options()
-        .create(true)
-        .append(true)
-        .open(folder.path().join("log"))
-        .unwrap();
-    // A killed test drops nothing; the kernel ends its children all the same.
-    let mut command = Command::new("setpriv");
-    command
-        .args([
-            "--pdeathsig",
-            "KILL",
-            env!("CARGO_BIN_EXE_leaderboard-operator"),
-            "controller",
-        ])
-        .args([
-            "--namespace",
-            namespace,
-            "--http",
-            "127.0.0.1:0",
-            "--image",
-            "operator:1",
-        ])
-        .args(["--lease", "operator", "--lease-namespace", namespace])
-        .env("KUBECONFIG", path)
-        .env("POD_NAME", user)
-        .env("RUST_LOG", "info")
-        .env("AWS_ACCESS_KEY_ID", "test")
-        .env("AWS_SECRET_ACCESS_KEY", "test")
-        .env("AWS_REGION", "us-east-1")
-        .env("AWS_EC2_METADATA_DISABLED", "true")
-        .env_remove("AWS_ENDPOINT_URL")
-        .stdin(Stdio::null())
-        .stdout(log.try_clone().unwrap())
-        .stderr(log)
-        .kill_on_drop(true);
+    let mut command = operator("controller", user, namespace, &path, &folder.path().join("log"));
+    command.env("RUST_LOG", "info");
     command
 }
 

@@ -341,6 +341,46 @@ where
     assert_eq!(api.list(&ListParams::default()).await.unwrap().items.len(), 0);
 }
 
+async fn lose_all(world: &World) {
+    lose::<Submission>(world).await;
+    lose::<Leaderboard>(world).await;
+    lose::<Job>(world).await;
+    lose::<Pod>(world).await;
+    lose::<NetworkPolicy>(world).await;
+}
+
+async fn ends_are_shown(season: &Season) {
+    for (name, state) in [
+        (season.finished.1.as_str(), State::Finished),
+        (season.failed.1.as_str(), State::Failed),
+        (season.cancelled.1.as_str(), State::Cancelled),
+        (season.unread.1.as_str(), State::Finished),
+        (LOCAL_FINISHED, State::Finished),
+    ] {
+        season
+            .world
+            .until(name, "it shows its end", |status| {
+                status.state == Some(state) && is_settled(status)
+            })
+            .await;
+    }
+}
+
+/// Each run goes on where it was, and its Submission says so.
+async fn runs_are_resumed(season: &Season) {
+    for name in [season.running.1.as_str(), LOCAL_RUNNING] {
+        season.world.job(name, 0).await;
+        let status = season.status(name).await;
+        assert!(status.plan.as_ref().unwrap().resume, "{status:?}");
+        assert_eq!(status.progress.unwrap().text, format!("{DONE}/{ROUTES}"));
+        let accepted = conditions::get(&status.conditions, conditions::ACCEPTED).unwrap();
+        assert_eq!(
+            (accepted.status.as_str(), accepted.reason.as_str()),
+            ("True", reasons::RESTORED)
+        );
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_backup_brings_back_without_a_status_is_neither_run_nor_published_again() {
     let season = Season::play().await;
@@ -354,11 +394,7 @@ async fn what_a_backup_brings_back_without_a_status_is_neither_run_nor_published
         &format!("kubectl --namespace $NS get submissions {LOCAL_FINISHED} {LOCAL_RUNNING} --output yaml > {file}"),
     )
     .await;
-    lose::<Submission>(world).await;
-    lose::<Leaderboard>(world).await;
-    lose::<Job>(world).await;
-    lose::<Pod>(world).await;
-    lose::<NetworkPolicy>(world).await;
+    lose_all(world).await;
     let ended = [season.finished.0, season.failed.0, season.cancelled.0];
     let mut before = Vec::new();
     for pk in ended {
@@ -381,30 +417,8 @@ async fn what_a_backup_brings_back_without_a_status_is_neither_run_nor_published
     )
     .await;
     let _controller = world.controller();
-    for (name, state) in [
-        (season.finished.1.as_str(), State::Finished),
-        (season.failed.1.as_str(), State::Failed),
-        (season.cancelled.1.as_str(), State::Cancelled),
-        (season.unread.1.as_str(), State::Finished),
-        (LOCAL_FINISHED, State::Finished),
-    ] {
-        world
-            .until(name, "it shows its end", |status| {
-                status.state == Some(state) && is_settled(status)
-            })
-            .await;
-    }
-    for name in [season.running.1.as_str(), LOCAL_RUNNING] {
-        world.job(name, 0).await;
-        let status = season.status(name).await;
-        assert!(status.plan.as_ref().unwrap().resume, "{status:?}");
-        assert_eq!(status.progress.unwrap().text, format!("{DONE}/{ROUTES}"));
-        let accepted = conditions::get(&status.conditions, conditions::ACCEPTED).unwrap();
-        assert_eq!(
-            (accepted.status.as_str(), accepted.reason.as_str()),
-            ("True", reasons::RESTORED)
-        );
-    }
+    ends_are_shown(&season).await;
+    runs_are_resumed(&season).await;
     let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::PAUSED);
     world.until(&season.pending.1, "it is held again", is_held).await;
 

@@ -1,11 +1,11 @@
 //! One of the operator's programs as a child process that can be killed and started again.
 
-use std::fs::{self, File, OpenOptions};
-use std::path::PathBuf;
-use std::process::Stdio;
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use tokio::process::{Child, Command};
 
+use super::super::process::operator;
 use crate::support::apiserver::server;
 
 /// What the controller writes last when it ends because its Lease could not be renewed: on a busy machine that may be.
@@ -90,41 +90,8 @@ fn log(folder: &tempfile::TempDir) -> PathBuf {
     folder.path().join("log")
 }
 
-fn command(program: &str, name: &str, namespace: &str, kubeconfig: &PathBuf, folder: &tempfile::TempDir) -> Command {
-    let log: File = OpenOptions::new().create(true).append(true).open(log(folder)).unwrap();
-    // A killed test drops nothing; the kernel ends its children all the same.
-    let mut command = Command::new("setpriv");
-    command
-        .args([
-            "--pdeathsig",
-            "KILL",
-            env!("CARGO_BIN_EXE_leaderboard-operator"),
-            program,
-        ])
-        .args(["--namespace", namespace, "--http", "127.0.0.1:0"]);
-    if program == "controller" {
-        command.args([
-            "--image",
-            "operator:1",
-            "--lease",
-            "operator",
-            "--lease-namespace",
-            namespace,
-        ]);
-    }
-    command
-        .env("KUBECONFIG", kubeconfig)
-        .env("POD_NAME", name)
-        .env("POD_UID", name)
-        .env("RUST_LOG", "warn")
-        .env("AWS_ACCESS_KEY_ID", "test")
-        .env("AWS_SECRET_ACCESS_KEY", "test")
-        .env("AWS_REGION", "us-east-1")
-        .env("AWS_EC2_METADATA_DISABLED", "true")
-        .env_remove("AWS_ENDPOINT_URL")
-        .stdin(Stdio::null())
-        .stdout(log.try_clone().unwrap())
-        .stderr(log)
-        .kill_on_drop(true);
+fn command(program: &str, name: &str, namespace: &str, kubeconfig: &Path, folder: &tempfile::TempDir) -> Command {
+    let mut command = operator(program, name, namespace, kubeconfig, &log(folder));
+    command.env("POD_UID", name).env("RUST_LOG", "warn");
     command
 }

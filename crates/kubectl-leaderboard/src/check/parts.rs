@@ -362,7 +362,7 @@ fn is_of_sidecars(text: &str) -> bool {
         || text.starts_with("Logcopy ")
 }
 
-/// The part that a reason is about; `text` tells containers apart.
+/// The part that a reason is about; `text` says which container it is.
 fn part_of(reason: &str, text: &str) -> Part {
     match reason {
         reason if NO_GRAPHICS.contains(&reason) => Part::Simulator,

@@ -4,8 +4,8 @@ use clap::Parser;
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, crashed, finished, frame, leaderboard, named, node_lost, running, submission, waiting,
-    with,
+    assert_width, cancelled, crashed, driving, finished, frame, leaderboard, named, node_lost, running, submission,
+    waiting, with,
 };
 use crate::board::Observed;
 use crate::submit::{Submit, object};
@@ -21,24 +21,6 @@ fn shown(lines: &[String]) -> String {
         "docs/plugin.md does not show\n```\n{text}\n```"
     );
     text
-}
-
-/// Two pairs, one of which has crashed.
-fn driving() -> Value {
-    with(
-        running(),
-        &json!({
-            "team": {"id": "7", "name": "Team Seven"},
-            "pairs": [
-                {"id": 1, "done": 9, "total": 10, "crashes": 0, "state": "Running"},
-                {"id": 2, "done": 3, "total": 10, "crashes": 1, "state": "Running",
-                 "last": {"reason": "SimulatorCrashed", "time": "2026-11-01T11:40:00Z"}},
-            ],
-            "score": {"driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20"},
-            "times": {"submitted": "2026-11-01T10:00:00Z", "accepted": "2026-11-01T10:00:02Z",
-                      "scheduled": "2026-11-01T10:56:00Z", "started": "2026-11-01T11:00:00Z"},
-        }),
-    )
 }
 
 #[test]

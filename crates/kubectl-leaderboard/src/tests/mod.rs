@@ -163,3 +163,22 @@ fn assert_width(lines: &[String]) {
         assert_eq!(line.trim_end(), line, "no line ends with white space");
     }
 }
+
+fn of_team(status: Value, id: &str, name: &str) -> Value {
+    with(status, &json!({"team": {"id": id, "name": name}}))
+}
+
+/// Two pairs, one of which has crashed, with all three scores.
+fn driving() -> Value {
+    let more = json!({
+        "pairs": [
+            {"id": 1, "done": 9, "total": 10, "crashes": 0, "state": "Running"},
+            {"id": 2, "done": 3, "total": 10, "crashes": 1, "state": "Running",
+             "last": {"reason": "SimulatorCrashed", "time": "2026-11-01T11:40:00Z"}},
+        ],
+        "score": {"driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20"},
+        "times": {"submitted": "2026-11-01T10:00:00Z", "accepted": "2026-11-01T10:00:02Z",
+                  "scheduled": "2026-11-01T10:56:00Z", "started": "2026-11-01T11:00:00Z"},
+    });
+    of_team(with(running(), &more), "7", "Team Seven")
+}

@@ -8,7 +8,8 @@ use clap::Parser;
 use serde_json::{Value, json};
 
 use super::{
-    cancelled, condition, crashed, finished, leaderboard, named, node_lost, now, running, submission, waiting, with,
+    cancelled, condition, crashed, driving, finished, leaderboard, named, node_lost, now, of_team, running, submission,
+    waiting, with,
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
@@ -50,25 +51,6 @@ fn assert_shown(name: &str, lines: impl Fn(Frame) -> Vec<String>) {
         text, known,
         "{name} is shown in another way; set UPDATE_GOLDEN=1 and read the difference"
     );
-}
-
-fn of_team(status: Value, id: &str, name: &str) -> Value {
-    with(status, &json!({"team": {"id": id, "name": name}}))
-}
-
-/// Two pairs, one of which has crashed, with all three scores.
-fn driving() -> Value {
-    let more = json!({
-        "pairs": [
-            {"id": 1, "done": 9, "total": 10, "crashes": 0, "state": "Running"},
-            {"id": 2, "done": 3, "total": 10, "crashes": 1, "state": "Running",
-             "last": {"reason": "SimulatorCrashed", "time": "2026-11-01T11:40:00Z"}},
-        ],
-        "score": {"driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20"},
-        "times": {"submitted": "2026-11-01T10:00:00Z", "accepted": "2026-11-01T10:00:02Z",
-                  "scheduled": "2026-11-01T10:56:00Z", "started": "2026-11-01T11:00:00Z"},
-    });
-    of_team(with(running(), &more), "7", "Team Seven")
 }
 
 /// The status of a failure in a run with this simulator.

@@ -79,17 +79,22 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         }
     };
     pin(draft, leaderboard, track, image, info.as_ref());
+    take(draft, note);
+    true
+}
+
+/// Accepts it, with what there is to say: that its image has no digest (`unpinned`), or that it was restored.
+fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
     let known = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
     let known = known
         .filter(|c| c.reason == reasons::RESTORED)
         .map(|c| c.message.clone());
-    let (reason, note) = match (note, known.or_else(|| restored::note(draft))) {
+    let (reason, note) = match (unpinned, known.or_else(|| restored::note(draft))) {
         (Some(note), _) => (reasons::IMAGE_NOT_PINNED, note),
         (None, Some(note)) => (reasons::RESTORED, note),
         (None, None) => (reasons::ACCEPTED, String::new()),
     };
     draft.condition(conditions::ACCEPTED, Truth::True, reason, &note);
-    true
 }
 
 /// Whether EvalAI's own end is ours, of an object that has lost its status, or that is still being found out.
