@@ -1,12 +1,14 @@
 //! EvalAI's files: results.json, stdout.txt, metadata.json. Called with the merge's outcome each round, byte for byte what
 //! the original's rendering scripts write.
 
+use std::fmt::{self, Write as _};
+
 use crate::json::{KeyOrder, Node, write};
 use crate::merge::{Line, Merged};
 use crate::names::{metrics, sensor_name};
 use crate::number::Number;
 use crate::statistics::Global;
-use crate::{Format, Metric, Plan, Refusal};
+use crate::{Format, Plan, Refusal};
 
 const RATIO_DIGITS: usize = 4;
 /// Simulated frames per second.
@@ -72,56 +74,52 @@ fn results(format: Format, global: Option<&Global>) -> Result<String, Refusal> {
 
 fn stdout(format: Format, merged: &Merged) -> Result<String, Refusal> {
     let current = if merged.view.global.is_some() { "" } else { "current " };
-    let mut lines = vec![
-        format!("Here is a summary of the submission's {current}results"),
-        String::new(),
-    ];
-    lines.extend(["General information:", "- Sensors:"].map(str::to_owned));
-    lines.extend(
-        sensors(merged)?
-            .into_iter()
-            .map(|(name, count)| format!("  - {count} {name}")),
-    );
+    let mut out =
+        format!("Here is a summary of the submission's {current}results\n\nGeneral information:\n- Sensors:\n");
+    for (name, count) in sensors(merged)? {
+        line(&mut out, format_args!("  - {count} {name}"));
+    }
     let (done, total) = (merged.done, merged.total);
-    lines.push(if done == total {
-        format!("- All {total} route have been completed")
+    if done == total {
+        line(&mut out, format_args!("- All {total} route have been completed"));
     } else {
-        format!("- Completed {done} out of the {total} routes")
-    });
+        line(&mut out, format_args!("- Completed {done} out of the {total} routes"));
+    }
     let whole = whole_ratio(&merged.view.routes);
-    lines.push(format!("- Submission ratio of {}x", whole.text()));
-    lines.push(format!("- Submission FPS of {}", frames(whole).text()));
+    line(&mut out, format_args!("- Submission ratio of {}x", whole.text()));
+    line(&mut out, format_args!("- Submission FPS of {}", frames(whole).text()));
     if let Some(global) = &merged.view.global {
-        lines.push("- Results:".to_owned());
-        let result = |metric: &Metric| format!("  - {}: {}", metric.name, global.metric(metric).text());
-        lines.extend(metrics(format).iter().map(result));
+        out.push_str("- Results:\n");
+        for metric in metrics(format) {
+            line(
+                &mut out,
+                format_args!("  - {}: {}", metric.name, global.metric(metric).text()),
+            );
+        }
     }
-    lines.push(String::new());
+    out.push('\n');
     if !merged.view.routes.is_empty() {
-        lines.push("Glossary of each route:".to_owned());
+        out.push_str("Glossary of each route:\n");
     }
-    lines.extend(
-        merged
-            .view
-            .routes
-            .iter()
-            .enumerate()
-            .flat_map(|(index, line)| glossary(index, line)),
-    );
-    lines.push(String::new());
-    Ok(lines.join("\n"))
+    for (index, route) in merged.view.routes.iter().enumerate() {
+        glossary(&mut out, index, route);
+    }
+    Ok(out)
 }
 
-fn glossary(index: usize, line: &Line) -> [String; 6] {
-    let ratio = ratio(line);
-    [
-        String::new(),
-        format!("- Index: {index}"),
-        format!("  - Route ID: {}", line.route_id),
-        format!("  - Status: {}", line.status),
-        format!("  - Ratio: {}x", ratio.rounded(RATIO_DIGITS).text()),
-        format!("  - FPS: {}", frames(ratio).text()),
-    ]
+/// Writing to a String does not fail.
+fn line(out: &mut String, text: fmt::Arguments<'_>) {
+    let _ = out.write_fmt(text);
+    out.push('\n');
+}
+
+fn glossary(out: &mut String, index: usize, route: &Line) {
+    let ratio = ratio(route);
+    line(out, format_args!("\n- Index: {index}"));
+    line(out, format_args!("  - Route ID: {}", route.route_id));
+    line(out, format_args!("  - Status: {}", route.status));
+    line(out, format_args!("  - Ratio: {}x", ratio.rounded(RATIO_DIGITS).text()));
+    line(out, format_args!("  - FPS: {}", frames(ratio).text()));
 }
 
 /// Each kind of sensor and how many, in the order of their first appearance.

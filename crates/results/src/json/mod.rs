@@ -8,23 +8,68 @@ mod limits;
 mod read;
 mod write;
 
+use std::cmp::Ordering;
+use std::fmt;
+use std::ops::Range;
+use std::sync::Arc;
+
 pub use limits::{FileLimits, Limit};
 pub(crate) use read::{ReadError, read};
 pub(crate) use write::{KeyOrder, Node, write};
 
 /// A text of Unicode code points in which, as in Python, half of a surrogate pair may stand alone. Encoded as UTF-8 with
 /// such halves as three bytes; byte order is code point order.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct Text(Box<[u8]>);
+///
+/// A part of the file it was read from, which all texts share: a record has some thirty, and an allocation for each would be
+/// most of what a merge does. A text with escapes has bytes of its own.
+#[derive(Clone)]
+pub(crate) struct Text {
+    shared: Arc<[u8]>,
+    place: Range<u32>,
+}
 
 impl Text {
+    /// What stands in `shared` at `place`.
+    fn part(shared: &Arc<[u8]>, place: Range<usize>) -> Option<Self> {
+        let place = u32::try_from(place.start).ok()?..u32::try_from(place.end).ok()?;
+        let shared = Arc::clone(shared);
+        Some(Self { shared, place })
+    }
+
     /// The text, unless half of a surrogate pair stands alone in it.
     pub(crate) fn as_str(&self) -> Option<&str> {
-        std::str::from_utf8(&self.0).ok()
+        std::str::from_utf8(self.as_bytes()).ok()
     }
 
     pub(crate) fn as_bytes(&self) -> &[u8] {
-        &self.0
+        let [start, end] = [self.place.start, self.place.end].map(|at| usize::try_from(at).unwrap_or(usize::MAX));
+        self.shared.get(start..end).unwrap_or_default()
+    }
+}
+
+impl PartialEq for Text {
+    fn eq(&self, other: &Self) -> bool {
+        self.as_bytes() == other.as_bytes()
+    }
+}
+
+impl Eq for Text {}
+
+impl PartialOrd for Text {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Text {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.as_bytes().cmp(other.as_bytes())
+    }
+}
+
+impl fmt::Debug for Text {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:?}", String::from_utf8_lossy(self.as_bytes()))
     }
 }
 

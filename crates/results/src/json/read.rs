@@ -1,5 +1,7 @@
 //! The reader: bytes to a value, within limits that hold whatever the bytes are. One recursive descent, depth counted.
 
+use std::sync::Arc;
+
 use super::limits::{FileLimits, Limit};
 use super::{Object, Text, Value};
 
@@ -29,9 +31,12 @@ pub(crate) fn read(bytes: &[u8], limits: FileLimits) -> Result<Value, ReadError>
     }
     let mut reader = Reader {
         bytes,
+        shared: bytes.into(),
         at: 0,
         values: limits.values,
         limits,
+        items: Vec::new(),
+        entries: Vec::new(),
     };
     reader.space();
     let value = reader.value(0)?;
@@ -45,10 +50,15 @@ pub(crate) fn read(bytes: &[u8], limits: FileLimits) -> Result<Value, ReadError>
 
 struct Reader<'a> {
     bytes: &'a [u8],
+    /// The same, for the texts.
+    shared: Arc<[u8]>,
     at: usize,
     /// How many more there may be.
     values: usize,
     limits: FileLimits,
+    /// What the lists and objects around this place hold so far: each is allocated once, when its length is known.
+    items: Vec<Value>,
+    entries: Vec<(Text, Value)>,
 }
 
 type Read<T> = Result<T, ReadError>;
@@ -119,18 +129,19 @@ impl<'a> Reader<'a> {
 
     fn list(&mut self, depth: usize) -> Read<Value> {
         self.step(1);
-        let mut items = Vec::new();
+        let first = self.items.len();
         self.space();
         if self.take(b"]") {
-            return Ok(Value::List(items));
+            return Ok(Value::List(Vec::new()));
         }
         loop {
             self.space();
-            items.push(self.value(depth.saturating_add(1))?);
+            let item = self.value(depth.saturating_add(1))?;
+            self.items.push(item);
             self.space();
             match self.next()? {
                 b',' => {}
-                b']' => return Ok(Value::List(items)),
+                b']' => return Ok(Value::List(self.items.drain(first..).collect())),
                 _ => return Err(ReadError::NotJson),
             }
         }
@@ -138,10 +149,10 @@ impl<'a> Reader<'a> {
 
     fn object(&mut self, depth: usize) -> Read<Value> {
         self.step(1);
-        let mut entries = Vec::new();
+        let first = self.entries.len();
         self.space();
         if self.take(b"}") {
-            return Ok(Value::Object(Object(entries)));
+            return Ok(Value::Object(Object::default()));
         }
         loop {
             self.space();
@@ -154,26 +165,35 @@ impl<'a> Reader<'a> {
                 return Err(ReadError::NotJson);
             }
             self.space();
-            entries.push((key, self.value(depth.saturating_add(1))?));
+            let value = self.value(depth.saturating_add(1))?;
+            self.entries.push((key, value));
             self.space();
             match self.next()? {
                 b',' => {}
-                b'}' => return Ok(Value::Object(Object(without_repeats(entries)))),
+                b'}' => {
+                    let entries = self.entries.drain(first..).collect();
+                    return Ok(Value::Object(Object(without_repeats(entries))));
+                }
                 _ => return Err(ReadError::NotJson),
             }
         }
     }
 
-    /// The rest of a text whose opening quote was read. Most have no escapes, and are copied in one piece.
+    /// The rest of a text whose opening quote was read. Most have no escapes, and stay where they are.
     fn text(&mut self) -> Read<Text> {
+        let start = self.at;
         let plain = self.plain()?;
+        let end = self.at;
         if self.take(b"\"") {
-            return Ok(Text(plain.into()));
+            return Text::part(&self.shared, start..end).ok_or(ReadError::Limit(Limit::Text));
         }
         let mut text = plain.to_vec();
         loop {
             match self.next()? {
-                b'"' => return Ok(Text(text.into_boxed_slice())),
+                b'"' => {
+                    let length = text.len();
+                    return Text::part(&text.into(), 0..length).ok_or(ReadError::Limit(Limit::Text));
+                }
                 b'\\' => self.escape(&mut text)?,
                 _ => return Err(ReadError::NotJson),
             }

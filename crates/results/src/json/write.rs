@@ -8,6 +8,10 @@ use crate::number::{Number, push_number};
 
 /// The largest text that is written, in bytes.
 const MAX_OUTPUT: usize = 64 << 20;
+/// Blanks for each level.
+const INDENT: usize = 4;
+/// Enough for the levels of a usual file in one piece.
+const BLANKS: &str = "                                ";
 
 /// The order in which the keys of an object are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -152,8 +156,11 @@ impl Writer {
             return Err(Limit::Output);
         }
         self.out.push_str(if comma { ",\n" } else { "\n" });
-        for _ in 0..depth {
-            self.out.push_str("    ");
+        let mut blanks = depth.saturating_mul(INDENT);
+        while blanks > 0 {
+            let some = BLANKS.get(..blanks).unwrap_or(BLANKS);
+            self.out.push_str(some);
+            blanks = blanks.saturating_sub(some.len());
         }
         Ok(())
     }
