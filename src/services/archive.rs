@@ -109,6 +109,11 @@ impl Archive {
         }
     }
 
+    /// The bucket's name.
+    pub fn bucket(&self) -> &str {
+        &self.bucket
+    }
+
     /// The same bucket by the same client, below another prefix.
     #[must_use]
     pub fn at_prefix(&self, prefix: impl Into<String>) -> Self {

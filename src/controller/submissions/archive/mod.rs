@@ -183,8 +183,7 @@ impl ArchiveWorkers {
         let target = Target {
             namespace: submission.namespace().unwrap_or_default(),
             name: submission.name_any(),
-            storage: plan.storage.clone(),
-            run_id: plan.run_id.clone(),
+            prefix: effective::key_prefix(&plan.storage, &plan.run_id),
             submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
         };
         let id = bucket_id(&plan.storage);
@@ -266,10 +265,7 @@ impl ArchiveWorker {
     }
 
     async fn done(&self, work: Work) -> (Work, Done) {
-        let target = &work.target;
-        let archive = self
-            .archive
-            .at_prefix(effective::key_prefix(&target.storage, &target.run_id));
+        let archive = self.archive.at_prefix(work.target.prefix.as_str());
         let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work).await;
         (work, done)
     }

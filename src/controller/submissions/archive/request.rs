@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
-use leaderboard_api::{JobNumber, RunId, Storage};
+use leaderboard_api::JobNumber;
 
 pub(super) type Uid = Arc<str>;
 
@@ -29,8 +29,8 @@ pub(super) const LIMITS: [usize; 5] = [16, 32, 8, 4, 32];
 pub struct Target {
     pub namespace: String,
     pub name: String,
-    pub storage: Storage,
-    pub run_id: RunId,
+    /// Key prefix of the run in the bucket, with the final slash.
+    pub prefix: String,
     /// UID that its reports name.
     pub submission_uid: String,
 }

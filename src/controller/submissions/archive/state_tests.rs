@@ -1,7 +1,5 @@
 //! Demands and answers, under a clock that only the test moves.
 
-use serde_json::json;
-
 use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -45,15 +43,13 @@ fn found(done: u32) -> Answer {
 
 impl Bench {
     fn new() -> Self {
-        let storage = serde_json::from_value(json!({"bucket": "results"})).unwrap();
         Self {
             state: State::default(),
             now: Instant::now(),
             target: Arc::new(Target {
                 namespace: "one".into(),
                 name: "sub".into(),
-                storage,
-                run_id: "7".parse().unwrap(),
+                prefix: "7/".into(),
                 submission_uid: "u".into(),
             }),
         }

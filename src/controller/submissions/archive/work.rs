@@ -43,7 +43,7 @@ pub(super) async fn carry_out(client: &Client, archive: &Archive, budget: &TextB
         }
         What::Fence { mark, left, .. } => {
             let write = archive.put(OWNER_KEY, Owner::new(mark).to_json());
-            let written = within(LIMIT.min(*left), target, write).await;
+            let written = within(LIMIT.min(*left), archive, write).await;
             if let Err(why) = &written {
                 let (object, why) = (&target.name, why.as_str());
                 tracing::warn!(submission = %object, why, "the fence against a lost Pod was not written");
@@ -59,22 +59,22 @@ pub(super) async fn carry_out(client: &Client, archive: &Archive, budget: &TextB
 
 async fn within<T>(
     limit: Duration,
-    target: &Target,
+    archive: &Archive,
     call: impl Future<Output = Result<T, ArchiveError>>,
 ) -> Result<T, String> {
     match tokio::time::timeout(limit, call).await {
         Ok(result) => result.map_err(|error| error.to_string()),
-        Err(_) => Err(no_answer(target)),
+        Err(_) => Err(no_answer(archive)),
     }
 }
 
-fn no_answer(target: &Target) -> String {
-    format!("the bucket {} did not answer in time", target.storage.bucket)
+fn no_answer(archive: &Archive) -> String {
+    format!("the bucket {} did not answer in time", archive.bucket())
 }
 
 async fn report(archive: &Archive, target: &Target, etag: Option<&str>) -> (Answer, Option<Report>) {
     let read = archive.get_if_none_match(REPORT_KEY, etag, MAX_BYTES as u64);
-    let object = match within(LIMIT, target, read).await {
+    let object = match within(LIMIT, archive, read).await {
         Ok(Fetched::NotModified) => return (Answer::NotModified, None),
         Ok(Fetched::Absent) => return (Answer::Absent, None),
         Ok(Fetched::Found(object)) => object,
@@ -111,7 +111,7 @@ async fn texts(
         Ok(place) => {
             let of = |key: &'static str| {
                 let file = named.iter().find(|(named, _)| *named == key).map(|(_, file)| *file);
-                text(archive, target, key, file, Arc::clone(&place))
+                text(archive, key, file, Arc::clone(&place))
             };
             futures::future::try_join(of(STDOUT_KEY), of(METADATA_KEY)).await
         }
@@ -147,7 +147,6 @@ fn named(report: &Report) -> (Vec<(&'static str, &StoredFile)>, Option<String>) 
 /// A text counts only with the digest that the report names.
 async fn text(
     archive: &Archive,
-    target: &Target,
     key: &'static str,
     expected: Option<&StoredFile>,
     place: Place,
@@ -160,7 +159,7 @@ async fn text(
     let read = match tokio::time::timeout(TEXT_LIMIT, archive.get(key, expected.size)).await {
         Ok(Err(error)) if error.is_too_large() => return Err(another()),
         read => read
-            .map_err(|_| no_answer(target))
+            .map_err(|_| no_answer(archive))
             .and_then(|read| read.map_err(|e| e.to_string())),
     };
     let object = read.map_err(TextProblem::Unread)?;
