@@ -46,6 +46,9 @@ impl Operator {
             ("AWS_SECRET_ACCESS_KEY", "bench".to_owned()),
             ("AWS_REGION", "us-east-1".to_owned()),
             ("AWS_EC2_METADATA_DISABLED", "true".to_owned()),
+            // As the image sets them.
+            ("MALLOC_ARENA_MAX", "1".to_owned()),
+            ("MALLOC_TRIM_THRESHOLD_", "131072".to_owned()),
         ];
         let started = Instant::now();
         let program = Program::start_with("operator", binary, &arguments, servers.folder.path(), &variables)?;

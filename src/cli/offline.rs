@@ -2,8 +2,10 @@
 
 use std::fs::{self, File};
 use std::io::{ErrorKind, Read as _, Write as _};
+use std::panic::resume_unwind;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::thread;
 
 use clap::{Args, ValueEnum};
 use leaderboard_results::{Files, Format, Plan, Refusal, Verify, offline};
@@ -192,7 +194,8 @@ impl Results {
 
 fn read(path: &Path) -> Result<Option<Vec<u8>>, Failure> {
     let bytes = File::open(path).and_then(|file| {
-        let mut bytes = Vec::new();
+        let size = file.metadata()?.len().min(READ_LIMIT);
+        let mut bytes = Vec::with_capacity(usize::try_from(size).unwrap_or_default());
         file.take(READ_LIMIT).read_to_end(&mut bytes)?;
         Ok(bytes)
     });
@@ -225,13 +228,16 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
     ];
     texts.extend(files.metadata_json.as_deref().map(|text| ("metadata.json", text)));
     let places: Vec<Place> = texts.iter().map(|(name, _)| Place::of(out, name)).collect();
-    let put = || {
-        for (place, (_, text)) in places.iter().zip(&texts) {
-            place.stage(text)?;
-        }
-        places.iter().try_for_each(Place::take)
-    };
-    let done = put();
+    // Side by side, as each waits for the disk.
+    let staged = thread::scope(|scope| {
+        let stage = |(place, (_, text))| scope.spawn(move || Place::stage(place, text));
+        let writers: Vec<_> = places.iter().zip(&texts).map(stage).collect();
+        let ended = writers
+            .into_iter()
+            .map(|writer| writer.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        ended.fold(Ok(()), Result::and)
+    });
+    let done = staged.and_then(|()| places.iter().try_for_each(Place::take));
     if done.is_err() {
         for place in &places {
             // What is left of the attempt; most of it may not be there.
