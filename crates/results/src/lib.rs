@@ -57,11 +57,11 @@ pub fn offline(plan: &Plan, inputs: &[Option<Vec<u8>>]) -> Result<(Merged, Files
 /// Each worker's file in a thread of its own; the first refusal is that of the first worker.
 fn read_all(plan: &Plan, inputs: &[Option<Vec<u8>>]) -> Result<Vec<Option<Checkpoint>>, Refusal> {
     thread::scope(|scope| {
-        let read = |(pair, bytes): (usize, &Option<Vec<u8>>)| {
-            let bytes = bytes.as_deref()?;
-            Some(scope.spawn(move || read_worker(plan, pair, bytes)))
-        };
-        let readers: Vec<_> = inputs.iter().enumerate().map(read).collect();
+        let mut readers = Vec::with_capacity(inputs.len());
+        for (pair, bytes) in inputs.iter().enumerate() {
+            let read = |bytes| scope.spawn(move || read_worker(plan, pair, bytes));
+            readers.push(bytes.as_deref().map(read));
+        }
         let ended = readers.into_iter().map(|reader| match reader {
             Some(reader) => reader.join().unwrap_or_else(|panic| resume_unwind(panic)),
             None => Ok(None),
