@@ -142,3 +142,7 @@ pub fn run() -> ExitCode {
         Command::Logcopy(options) => serve::logcopy(&options),
     }
 }
+
+#[cfg(test)]
+#[path = "pages_tests.rs"]
+mod pages_tests;
