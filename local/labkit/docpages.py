@@ -1,6 +1,6 @@
-"""Owns what the documents show people to type and to apply: the blocks and lines of README.md and docs/. Pure but for reading files.
+"""Owns what the documents show people to type and to apply: the blocks and lines of README.md, docs/ and the chart's README.
 
-Called by `docruns`, which runs and applies them, and by local/tests.
+Pure but for reading files. Called by `docruns`, which runs and applies them, and by local/tests.
 """
 
 import re
@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+# The blocks of YAML on this page are values.
+CHART = "charts/leaderboard-operator/README.md"
 BLOCK = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"`([^`\n]+(?:\n[^`\n]+)?)`")
 # A line of prose that starts with one of these and goes on is a command, not the name of one.
@@ -34,7 +36,8 @@ class Block:
 
 
 def pages(repository: Path) -> list[Path]:
-    return [repository / "README.md", *sorted((repository / "docs").rglob("*.md"))]
+    """The chart's own page is the last one: it ends with an uninstall."""
+    return [repository / "README.md", *sorted((repository / "docs").rglob("*.md")), repository / CHART]
 
 
 def blocks(page: str, text: str) -> Iterator[Block]:

@@ -21,6 +21,7 @@ PRINTS: dict[str, tuple[str, int]] = {
     "aws sqs receive-message": (f'{{"Messages": [{MESSAGE}]}}', 99),
     "aws ecr describe-repositories": ("challenge-participant-team-7", 99),
     "aws": ("stand-in", 99),
+    "make --silent install-yaml": ("apiVersion: v1\nkind: ConfigMap\nmetadata: {name: installed}", 99),
     "docker create": ("0123456789ab", 99),
     PLUGIN: ("stand-in", 99),
 }
@@ -65,7 +66,9 @@ def changed(words: Sequence[str]) -> list[str] | None:
     if words[0] == "helm" and what != "test" and not from_afar:
         words = [word for word in words if word != "--wait"]
         is_other = what in INSTALLS and OWN_NAMESPACE not in words
-        return [*words, "--dry-run=client"] if is_other else words
+        # What one page removes, the next one asks for.
+        more = ["--dry-run=client"] if is_other else ["--dry-run"] if what == "uninstall" else []
+        return [*words, *more]
     return None
 
 

@@ -58,10 +58,11 @@ NOT_TYPED = {
     'set -e\n: "${': "the command of an init container, which contractcheck.py compares with the Job",
     "kubectl logs -c private-contents": "named as what works no more",
     "aws s3 sync": "the name of a command",
+    "helm upgrade --wait": "the name of an option",
 }
 # Answers to a line that is right, of a server without nodes and without the object.
 ANSWERS = re.compile(
-    r"\(NotFound\)|\(AlreadyExists\)|timed out waiting|Metrics API not available|no endpoints available|release: not found"
+    r"\(NotFound\)|\(AlreadyExists\)|already exists|timed out waiting|Metrics API not available|no endpoints available|release: not found"
 )
 MAY_MISS = {"create", "exec", "get --raw", "logs", "top", "uninstall", "wait"}
 SERVICE = re.compile(r"/namespaces/([\w-]+)/services/([\w-]+):(\d+)/proxy/")
@@ -76,6 +77,7 @@ PLACEHOLDERS = {
     "KIND": "submissions",
     "REGISTRY": "registry.example",
     "REGION": "us-east-1",
+    "arn:aws:iam::…:role/…": "arn:aws:iam::123456789012:role/a",
 }
 PATIENCE = 180
 
@@ -234,7 +236,9 @@ def of_words(settings: Settings, notes: Sequence[Note]) -> Iterator[str]:
     for note in notes:
         words = note.words[1:]
         if note.program == "make":
-            yield from (f"{note}: no target {word}" for word in words if "=" not in word and word not in targets)
+            yield from (
+                f"{note}: no target {word}" for word in words if not re.match("-|.*=", word) and word not in targets
+            )
         elif (
             note.program == "lab"
             and f'add_parser("{words[0]}"' not in (settings.local / "labkit" / "cli.py").read_text()

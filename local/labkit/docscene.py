@@ -95,7 +95,8 @@ def manifests(repository: Path, kube: Kube, found: Sequence[Block]) -> tuple[int
     for block in found:
         if block.language != "yaml" or any(mark in block.text for mark in NOT_OURS):
             continue
-        for kind, text in docpages.manifests(block, known):
+        is_values = block.page == docpages.CHART
+        for kind, text in [("values", block.text)] if is_values else docpages.manifests(block, known):
             fault = applied(repository, kube, block.page, kind, text)
             count += not fault
             faults += [f"{block.place}: {fault}"] if fault else []
@@ -106,6 +107,9 @@ def applied(repository: Path, kube: Kube, page: str, kind: str, text: str) -> st
     """What the server says against it; empty where nothing."""
     if kind == "other":
         return "a manifest of nothing that is known: give it a kind, or a reason in docscene.py"
+    if kind == "values":
+        done = kube.attempt("helm", "template", RELEASE, str(folder(repository)), "--values=-", given=text)
+        return last_words(done.stderr) if done.returncode != 0 else ""
     if kind == "part":
         base = example(repository, kube, {"metadata": {"name": "fragment"}, "spec": INSTEAD.get(page, {})})
         argv = ["patch", "--local", "--filename=-", "--type=merge", f"--patch={as_json(kube, text)}", "--output=json"]

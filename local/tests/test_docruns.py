@@ -34,7 +34,7 @@ kubectl get pods    # `kubectl get none`
    version: v1
    ```
 """
-# Stands for kubectl and helm: refuses what it is told to, in the words of an API server.
+# Stands for kubectl and helm: refuses some words, in the words of an API server.
 SERVER = """#!/bin/sh
 for word in "$@"; do
     case "$word" in
