@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -117,7 +118,8 @@ def how(note: Note) -> str:
     """How far a command was tried."""
     if note.code is not None:
         return "commands run" if note.code == 0 else "answered"
-    return "for elsewhere" if note.program in ELSEWHERE else "parsed"
+    # helm that asks a registry, or waits for a Pod.
+    return "for elsewhere" if note.program in {*ELSEWHERE, "helm"} else "parsed"
 
 
 def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) -> tuple[list[Note], list[str]]:
@@ -166,7 +168,7 @@ def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) ->
 def install(programs: Path) -> None:
     """Standard tools, and a stand-in under each other name."""
     for name in TOOLS:
-        found = shutil.which(name)
+        found = sys.executable if name == "python3" else shutil.which(name)
         if found is None:
             raise LabError(f"{name} is missing, which the documents use: apt-get install {name}")
         (programs / name).symlink_to(found)
