@@ -57,13 +57,14 @@ ELSEWHERE = {
 # Blocks that nobody types, by what they begin with.
 NOT_TYPED = {
     'set -e\n: "${': "the command of an init container, which contractcheck.py compares with the Job",
-    "kubectl logs -c private-contents": "named as what works no more",
+    "kubectl logs -c private-contents": "named as what no longer works",
     "aws s3 sync": "the name of a command",
     "helm upgrade --wait": "the name of an option",
 }
 # Answers to a line that is right, of a server without nodes and without the object.
 ANSWERS = re.compile(
-    r"\(NotFound\)|\(AlreadyExists\)|already exists|timed out waiting|Metrics API not available|no endpoints available|release: not found"
+    r"\(NotFound\): (?:pods|services) |\(AlreadyExists\)|already exists|timed out waiting|Metrics API not available"
+    r"|no endpoints available|release: not found"
 )
 MAY_MISS = {"create", "exec", "get --raw", "logs", "top", "uninstall", "wait"}
 SERVICE = re.compile(r"/namespaces/([\w-]+)/services/([\w-]+):(\d+)/proxy/")

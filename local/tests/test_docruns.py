@@ -39,6 +39,7 @@ SERVER = """#!/bin/sh
 for word in "$@"; do
     case "$word" in
     lost) echo 'Error from server (NotFound): pods "lost" not found' >&2; exit 1 ;;
+    deployment/gone) echo 'Error from server (NotFound): deployments.apps "gone" not found' >&2; exit 1 ;;
     --odd) echo 'error: unknown flag: --odd' >&2; exit 1 ;;
     esac
 done
@@ -108,6 +109,7 @@ class Shell(unittest.TestCase):
         for line, fault in (
             ("kubectl get pods --odd", "docs/a.md:0: kubectl get pods --odd: error: unknown flag: --odd"),
             ("kubectl get pod lost", "(NotFound)"),
+            ("kubectl logs deployment/gone", "(NotFound)"),
             ("kubctl get pods", "kubctl: command not found"),
             ("for a in b; do", "syntax error"),
             ("sed -i s/a/b/ examples/none.yaml", "examples/none.yaml"),
