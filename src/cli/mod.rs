@@ -5,6 +5,8 @@
 mod import;
 mod labels;
 mod offline;
+#[cfg(test)]
+mod pages_tests;
 mod preflight;
 mod serve;
 
@@ -142,7 +144,3 @@ pub fn run() -> ExitCode {
         Command::Logcopy(options) => serve::logcopy(&options),
     }
 }
-
-#[cfg(test)]
-#[path = "pages_tests.rs"]
-mod pages_tests;
