@@ -19,6 +19,7 @@ from . import (
     chartdocs,
     chartrender,
     doccheck,
+    docruns,
     kubeversions,
     metricdocs,
     release,
@@ -82,6 +83,8 @@ def run(settings: Settings, update: bool) -> None:
         check("install again, and nothing is lost", lambda: installed_again(kube, chart, before))
         check("install, rights in all namespaces", lambda: all_namespaces(kube, chart))
         check("install, and no right of the cluster", lambda: namespaced(kube, chart))
+    with apiserver.running(settings, folder) as kube:
+        check("commands and manifests of the documents", lambda: docruns.check(settings, kube))
 
 
 def check(what: str, work: Callable[[], str]) -> None:

@@ -78,4 +78,14 @@ mod tests {
             }
         }
     }
+
+    /// A host copies it from there.
+    #[test]
+    fn the_page_shows_the_schema() {
+        let page = include_str!("../../docs/import.md");
+        let (_, rest) = page.split_once("```json\n").unwrap();
+        let (shown, _) = rest.split_once("```").unwrap();
+        let shown: serde_json::Value = serde_json::from_str(shown).unwrap();
+        assert_eq!(shown, serde_json::to_value(schema(metrics(Format::V2))).unwrap());
+    }
 }

@@ -5,6 +5,8 @@
 mod import;
 mod labels;
 mod offline;
+#[cfg(test)]
+mod pages_tests;
 mod preflight;
 mod serve;
 

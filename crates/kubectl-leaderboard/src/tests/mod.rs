@@ -5,6 +5,7 @@ mod check;
 mod daily;
 mod docs;
 mod overview;
+mod pages;
 mod requeue;
 mod shown;
 mod why;
