@@ -271,8 +271,8 @@ fn status(has_ended: bool) -> Value {
         "startTime": now,
         "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
         "initContainerStatuses": [
-            container(names::CONTAINER_CONTENTS.into(), true),
             container(names::CONTAINER_WORKSPACE.into(), true),
+            container(names::CONTAINER_CONTENTS.into(), true),
             container(names::CONTAINER_LOGCOPY.into(), has_ended),
         ],
         "containerStatuses": containers,

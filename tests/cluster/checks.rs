@@ -136,7 +136,7 @@ async fn each_broken_part_is_marked_with_its_next_step() {
                 "agent:standard",
                 &[
                     "✘ Images         ImagePull: The image of simulator-1 cannot be pulled",
-                    "→ Fix this.",
+                    "→ Fix what this names, then run the check again.",
                 ],
             ),
             (

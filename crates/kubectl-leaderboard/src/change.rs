@@ -6,7 +6,7 @@ use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
-use super::facts::{command, has_ended, is_attempt_requested, is_requeue_requested, state};
+use super::facts::{command, has_ended, is_attempt_requested, is_requeue_requested, shown, state};
 use super::text::{Frame, when};
 use leaderboard_api::{Deadlines, State, Submission, reasons};
 
@@ -15,6 +15,8 @@ use leaderboard_api::{Deadlines, State, Submission, reasons};
 pub enum Request<'a> {
     Cancel,
     Resume,
+    /// The same for many: in few words.
+    Rerun,
     /// With the reason, for people.
     Requeue(Option<&'a str>),
 }
@@ -40,6 +42,7 @@ pub fn plan(
     match request {
         Request::Cancel => cancel(submission, leaderboard, frame),
         Request::Resume => resume(submission, leaderboard, frame),
+        Request::Rerun => rerun(submission, frame),
         Request::Requeue(why) => requeue(submission, why, frame),
     }
 }
@@ -141,15 +144,18 @@ fn requeue(submission: &Submission, why: Option<&str>, frame: Frame) -> Result<C
     })
 }
 
+fn rerun(submission: &Submission, frame: Frame) -> Result<Change, String> {
+    let mut page = frame.page();
+    let attempt = next_attempt(submission)?;
+    page.paragraph(&format!("Requested attempt {attempt} of {}.", submission.name_any()));
+    Ok(resumption(submission, attempt, page.into_lines()))
+}
+
 fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Result<Change, String> {
-    let name = submission.name_any();
-    if let Some(why_not) = not_resumable(submission) {
-        return Err(why_not);
-    }
-    let attempt = submission.spec.attempt.saturating_add(1);
+    let attempt = next_attempt(submission)?;
     let mut page = frame.page();
     let results = submission.status.as_ref().and_then(|s| s.results_url.as_deref());
-    page.paragraph(&format!("Requested attempt {attempt} of {name}."));
+    page.paragraph(&format!("Requested attempt {attempt} of {}.", submission.name_any()));
     match results {
         Some(results) => page.paragraph(&format!(
             "It continues from the results in {results} and runs the missing routes."
@@ -167,15 +173,28 @@ fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
             reasons::ENDED_IN_EVALAI
         ));
     }
-    Ok(Change {
+    page.paragraph(&format!("To follow it: `{} -w`.", command("status", submission)));
+    Ok(resumption(submission, attempt, page.into_lines()))
+}
+
+/// The attempt that a resume requests, or why there is none.
+fn next_attempt(submission: &Submission) -> Result<i64, String> {
+    match not_resumable(submission) {
+        Some(why_not) => Err(why_not),
+        None => Ok(submission.spec.attempt.saturating_add(1)),
+    }
+}
+
+fn resumption(submission: &Submission, attempt: i64, lines: Vec<String>) -> Change {
+    Change {
         // Somebody else may raise the attempt at the same time: then the patch conflicts.
         patch: Some(json!({
             "metadata": {"resourceVersion": submission.resource_version()},
             "spec": {"attempt": attempt, "cancel": false},
         })),
-        lines: page.into_lines(),
+        lines,
         attempt,
-    })
+    }
 }
 
 fn not_resumable(submission: &Submission) -> Option<String> {
@@ -200,7 +219,7 @@ fn not_resumable(submission: &Submission) -> Option<String> {
             "{name} has finished and cannot be resumed. Submit the image again to run it once more"
         )),
         _ => {
-            let shown = found.map_or("new", State::as_str);
+            let shown = shown(submission);
             let cancel = command("cancel", submission);
             Some(format!(
                 "{name} is {shown}; only Failed and Cancelled submissions can be resumed. Wait for its end (`{see}`), or \
@@ -213,7 +232,7 @@ fn not_resumable(submission: &Submission) -> Option<String> {
 /// What to do when the API server refuses a patch.
 pub fn after_refusal(request: Request<'_>, submission: &Submission) -> String {
     match (request, submission.spec.evalai) {
-        (Request::Resume | Request::Requeue(_), Some(evalai)) => format!(
+        (Request::Resume | Request::Rerun | Request::Requeue(_), Some(evalai)) => format!(
             "Resume submission {} in EvalAI (challenge {}): its message raises the attempt here",
             evalai.submission, evalai.challenge
         ),

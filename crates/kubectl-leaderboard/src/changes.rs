@@ -11,7 +11,7 @@ use crate::change::{self, Request};
 use crate::cluster::{Cluster, Scope};
 use crate::commands::{frame, note_interruption, nothing};
 use crate::error::{self, Error};
-use crate::output::{self, print};
+use crate::output::{self, note, print};
 use crate::transitions::Waiting;
 use crate::{Change, requeue, rerun};
 use leaderboard_api::{State, Submission};
@@ -27,20 +27,17 @@ pub async fn rerun(cluster: &Cluster, wanted: &rerun::Rerun) -> Result<ExitCode,
         print(&nothing(cluster, &scope).await);
         return Ok(ExitCode::SUCCESS);
     }
-    let names = rerun::chosen(&submissions, wanted.reason.as_deref());
-    if names.is_empty() {
-        print(&["No submission has failed so because of the infrastructure.".to_owned()]);
-    }
-    if wanted.dry_run {
-        print(
-            &names
-                .iter()
-                .map(|name| format!("Would resume {name}."))
-                .collect::<Vec<_>>(),
-        );
+    let (frame, reason) = (frame(), wanted.reason.as_deref());
+    let chosen = rerun::chosen(&submissions, reason);
+    if chosen.is_empty() {
+        print(&rerun::none(submissions.len(), reason, &cluster.namespace, frame));
         return Ok(ExitCode::SUCCESS);
     }
-    send_all(cluster, Request::Resume, &names).await
+    if wanted.dry_run {
+        print(&requeue::dry_run("resume", &chosen, frame));
+        return Ok(ExitCode::SUCCESS);
+    }
+    send_all(cluster, Request::Rerun, &chosen).await
 }
 
 /// `requeue`.
@@ -62,28 +59,21 @@ pub async fn requeue(cluster: &Cluster, wanted: &requeue::Requeue) -> Result<Exi
     let frame = frame();
     let chosen = wanted.chosen(&submissions, frame.now);
     if chosen.is_empty() {
-        let all = requeue::counted(submissions.len());
-        let mut page = frame.page();
-        page.paragraph(&format!(
-            "None of {all} fits, or can be requeued. `kubectl leaderboard status -n {}` lists them.",
-            cluster.namespace
-        ));
-        print(&page.into_lines());
+        print(&requeue::none(submissions.len(), &cluster.namespace, frame));
+        return Ok(ExitCode::SUCCESS);
+    }
+    if wanted.dry_run {
+        print(&requeue::dry_run("requeue", &chosen, frame));
         return Ok(ExitCode::SUCCESS);
     }
     print(&requeue::lines(&chosen, frame));
-    let number = requeue::counted(chosen.len());
-    if wanted.dry_run {
-        print(&[String::new(), format!("Would requeue {number}.")]);
-        return Ok(ExitCode::SUCCESS);
-    }
     print(&[String::new()]);
-    if !wanted.yes && !output::is_confirmed(&format!("Requeue {number}?")) {
+    let question = format!("Requeue {}?", requeue::counted(chosen.len()));
+    if !wanted.yes && !output::is_confirmed(&question) {
         print(&["Nothing was changed.".to_owned()]);
         return Ok(ExitCode::SUCCESS);
     }
-    let names: Vec<String> = chosen.iter().map(|one| one.name_any()).collect();
-    send_all(cluster, Request::Requeue(wanted.why.as_deref()), &names).await
+    send_all(cluster, Request::Requeue(wanted.why.as_deref()), &chosen).await
 }
 
 fn of_labels(selector: Option<&String>) -> Scope {
@@ -93,20 +83,21 @@ fn of_labels(selector: Option<&String>) -> Scope {
     }
 }
 
-/// Sends a request for each; one that is refused does not hold up the others, but without the right to it none is tried.
-async fn send_all(cluster: &Cluster, request: Request<'_>, names: &[String]) -> Result<ExitCode, Error> {
-    let mut is_refused = false;
-    for name in names {
-        match send(cluster, request, name).await {
-            Ok(_) => {}
-            Err(error @ (Error::Forbidden(_) | Error::Credentials(_))) => return Err(error),
-            Err(error) => {
-                eprintln!("kubectl leaderboard: {error}");
-                is_refused = true;
+/// Sends a request for each; one that is refused does not hold up the others, but without the right to it, or a way to the API server, no
+/// further one is tried.
+async fn send_all(cluster: &Cluster, request: Request<'_>, chosen: &[&Submission]) -> Result<ExitCode, Error> {
+    let mut requested = 0;
+    for one in chosen {
+        match send(cluster, request, &one.name_any()).await {
+            Ok(_) => requested += 1,
+            Err(error @ (Error::Forbidden(_) | Error::Credentials(_) | Error::Unreachable { .. })) => {
+                return Err(error);
             }
+            Err(error) => note(&error.to_string()),
         }
     }
-    Ok(if is_refused {
+    print(&requeue::summary(requested, chosen.len(), &cluster.namespace, frame()));
+    Ok(if requested < chosen.len() {
         ExitCode::FAILURE
     } else {
         ExitCode::SUCCESS

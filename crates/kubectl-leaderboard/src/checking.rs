@@ -13,13 +13,12 @@ use kube::ResourceExt;
 use serde_json::json;
 
 use crate::board::Observed;
-use crate::bucket;
-use crate::check::{Outcome, Patience, Readers, Seen, Wanted, ask_for_readers, findings, lines, submission};
+use crate::check::{self, Outcome, Patience, Readers, Seen, Wanted, ask_for_readers, findings, submission};
 use crate::cluster::{Cluster, Scope};
-use crate::error::{self, Error};
-use crate::output::print;
+use crate::commands::{frame, note_interruption};
+use crate::error::Error;
+use crate::output::{print, width};
 use crate::transitions::Waiting;
-use leaderboard_api::client_errors::watch as watch_error;
 use leaderboard_api::conditions;
 use leaderboard_api::{Leaderboard, State, Submission};
 
@@ -66,12 +65,7 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
     )
     .map_err(Error::Unfit)?;
     let created = cluster.create(&object).await?;
-    let (check, spec) = (created.name_any(), &created.spec);
-    print(&[format!(
-        "Check {check} of Leaderboard {name}: one route of track {} with {}.",
-        spec.track.as_deref().unwrap_or_default(),
-        spec.image.as_deref().unwrap_or_default()
-    )]);
+    print(&check::begun(&created, frame()));
     let waited = tokio::select! {
         waited = run(cluster, &created, wanted.timeout) => waited,
         _ = tokio::signal::ctrl_c() => Err(Error::Interrupted),
@@ -81,12 +75,9 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
         Err(error) => Err(error),
     };
     if wanted.keep {
-        print(&[format!(
-            "Kept: kubectl delete submission {check} -n {}",
-            cluster.namespace
-        )]);
+        print(&check::kept(&created, frame()));
     } else {
-        cluster.delete(&check).await?;
+        cluster.delete(&created.name_any()).await?;
     }
     shown
 }
@@ -98,9 +89,10 @@ async fn leaderboard(cluster: &Cluster, name: Option<&str>) -> Result<Leaderboar
     let mut found = all
         .into_iter()
         .filter(|one| name.is_none_or(|name| one.name_any() == name));
-    match (found.next(), found.next()) {
-        (Some(one), None) => Ok(one),
-        _ => Err(Error::Unfit(crate::check::which(name, &known, &cluster.namespace))),
+    match (found.next(), found.next(), name) {
+        (Some(one), None, _) => Ok(one),
+        (.., Some(name)) => Err(cluster.unknown_leaderboard(name).await?),
+        (.., None) => Err(Error::Unfit(check::which(&known, &cluster.namespace))),
     }
 }
 
@@ -117,7 +109,8 @@ async fn run(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<(W
 
 async fn wait(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<Waited, Error> {
     let name = created.name_any();
-    let mut printed = Waiting::new(1);
+    let mut transitions = Waiting::new(1).within(width());
+    let mut interruption = String::new();
     let mut patience = Patience::new(Timestamp::now(), seconds);
     let mut last = created.clone();
     let mut changes = pin!(cluster.changes(&name));
@@ -127,7 +120,7 @@ async fn wait(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<W
         match tokio::time::timeout(left, changes.next()).await {
             Ok(Some(Ok(Some(submission)))) => {
                 let now = Timestamp::now();
-                print(&printed.observe(&submission, now).lines);
+                print(&transitions.observe(&submission, now).lines);
                 patience.observe(&submission, now);
                 last = submission;
                 if is_over(&last, now) {
@@ -138,13 +131,7 @@ async fn wait(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<W
                 }
             }
             Ok(Some(Ok(None)) | None) => return Err(Error::Gone(name)),
-            Ok(Some(Err(error))) => {
-                let message = error::phrase(&watch_error(&error));
-                if let Some(permanent) = error::permanent(error) {
-                    return Err(permanent);
-                }
-                eprintln!("kubectl leaderboard: {message}; retrying.");
-            }
+            Ok(Some(Err(error))) => note_interruption(error, &mut interruption)?,
             Err(_) => {}
         }
         if let Some(why) = patience.given_up(Timestamp::now()) {
@@ -209,15 +196,8 @@ async fn show(cluster: &Cluster, name: &str, waited: &Waited, readers: &Readers)
     let has_finished = status.is_some_and(|status| status.state_of_conditions() == State::Finished);
     let outcome = Outcome::of(&found, has_finished);
     print(&[String::new()]);
-    print(&lines(&found, outcome));
-    let results = status.and_then(|status| status.results_url.as_deref());
-    let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
-    if let Some(results) = results.filter(|_| status.is_some_and(|status| status.times.started.is_some())) {
-        print(&[format!(
-            "Its results stay in {results}/; remove them with: {}",
-            bucket::remove(&format!("{results}/"), storage)
-        )]);
-    }
+    print(&check::lines(&found, outcome, width()));
+    print(&check::left(&waited.submission, frame()));
     Ok(if outcome.has_passed {
         ExitCode::SUCCESS
     } else {

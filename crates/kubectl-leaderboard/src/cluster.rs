@@ -62,6 +62,8 @@ pub struct Cluster {
     pub(super) client: Client,
     /// Its name.
     pub namespace: String,
+    /// Where the API server is, for errors.
+    pub(super) server: String,
 }
 
 /// The answer to a request for the Leaderboard of a submission.
@@ -87,9 +89,11 @@ impl Cluster {
     pub async fn connect(target: Target) -> Result<Self, Error> {
         let config = config(&target).await?;
         let namespace = target.namespace.unwrap_or_else(|| config.default_namespace.clone());
+        let server = config.cluster_url.to_string().trim_end_matches('/').to_owned();
         Ok(Self {
             client: Client::try_from(config)?,
             namespace,
+            server,
         })
     }
 
@@ -258,35 +262,42 @@ impl Cluster {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
-    /// The error for an unknown name, with the names that the person may have meant.
+    /// The error for an unknown name of a submission, with the names that the person may have meant.
     async fn unknown(&self, name: &str) -> Result<Error, Error> {
-        let all = list(self, &self.api::<PartialObjectMeta<Submission>>(), None).await;
-        let known: Vec<String> = match all {
+        let next = self.where_else::<Submission>("submissions", name).await?;
+        Ok(Error::Unknown {
+            kind: "submission",
+            name: name.to_owned(),
+            namespace: self.namespace.clone(),
+            next,
+        })
+    }
+
+    /// The same of a Leaderboard.
+    pub async fn unknown_leaderboard(&self, name: &str) -> Result<Error, Error> {
+        let next = self.where_else::<Leaderboard>("leaderboards", name).await?;
+        Ok(Error::Unknown {
+            kind: "Leaderboard",
+            name: name.to_owned(),
+            namespace: self.namespace.clone(),
+            next,
+        })
+    }
+
+    /// Where to look for an object that the namespace does not have.
+    async fn where_else<K>(&self, kind: &str, name: &str) -> Result<String, Error>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + std::fmt::Debug,
+        K::DynamicType: Default,
+    {
+        let known: Vec<String> = match list(self, &self.api::<PartialObjectMeta<K>>(), None).await {
             Ok(found) => found.iter().map(ResourceExt::name_any).collect(),
             // The right to read an object by its name does not include the right to list them.
             Err(Error::Forbidden(_)) => Vec::new(),
             Err(error) => return Err(error),
         };
-        let near = near::names(name, &known);
-        let namespace = self.namespace.clone();
-        let elsewhere = self.namespaces_of::<Submission>(name).await;
-        let next = if let Some(other) = elsewhere.first() {
-            format!("There is one in namespace {}: use -n {other}", elsewhere.join(", "))
-        } else if near.is_empty() {
-            format!("`kubectl get submissions -n {namespace}` lists all; use -n for another namespace")
-        } else {
-            format!("Did you mean {}?", near.join(", "))
-        };
-        Ok(Error::Unknown {
-            name: name.to_owned(),
-            namespace,
-            next,
-        })
-    }
-
-    /// Namespaces that have a Leaderboard of this name; none if this person may not look.
-    pub async fn namespaces_of_leaderboard(&self, name: &str) -> Vec<String> {
-        self.namespaces_of::<Leaderboard>(name).await
+        let elsewhere = self.namespaces_of::<K>(name).await;
+        Ok(near::next(kind, name, &self.namespace, &known, &elsewhere))
     }
 
     /// Namespaces that have an object of this name; none if this person may not look.
@@ -306,7 +317,10 @@ impl Cluster {
 
     async fn in_time<T>(&self, request: impl Future<Output = T>) -> Result<T, Error> {
         let answer = tokio::time::timeout(LIMIT, request).await;
-        answer.map_err(|_| Error::Silent(LIMIT.as_secs()))
+        answer.map_err(|_| Error::Unreachable {
+            server: None,
+            why: format!("no answer within {} s", LIMIT.as_secs()),
+        })
     }
 }
 

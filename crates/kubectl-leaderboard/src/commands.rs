@@ -12,7 +12,7 @@ use serde_json::Value;
 use crate::changes::wait;
 use crate::cluster::{Cluster, Fetched, Scope};
 use crate::error::{self, Error};
-use crate::output::{self, Format, Screen, print};
+use crate::output::{self, Format, Screen, note, print};
 use crate::text::Frame;
 use crate::{Show, facts, overview, status, submit, top, why};
 use leaderboard_api::client_errors::watch as watch_error;
@@ -51,13 +51,17 @@ pub async fn survey(cluster: &Cluster, scope: &Scope, format: Format) -> Result<
     if submissions.is_empty() {
         print(&nothing(cluster, scope).await);
     } else {
-        let place = overview::Place {
-            namespace: &cluster.namespace,
-            is_all: scope.all_namespaces,
-        };
+        let place = place(cluster, scope);
         print(&overview::lines(place, &submissions, leaderboards.as_deref(), frame()));
     }
     Ok(ExitCode::SUCCESS)
+}
+
+fn place<'a>(cluster: &'a Cluster, scope: &Scope) -> overview::Place<'a> {
+    overview::Place {
+        namespace: &cluster.namespace,
+        is_all: scope.all_namespaces,
+    }
 }
 
 /// The message where no submission is found: most often the namespace is another one.
@@ -67,7 +71,7 @@ pub async fn nothing(cluster: &Cluster, scope: &Scope) -> Vec<String> {
     } else {
         cluster.elsewhere().await
     };
-    overview::nothing(&cluster.namespace, scope.selector.as_deref(), &elsewhere, frame())
+    overview::nothing(place(cluster, scope), scope.selector.as_deref(), &elsewhere, frame())
 }
 
 /// `status`.
@@ -151,17 +155,13 @@ pub async fn top(cluster: &Cluster, scope: &Scope, format: Format) -> Result<Exi
 /// `submit`.
 pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCode, Error> {
     let leaderboard = cluster.leaderboard(&wanted.leaderboard).await?;
-    let elsewhere = match leaderboard {
-        Fetched::Missing => cluster.namespaces_of_leaderboard(&wanted.leaderboard).await,
-        Fetched::Found(_) | Fetched::Forbidden => Vec::new(),
-    };
-    submit::fits(wanted, leaderboard.observed(), &cluster.namespace, &elsewhere).map_err(Error::Unfit)?;
+    if matches!(leaderboard, Fetched::Missing) {
+        return Err(cluster.unknown_leaderboard(&wanted.leaderboard).await?);
+    }
+    submit::fits(wanted, leaderboard.observed()).map_err(Error::Unfit)?;
     let created = cluster.create(&submit::object(wanted)).await?;
     let name = created.name_any();
-    print(&[format!(
-        "Submitted {name}. `kubectl leaderboard status {name} -n {} -w` follows it.",
-        cluster.namespace
-    )]);
+    print(&submit::lines(&created, leaderboard.observed(), frame()));
     if !wanted.wait {
         return Ok(ExitCode::SUCCESS);
     }
@@ -180,7 +180,7 @@ pub fn note_interruption(error: kube::runtime::watcher::Error, printed: &mut Str
         return Err(permanent);
     }
     if message != *printed {
-        eprintln!("kubectl leaderboard: {message}; retrying.");
+        note(&format!("{message}; retrying."));
         *printed = message;
     }
     Ok(())

@@ -15,7 +15,7 @@ use tokio::sync::Semaphore;
 
 use super::cluster::{Cluster, Scope};
 use super::error::{Error, phrase};
-use super::output::print;
+use super::output::{note, print};
 use leaderboard_api::client_errors;
 
 /// The controller's replicas, whatever the release is called.
@@ -175,7 +175,7 @@ impl Forwards {
     fn report(&self, why: String) {
         let mut printed = self.printed.lock().unwrap_or_else(PoisonError::into_inner);
         if *printed != why {
-            eprintln!("kubectl leaderboard: {why}");
+            note(&why);
             *printed = why;
         }
     }

@@ -11,10 +11,6 @@ use kube::runtime::watcher;
 use super::text::clean;
 use leaderboard_api::client_errors as text;
 
-/// The rights that the commands need; docs/plugin.md has them as a Role.
-const RIGHTS: &str =
-    "Ask the host for get, list, watch and patch on submissions, and get and list on leaderboards, in this namespace";
-
 /// Why a command could not be carried out.
 #[derive(thiserror::Error, Debug)]
 pub enum Error {
@@ -27,7 +23,9 @@ pub enum Error {
     )]
     Credentials(String),
     /// The person lacks a right.
-    #[error("missing right: {0}. {RIGHTS}")]
+    #[error(
+        "missing right: {0}. Check namespace and context, or ask for the right: docs/plugin.md has a Role with all that the plugin needs"
+    )]
     Forbidden(String),
     /// The cluster does not have the kind.
     #[error(
@@ -35,8 +33,10 @@ pub enum Error {
     )]
     NotInstalled,
     /// No object has the name.
-    #[error("there is no submission {name} in namespace {namespace}. {next}")]
+    #[error("there is no {kind} {name} in namespace {namespace}. {next}")]
     Unknown {
+        /// What it is.
+        kind: &'static str,
         /// As the person wrote it.
         name: String,
         /// The namespace that was searched.
@@ -67,11 +67,19 @@ pub enum Error {
     #[error("cannot write {0}: {1}. Name another file")]
     File(String, std::io::Error),
     /// The person ended the command.
-    #[error("interrupted. Run it again")]
+    #[error("interrupted before the check had ended, so nothing is known. Run it again")]
     Interrupted,
-    /// The API server does not answer.
-    #[error("the API server did not answer within {0} s. Check that `kubectl get submissions` works")]
-    Silent(u64),
+    /// There is no way to the API server, or it does not answer.
+    #[error(
+        "the API server{} cannot be reached: {why}. Check the network and the context: `kubectl cluster-info` uses the same",
+        .server.as_ref().map(|server| format!(" {server}")).unwrap_or_default()
+    )]
+    Unreachable {
+        /// Where it is.
+        server: Option<String>,
+        /// What happened.
+        why: String,
+    },
     /// An object does not have the expected form.
     #[error("cannot read the API server's answer: {0}. Use the plugin of the operator's version")]
     Malformed(String),
@@ -96,7 +104,25 @@ impl From<kube::Error> for Error {
                 _ => Self::Api(message(&error)),
             },
             kube::Error::SerdeError(_) => Self::Malformed(message(&error)),
+            kube::Error::HyperError(_) | kube::Error::Service(_) => Self::Unreachable {
+                server: None,
+                why: message(&error),
+            },
             _ => Self::Api(message(&error)),
+        }
+    }
+}
+
+impl Error {
+    /// The same with the address of the API server that was asked.
+    #[must_use]
+    pub fn naming(self, api_server: &str) -> Self {
+        match self {
+            Self::Unreachable { why, server: None } => Self::Unreachable {
+                server: Some(api_server.to_owned()),
+                why,
+            },
+            other => other,
         }
     }
 }
@@ -106,7 +132,7 @@ pub(super) fn permanent(error: watcher::Error) -> Option<Error> {
     match error {
         watcher::Error::InitialListFailed(cause) | watcher::Error::WatchStartFailed(cause) => {
             match Error::from(cause) {
-                Error::Api(_) => None,
+                Error::Api(_) | Error::Unreachable { .. } => None,
                 other => Some(other),
             }
         }

@@ -14,6 +14,12 @@ pub(super) fn state(status: &SubmissionStatus) -> Option<State> {
     status.attempt.map(|_| status.state_of_conditions())
 }
 
+/// The same as people read it.
+pub(super) fn shown(submission: &Submission) -> &'static str {
+    let known = submission.status.as_ref().and_then(state);
+    known.map_or("new", State::as_str)
+}
+
 /// Since when a submission is in its state.
 pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     let status = submission.status.as_ref()?;

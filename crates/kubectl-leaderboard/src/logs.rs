@@ -6,16 +6,16 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 use futures::StreamExt;
-use futures::stream::select_all;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Submission, names};
+use leaderboard_api::{Submission, SubmissionStatus, names};
 
 use crate::bucket_log::{Unread, read};
 use crate::cluster::Cluster;
+use crate::commands::frame;
 use crate::error::Error;
-use crate::output::{print, print_labelled};
-use crate::text::clean;
+use crate::output::{note, print, print_labelled};
+use crate::text::{Frame, log_line};
 use crate::{bucket, facts};
 
 /// Which logs.
@@ -30,17 +30,17 @@ pub struct Logs {
     #[arg(long, value_name = "NUMBER")]
     pair: Option<usize>,
     /// Whose log.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, value_name = "CONTAINERS")]
     of: Whose,
 }
 
 /// Whose log is shown.
 #[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum Whose {
+pub(super) enum Whose {
     #[default]
     Agent,
     Simulator,
-    /// What prepares the Pod: contents and workspace.
+    /// What prepares the Pod: workspace, then contents.
     Start,
     /// What stores results and logs.
     Logcopy,
@@ -56,15 +56,22 @@ impl Whose {
         match self {
             Self::Agent => of_pairs(names::agent_container),
             Self::Simulator => of_pairs(names::simulator_container),
-            Self::Start => [names::CONTAINER_CONTENTS, names::CONTAINER_WORKSPACE]
-                .map(|name| (name.to_owned(), name.to_owned()))
-                .to_vec(),
+            Self::Start => {
+                let all = names::INIT_CONTAINERS.into_iter();
+                let that_end = all.filter(|name| *name != names::CONTAINER_LOGCOPY);
+                that_end.map(|name| (name.to_owned(), name.to_owned())).collect()
+            }
             Self::Logcopy => vec![("logcopy".to_owned(), names::CONTAINER_LOGCOPY.to_owned())],
         }
     }
 
+    /// Whether each container begins when the one before has ended.
+    fn is_in_turn(self) -> bool {
+        self == Self::Start
+    }
+
     /// The keys of these logs below the run's prefix, with their labels.
-    fn keys(self, pairs: usize, only: Option<usize>) -> Vec<(String, String)> {
+    pub(super) fn keys(self, pairs: usize, only: Option<usize>) -> Vec<(String, String)> {
         let pairs = (1..=pairs).filter(|pair| only.is_none_or(|only| only == *pair));
         let of_pairs = |key: fn(usize) -> String| pairs.map(|pair| (pair.to_string(), key(pair))).collect();
         match self {
@@ -89,19 +96,56 @@ pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     let submission = cluster.submission(&wanted.name).await?;
     let pairs = pairs(&submission);
     if let Some(pair) = wanted.pair.filter(|pair| *pair == 0 || *pair > pairs.max(1)) {
-        return Err(Error::Unfit(format!(
-            "{} has no pair {pair}. It has {pairs}, counted from 1",
-            wanted.name
-        )));
+        return Err(Error::Unfit(no_pair(&wanted.name, pair, pairs)));
     }
     if wanted.follow && !facts::has_ended(&submission) {
         return follow::follow(cluster, wanted, submission).await;
     }
-    let Some(pod) = cluster.pod(&wanted.name).await? else {
-        return from_bucket(&submission, wanted, pairs).await;
+    let code = match cluster.pod(&wanted.name).await? {
+        Some(pod) => stream(cluster, &pod, &sources(wanted, pairs)).await?,
+        None => from_bucket(&submission, wanted, pairs).await?,
     };
-    stream(cluster, &pod, &sources(wanted, pairs)).await?;
-    Ok(ExitCode::SUCCESS)
+    if wanted.follow {
+        note(&end(&submission));
+    }
+    Ok(code)
+}
+
+fn no_pair(name: &str, pair: usize, pairs: usize) -> String {
+    match pairs {
+        0 | 1 => format!("{name} has no pair {pair}. It has one: leave out --pair"),
+        pairs => format!("{name} has no pair {pair}. It has {pairs}, counted from 1"),
+    }
+}
+
+/// That nothing can be followed yet.
+pub(super) fn begins_later(submission: &Submission) -> String {
+    let shown = facts::shown(submission);
+    format!(
+        "{} is {shown}. Its log follows once its Pod runs.",
+        submission.name_any()
+    )
+}
+
+/// That a container runs again; the lines of its life before are above.
+pub(super) fn begins_again(container: &str, restarts: i32) -> String {
+    format!("{container} was started again (restart {restarts}). Its log follows.")
+}
+
+/// What has become of a submission whose log was followed.
+pub(super) fn end(submission: &Submission) -> String {
+    let status = submission.status.as_ref();
+    let shown = facts::shown(submission);
+    let reason = status.and_then(|status| status.reason.as_deref());
+    let reason = reason
+        .filter(|reason| *reason != shown)
+        .map(|reason| format!(" ({reason})"));
+    format!(
+        "{} is {shown}{}. `{}` has the next step.",
+        submission.name_any(),
+        reason.unwrap_or_default(),
+        facts::command("why", submission)
+    )
 }
 
 fn sources(wanted: &Logs, pairs: usize) -> Vec<Source> {
@@ -120,33 +164,38 @@ fn pairs(submission: &Submission) -> usize {
     plan.map_or(0, |plan| plan.slices.len())
 }
 
-/// Prints the lines of several containers so far, each with its label.
-async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<(), Error> {
+/// Prints the lines of several containers so far, one after the other, each with its label.
+async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<ExitCode, Error> {
     let name = pod.name_any();
-    let mut streams = Vec::new();
     for source in sources {
         let container = &source.container;
-        match cluster.log(&name, container).await {
-            Ok(lines) => streams.push(lines.map(move |line| (source, line)).boxed()),
+        let mut lines = match cluster.log(&name, container).await {
+            Ok(lines) => lines,
             // One that has not started yet has no log, and the others may.
-            Err(Error::Api(why)) => eprintln!("kubectl leaderboard: {container} has no log yet: {why}"),
+            Err(Error::Api(why)) => {
+                note(&format!("{container} of Pod {name} has no log yet: {why}"));
+                continue;
+            }
             Err(error) => return Err(error),
+        };
+        while let Some(line) = lines.next().await {
+            match line {
+                Ok(line) => print_labelled(source.stream, &source.label, &log_line(&line)),
+                Err(error) => {
+                    return Err(Error::Api(format!(
+                        "the log of {container} of Pod {name} ended: {error}"
+                    )));
+                }
+            }
         }
     }
-    let mut all = select_all(streams);
-    while let Some((source, line)) = all.next().await {
-        match line {
-            Ok(line) => print_labelled(source.stream, &source.label, &clean(&line)),
-            Err(error) => return Err(Error::Api(format!("the log of {name} ended: {error}"))),
-        }
-    }
-    Ok(())
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Prints the logs that are stored, or the commands that do so where there is no program for it.
 async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Result<ExitCode, Error> {
     let keys = wanted.of.keys(pairs, wanted.pair);
-    let commands = in_bucket(submission, &keys).map_err(Error::Unfit)?;
+    let commands = in_bucket(submission, wanted.of, &keys, frame()).map_err(Error::Unfit)?;
     let status = submission.status.as_ref();
     let results = status
         .and_then(|status| status.results_url.as_deref())
@@ -155,7 +204,7 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Re
     let mut is_unread = false;
     for (stream, (label, key)) in keys.iter().enumerate() {
         let stream = label.parse().unwrap_or(stream);
-        let show = |line: &str| print_labelled(stream, label, &clean(line));
+        let show = |line: &str| print_labelled(stream, label, &log_line(line));
         match read(&format!("{results}/{key}"), storage, show).await {
             Ok(()) => {}
             Err(Unread::NoProgram) => {
@@ -164,7 +213,7 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Re
             }
             Err(Unread::Failed(why)) => {
                 let next = "Check that it was stored, and that your AWS credentials may read the bucket";
-                eprintln!("kubectl leaderboard: cannot read {results}/{key}: {why}. {next}");
+                note(&format!("cannot read {results}/{key}: {why}. {next}"));
                 is_unread = true;
             }
         }
@@ -176,19 +225,42 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Re
     })
 }
 
-/// The commands that read the logs once the Pod is gone.
-fn in_bucket(submission: &Submission, keys: &[(String, String)]) -> Result<Vec<String>, String> {
+/// The commands that read the logs once the Pod is gone, or why there is none, with the next step.
+pub(super) fn in_bucket(
+    submission: &Submission,
+    of: Whose,
+    keys: &[(String, String)],
+    frame: Frame,
+) -> Result<Vec<String>, String> {
     let name = submission.name_any();
     let status = submission.status.as_ref();
     let results = status.and_then(|status| status.results_url.as_deref());
-    let (Some(results), false) = (results, keys.is_empty()) else {
+    let is_before_start =
+        |status: &SubmissionStatus| status.times.started.is_none() && status.attempt <= Some(1) && status.retry == 0;
+    if !facts::has_ended(submission) && status.is_none_or(is_before_start) {
         return Err(format!(
-            "{name} has no Pod, and no such log is stored. See `kubectl leaderboard why {name}`"
+            "{name} is {} and has no Pod yet, so it has no log. `{} -f` waits for it",
+            facts::shown(submission),
+            facts::command("logs", submission)
+        ));
+    }
+    let (Some(results), false) = (results, keys.is_empty()) else {
+        let what = if of.is_in_turn() {
+            "what prepared it is not stored"
+        } else {
+            "no such log is stored"
+        };
+        return Err(format!(
+            "the Pod of {name} is gone, and {what}. `{}` names the log that explains a failure",
+            facts::command("why", submission)
         ));
     };
     let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
-    let mut lines =
-        vec!["The Pod is gone. With the program aws on the PATH, this command shows its logs. Without it:".to_owned()];
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "The Pod of {name} is gone. With the program aws on the PATH, this command shows its logs. Without it:"
+    ));
+    let mut lines = page.into_lines();
     lines.extend(
         keys.iter()
             .map(|(_, key)| bucket::print(&format!("{results}/{key}"), storage)),
@@ -200,6 +272,18 @@ fn in_bucket(submission: &Submission, keys: &[(String, String)]) -> Result<Vec<S
 mod tests {
     use super::*;
     use serde_json::{Value, json};
+
+    fn frame() -> Frame {
+        Frame {
+            now: jiff::Timestamp::UNIX_EPOCH,
+            width: 100,
+        }
+    }
+
+    fn ended() -> Value {
+        json!([{"type": "Finished", "status": "True", "reason": "Finished", "message": "",
+                "lastTransitionTime": "2026-11-01T10:00:00Z"}])
+    }
 
     fn submission(status: &Value) -> Submission {
         let spec = json!({"leaderboardName": "lb", "image": "i", "track": "sensors"});
@@ -228,14 +312,14 @@ mod tests {
             vec!["simulator/console-2.log".to_owned()],
         );
         assert_eq!(names(Whose::Simulator, Some(2)), one);
-        assert_eq!(names(Whose::Start, None), (two("contents", "workspace"), vec![]));
+        assert_eq!(names(Whose::Start, None), (two("workspace", "contents"), vec![]));
         assert_eq!(names(Whose::Logcopy, Some(2)).0, ["logcopy"]);
     }
 
     #[test]
     fn no_part_of_an_imported_address_is_a_command() {
-        let hostile = submission(&json!({"resultsURL": "s3://b/$(reboot)';reboot;#"}));
-        let lines = in_bucket(&hostile, &[("1".to_owned(), "a.log".to_owned())]).unwrap();
+        let hostile = submission(&json!({"resultsURL": "s3://b/$(reboot)';reboot;#", "conditions": ended()}));
+        let lines = in_bucket(&hostile, Whose::Agent, &[("1".to_owned(), "a.log".to_owned())], frame()).unwrap();
         assert_eq!(lines[1], r"aws s3 cp 's3://b/$(reboot)'\'';reboot;#/a.log' -");
     }
 
@@ -245,19 +329,46 @@ mod tests {
         let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
                           "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1, "storage": storage, "image": "a",
                           "contentsImage": "c", "simulatorImage": "s"});
-        let stored = submission(&json!({"resultsURL": "s3://b/mine", "plan": plan}));
+        let stored = submission(&json!({"resultsURL": "s3://b/mine", "plan": plan, "conditions": ended()}));
         assert_eq!(pairs(&stored), 1);
-        let lines = in_bucket(&stored, &Whose::Agent.keys(1, None)).unwrap();
+        let in_bucket = |submission, of: Whose| in_bucket(submission, of, &of.keys(1, None), frame());
+        let lines = in_bucket(&stored, Whose::Agent).unwrap();
         assert_eq!(
             lines[1],
             "aws s3 cp s3://b/mine/agent/agent1/leaderboard.log - --region eu-west-1"
         );
-        for (submission, keys) in [
-            (submission(&Value::Null), Whose::Agent.keys(1, None)),
-            (stored, Vec::new()),
+        let unstored = submission(&json!({"conditions": ended()}));
+        for (submission, of, expected) in [
+            (
+                &submission(&Value::Null),
+                Whose::Agent,
+                "mine is new and has no Pod yet",
+            ),
+            (
+                &unstored,
+                Whose::Agent,
+                "the Pod of mine is gone, and no such log is stored.",
+            ),
+            (
+                &stored,
+                Whose::Start,
+                "the Pod of mine is gone, and what prepared it is not stored.",
+            ),
         ] {
-            let why = in_bucket(&submission, &keys).unwrap_err();
-            assert!(why.starts_with("mine has no Pod, and no such log is stored."), "{why}");
+            let why = in_bucket(submission, of).unwrap_err();
+            assert!(why.starts_with(expected), "{why}");
+        }
+    }
+
+    #[test]
+    fn a_pair_that_does_not_exist_is_named_with_how_many_there_are() {
+        for (pairs, next) in [
+            (0, "leave out --pair"),
+            (1, "leave out --pair"),
+            (4, "It has 4, counted from 1"),
+        ] {
+            let why = no_pair("mine", 7, pairs);
+            assert!(why.starts_with("mine has no pair 7. ") && why.ends_with(next), "{why}");
         }
     }
 }

@@ -36,17 +36,18 @@ mod why;
 #[cfg(test)]
 mod tests;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap::{Args, ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
 use kube::ResourceExt;
 
 use self::change::Request;
 use self::cluster::{Cluster, Scope, Target};
 use self::complete::Offer;
 use self::error::Error;
-use self::output::{Colour, Output, print};
+use self::output::{Colour, Output, note, print};
 
 /// How long a shell waits for names.
 const COMPLETION: Duration = Duration::from_secs(3);
@@ -59,7 +60,7 @@ struct Cli {
     command: Command,
     #[command(flatten)]
     target: Target,
-    /// When to colour lines.
+    /// When to color lines.
     #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN")]
     color: Colour,
     /// The same as --color never.
@@ -81,6 +82,10 @@ enum Command {
         output: Output,
     },
     /// Submit an image to a track, without EvalAI.
+    #[command(
+        override_usage = "kubectl leaderboard submit [OPTIONS] --leaderboard <LEADERBOARD>\n       --track <TRACK> --image <IMAGE>",
+        after_help = "Exit code 0: it is submitted; with --wait, it is Finished. 1: it did not finish, or an error."
+    )]
     Submit(submit::Submit),
     /// Open the operator's page for a browser on this machine, until Ctrl-C.
     Dashboard(dashboard::Dashboard),
@@ -157,9 +162,14 @@ struct Change {
     wait: bool,
 }
 
+/// Columns of the help on a wide terminal.
+const HELP_WIDTH: usize = 120;
+
 /// Runs the command line.
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let words: Vec<OsString> = std::env::args_os().collect();
+    let matches = command_line(&words).get_matches_from(&words);
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     if cli.no_color { Colour::Never } else { cli.color }.settle();
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
@@ -170,10 +180,21 @@ fn main() -> ExitCode {
     match result {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("kubectl leaderboard: {error}");
+            note(&error.to_string());
             ExitCode::FAILURE
         }
     }
+}
+
+/// The command line. Its help is printed before the flags are known, and they count for it all the same.
+fn command_line(words: &[OsString]) -> clap::Command {
+    let is_plain = words.iter().any(|word| word == "--no-color" || word == "--color=never");
+    let colors = if is_plain || words.windows(2).any(|pair| pair == ["--color", "never"]) {
+        ColorChoice::Never
+    } else {
+        ColorChoice::Auto
+    };
+    Cli::command().color(colors).max_term_width(HELP_WIDTH)
 }
 
 async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
@@ -187,7 +208,11 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
             Ok(ExitCode::SUCCESS)
         }
         Command::Man(wanted) => manual::write(Cli::command(), &wanted),
-        command => carry_out_there(command, &Cluster::connect(cli.target).await?).await,
+        command => {
+            let cluster = Cluster::connect(cli.target).await?;
+            let done = carry_out_there(command, &cluster).await;
+            done.map_err(|error| error.naming(&cluster.server))
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Names that a person may have meant. Pure; called by `cluster` for an unknown name.
+//! Names that a person may have meant. Pure; called for an unknown name.
 
 /// Names that are offered.
 const MOST: usize = 3;
@@ -19,6 +19,20 @@ pub(super) fn names(wrong: &str, known: &[String]) -> Vec<String> {
     found.retain(|(score, _)| *score >= ALIKE);
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(b.1)));
     found.into_iter().take(MOST).map(|(_, name)| name.clone()).collect()
+}
+
+/// Where else to look for an object of this kind: in a namespace that has one of its name, under a name like it, or among all.
+pub(super) fn next(kind: &str, wrong: &str, namespace: &str, known: &[String], elsewhere: &[String]) -> String {
+    let near = names(wrong, known);
+    match elsewhere {
+        [other] => format!("There is one in namespace {other}: use -n {other}"),
+        [first, ..] => format!(
+            "There is one in each of the namespaces {}: use -n {first}",
+            elsewhere.join(", ")
+        ),
+        [] if near.is_empty() => format!("`kubectl get {kind} -n {namespace}` lists all; use -n for another namespace"),
+        [] => format!("Did you mean {}?", near.join(", ")),
+    }
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use clap::{Args, ValueEnum};
 use serde_json::Value;
 
-use super::text::WIDTH;
+use super::text::{WIDTH, clean, join, wrap};
 
 /// The narrowest and the widest page. A text in longer lines is hard to read.
 const NARROWEST: usize = 60;
@@ -104,8 +104,11 @@ fn nested(start: &str, value: &Value, indent: usize, lines: &mut Vec<String>) {
 
 /// Columns of a page of text: those of the terminal, within reason.
 pub fn width() -> usize {
-    let columns = terminal().map(|(columns, _)| columns);
-    columns.map_or(WIDTH, |columns| columns.clamp(NARROWEST, WIDEST))
+    terminal().map_or(WIDTH, |(columns, _)| within_reason(columns))
+}
+
+fn within_reason(columns: usize) -> usize {
+    columns.clamp(NARROWEST, WIDEST)
 }
 
 /// Columns and rows of the terminal, if it is written to.
@@ -173,14 +176,44 @@ pub fn print(lines: &[String]) {
     }
 }
 
+/// Prints what a person should see and a program that reads the output should not: an error, or what has become of what is followed.
+pub fn note(text: &str) {
+    let columns = terminal_size::terminal_size_of(std::io::stderr()).map(|(columns, _)| columns.0.into());
+    for line in noted(text, columns) {
+        eprintln!("{line}");
+    }
+}
+
+/// The lines of a note: one, or on a terminal of so many columns as many as it needs.
+pub(super) fn noted(text: &str, columns: Option<usize>) -> Vec<String> {
+    let text = format!("kubectl leaderboard: {}", clean(text));
+    let Some(columns) = columns else {
+        return vec![text];
+    };
+    let lines = wrap(&text, within_reason(columns).saturating_sub(NOTE_INDENT.len()));
+    let indents = std::iter::once("").chain(std::iter::repeat(NOTE_INDENT));
+    indents
+        .zip(lines)
+        .map(|(indent, line)| format!("{indent}{line}"))
+        .collect()
+}
+
+/// Before each further line of a note.
+const NOTE_INDENT: &str = "  ";
+
 /// Prints a line of the stream of this number behind its label. Each stream has its colour.
 pub fn print_labelled(stream: usize, label: &str, line: &str) {
-    let colour = STREAMS.get(stream % STREAMS.len()).copied().unwrap_or(PLAIN);
-    if has_colours() {
-        write_all(&format!("{colour}[{label}]{PLAIN} {line}\n"));
+    write_all(&format!("{}\n", labelled(stream, label, line, has_colours())));
+}
+
+pub(super) fn labelled(stream: usize, label: &str, line: &str, is_coloured: bool) -> String {
+    let label = if is_coloured {
+        let colour = STREAMS.get(stream % STREAMS.len()).copied().unwrap_or(PLAIN);
+        format!("{colour}[{label}]{PLAIN}")
     } else {
-        write_all(&format!("[{label}] {line}\n"));
-    }
+        format!("[{label}]")
+    };
+    join(&[&label, line])
 }
 
 /// Asks a person at a terminal; elsewhere there is nobody to ask, and the command is the answer.
@@ -209,7 +242,9 @@ fn write_all(text: &str) {
     if let Err(error) = written
         && error.kind() != ErrorKind::BrokenPipe
     {
-        eprintln!("kubectl leaderboard: cannot write the output: {error}. Check where it is redirected to");
+        note(&format!(
+            "cannot write the output: {error}. Check where it is redirected to"
+        ));
     }
 }
 

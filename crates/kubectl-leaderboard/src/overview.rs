@@ -11,7 +11,7 @@ use kube::ResourceExt;
 use super::board::{self, Observed};
 use super::facts;
 use super::table::table;
-use super::text::{Frame, clean, join, span};
+use super::text::{Frame, clean, join, span, wrap};
 use leaderboard_api::conditions;
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 
@@ -46,10 +46,19 @@ impl Place<'_> {
 }
 
 /// What is printed where there is no submission. `elsewhere` are the namespaces that have some, with their number.
-pub fn nothing(namespace: &str, selector: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
-    let mut page = frame.page();
+pub fn nothing(place: Place<'_>, selector: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
+    let (mut page, namespace) = (frame.page(), place.namespace);
     if let Some(selector) = selector {
-        page.paragraph(&format!("No submission has the labels {selector}."));
+        let of = if place.is_all {
+            "any namespace".to_owned()
+        } else {
+            format!("namespace {namespace}")
+        };
+        page.paragraph(&format!("No submission of {of} has the labels {selector}."));
+        return page.into_lines();
+    }
+    if place.is_all {
+        page.paragraph("No namespace has a submission. Check that the context is that of the right cluster.");
         return page.into_lines();
     }
     let others: Vec<String> = elsewhere
@@ -101,7 +110,9 @@ pub fn lines(
         .collect();
     lines.extend(table(&["NAME", "STATE", "SINCE", "WHY"], &rows, frame.width));
     lines.push(String::new());
-    lines.push("`kubectl leaderboard why NAME` has the details and the next step.".to_owned());
+    let namespace = if place.is_all { "NAMESPACE" } else { place.namespace };
+    let hint = format!("`kubectl leaderboard why NAME -n {namespace}` has the details and the next step.");
+    lines.extend(wrap(&hint, frame.width));
     lines
 }
 

@@ -187,6 +187,17 @@ pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     table(&head, &rows, frame.width)
 }
 
+/// What `verb` would do.
+pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> {
+    let mut lines = lines(chosen, frame);
+    let number = counted(chosen.len());
+    lines.extend([
+        String::new(),
+        format!("Would {verb} {number}. Without --dry-run it does."),
+    ]);
+    lines
+}
+
 fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let status = one.status.as_ref();
     let failure = status.and_then(|status| status.failure.as_ref());
@@ -205,6 +216,35 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
         status.and_then(|status| status.node_name.clone()).unwrap_or_default(),
         simulator.unwrap_or_default().to_owned(),
     ]
+}
+
+/// What has become of all, after a line of each.
+pub fn summary(requested: usize, chosen: usize, namespace: &str, frame: Frame) -> Vec<String> {
+    let refused = match chosen - requested {
+        0 => String::new(),
+        1 => " One was refused; its reason is above.".to_owned(),
+        refused => format!(" {refused} were refused; the reasons are above."),
+    };
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "Requested for {requested} of {}.{refused} To follow them: `kubectl leaderboard status -n {namespace}`.",
+        counted(chosen)
+    ));
+    page.into_lines()
+}
+
+/// What is said where nothing is chosen of so many submissions.
+pub fn none(number: usize, namespace: &str, frame: Frame) -> Vec<String> {
+    let what = match number {
+        1 => "The submission does not fit".to_owned(),
+        number => format!("None of {number} submissions fits"),
+    };
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "{what}. Runs are requeued if they are named or with --state running; what waits or has finished is not. \
+         `kubectl leaderboard status -n {namespace}` lists all."
+    ));
+    page.into_lines()
 }
 
 /// `1 submission`, `38 submissions`.

@@ -5,6 +5,8 @@ use kube::ResourceExt;
 use leaderboard_api::{FailureClass, Submission};
 
 use crate::facts;
+use crate::requeue::counted;
+use crate::text::Frame;
 
 /// Which submissions.
 #[derive(Args, Debug)]
@@ -23,8 +25,8 @@ pub struct Rerun {
     pub dry_run: bool,
 }
 
-/// The names of those whose last attempt the infrastructure ended, which costs no participant an attempt. Checks are left out.
-pub fn chosen(submissions: &[Submission], reason: Option<&str>) -> Vec<String> {
+/// Those whose last attempt the infrastructure ended, which costs no participant an attempt, by name. Checks are left out.
+pub fn chosen<'a>(submissions: &'a [Submission], reason: Option<&str>) -> Vec<&'a Submission> {
     let is_chosen = |one: &&Submission| {
         let status = one.status.as_ref();
         let failure = status.and_then(|status| status.failure.as_ref());
@@ -34,11 +36,21 @@ pub fn chosen(submissions: &[Submission], reason: Option<&str>) -> Vec<String> {
         });
         is_hosts && facts::has_ended(one) && one.metadata.deletion_timestamp.is_none() && !one.spec.check
     };
-    let mut names: Vec<String> = submissions
-        .iter()
-        .filter(is_chosen)
-        .map(ResourceExt::name_any)
-        .collect();
-    names.sort();
-    names
+    let mut found: Vec<&Submission> = submissions.iter().filter(is_chosen).collect();
+    found.sort_by_key(|one| one.name_any());
+    found
+}
+
+/// What is said where nothing is chosen of so many submissions.
+pub fn none(number: usize, reason: Option<&str>, namespace: &str, frame: Frame) -> Vec<String> {
+    let reason = reason
+        .map(|reason| format!(" with the reason {reason}"))
+        .unwrap_or_default();
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "None of {} has failed because of the infrastructure{reason}. `kubectl leaderboard why -n {namespace}` lists what has failed; \
+         `kubectl leaderboard requeue` takes what is charged, too.",
+        counted(number)
+    ));
+    page.into_lines()
 }

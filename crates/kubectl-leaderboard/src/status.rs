@@ -35,7 +35,8 @@ pub fn screen(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) 
         page.row("Routes", &format!("{bar} {}", progress.text));
     }
     for each in &status.pairs {
-        page.row(&format!("Pair {}", each.id), &pair(each, now));
+        let has_ended = facts::has_ended(submission);
+        page.row(&format!("Pair {}", each.id), &pair(each, has_ended, now));
     }
     page.row("Scores", &scores(status));
     page.row("Times", &times(submission, &status.times, now));
@@ -91,11 +92,12 @@ fn links(page: &mut Page, submission: &Submission, status: &SubmissionStatus, le
     page.whole("Next", &facts::command("why", submission));
 }
 
-fn pair(pair: &PairStatus, now: Timestamp) -> String {
+fn pair(pair: &PairStatus, has_ended: bool, now: Timestamp) -> String {
     let state = match pair.state {
         PairState::Waiting => "waiting",
         PairState::Running => "running",
         PairState::Done => "done",
+        PairState::Crashed if has_ended => "given up",
         PairState::Crashed => "crashed, starts again",
         PairState::Unknown => "",
     };

@@ -1,10 +1,13 @@
 //! `submit`: an image on a track of a Leaderboard, without EvalAI. Pure.
 
 use clap::Args;
-use leaderboard_api::names;
+use kube::ResourceExt;
+use leaderboard_api::{Submission, names};
 use serde_json::{Value, json};
 
-use crate::board::Observed;
+use crate::board::{self, Observed};
+use crate::facts::command;
+use crate::text::Frame;
 
 /// What is submitted.
 #[derive(Args, Debug)]
@@ -35,32 +38,37 @@ pub struct Submit {
     pub wait: bool,
 }
 
-/// Whether the Leaderboard is there and has the track; the text has the next step. `elsewhere` are the namespaces that have one of its name.
-pub fn fits(wanted: &Submit, leaderboard: Observed<'_>, namespace: &str, elsewhere: &[String]) -> Result<(), String> {
-    let name = &wanted.leaderboard;
-    let found = match leaderboard {
-        Observed::Found(found) => found,
-        Observed::Missing => {
-            let next = match elsewhere.first() {
-                Some(other) => format!("There is one in namespace {}: use -n {other}", elsewhere.join(", ")),
-                None => format!("`kubectl get leaderboards -n {namespace}` lists all; use -n for another namespace"),
-            };
-            return Err(format!(
-                "there is no Leaderboard {name} in namespace {namespace}. {next}"
-            ));
-        }
-        // The operator will know.
-        Observed::Forbidden => return Ok(()),
+/// Whether the Leaderboard has the track; the text has the next step. Of one that cannot be read, the operator will know.
+pub fn fits(wanted: &Submit, leaderboard: Observed<'_>) -> Result<(), String> {
+    let Some(found) = leaderboard.leaderboard() else {
+        return Ok(());
     };
     let tracks: Vec<&str> = found.spec.tracks.iter().map(|track| track.name.as_str()).collect();
     if tracks.contains(&wanted.track.as_str()) {
         return Ok(());
     }
     Err(format!(
-        "Leaderboard {name} has no track {}. It has {}",
+        "Leaderboard {} has no track {}. It has {}",
+        wanted.leaderboard,
         wanted.track,
         tracks.join(", ")
     ))
+}
+
+/// What was submitted, what keeps it from starting, and how to follow it.
+pub fn lines(created: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
+    let (spec, mut page) = (&created.spec, frame.page());
+    page.paragraph(&format!(
+        "Submitted {} to track {} of Leaderboard {}.",
+        created.name_any(),
+        spec.track.as_deref().unwrap_or_default(),
+        spec.leaderboard_name
+    ));
+    for problem in board::problems(&spec.leaderboard_name, leaderboard) {
+        page.paragraph(&problem.text);
+    }
+    page.paragraph(&format!("To follow it: `{} -w`.", command("status", created)));
+    page.into_lines()
 }
 
 /// Characters of the Leaderboard's name in the name of a submission: with the API server's five letters at most 52.

@@ -1,6 +1,6 @@
 //! Columns of text, as kubectl prints them. Pure.
 
-use crate::text::{clean, columns, cut, padded};
+use crate::text::{clean, columns, cut, cut_start, padded};
 
 /// Columns between two cells.
 const GAP: usize = 2;
@@ -8,6 +8,8 @@ const GAP: usize = 2;
 const LEAST: usize = 8;
 /// What is copied from a table, so it is not cut.
 const WHOLE: [&str; 2] = ["NAMESPACE", "NAME"];
+/// What is cut at its start: the tags of an image's versions differ at the end.
+const ENDS: [&str; 1] = ["SIMULATOR"];
 
 /// Lines of a table with its head, of at most `width` columns as far as cutting its widest cells can help. Each cell is cleaned: many were
 /// written by strangers.
@@ -21,11 +23,19 @@ pub(super) fn table(head: &[&str], rows: &[Vec<String>], width: usize) -> Vec<St
     std::iter::once(&head)
         .chain(&rows)
         .map(|row| {
-            let cells = row.iter().zip(&widths);
-            let cells = cells.map(|(cell, width)| padded(&cut(cell, *width), width + GAP));
+            let cells = head.iter().zip(row).zip(&widths);
+            let cells = cells.map(|((title, cell), width)| padded(&cell_of(title, cell, *width), width + GAP));
             cells.collect::<String>().trim_end().to_owned()
         })
         .collect()
+}
+
+fn cell_of(title: &str, cell: &str, width: usize) -> String {
+    if ENDS.contains(&title) {
+        cut_start(cell, width)
+    } else {
+        cut(cell, width)
+    }
 }
 
 /// The columns of each cell: the widest ones are made narrower until all fit.

@@ -75,11 +75,16 @@ impl Page {
     }
 }
 
-/// A text in lines of at most `width` columns.
+/// A text in lines of at most `width` columns. A command between backticks is not broken: one that is longer has a line of its own.
 pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
-    for word in clean(text).split_whitespace() {
-        for piece in pieces(word, width.max(2)) {
+    for word in words(&clean(text)) {
+        let pieces = if word.contains(' ') {
+            vec![word]
+        } else {
+            pieces(&word, width.max(2))
+        };
+        for piece in pieces {
             match lines.last_mut() {
                 Some(last) if columns(last) + 1 + columns(&piece) <= width => {
                     last.push(' ');
@@ -90,6 +95,24 @@ pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
         }
     }
     lines
+}
+
+/// The words of a text. What stands between two backticks is one, with what touches it.
+fn words(text: &str) -> Vec<String> {
+    let is_balanced = text.matches('`').count().is_multiple_of(2);
+    let mut words: Vec<String> = Vec::new();
+    let mut is_open = false;
+    for word in text.split_whitespace() {
+        match words.last_mut().filter(|_| is_open) {
+            Some(last) => {
+                last.push(' ');
+                last.push_str(word);
+            }
+            None => words.push(word.to_owned()),
+        }
+        is_open ^= is_balanced && !word.matches('`').count().is_multiple_of(2);
+    }
+    words
 }
 
 /// A word in pieces of at most `width` columns.
@@ -127,6 +150,21 @@ pub(super) fn cut(text: &str, width: usize) -> String {
     format!("{}…", kept.trim_end())
 }
 
+/// The end of a text, of at most so many columns.
+pub(super) fn cut_start(text: &str, width: usize) -> String {
+    if columns(text) <= width {
+        return text.to_owned();
+    }
+    let mut kept = String::new();
+    for letter in text.chars().rev() {
+        if columns(&kept) + letter.width().unwrap_or(0) + 1 > width {
+            break;
+        }
+        kept.insert(0, letter);
+    }
+    format!("…{}", kept.trim_start())
+}
+
 /// A text with blanks up to so many columns.
 pub(super) fn padded(text: &str, width: usize) -> String {
     format!("{text}{}", " ".repeat(width.saturating_sub(columns(text))))
@@ -135,6 +173,12 @@ pub(super) fn padded(text: &str, width: usize) -> String {
 /// A text of any length: much of what is printed was written by strangers.
 pub(super) fn clean(text: &str) -> String {
     one_line(text, usize::MAX)
+}
+
+/// A line of a log, in which columns and indentation stay.
+pub(super) fn log_line(line: &str) -> String {
+    let line = line.trim_end().replace('\t', "    ");
+    line.split(' ').map(clean).collect::<Vec<_>>().join(" ")
 }
 
 /// Joins what is not empty by spaces.
@@ -180,6 +224,9 @@ mod tests {
         assert_eq!(wrap("自動運転隊", 4), ["自動", "運転", "隊"]);
         assert_eq!(cut("自動運転隊", 7), "自動運…");
         assert_eq!(cut("short", 5), "short");
+        assert_eq!(cut_start("simulator:0.9.15-3", 10), "…:0.9.15-3");
+        assert_eq!(cut_start("自動運転隊", 7), "…運転隊");
+        assert_eq!(cut_start("short", 5), "short");
         assert_eq!(padded("隊", 4), "隊  ");
     }
 
@@ -208,10 +255,27 @@ mod tests {
     }
 
     #[test]
+    fn a_command_in_a_text_is_not_broken() {
+        let text = "There is more: `kubectl leaderboard why submission-42 -n carla`. Or `two` `of them` or 5` tall.";
+        let command = "`kubectl leaderboard why submission-42 -n carla`.";
+        for width in [20, 50] {
+            let lines = wrap(&format!("{text}`"), width);
+            assert!(lines.iter().any(|line| line == command), "{lines:#?}");
+            assert_eq!(lines.join(" "), format!("{text}`"));
+        }
+        let lines = wrap(text, 50);
+        assert!(
+            lines.iter().all(|line| columns(line) <= 50),
+            "one is not closed: {lines:#?}"
+        );
+    }
+
+    #[test]
     fn what_is_printed_is_harmless() {
         let hostile = "Team\u{1b}[2J\u{202e}\u{9b}31m\r\nSeven";
         assert_eq!(wrap(hostile, 80), ["Team\u{fffd}[2J\u{fffd}\u{fffd}31m Seven"]);
         assert_eq!(clean(hostile), "Team\u{fffd}[2J\u{fffd}\u{fffd}31m Seven");
+        assert_eq!(log_line("\tat  main\u{1b}[2J \r\n"), "    at  main\u{fffd}[2J");
     }
 
     #[test]

@@ -112,7 +112,6 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Fr
         "TEAM",
         "RUNNING",
         "WAITING",
-        "NEXT",
         "FINISHED",
         "FAILED",
         "CANCELLED",
@@ -123,13 +122,15 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Fr
 }
 
 fn row((_, board, team): &Key, each: &Use) -> Vec<String> {
+    let waiting = match each.first_in_line {
+        Some(place) => format!("{} (#{place})", each.waiting),
+        None => each.waiting.to_string(),
+    };
     vec![
         board.clone(),
         team.clone(),
         each.running.to_string(),
-        each.waiting.to_string(),
-        each.first_in_line
-            .map_or_else(|| "-".to_owned(), |place| format!("#{place}")),
+        waiting,
         each.finished.to_string(),
         each.failed.to_string(),
         each.cancelled.to_string(),

@@ -10,7 +10,7 @@ use leaderboard_api::conditions;
 use leaderboard_api::{State, Submission};
 
 /// Columns before the text of a transition.
-const INDENT: usize = 10;
+const INDENT: usize = 11;
 
 /// A wait for the end of an attempt.
 pub struct Waiting {
@@ -67,7 +67,7 @@ impl Waiting {
         let text = format!("{name} is {} ({reason}){colon} {message}", state.as_str());
         self.last = Some((state, reason));
         Update {
-            lines: hang(&now.strftime("%H:%M:%S").to_string(), &text, self.width),
+            lines: hang(&now.strftime("%H:%M:%SZ").to_string(), &text, self.width),
             end,
         }
     }

@@ -129,7 +129,7 @@ async fn a_fault_is_named_with_its_step_and_the_code_is_one() {
         &[
             "✘ Images         ImagePull: The image of simulator-1 cannot be pulled: not found.",
             "The check failed: 1 part is broken",
-            &format!("Kept: kubectl delete submission {}", object.name_any()),
+            &format!("  kubectl delete submission {}", object.name_any()),
         ],
     );
     let kept = terminal

@@ -38,7 +38,13 @@ async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
     let text = terminal.run(&["why", "waits", "-o", "yaml"]).await.out;
     assert_has(&text, &["\"reason\": \"WaitingForSlot\"", "\"nextSteps\":\n  - "]);
     let text = terminal.run(&["status", "-l", "a=b"]).await.well();
-    assert_has(&text, &["No submission has the labels a=b."]);
+    assert_has(
+        &text,
+        &[&format!(
+            "No submission of namespace {} has the labels a=b.",
+            terminal.namespace
+        )],
+    );
 }
 
 #[tokio::test]
@@ -85,7 +91,9 @@ async fn submit_creates_and_waits() {
         "7",
     ];
     let mut waits = terminal.waits(&[&["submit"], &flags[..], &["--wait"]].concat());
-    waits.until("Submitted mine.").await;
+    waits
+        .until("Submitted mine to track sensors of Leaderboard local.")
+        .await;
     let made = terminal.api(Kind::Submission).get("mine").await.unwrap();
     assert_eq!(made.data["spec"]["team"], json!({"id": "7"}));
     terminal.status(Kind::Submission, "mine", &finished()).await;
@@ -130,14 +138,22 @@ async fn only_what_the_infrastructure_failed_is_resumed() {
         .submission("crashed", &json!({}), &failed("Participant", "AgentCrashed"))
         .await;
     let text = terminal.run(&["rerun", "--all", "--dry-run"]).await.well();
-    assert_eq!(text, "Would resume lost.\n");
+    assert_has(&text, &["lost  ", "Would resume 1 submission."]);
+    assert!(!text.contains("crashed"), "{text}");
     assert_eq!(terminal.requested("lost").await, (1, false));
     let text = terminal
         .run(&["rerun", "--all", "--reason", "SimulationCrashed"])
         .await
         .well();
-    assert_has(&text, &["No submission has failed so"]);
-    terminal.run(&["rerun", "--all"]).await.well();
+    assert_has(
+        &text,
+        &["None of 2 submissions has failed because of the infrastructure with the reason SimulationCrashed."],
+    );
+    let text = terminal.run(&["rerun", "--all"]).await.well();
+    assert_has(
+        &text,
+        &["Requested attempt 2 of lost.", "Requested for 1 of 1 submission."],
+    );
     assert_eq!(terminal.requested("lost").await, (2, false));
     assert_eq!(terminal.requested("crashed").await, (1, false));
 }
@@ -154,7 +170,11 @@ async fn a_report_is_an_archive_without_secrets() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("report.tar");
     let text = terminal.run(&["report", "--file", file.to_str().unwrap()]).await.out;
-    assert_has(&text, &["Wrote ", "report.tar"]);
+    let text = text.replace('\n', " ");
+    assert_has(
+        &text,
+        &["Wrote ", "report.tar", "1 Leaderboard, 1 submission, 0 Pods, "],
+    );
     let archive = String::from_utf8(std::fs::read(&file).unwrap()).unwrap();
     assert_has(
         &archive,

@@ -54,7 +54,7 @@ async fn what_a_broken_image_has_failed_is_shown_and_then_requeued() {
     assert_eq!(spec(&terminal, "other").await["requeue"], Value::Null);
 
     let text = terminal.run(&choice).await.well();
-    assert_has(&text, &["None of 4 submissions fits, or can be requeued."]);
+    assert_has(&text, &["None of 4 submissions fits."]);
     let text = terminal.run(&["why", "runs"]).await.well().replace('\n', " ");
     assert_has(
         &text,

@@ -107,7 +107,7 @@ async fn the_documented_rights_are_enough() {
             &[
                 "missing right: ",
                 "is forbidden",
-                "Ask the host for get, list, watch and patch",
+                "ask for the right: docs/plugin.md has a Role",
             ],
         );
     }

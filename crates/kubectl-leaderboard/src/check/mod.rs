@@ -15,5 +15,7 @@ pub use finding::{Mark, Part};
 pub use give_up::Patience;
 pub use parts::{Seen, findings};
 pub use plan::{Wanted, submission, which};
+#[cfg(test)]
+pub use readers::Reader;
 pub use readers::{Readers, ask as ask_for_readers};
-pub use table::{Outcome, lines};
+pub use table::{Outcome, begun, kept, left, lines};

@@ -13,6 +13,8 @@ use crate::why;
 /// Reasons of the runner about a node without what rendering needs.
 const NO_GRAPHICS: [&str; 2] = ["NoGPU", "GraphicsDriverMissing"];
 const NOT_REACHED: &str = "not reached";
+/// Characters of a digest that tell one image from another: its algorithm, and as many digits as docker shows.
+const DIGEST: usize = "sha256:".len() + 12;
 
 /// What a check has seen.
 #[derive(Clone, Copy, Debug)]
@@ -147,7 +149,10 @@ fn registry(status: &SubmissionStatus) -> Finding {
     let accepted = conditions::get(&status.conditions, conditions::ACCEPTED).filter(|c| c.status == "True");
     match (accepted, &status.image) {
         (None, _) => finding_of(Part::Registry, Mark::Open, NOT_REACHED),
-        (Some(_), Some(image)) => finding_of(Part::Registry, Mark::Works, format!("has the image, {}", image.digest)),
+        (Some(_), Some(image)) => {
+            let short: String = image.digest.chars().take(DIGEST).collect();
+            finding_of(Part::Registry, Mark::Works, format!("has the image, {short}…"))
+        }
         (Some(accepted), None) if accepted.reason == reasons::IMAGE_NOT_PINNED => Finding {
             step: step_of(reasons::IMAGE_NOT_PINNED),
             ..finding_of(Part::Registry, Mark::Note, sentence(&accepted.message))
@@ -422,5 +427,9 @@ fn step_of(reason: &str) -> Option<String> {
     let step = step
         .replace(", then resume the submission", "")
         .replace("the submission then continues", "run the check again");
-    (step != "Nothing.").then_some(step)
+    match step.as_str() {
+        "Nothing." => None,
+        "Fix this." => Some("Fix what this names, then run the check again.".to_owned()),
+        _ => Some(step),
+    }
 }

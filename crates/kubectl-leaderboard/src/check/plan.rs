@@ -53,17 +53,11 @@ pub fn submission(leaderboard: &Leaderboard, wanted: Wanted<'_>) -> Result<Value
     }))
 }
 
-/// Why no single Leaderboard is meant, with the next step.
-pub fn which(name: Option<&str>, known: &[String], namespace: &str) -> String {
-    match (name, known) {
-        (_, []) => format!("namespace {namespace} has no Leaderboard. Use -n for another namespace"),
-        (Some(name), known) => {
-            let names = known.join(", ");
-            format!(
-                "there is no Leaderboard {name} in namespace {namespace}. It has {names}; use -n for another namespace"
-            )
-        }
-        (None, known) => format!(
+/// Why no single Leaderboard is meant where none is named, with the next step.
+pub fn which(known: &[String], namespace: &str) -> String {
+    match known {
+        [] => format!("namespace {namespace} has no Leaderboard. Use -n for another namespace"),
+        known => format!(
             "namespace {namespace} has several Leaderboards. Name one of {}",
             known.join(", ")
         ),
@@ -122,8 +116,7 @@ mod tests {
             assert!(why.contains(words), "{why}");
         }
         let two = ["a".to_owned(), "b".to_owned()];
-        assert!(which(None, &two, "carla").ends_with("Name one of a, b"));
-        assert!(which(Some("c"), &two, "carla").starts_with("there is no Leaderboard c in namespace carla."));
-        assert!(which(None, &[], "carla").starts_with("namespace carla has no Leaderboard."));
+        assert!(which(&two, "carla").ends_with("Name one of a, b"));
+        assert!(which(&[], "carla").starts_with("namespace carla has no Leaderboard."));
     }
 }

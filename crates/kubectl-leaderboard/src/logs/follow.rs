@@ -11,13 +11,13 @@ use kube::ResourceExt;
 use kube::runtime::watcher;
 use leaderboard_api::Submission;
 
-use super::{Logs, Source, pairs, sources};
+use super::{Logs, Source, begins_again, begins_later, end, pairs, sources};
 use crate::cluster::Cluster;
 use crate::commands::note_interruption;
 use crate::error::Error;
 use crate::facts;
-use crate::output::print_labelled;
-use crate::text::clean;
+use crate::output::{note, print_labelled};
+use crate::text::log_line;
 
 /// A life of a container: one that crashes begins another one, with a log of its own.
 type Life = (String, String, i32);
@@ -40,12 +40,7 @@ pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submiss
         .as_ref()
         .is_none_or(|status| status.job_name.is_none())
     {
-        let shown = submission.status.as_ref().and_then(facts::state);
-        let shown = shown.map_or("new", leaderboard_api::State::as_str);
-        eprintln!(
-            "kubectl leaderboard: {} is {shown}. Its log follows once its Pod runs.",
-            wanted.name
-        );
+        note(&begins_later(&submission));
     }
     let mut changes = pin!(cluster.changes(&wanted.name));
     let mut pods = pin!(cluster.pod_changes(&wanted.name));
@@ -60,6 +55,7 @@ pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submiss
     while !following.is_over() {
         following.step(&mut changes, &mut pods).await?;
     }
+    note(&end(&following.submission));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -79,9 +75,9 @@ impl Following<'_> {
             line = self.lines.next(), if !self.lines.is_empty() => match line {
                 // The last log has ended.
                 None => {}
-                Some((source, Ok(line))) => print_labelled(source.stream, &source.label, &clean(&line)),
+                Some((source, Ok(line))) => print_labelled(source.stream, &source.label, &log_line(&line)),
                 Some((_, Err(error @ (Error::Forbidden(_) | Error::Credentials(_))))) => return Err(error),
-                Some((source, Err(error))) => eprintln!("kubectl leaderboard: the log of {} was interrupted: {error}", source.container),
+                Some((source, Err(error))) => note(&format!("the log of {} was interrupted: {error}", source.container)),
             },
             Some(change) = changes.next() => match change {
                 Ok(Some(submission)) => self.submission = submission,
@@ -99,6 +95,7 @@ impl Following<'_> {
 
     /// Begins the logs of containers that have one and were not begun.
     fn begin(&mut self, pod: &Pod) {
+        let mut new = Vec::new();
         for source in sources(self.wanted, pairs(&self.submission).max(self.wanted.pair.unwrap_or(0))) {
             let Some(restarts) = life(pod, &source.container) else {
                 continue;
@@ -108,8 +105,16 @@ impl Following<'_> {
                 continue;
             }
             self.begun.insert(life);
+            if restarts > 0 {
+                note(&begins_again(&source.container, restarts));
+            }
             let lines = self.cluster.followed_log(&pod.name_any(), &source.container);
-            self.lines.push(lines.map(move |line| (source.clone(), line)).boxed());
+            new.push(lines.map(move |line| (source.clone(), line)).boxed());
+        }
+        if self.wanted.of.is_in_turn() {
+            self.lines.push(futures::stream::iter(new).flatten().boxed());
+        } else {
+            self.lines.extend(new);
         }
     }
 }

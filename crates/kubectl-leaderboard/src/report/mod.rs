@@ -9,11 +9,14 @@ use std::path::PathBuf;
 
 use clap::Args;
 use jiff::Timestamp;
+use leaderboard_api::text::sentence;
 use serde_json::Value;
 
 use crate::cluster::{Cluster, Scope};
+use crate::commands::frame;
 use crate::error::Error;
 use crate::output::print;
+use crate::text::Frame;
 
 /// Where the archive goes.
 #[derive(Args, Debug)]
@@ -23,25 +26,32 @@ pub struct Report {
     file: Option<PathBuf>,
 }
 
+/// One file of the archive, and what it counts.
+struct Part {
+    file: &'static str,
+    one: &'static str,
+    many: &'static str,
+    objects: Result<Vec<Value>, Error>,
+}
+
 /// Writes the archive.
 pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
-    let scope = Scope::default();
     let now = Timestamp::now();
-    let (mut files, mut missing) = (Vec::new(), Vec::new());
-    let leaderboards = cluster.leaderboards(&scope).await.map(Option::unwrap_or_default);
-    let pods = cluster.pods().await;
-    let events = cluster.events().await;
-    let parts = [
-        ("leaderboards.json", documents(leaderboards)),
-        ("submissions.json", documents(cluster.submissions(&scope).await)),
-        ("pods.json", documents(pods)),
-        ("events.json", documents(events)),
-    ];
-    for (name, part) in parts {
-        match part {
-            Ok(objects) => files.push((name.to_owned(), format!("{:#}\n", redact::objects(name, objects)))),
+    let parts = ask(cluster).await;
+    let (mut files, mut missing, mut counts) = (Vec::new(), Vec::new(), Vec::new());
+    for part in parts {
+        match part.objects {
+            Ok(objects) => {
+                counts.push(counted(objects.len(), part.one, part.many));
+                files.push((
+                    part.file.to_owned(),
+                    format!("{:#}\n", redact::objects(part.file, objects)),
+                ));
+            }
+            // An archive of nothing helps nobody.
+            Err(error @ (Error::Credentials(_) | Error::Unreachable { .. })) => return Err(error),
             // Without a right to one kind, the others help all the same.
-            Err(error) => missing.push(format!("{name}: {error}")),
+            Err(error) => missing.push(format!("{}: {error}", part.file)),
         }
     }
     let about = format!(
@@ -54,13 +64,55 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
     let default = || PathBuf::from(format!("leaderboard-report-{}.tar", cluster.namespace));
     let file = wanted.file.clone().unwrap_or_else(default);
     let archive = tar::archive(&files, now.as_second());
-    std::fs::write(&file, archive).map_err(|error| Error::File(file.display().to_string(), error))?;
-    print(&[
-        format!("Wrote {}. Look through it before you hand it on.", file.display()),
-        "Left out: Secrets, values of environment variables, names of teams, texts of results, logs.".to_owned(),
-    ]);
-    print(&missing.iter().map(|why| format!("Missing: {why}")).collect::<Vec<_>>());
+    let path = file.display().to_string();
+    std::fs::write(&file, archive).map_err(|error| Error::File(path.clone(), error))?;
+    print(&lines(&path, &cluster.namespace, &counts, &missing, frame()));
     Ok(())
+}
+
+async fn ask(cluster: &Cluster) -> [Part; 4] {
+    let scope = Scope::default();
+    let leaderboards = cluster.leaderboards(&scope).await;
+    let unread = || Error::Forbidden("Leaderboards cannot be listed".to_owned());
+    let part = |file, one, many, objects| Part {
+        file,
+        one,
+        many,
+        objects,
+    };
+    let leaderboards = documents(leaderboards.and_then(|all| all.ok_or_else(unread)));
+    let submissions = documents(cluster.submissions(&scope).await);
+    let (pods, events) = (documents(cluster.pods().await), documents(cluster.events().await));
+    [
+        part("leaderboards.json", "Leaderboard", "Leaderboards", leaderboards),
+        part("submissions.json", "submission", "submissions", submissions),
+        part("pods.json", "Pod", "Pods", pods),
+        part("events.json", "event", "events", events),
+    ]
+}
+
+fn counted(number: usize, one: &str, many: &str) -> String {
+    format!("{number} {}", if number == 1 { one } else { many })
+}
+
+/// What was written, what is not in it, and what to do before it is handed on.
+pub(super) fn lines(file: &str, namespace: &str, counts: &[String], missing: &[String], frame: Frame) -> Vec<String> {
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "Wrote {file}, of namespace {namespace}: {}.",
+        counts.join(", ")
+    ));
+    for why in missing {
+        page.paragraph(&format!("Without {}", sentence(why)));
+    }
+    if counts.iter().all(|count| count.starts_with("0 ")) {
+        page.paragraph("Nothing was found: use -n for the namespace of the Leaderboard.");
+    }
+    page.paragraph(
+        "Left out: Secrets, values of environment variables, podOverrides, names of teams, texts that quote results, and logs.",
+    );
+    page.paragraph("Look through it before you hand it on: images, buckets and addresses are in it.");
+    page.into_lines()
 }
 
 fn documents<K: serde::Serialize>(objects: Result<Vec<K>, Error>) -> Result<Vec<Value>, Error> {

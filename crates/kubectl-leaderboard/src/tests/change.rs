@@ -194,13 +194,13 @@ fn a_wait_prints_each_transition_once_and_the_end() {
     let update = observe(&attempt(waiting()));
     assert_eq!(
         update.lines[0],
-        "12:00:00  submission-42 is Pending (WaitingForSlot): All slots of the Leaderboard are in use;"
+        "12:00:00Z  submission-42 is Pending (WaitingForSlot): All slots of the Leaderboard are in use;"
     );
     assert_width(&update.lines);
     assert!(observe(&attempt(waiting())).lines.is_empty());
     assert_eq!(
         observe(&attempt(running())).lines,
-        ["12:00:00  submission-42 is Resumed (Running): 12/20 routes done."]
+        ["12:00:00Z  submission-42 is Resumed (Running): 12/20 routes done."]
     );
     let more = with(running(), &json!({"attempt": 2, "message": "13/20 routes done."}));
     assert!(

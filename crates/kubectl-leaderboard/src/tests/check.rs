@@ -2,8 +2,9 @@
 
 use serde_json::{Value, json};
 
-use super::{assert_width, condition, now, with};
+use super::{assert_width, condition, now, plan_with, with};
 use crate::check::{Mark, Outcome, Part, Patience, Readers, Seen, findings, lines};
+use crate::text::WIDTH;
 use leaderboard_api::{Leaderboard, State, Submission};
 
 /// A Leaderboard of EvalAI with a queue, a table and a log group, that is Ready.
@@ -24,7 +25,7 @@ fn leaderboard(conditions: &Value) -> Leaderboard {
     serde_json::from_value(object).unwrap()
 }
 
-fn good_leaderboard() -> Leaderboard {
+pub(super) fn good_leaderboard() -> Leaderboard {
     leaderboard(&json!([
         condition("Ready", "True", "Ready", ""),
         condition(
@@ -36,7 +37,7 @@ fn good_leaderboard() -> Leaderboard {
     ]))
 }
 
-fn check(status: &Value) -> Submission {
+pub(super) fn check(status: &Value) -> Submission {
     let object = json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
         "metadata": {"name": "check-carla-20-x7k2p", "namespace": "carla"},
@@ -48,12 +49,13 @@ fn check(status: &Value) -> Submission {
 }
 
 /// Its route is driven and stored, and the table would take a row.
-fn passed() -> Value {
+pub(super) fn passed() -> Value {
     json!({
         "attempt": 1, "reason": "Finished", "message": "1 of 1 routes, driving score 98.00.", "track": "sensors",
         "progress": {"done": 1, "total": 1, "text": "1/1"}, "score": {"driving": "98.00", "final": true, "text": "98.00"},
         "jobName": "check-carla-20-x7k2p-1", "nodeName": "gpu-3", "resultsURL": "s3://results/v2/check-carla-20-x7k2p",
-        "image": {"digest": format!("sha256:{}", "4f".repeat(32))}, "plan": plan(),
+        "image": {"digest": format!("sha256:{}", "4f".repeat(32))},
+        "plan": with(plan_with("simulator:1"), &json!({"runId": "check-carla-20-x7k2p"})),
         "times": {"accepted": "2026-11-01T11:50:00Z", "scheduled": "2026-11-01T11:50:41Z", "started": "2026-11-01T11:54:02Z",
                   "finished": "2026-11-01T11:57:00Z"},
         "conditions": [
@@ -65,14 +67,8 @@ fn passed() -> Value {
     })
 }
 
-fn plan() -> Value {
-    json!({"runId": "check-carla-20-x7k2p", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS",
-           "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1, "storage": {"bucket": "results"}, "image": "a:1",
-           "contentsImage": "contents:1", "simulatorImage": "simulator:1"})
-}
-
 /// It failed before its agent ran.
-fn failed(class: &str, reason: &str, message: &str) -> Value {
+pub(super) fn failed(class: &str, reason: &str, message: &str) -> Value {
     with(
         passed(),
         &json!({
@@ -88,6 +84,19 @@ fn failed(class: &str, reason: &str, message: &str) -> Value {
 }
 
 fn printed(leaderboard: &Leaderboard, status: &Value, given_up: Option<&str>, readers: &Readers) -> (String, bool) {
+    let (lines, has_passed) = table(leaderboard, status, given_up, readers, WIDTH);
+    let bare: Vec<String> = lines.iter().filter(|line| !line.contains("  aws ")).cloned().collect();
+    assert_width(&bare);
+    (lines.join("\n"), has_passed)
+}
+
+pub(super) fn table(
+    leaderboard: &Leaderboard,
+    status: &Value,
+    given_up: Option<&str>,
+    readers: &Readers,
+    width: usize,
+) -> (Vec<String>, bool) {
     let submission = check(status);
     let found = findings(Seen {
         leaderboard,
@@ -100,10 +109,7 @@ fn printed(leaderboard: &Leaderboard, status: &Value, given_up: Option<&str>, re
         .as_ref()
         .map(leaderboard_api::SubmissionStatus::state_of_conditions);
     let outcome = Outcome::of(&found, state == Some(State::Finished));
-    let lines = lines(&found, outcome);
-    let bare: Vec<String> = lines.iter().filter(|line| !line.contains("  aws ")).cloned().collect();
-    assert_width(&bare);
-    (lines.join("\n"), outcome.has_passed)
+    (lines(&found, outcome, width), outcome.has_passed)
 }
 
 const PASSED: &str = "\
@@ -111,8 +117,7 @@ const PASSED: &str = "\
 ✔ EvalAI         accepts the token; phases, split and labels fit
 ✔ Queue          answers
 ✔ Other readers  no running Pipe and no Lambda function reads the queue
-✔ Registry       has the image,
-                 sha256:4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f4f
+✔ Registry       has the image, sha256:4f4f4f4f4f4f…
 ✔ Slot           granted
 ✔ Node           gpu-3, after 41 s
 ✔ Images         pulled, 201 s from the node to the agent
@@ -180,7 +185,7 @@ fn a_fault_marks_its_part_and_leaves_open_what_was_not_reached() {
 ✔ Node           gpu-3, after 41 s
 ✘ Images         ImagePull: The image of simulator-1 cannot be pulled: not found. It was tried for
                  60 s.
-                 → Fix this.
+                 → Fix what this names, then run the check again.
 – Contents       not reached
 ✔ Isolation      Enforced: The Pod of check-carla-20-x7k2p could not reach 10.96.0.1:443.
 – Simulator      not reached

@@ -1,26 +1,22 @@
 //! `status`, `top`, `submit` and `rerun`, as they print.
 
 use clap::Parser;
+use kube::ResourceExt;
 use serde_json::{Value, json};
 
+use super::docs::assert_documented;
 use super::{
-    assert_width, cancelled, crashed, driving, finished, frame, leaderboard, named, node_lost, running, submission,
-    waiting, with,
+    assert_width, cancelled, crashed, driving, finished, frame, leaderboard, named, node_lost, of_team, running,
+    submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::submit::{Submit, object};
 use crate::{rerun, status, top, why};
 
-const DOCS: &str = include_str!("../../../../docs/plugin.md");
-
 /// The text, which docs/plugin.md has to show.
 fn shown(lines: &[String]) -> String {
-    let text = lines.join("\n");
-    assert!(
-        DOCS.contains(&format!("```\n{text}\n```\n")),
-        "docs/plugin.md does not show\n```\n{text}\n```"
-    );
-    text
+    assert_documented(lines);
+    lines.join("\n")
 }
 
 #[test]
@@ -83,21 +79,20 @@ fn a_screen_exists_for_every_state() {
 }
 
 fn some() -> Vec<leaderboard_api::Submission> {
-    let of = |status: Value, id: &str, name: &str| with(status, &json!({"team": {"id": id, "name": name}}));
     vec![
-        named("submission-38", &of(finished(), "7", "Team Seven")),
-        named("submission-39", &of(node_lost(), "8", "Team Eight")),
+        named("submission-38", &of_team(finished(), "7", "Team Seven")),
+        named("submission-39", &of_team(node_lost(), "8", "Team Eight")),
         named("submission-40", &driving()),
-        named("submission-42", &of(crashed(), "7", "Team Seven")),
+        named("submission-42", &of_team(crashed(), "7", "Team Seven")),
         named(
             "submission-43",
-            &of(
+            &of_team(
                 with(waiting(), &json!({"waiting": {"position": 1, "text": "1st"}})),
                 "8",
                 "Team Eight",
             ),
         ),
-        named("submission-45", &of(waiting(), "7", "Team Seven")),
+        named("submission-45", &of_team(waiting(), "7", "Team Seven")),
         named("submission-46", &Value::Null),
     ]
 }
@@ -139,10 +134,10 @@ fn top_shows_slots_and_teams() {
 NAMESPACE  LEADERBOARD  SLOTS  WAITING
 carla      carla-20     1/2    3
 
-LEADERBOARD  TEAM        RUNNING  WAITING  NEXT  FINISHED  FAILED  CANCELLED  CRASHES
-carla-20     Team Seven  1        1        #3    1         1       0          5
-carla-20     (none)      0        1        -     0         0       0          0
-carla-20     Team Eight  0        1        #1    0         1       0          0"
+LEADERBOARD  TEAM        RUNNING  WAITING  FINISHED  FAILED  CANCELLED  CRASHES
+carla-20     Team Seven  1        1 (#3)   1         1       0          5
+carla-20     (none)      0        1        0         0       0          0
+carla-20     Team Eight  0        1 (#1)   0         1       0          0"
     );
     let value = top::value(&some());
     assert_eq!(
@@ -220,7 +215,11 @@ fn only_what_the_infrastructure_failed_is_run_again() {
         check,
         again,
     ];
-    assert_eq!(rerun::chosen(&all, None), ["a-lost", "b-lost"]);
-    assert_eq!(rerun::chosen(&all, Some("NodeLost")), ["a-lost", "b-lost"]);
-    assert_eq!(rerun::chosen(&all, Some("SimulationCrashed")), Vec::<String>::new());
+    let chosen = |reason| {
+        let found = rerun::chosen(&all, reason).into_iter().map(ResourceExt::name_any);
+        found.collect::<Vec<_>>()
+    };
+    assert_eq!(chosen(None), ["a-lost", "b-lost"]);
+    assert_eq!(chosen(Some("NodeLost")), ["a-lost", "b-lost"]);
+    assert_eq!(chosen(Some("SimulationCrashed")), Vec::<String>::new());
 }

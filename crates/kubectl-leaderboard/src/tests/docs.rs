@@ -4,7 +4,8 @@ use jiff::Timestamp;
 use serde_json::json;
 
 use super::{
-    cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, submission, waiting, with,
+    cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, of_team, ran_with, running,
+    submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
@@ -16,7 +17,7 @@ use leaderboard_api::Submission;
 
 const DOCS: &str = include_str!("../../../../docs/plugin.md");
 
-fn assert_shown(lines: &[String]) {
+pub(super) fn assert_documented(lines: &[String]) {
     let block = format!("```\n{}\n```\n", lines.join("\n"));
     assert!(DOCS.contains(&block), "docs/plugin.md does not show\n{block}");
 }
@@ -30,7 +31,7 @@ fn planned(request: Request, submission: &Submission) -> Result<Vec<String>, Str
 fn why() {
     for status in [crashed(), waiting()] {
         let board = leaderboard();
-        assert_shown(&why::explain(&submission(&status), Observed::Found(&board), frame()));
+        assert_documented(&why::explain(&submission(&status), Observed::Found(&board), frame()));
     }
 }
 
@@ -65,15 +66,15 @@ fn why_of_all() {
         is_all: false,
     };
     let lines = overview::lines(place, &submissions, Some(&[paused]), frame());
-    assert_shown(&lines);
+    assert_documented(&lines);
 }
 
 #[test]
 fn cancel_and_resume() {
-    assert_shown(&planned(Request::Cancel, &submission(&running())).unwrap());
-    assert_shown(&planned(Request::Resume, &submission(&crashed())).unwrap());
+    assert_documented(&planned(Request::Cancel, &submission(&running())).unwrap());
+    assert_documented(&planned(Request::Resume, &submission(&crashed())).unwrap());
     let why_not = planned(Request::Resume, &submission(&running())).unwrap_err();
-    assert_shown(&[format!("kubectl leaderboard: {}", Error::Unfit(why_not))]);
+    assert_documented(&[format!("kubectl leaderboard: {}", Error::Unfit(why_not))]);
 }
 
 #[test]
@@ -89,28 +90,15 @@ fn the_states_on_the_way() {
         let now: Timestamp = time.parse().unwrap();
         lines.extend(wait.observe(&submission(&status), now).lines);
     }
-    assert_shown(&lines);
+    assert_documented(&lines);
 }
 
 #[test]
 fn requeue() {
     let simulator = "registry.example/carla/simulator:0.9.15-3";
-    let of = |name: &str, status: serde_json::Value, id: &str, team: &str| {
-        let plan = json!({"runId": name, "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-                          "slices": [{"first": 0, "last": 9}], "routes": 10, "repetitions": 1,
-                          "storage": {"bucket": "results"}, "image": "a", "contentsImage": "c", "simulatorImage": simulator});
-        named(
-            name,
-            &with(
-                status,
-                &json!({"plan": plan, "nodeName": "gpu-3", "team": {"id": id, "name": team}}),
-            ),
-        )
-    };
-    let crashed = of("submission-42", crashed(), "7", "Team Seven");
-    let lost = of("submission-39", node_lost(), "8", "Team Eight");
-    let mut lines = requeue::lines(&[&lost, &crashed], frame());
-    lines.extend([String::new(), format!("Would requeue {}.", requeue::counted(2))]);
-    assert_shown(&lines);
-    assert_shown(&planned(Request::Requeue(None), &submission(&running())).unwrap());
+    let of = |status, id, team| ran_with(of_team(status, id, team), simulator);
+    let crashed = named("submission-42", &of(crashed(), "7", "Team Seven"));
+    let lost = named("submission-39", &of(node_lost(), "8", "Team Eight"));
+    assert_documented(&requeue::dry_run("requeue", &[&lost, &crashed], frame()));
+    assert_documented(&planned(Request::Requeue(None), &submission(&running())).unwrap());
 }

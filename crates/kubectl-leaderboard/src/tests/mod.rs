@@ -4,6 +4,10 @@ mod change;
 mod check;
 mod daily;
 mod docs;
+mod documents;
+mod golden;
+mod help;
+mod messages;
 mod overview;
 mod pages;
 mod requeue;
@@ -167,6 +171,18 @@ fn assert_width(lines: &[String]) {
 
 fn of_team(status: Value, id: &str, name: &str) -> Value {
     with(status, &json!({"team": {"id": id, "name": name}}))
+}
+
+/// The plan of a run of two pairs with this simulator.
+fn plan_with(simulator: &str) -> Value {
+    json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
+           "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}], "routes": 20, "repetitions": 1,
+           "storage": {"bucket": "results"}, "image": "agent:1", "contentsImage": "contents:1", "simulatorImage": simulator})
+}
+
+/// The status of a run with this simulator.
+fn ran_with(status: Value, simulator: &str) -> Value {
+    with(status, &json!({"plan": plan_with(simulator), "nodeName": "gpu-3"}))
 }
 
 /// Two pairs, one of which has crashed, with all three scores.

@@ -56,7 +56,7 @@ crashed      Failed    3 min   EvalAI: Waiting. AgentCrashed (participant failur
 lost         Failed    3 min   NodeLost (infrastructure failure): Node gpu-3 and its Pod were lost;…
 unpublished  Finished  3 min   EvalAI: Refused.
 
-`kubectl leaderboard why NAME` has the details and the next step."
+`kubectl leaderboard why NAME -n carla` has the details and the next step."
     );
 }
 
@@ -79,13 +79,20 @@ Namespace carla has 1 submission. It is not waiting, failed or stuck."
         !text.contains("There is no Leaderboard"),
         "what has ended needs none: {text}"
     );
-    let text = |selector, elsewhere: &[(String, usize)]| nothing("carla", selector, elsewhere, frame()).join("\n");
+    let place = Place {
+        namespace: "carla",
+        is_all: false,
+    };
+    let text = |selector, elsewhere: &[(String, usize)]| nothing(place, selector, elsewhere, frame()).join("\n");
     assert!(text(None, &[]).starts_with("Namespace carla has no submissions. `kubectl get submissions -A`"));
     assert_eq!(
         text(None, &[("carla-20".to_owned(), 12), ("test".to_owned(), 1)]),
         "Namespace carla has no submissions. There are some in carla-20 (12), test (1): use -n NAMESPACE, or\n-A."
     );
-    assert_eq!(text(Some("a=b"), &[]), "No submission has the labels a=b.");
+    assert_eq!(
+        text(Some("a=b"), &[]),
+        "No submission of namespace carla has the labels a=b."
+    );
     let text = printed(&[], None);
     assert!(text.starts_with("You have no right to read Leaderboards"), "{text}");
 }

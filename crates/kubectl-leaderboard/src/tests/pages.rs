@@ -1,30 +1,185 @@
-//! Every line of the documents that starts the plugin is one that it takes.
+//! The whole output of `check`, `submit`, `logs` and `report`.
 
-use std::path::Path;
+use std::fmt::Write as _;
 
-use clap::Parser;
-use clap::error::ErrorKind;
+use serde_json::{Value, json};
 
-use crate::Cli;
+use super::check::{check, failed, good_leaderboard, passed, table};
+use super::golden::{assert_golden, assert_shown};
+use super::{condition, crashed, leaderboard, now, ran_with, submission, waiting, with};
+use crate::board::Observed;
+use crate::check::{Reader, Readers, begun, kept, left};
+use crate::logs::{Whose, in_bucket};
+use crate::output::labelled;
+use crate::text::{Frame, log_line};
+use crate::transitions::Waiting;
+use crate::{report, submit};
+use leaderboard_api::{Leaderboard, Submission};
 
-#[path = "../../../../tests/support/pages.rs"]
-mod support;
+const TRIED: &str = "The image of simulator-1 cannot be pulled: not found. It was tried for 60 s.";
+
+/// All that a check prints, from its beginning to its end.
+fn checked(
+    board: &Leaderboard,
+    status: &Value,
+    given_up: Option<&str>,
+    readers: &Readers,
+    frame: Frame,
+) -> Vec<String> {
+    let check = check(status);
+    let mut wait = Waiting::new(1).within(frame.width);
+    let mut lines = begun(&check, frame);
+    lines.extend(wait.observe(&check, frame.now).lines);
+    lines.push(String::new());
+    lines.extend(table(board, status, given_up, readers, frame.width).0);
+    lines.extend(left(&check, frame));
+    lines
+}
 
 #[test]
-fn the_plugin_takes_every_line_of_the_documents() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let lines = support::lines(&root, "kubectl leaderboard");
-    assert!(lines.len() > 50, "{}", lines.len());
-    for line in lines {
-        let words = std::iter::once("kubectl-leaderboard").chain(line.words.iter().map(String::as_str));
-        let Err(error) = Cli::try_parse_from(words) else {
-            continue;
-        };
-        let is_name = matches!(
-            error.kind(),
-            ErrorKind::MissingRequiredArgument | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand
-        );
-        let is_right = error.kind() == ErrorKind::DisplayHelp || line.is_prose && is_name;
-        assert!(is_right, "{}: {:?}: {error}", line.place, line.words);
+fn a_check() {
+    let good = good_leaderboard();
+    assert_shown("check-passed", |frame| {
+        checked(&good, &passed(), None, &Readers::Nobody, frame)
+    });
+    let pulled = failed("Infrastructure", "ImagePull", TRIED);
+    assert_shown("check-failed", |frame| {
+        let mut lines = checked(&good, &pulled, None, &Readers::Nobody, frame);
+        lines.extend(kept(&check(&pulled), frame));
+        lines
+    });
+    let waits = json!({"attempt": 1, "reason": "Unschedulable", "jobName": "check-carla-20-x7k2p-1",
+                       "message": "0/3 nodes are available: 3 Insufficient nvidia.com/gpu.",
+                       "conditions": [condition("Accepted", "True", "Accepted", "")]});
+    let unknown = Readers::Unknown {
+        why: "the program aws is not on the PATH".to_owned(),
+        commands: vec![
+            "aws sqs get-queue-attributes --queue-url https://sqs.us-east-1.amazonaws.com/1/carla".to_owned(),
+        ],
+    };
+    let why = "The check did not end within 600 s (--timeout).";
+    assert_shown("check-given-up", |frame| {
+        checked(&good, &waits, Some(why), &unknown, frame)
+    });
+    let cancelled = with(
+        failed("Infrastructure", "Cancelled", "The submission was cancelled."),
+        &json!({"failure": null}),
+    );
+    assert_shown("check-cancelled", |frame| {
+        checked(&good, &cancelled, None, &Readers::Nobody, frame)
+    });
+}
+
+#[test]
+fn a_check_with_notes() {
+    let readers = Readers::Found(vec![Reader {
+        what: "EventBridge Pipe old-pipeline".to_owned(),
+        stop: "aws pipes stop-pipe --name old-pipeline".to_owned(),
+    }]);
+    let mut noted = good_leaderboard();
+    let conditions = json!([
+        condition(
+            "Ready",
+            "True",
+            "Ready",
+            "Runs of the track sensors have no time limit."
+        ),
+        condition("Isolated", "False", "NotEnforced", "The Pod could reach 10.96.0.1:443."),
+    ]);
+    noted.status.as_mut().unwrap().conditions = serde_json::from_value(conditions).unwrap();
+    assert_shown("check-notes", |frame| checked(&noted, &passed(), None, &readers, frame));
+}
+
+fn submitted() -> Submission {
+    let object = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+        "metadata": {"name": "carla-20-x7k2p", "namespace": "carla"},
+        "spec": {"leaderboardName": "carla-20", "track": "sensors", "image": "registry.example/agent:1"},
+    });
+    serde_json::from_value(object).unwrap()
+}
+
+#[test]
+fn a_submission() {
+    let board = leaderboard();
+    assert_shown("submit", |frame| {
+        submit::lines(&submitted(), Observed::Found(&board), frame)
+    });
+    let mut paused = leaderboard();
+    paused.spec.paused = true;
+    assert_shown("submit-paused", |frame| {
+        submit::lines(&submitted(), Observed::Found(&paused), frame)
+    });
+    assert_shown("submit-unknown", |frame| {
+        submit::lines(&submitted(), Observed::Forbidden, frame)
+    });
+}
+
+/// Lines of programs are never broken: what a person searches for must be found in them.
+#[test]
+fn logs() {
+    let lines = [
+        (1, "1", "2026-11-01 11:59:58 Traceback (most recent call last):"),
+        (1, "1", "  File \"agent.py\", line 7, in run_step"),
+        (2, "2", "\tindented \u{1b}[31mred\u{1b}[0m and \u{7}loud\r"),
+        (2, "2", ""),
+        (0, "workspace", "restored 12 files"),
+        (1, "contents", "copied 3 folders"),
+    ];
+    let mut text = String::new();
+    for is_coloured in [false, true] {
+        writeln!(text, "=== {} colours", if is_coloured { "with" } else { "without" }).unwrap();
+        for (stream, label, line) in lines {
+            let printed = labelled(stream, label, &log_line(line), is_coloured);
+            assert!(is_coloured || !printed.contains('\u{1b}'), "{printed:?}");
+            writeln!(text, "{printed}").unwrap();
+        }
     }
+    assert_golden("logs", &text);
+    let stored = submission(&ran_with(crashed(), "simulator:2"));
+    assert_shown("logs-in-bucket", |frame| {
+        in_bucket(&stored, Whose::Agent, &Whose::Agent.keys(2, None), frame).unwrap()
+    });
+}
+
+#[test]
+fn a_log_that_is_not_there_is_explained() {
+    let frame = |width| Frame { now: now(), width };
+    let why = |status: &Value, of: Whose| in_bucket(&submission(status), of, &of.keys(2, None), frame(80)).unwrap_err();
+    assert!(why(&waiting(), Whose::Agent).starts_with("submission-42 is Pending and has no Pod yet"));
+    // The attempt before has stored something.
+    let again = with(waiting(), &json!({"attempt": 2, "resultsURL": "s3://results/v2/42"}));
+    let lines = in_bucket(
+        &submission(&again),
+        Whose::Agent,
+        &Whose::Agent.keys(1, None),
+        frame(80),
+    )
+    .unwrap();
+    assert!(
+        lines
+            .last()
+            .unwrap()
+            .contains("s3://results/v2/42/agent/agent1/leaderboard.log")
+    );
+}
+
+#[test]
+fn a_report() {
+    let file = "leaderboard-report-carla.tar";
+    let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
+    let all = texts(&["1 Leaderboard", "12 submissions", "3 Pods", "40 events"]);
+    assert_shown("report", |frame| report::lines(file, "carla", &all, &[], frame));
+    let missing = texts(&[
+        "events.json: missing right: events.events.k8s.io is forbidden: User \"host\" cannot list \
+                          resource \"events\" in API group \"events.k8s.io\" in the namespace \"carla\". Check namespace and context, or \
+                          ask for the right: docs/plugin.md has a Role with all that the plugin needs",
+    ]);
+    assert_shown("report-incomplete", |frame| {
+        report::lines(file, "carla", &all[..3], &missing, frame)
+    });
+    let none = texts(&["0 Leaderboards", "0 submissions", "0 Pods", "0 events"]);
+    assert_shown("report-empty", |frame| {
+        report::lines(file, "default", &none, &[], frame)
+    });
 }

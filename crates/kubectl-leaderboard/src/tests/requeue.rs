@@ -4,7 +4,8 @@ use clap::Parser;
 use serde_json::{Value, json};
 
 use super::{
-    cancelled, crashed, finished, frame, leaderboard, named, node_lost, now, running, submission, waiting, with,
+    cancelled, crashed, finished, frame, leaderboard, named, node_lost, now, ran_with, running, submission, waiting,
+    with,
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
@@ -24,12 +25,7 @@ fn parsed(arguments: &str) -> Result<Requeue, clap::Error> {
 
 /// One of each kind.
 fn all() -> Vec<Submission> {
-    let of = |status: Value, simulator: &str, node: &str| {
-        let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-                          "slices": [{"first": 0, "last": 9}], "routes": 10, "repetitions": 1,
-                          "storage": {"bucket": "results"}, "image": "a", "contentsImage": "c", "simulatorImage": simulator});
-        with(status, &json!({"plan": plan, "nodeName": node}))
-    };
+    let of = |status: Value, simulator: &str, node: &str| with(ran_with(status, simulator), &json!({"nodeName": node}));
     let mut check = named("check-a", &crashed());
     check.spec.check = true;
     let mut higher = named("resumed", &crashed());

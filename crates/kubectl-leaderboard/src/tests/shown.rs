@@ -1,66 +1,19 @@
-//! The whole output of each command, for a narrow and a wide terminal, without and with colours: files in `shown/`. UPDATE_GOLDEN=1
-//! writes them; read the difference then.
-
-use std::fmt::Write as _;
-use std::path::Path;
+//! The whole output of the commands that show or change submissions.
 
 use clap::Parser;
 use serde_json::{Value, json};
 
+use super::golden::assert_shown;
 use super::{
-    cancelled, condition, crashed, driving, finished, leaderboard, named, node_lost, now, of_team, running, submission,
-    waiting, with,
+    cancelled, condition, crashed, driving, finished, leaderboard, named, node_lost, of_team, ran_with, running,
+    submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
-use crate::output::painted;
 use crate::requeue::{self, Requeue};
-use crate::text::{Frame, columns};
 use crate::transitions::Waiting;
-use crate::{overview, status, top, why};
+use crate::{overview, rerun, status, top, why};
 use leaderboard_api::Submission;
-
-/// Columns of the terminals.
-const WIDTHS: [usize; 2] = [80, 120];
-/// Lines that are longer: they are copied.
-const COPIED: [&str; 5] = ["s3://", "aws s3", "https://", "kubectl leaderboard", "CANCELLED"];
-
-/// Compares what one command prints with its file.
-fn assert_shown(name: &str, lines: impl Fn(Frame) -> Vec<String>) {
-    let mut text = String::new();
-    for width in WIDTHS {
-        let lines = lines(Frame { now: now(), width });
-        for line in &lines {
-            let is_copied = COPIED.iter().any(|part| line.contains(part));
-            assert!(is_copied || columns(line) <= width, "{name}, {width} columns: {line}");
-        }
-        for (colours, line_of) in [("without", str::to_owned as fn(&str) -> String), ("with", painted)] {
-            writeln!(text, "=== {width} columns, {colours} colours").unwrap();
-            for line in &lines {
-                // Files of text hold no escapes.
-                writeln!(text, "{}", line_of(line).replace('\u{1b}', "␛")).unwrap();
-            }
-        }
-    }
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("src/tests/shown/{name}.txt"));
-    if std::env::var_os("UPDATE_GOLDEN").is_some() {
-        return std::fs::write(file, text).unwrap();
-    }
-    let known = std::fs::read_to_string(&file).unwrap_or_default();
-    assert_eq!(
-        text, known,
-        "{name} is shown in another way; set UPDATE_GOLDEN=1 and read the difference"
-    );
-}
-
-/// The status of a failure in a run with this simulator.
-fn ran_with(status: Value, simulator: &str) -> Value {
-    let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-                      "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}], "routes": 20, "repetitions": 1,
-                      "storage": {"bucket": "results"}, "image": "agent:1", "contentsImage": "contents:1",
-                      "simulatorImage": simulator});
-    with(status, &json!({"plan": plan, "nodeName": "gpu-3"}))
-}
 
 fn some() -> Vec<Submission> {
     let broken = "registry.example/carla/simulator:0.9.15-3";
@@ -158,8 +111,25 @@ fn why_of_all() {
     assert_shown("why-all-namespaces", |frame| {
         overview::lines(place(true), &all, None, frame)
     });
+}
+
+#[test]
+fn nothing() {
+    let place = |namespace, is_all| overview::Place { namespace, is_all };
     let elsewhere = [("carla-20".to_owned(), 12), ("test".to_owned(), 1)];
-    assert_shown("nothing", |frame| overview::nothing("default", None, &elsewhere, frame));
+    assert_shown("nothing", |frame| {
+        overview::nothing(place("default", false), None, &elsewhere, frame)
+    });
+    assert_shown("nothing-anywhere", |frame| {
+        let phase = Some("leaderboard.carla.org/phase=7");
+        [
+            overview::nothing(place("default", false), None, &[], frame),
+            overview::nothing(place("default", true), None, &[], frame),
+            overview::nothing(place("carla", false), phase, &[], frame),
+            overview::nothing(place("carla", true), phase, &[], frame),
+        ]
+        .concat()
+    });
 }
 
 #[test]
@@ -170,9 +140,15 @@ fn top() {
 #[test]
 fn changes() {
     let board = leaderboard();
+    let prepared = with(waiting(), &json!({"jobName": "submission-42-1", "reason": "Preparing"}));
+    let unstored = with(crashed(), &json!({"resultsURL": null}));
     for (name, request, status) in [
         ("cancel", Request::Cancel, running()),
+        ("cancel-waiting", Request::Cancel, waiting()),
+        ("cancel-preparing", Request::Cancel, prepared),
         ("resume", Request::Resume, crashed()),
+        ("resume-without-results", Request::Resume, unstored),
+        ("rerun", Request::Rerun, node_lost()),
         ("requeue-run", Request::Requeue(None), running()),
         ("requeue-failed", Request::Requeue(None), crashed()),
     ] {
@@ -182,6 +158,25 @@ fn changes() {
                 .lines
         });
     }
+    let mut again = submission(&running());
+    again.spec.cancel = true;
+    assert_shown("cancel-again", |frame| {
+        plan(Request::Cancel, &again, Observed::Found(&board), frame)
+            .unwrap()
+            .lines
+    });
+    let mut paused = leaderboard();
+    paused.spec.paused = true;
+    assert_shown("resume-paused", |frame| {
+        plan(
+            Request::Resume,
+            &submission(&crashed()),
+            Observed::Found(&paused),
+            frame,
+        )
+        .unwrap()
+        .lines
+    });
     assert_shown("wait", |frame| {
         let mut wait = Waiting::new(1).within(frame.width);
         let states = [running(), crashed()];
@@ -204,5 +199,30 @@ fn requeue() {
     let wanted = Line::parse_from(["requeue", "--all", "--state", "failed,running"]).requeue;
     assert_shown("requeue", |frame| {
         requeue::lines(&wanted.chosen(&all, frame.now), frame)
+    });
+    assert_shown("requeue-end", |frame| {
+        [
+            requeue::summary(38, 38, "carla", frame),
+            requeue::summary(37, 38, "carla", frame),
+            requeue::summary(0, 2, "carla", frame),
+            requeue::none(7, "carla", frame),
+            requeue::none(1, "carla", frame),
+        ]
+        .concat()
+    });
+}
+
+#[test]
+fn rerun() {
+    let all = some();
+    assert_shown("rerun-dry", |frame| {
+        requeue::dry_run("resume", &rerun::chosen(&all, Some("NodeLost")), frame)
+    });
+    assert_shown("rerun-none", |frame| {
+        [
+            rerun::none(7, None, "carla", frame),
+            rerun::none(7, Some("SimulationCrashed"), "carla", frame),
+        ]
+        .concat()
     });
 }

@@ -3,8 +3,8 @@
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, submission,
-    waiting, with,
+    assert_width, cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, plan_with, running,
+    submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::why::explain;
@@ -322,9 +322,7 @@ fn one_that_is_not_processed_yet_is_called_new() {
 fn the_log_is_read_where_the_run_was_stored() {
     let storage =
         json!({"bucket": "results", "prefix": "v2/", "region": "eu-west-1", "endpoint": "http://127.0.0.1:4566"});
-    let plan = json!({"runId": "42", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": [{"first": 0, "last": 9}],
-                      "routes": 10, "repetitions": 1, "storage": storage, "image": "a:1", "contentsImage": "c:1",
-                      "simulatorImage": "s:1"});
+    let plan = with(plan_with("simulator:1"), &json!({"storage": storage}));
     let status = with(crashed(), &json!({"plan": plan}));
     let lines = explain(&submission(&status), Observed::Forbidden, frame());
     let command = "             aws s3 cp s3://results/v2/42/evalai/environment_log.txt - --region eu-west-1 \

@@ -83,12 +83,7 @@ fn last_begun(pod: &PodView) -> Option<Timestamp> {
 }
 
 fn is_before_agents(name: &str) -> bool {
-    [
-        names::CONTAINER_CONTENTS,
-        names::CONTAINER_WORKSPACE,
-        names::CONTAINER_LOGCOPY,
-    ]
-    .contains(&name)
+    names::INIT_CONTAINERS.contains(&name)
 }
 
 fn is_of_pair(name: &str) -> bool {

@@ -53,12 +53,7 @@ pub(super) fn failing_before_agents(pod: &PodView) -> Option<&str> {
 }
 
 fn is_before_agents(name: &str) -> bool {
-    [
-        names::CONTAINER_CONTENTS,
-        names::CONTAINER_WORKSPACE,
-        names::CONTAINER_LOGCOPY,
-    ]
-    .contains(&name)
+    names::INIT_CONTAINERS.contains(&name)
 }
 
 fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {

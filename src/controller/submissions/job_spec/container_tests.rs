@@ -23,6 +23,15 @@ fn is_own(container: &Value) -> bool {
     container["name"] == "workspace" || container["name"] == "logcopy"
 }
 
+/// `kubectl leaderboard logs --of start` shows them in the order of this list.
+#[test]
+fn the_init_containers_are_those_that_have_names_in_that_order() {
+    let job = Case::new("V1", json!({})).json();
+    let init = job["spec"]["template"]["spec"]["initContainers"].as_array().unwrap();
+    let found: Vec<&str> = init.iter().filter_map(|container| container["name"].as_str()).collect();
+    assert_eq!(found, names::INIT_CONTAINERS);
+}
+
 #[test]
 fn the_pairs_share_out_what_the_plan_says() {
     let job = Case::new("V1", json!({"pairs": 3})).json();

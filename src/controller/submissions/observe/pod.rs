@@ -121,12 +121,7 @@ fn container(status: &ContainerStatus) -> ContainerView {
 /// Whose words are passed on to people. A stranger's program can write whatever it likes where the runner leaves its
 /// verdict, for example a private route; of that only a verdict's closed words and numbers are used.
 fn may_speak(container: &str, ended: &Ended) -> bool {
-    let is_hosts = [
-        names::CONTAINER_CONTENTS,
-        names::CONTAINER_WORKSPACE,
-        names::CONTAINER_LOGCOPY,
-    ]
-    .contains(&container);
+    let is_hosts = names::INIT_CONTAINERS.contains(&container);
     // Without a start there was no program yet; the words are the kubelet's.
     is_hosts || matches!(ended.reason.as_deref(), Some("StartError" | "ContainerCannotRun"))
 }
