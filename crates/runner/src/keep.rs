@@ -213,6 +213,7 @@ impl std::fmt::Display for Failure {
 #[cfg(test)]
 mod tests {
     use std::os::unix::fs::symlink;
+    use std::process::Command;
 
     use super::*;
 
@@ -334,6 +335,28 @@ mod tests {
             (folder.kept(), fs::read_to_string(&outside).unwrap()),
             (SECOND.to_owned(), FIRST.to_owned())
         );
+    }
+
+    #[test]
+    fn a_pipe_or_a_folder_in_the_place_of_the_copy_holds_nothing_up() {
+        let mut folder = Folder::new();
+        let at = |folder: &Folder, name: &str| folder.folder.path().join(name);
+        let pipe = |path: &Path| assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+        pipe(&folder.keeper.kept);
+        assert_eq!(folder.restart(), "", "there is nothing to give back");
+        pipe(&at(&folder, ".checkpoint.json.tmp"));
+        folder.written(FIRST);
+        assert_eq!(folder.kept(), FIRST, "the copy takes the place of both pipes");
+        fs::create_dir(at(&folder, ".checkpoint.json.tmp")).unwrap();
+        folder.written(SECOND);
+        assert_eq!((folder.kept().as_str(), folder.keeper.complained), (FIRST, true));
+        fs::remove_dir(at(&folder, ".checkpoint.json.tmp")).unwrap();
+        fs::remove_file(&folder.keeper.kept).unwrap();
+        fs::create_dir(&folder.keeper.kept).unwrap();
+        folder.written(SECOND);
+        assert_eq!(folder.restart(), SECOND, "the command goes on without a copy");
+        fs::remove_file(&folder.keeper.checkpoint).unwrap();
+        assert_eq!(folder.restart(), "");
     }
 
     #[test]

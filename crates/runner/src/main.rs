@@ -9,6 +9,7 @@ mod keep;
 mod keep_output;
 mod launch;
 mod memory;
+mod own_folder;
 mod report;
 mod run;
 mod server;

@@ -286,6 +286,9 @@ fn exact_number(text: &str) -> Option<u32> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::symlink;
+    use std::process::Command;
+
     use super::*;
 
     fn member(side: Side, pair: u16) -> Member {
@@ -391,6 +394,37 @@ mod tests {
         fs::write(root.path().join("agent-1/agent-1.crash7"), "").unwrap();
         assert_eq!(present(root.path(), 2), files);
         assert_eq!(present(root.path(), 1).len(), 4);
+    }
+
+    /// A pipe that was opened would wait for its other end, and the test with it.
+    #[test]
+    fn a_name_counts_whatever_kind_of_file_it_is_and_none_is_opened() {
+        let root = tempfile::tempdir().unwrap();
+        let agent = member(Side::Agent, 1);
+        let at = |mark| StatusFile::Of(agent, mark).path(root.path());
+        fs::create_dir(root.path().join("agent-1")).unwrap();
+        let outside = root.path().join("outside");
+        let pipe = at(Mark::Start(0));
+        assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        fs::create_dir(at(Mark::Crash(0))).unwrap();
+        symlink(&outside, at(Mark::Start(1))).unwrap();
+        symlink(at(Mark::Done), at(Mark::Done)).unwrap();
+        let files =
+            [Mark::Start(0), Mark::Crash(0), Mark::Start(1), Mark::Done].map(|mark| StatusFile::Of(agent, mark));
+        for file in files {
+            assert!(file.exists(root.path()), "{}", file.name());
+            file.create(root.path()).unwrap();
+        }
+        assert!(!outside.exists(), "no link is followed");
+        assert_eq!(present(root.path(), 1), files);
+        assert_eq!(
+            Progress::read(root.path(), agent),
+            Progress {
+                crashes: 1,
+                started: true,
+                done: true
+            }
+        );
     }
 
     #[test]

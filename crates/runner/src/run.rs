@@ -19,7 +19,7 @@ use crate::launch;
 use crate::server::{self, Listener, Question};
 use crate::tee::Tee;
 use crate::wake::{Folders, Signals};
-use crate::{checkpoint, memory, report, say};
+use crate::{checkpoint, memory, own_folder, report, say};
 use leaderboard_runner::args::{Job, Role};
 
 /// Behind inotify, for whatever it misses.
@@ -67,8 +67,9 @@ impl Runner {
         };
         let watched = checkpoint.map(std::path::PathBuf::as_path);
         let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy], watched, job.inotify);
-        let kept = job.status.join(me.to_string()).join(KEPT_CHECKPOINT);
-        let keeper = checkpoint.map(|checkpoint| Keeper::new(checkpoint.clone(), kept));
+        let own = job.status.join(me.to_string());
+        own_folder::reopen(&own);
+        let keeper = checkpoint.map(|checkpoint| Keeper::new(checkpoint.clone(), own.join(KEPT_CHECKPOINT)));
         let round = Progress::read(&job.status, me).crashes;
         let now = Instant::now();
         Self {
@@ -368,6 +369,7 @@ impl Runner {
 
     fn conclude(&mut self, cause: Cause) -> Conclusion {
         let ran = self.group.is_some();
+        own_folder::reopen(&self.job.status.join(self.me.to_string()));
         let results = match &self.job.role {
             Role::Agent { checkpoint, .. } if ran => {
                 checkpoint::make_readable(checkpoint);

@@ -419,6 +419,18 @@ fn crashes_that_an_agent_forges_are_never_its_simulators() {
 }
 
 #[test]
+fn marks_that_an_agent_deletes_take_no_pair_out_of_step() {
+    let pod = Pod::new();
+    let script = format!("rm -rf {}/agent-1/* && exit 1", pod.status().display());
+    for round in 0..3 {
+        let (mut simulator, mut agent) = (pod.simulator(), pod.agent(&script));
+        assert_eq!((simulator.code(), agent.code()), (1, 1), "{}", agent.stderr());
+        assert_eq!(simulator.verdict().what, What::PeerCrashed);
+        assert_eq!([simulator.verdict().round, agent.verdict().round], [Some(round); 2]);
+    }
+}
+
+#[test]
 fn a_status_folder_that_cannot_be_written_is_said_and_ends_the_container() {
     let pod = Pod::new();
     fs::write(pod.status().join("simulator-1"), "").unwrap();

@@ -255,7 +255,7 @@ fn a_simulator_that_the_kubelet_could_not_start_is_the_cause() {
 
 #[test]
 fn an_agent_that_ends_alone_is_the_cause_after_a_while() {
-    use EndReason::{BlamesSimulator, Exited, SilentDeath};
+    use EndReason::{BlamesSimulator, CannotStart, Exited, SilentDeath};
     let round_2 = || restarted("simulator-1", 2, "peerCrashed", 1, 40);
     let later = |what| since(50, ended("agent-1", 2, what, 1, 100));
     let mut paused = ended("simulator-1", 2, "peerCrashed", 1, 40);
@@ -267,6 +267,12 @@ fn an_agent_that_ends_alone_is_the_cause_after_a_while() {
             running("simulator-1"),
             ended("agent-1", 0, "exited", 1, 100),
             Awaited(Exited),
+        ),
+        row(
+            "its runner can write no status file",
+            running("simulator-1"),
+            ended("agent-1", 0, "cannotStart", 74, 100),
+            Awaited(CannotStart),
         ),
         row("killed", round_2(), later("silentDeath"), Awaited(SilentDeath)),
         row(
