@@ -55,7 +55,14 @@ def run(settings: Settings, profile: str) -> None:
         say(f"the caches of the build are warm ({seconds(time.monotonic() - started)})")
         make(settings, own, profile, mounts)
         own.layout(BUILT, work / "layout")
-        say(check(settings, own, enginecheck.read(work / "layout"), base, spec))
+        built = enginecheck.read(work / "layout")
+        found = enginecheck.faults(built, [plain_digest(base)], spec)
+        if profile == "release":
+            found += enginecheck.too_large(built)
+        if found:
+            raise LabError(f"the image of the Dockerfile: {'; '.join(found)}")
+        try_programs(settings, own, spec)
+        say(f"the image of the Dockerfile is as expected, {enginecheck.sizes(built, 1)}")
 
 
 def make(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, str]) -> None:
@@ -70,11 +77,8 @@ def make(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, st
     say(f"the Dockerfile is built ({seconds(time.monotonic() - started)})")
 
 
-def check(settings: Settings, own: Engine, built: enginecheck.Built, base: layer.Image, spec: ImageSpec) -> str:
-    """Compares the image with our own maker's and runs its programs; returns what it is."""
-    found = enginecheck.faults(built, [plain_digest(base)], spec)
-    if found:
-        raise LabError(f"the image of the Dockerfile: {'; '.join(found)}")
+def try_programs(settings: Settings, own: Engine, spec: ImageSpec) -> None:
+    """Runs the programs of the image in it: they say which build they are."""
     version = release.version(settings.repository)
     printed = {"leaderboard-operator": f"leaderboard-operator {version} ({REVISION})"}
     for item in enginecheck.programs(spec):
@@ -83,7 +87,6 @@ def check(settings: Settings, own: Engine, built: enginecheck.Built, base: layer
         line = own.output(BUILT, [item.to, "--version"])
         if line != expected:
             raise LabError(f"the image of the Dockerfile: {name} --version prints {line!r}, and {expected!r} expected")
-    return f"the image of the Dockerfile is as expected, {enginecheck.sizes(built, 1)}"
 
 
 def plain_digest(made: layer.Image) -> str:

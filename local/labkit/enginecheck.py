@@ -15,6 +15,8 @@ from .layer import sha256
 
 GZIP = b"\x1f\x8b"
 ELF = b"\x7fELF"
+# Of a release, as a registry keeps it.
+MOST_PUSHED_BYTES = 30 << 20
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,14 @@ def of_program(path: str, content: bytes, libs: bool, base: set[str]) -> Iterato
         yield f"{path} needs {loader}, and a static program expected"
     elif loader is not None and loader not in base:
         yield f"{path} needs {loader}, which its base lacks"
+
+
+def too_large(built: Built) -> list[str]:
+    """That an image of a release has more bytes than it may have."""
+    pushed = sum(one.pushed_bytes for one in built.layers)
+    if pushed <= MOST_PUSHED_BYTES:
+        return []
+    return [f"it has {mib(pushed)} compressed, and {mib(MOST_PUSHED_BYTES)} are the most"]
 
 
 def sizes(built: Built, base: int) -> str:

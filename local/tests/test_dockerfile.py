@@ -102,6 +102,14 @@ class Image(unittest.TestCase):
         self.assertTrue(built.layers[0].members["/usr/local/bin"].is_dir)
         self.assertEqual(built.layers[0].pushed_bytes, len(made.blobs[made.layer]))
 
+    def test_a_release_has_a_limit_as_a_registry_keeps_it(self) -> None:
+        self.assertEqual(enginecheck.too_large(Built(CONFIG, [BASE])), [])
+        heavy = replace(BASE, pushed_bytes=enginecheck.MOST_PUSHED_BYTES)
+        self.assertEqual(
+            enginecheck.too_large(Built(CONFIG, [BASE, heavy])),
+            ["it has 30.0 MiB compressed, and 30.0 MiB are the most"],
+        )
+
     def test_its_size_is_said_for_people(self) -> None:
         text = enginecheck.sizes(Built(CONFIG, [BASE, layer_of(Entry("/a", 0o755, bytes(3 << 20)))]), 1)
         self.assertRegex(text, r"^3\.0 MiB \(0\.0 MiB compressed\): base 0\.0 MiB .* programs 3\.0 MiB .* a 3\.0 MiB$")
