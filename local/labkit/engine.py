@@ -67,7 +67,8 @@ class Engine:
         """Builds a Dockerfile from images that are here; no registry is asked."""
         places = ["--file", str(file), "--tag", tag, str(context)]
         argv = self.argv("bud", *ISOLATION, "--network", "host", "--pull-never", *options, *places)
-        run_long(argv, what, log, env=self.environment())
+        # A build goes on where only its engine is ended.
+        run_long(argv, what, log, env=self.environment(), group=True)
 
     def output(self, image: str, argv: Sequence[str]) -> str:
         """What a program of an image prints, run as the image's user."""
