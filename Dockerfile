@@ -10,15 +10,17 @@ FROM ${BUILD_IMAGE} AS build
 WORKDIR /src
 # The commit, for the first line of the log and for leaderboard_build_info: --build-arg REVISION="$(git rev-parse --short HEAD)"
 ARG REVISION=""
+# cargo's profile of the operator; `local/lab dockerfile`, which builds this file in the tests, gives `local`.
+ARG PROFILE=release
 COPY . .
 # Two builds, as the runner is static and small: it is copied into every Pod and runs inside any image.
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/src/target \
     triple="$(rustc -vV | sed -n 's/^host: //p')" \
     && LEADERBOARD_REVISION="$REVISION" \
-       cargo build --locked --release --features otel -p leaderboard-operator --bin leaderboard-operator \
+       cargo build --locked --profile "$PROFILE" --features otel -p leaderboard-operator --bin leaderboard-operator \
     && RUSTFLAGS="-C target-feature=+crt-static" \
        cargo build --locked --release --target "$triple" -p leaderboard-runner \
-    && install -D -t /out target/release/leaderboard-operator "target/$triple/release/leaderboard-runner"
+    && install -D -t /out "target/$PROFILE/leaderboard-operator" "target/$triple/release/leaderboard-runner"
 
 # Has the C library, the authorities for TLS, the user 65532, and no shell.
 FROM ${BASE_IMAGE}

@@ -16,6 +16,7 @@ from . import (
     cluster,
     crash,
     demo,
+    dockerfile,
     image,
     kube,
     metricdocs,
@@ -63,6 +64,8 @@ def parser() -> argparse.ArgumentParser:
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
     page = commands.add_parser("page-test", help="test the operator's page in a headless Chromium")
     page.add_argument("--pictures", action="store_true", help="take the pictures of docs/images too")
+    engine = commands.add_parser("dockerfile", help="build the Dockerfile with buildah and check its image")
+    engine.add_argument("--profile", default=build.PROFILE, help=f"cargo profile (default: {build.PROFILE})")
     commands.add_parser("chart-docs", help="write the tables of the chart's values and of the metrics")
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
@@ -124,6 +127,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             charttest.run(settings, arguments.update)
         case "page-test":
             pagetest.run(settings, arguments.pictures)
+        case "dockerfile":
+            dockerfile.run(settings, arguments.profile)
         case "chart-docs":
             chartdocs.update(chartrender.folder(settings.repository))
             metricdocs.update(settings.repository)

@@ -1,6 +1,8 @@
 """Owns what a person sees while something runs: progress lines and heartbeats on stderr. stdout is for results only."""
 
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -65,10 +67,12 @@ def run_long(
     keep: Sequence[int] = (),
     progress: Callable[[str], str] | None = None,
     usual: float = 0,
+    group: bool = False,
 ) -> None:
     """Runs a command that may take minutes: its output goes to `log`, a heartbeat to stderr; raises LabError if it fails.
 
     `progress` makes of the log so far how far it is, for the heartbeat. With `usual` seconds, a bar takes its place on a terminal.
+    With `group`, what the command has started ends with it when we are interrupted, also where the command leaves it behind.
     The command inherits the descriptors in `keep`: a lock among them is held as long as the command lives, even if we die.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +80,14 @@ def run_long(
     draws = usual > 0 and sys.stderr.isatty()
     with log.open("wb") as sink:
         child = subprocess.Popen(
-            argv, cwd=cwd, env=env, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT, pass_fds=keep
+            argv,
+            cwd=cwd,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=sink,
+            stderr=subprocess.STDOUT,
+            pass_fds=keep,
+            process_group=0 if group else None,
         )
         try:
             while True:
@@ -90,7 +101,10 @@ def run_long(
                     far = progress(log.read_text(errors="replace")) if progress else "still running"
                     say(f"  {what}: {far} after {seconds(time.monotonic() - started)}")
         except BaseException:
-            child.terminate()
+            if group:
+                os.killpg(child.pid, signal.SIGTERM)
+            else:
+                child.terminate()
             child.wait()
             raise
         finally:

@@ -14,9 +14,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from . import awsrecorded, build, charttest, cluster, demo, gpus, kube, pagetest, pythonenv, quickstart, rights, tools
+from . import (
+    awsrecorded,
+    build,
+    charttest,
+    cluster,
+    demo,
+    dockerfile,
+    gpus,
+    kube,
+    pagetest,
+    pythonenv,
+    quickstart,
+    rights,
+    tools,
+)
 from .console import say, seconds
-from .errors import LabError
+from .errors import LabError, NotRun
 from .failures import Failure, Reader, Summary, failed_cases
 from .settings import Settings, client_environment, without_proxy
 from .toolsets import ENVTEST_TOOLS
@@ -51,7 +65,7 @@ class Plan:
 class Layer:
     name: str
     about: str
-    # Raises LabError if it fails.
+    # Raises LabError if it fails, NotRun where this machine lacks what it needs.
     work: Callable[[Plan], None]
     # Needs root: for a node, or to install what is missing.
     needs_root: bool = False
@@ -71,8 +85,10 @@ class Outcome:
 class Result:
     name: str
     seconds: float
-    # Empty: it passed.
+    # Empty: it passed, or was not run.
     failure: str
+    # What this machine lacks for it.
+    lacks: str = ""
 
 
 def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -> bool:
@@ -93,23 +109,30 @@ def run_layer(plan: Plan, layer: Layer, before: Sequence[Result]) -> Result:
         return Result(layer.name, 0, "not run, as the build failed")
     say(f"--- {layer.name}: {layer.about}")
     started = time.monotonic()
+    failure, lacks = "", ""
     try:
         layer.work(plan)
-        failure = ""
+    except NotRun as reason:
+        lacks = str(reason)
+        say(f"{layer.name} was not run: {lacks}")
     except LabError as error:
         failure = str(error)
         say(f"{layer.name} failed: {failure}")
-    return Result(layer.name, time.monotonic() - started, failure)
+    return Result(layer.name, time.monotonic() - started, failure, lacks)
 
 
 def table(results: Sequence[Result]) -> str:
-    """Each layer with its time, and what failed."""
+    """Each layer with its time, and what failed or was not run."""
     lines = [""]
     for result in results:
-        lines.append(f"{result.name:<9}{seconds(result.seconds):>13}   {result.failure or 'passed'}")
+        lacks = f"not run: {result.lacks}" if result.lacks else ""
+        lines.append(f"{result.name:<9}{seconds(result.seconds):>13}   {result.failure or lacks or 'passed'}")
     total = seconds(sum(result.seconds for result in results))
     failed = [result.name for result in results if result.failure]
-    lines.append(f"{'all':<9}{total:>13}   {'failed: ' + ', '.join(failed) if failed else 'passed'}")
+    left_out = [result.name for result in results if result.lacks]
+    end = f"failed: {', '.join(failed)}" if failed else "passed"
+    end += f"; not run: {', '.join(left_out)}" if left_out else ""
+    lines.append(f"{'all':<9}{total:>13}   {end}")
     return "\n".join(lines)
 
 
@@ -155,6 +178,13 @@ def page(plan: Plan) -> None:
         say("no single test here has a name: left out because of --filter")
         return
     pagetest.run(plan.settings, pictures=False)
+
+
+def image(plan: Plan) -> None:
+    if plan.filter:
+        say("no single test here has a name: left out because of --filter")
+        return
+    dockerfile.run(plan.settings, build.PROFILE)
 
 
 def in_cluster(plan: Plan) -> None:
@@ -368,6 +398,7 @@ LAYERS = (
     Layer("api", "a real API server, without nodes", api),
     Layer("page", "the operator's page, in a headless Chromium", page, needs_root=True),
     Layer("chart", "the Helm chart, against an API server", chart),
+    Layer("image", "the Dockerfile, by a container engine", image, needs_root=True),
     Layer("cluster", "a real node with containers", in_cluster, needs_root=True),
 )
 NAMES = tuple(layer.name for layer in LAYERS)

@@ -11,19 +11,22 @@ mod preflight;
 mod serve;
 
 use std::process::ExitCode;
+use std::sync::LazyLock;
 
 use clap::{Args, Parser, Subcommand};
 
 use crate::allowed::Allowed;
 use crate::controller::runtime::leader::{self, Identity};
+use crate::observability::REVISION;
 use crate::observability::logging::Format;
 
 /// The port that `--dashboard` alone stands for.
 const PAGE_PORT: &str = "8081";
+static VERSION: LazyLock<String> = LazyLock::new(|| version_of(REVISION));
 
 /// Runs the submissions of an AI challenge on Kubernetes.
 #[derive(Parser, Debug)]
-#[command(name = "leaderboard-operator", version, about, long_about = None)]
+#[command(name = "leaderboard-operator", version = VERSION.as_str(), about, long_about = None)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -129,6 +132,16 @@ struct InPod {
     faster: u32,
 }
 
+/// The version, with the commit where the build was given one.
+fn version_of(revision: &str) -> String {
+    let version = env!("CARGO_PKG_VERSION");
+    if revision.is_empty() {
+        version.to_owned()
+    } else {
+        format!("{version} ({revision})")
+    }
+}
+
 /// Runs what the command line asks for.
 pub fn run() -> ExitCode {
     let cli = Cli::parse();
@@ -142,5 +155,19 @@ pub fn run() -> ExitCode {
         Command::Preflight(options) => options.run(),
         Command::Workspace(options) => serve::workspace(&options),
         Command::Logcopy(options) => serve::logcopy(&options),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_version_names_the_commit_of_a_build_that_was_given_one() {
+        assert_eq!(version_of(""), env!("CARGO_PKG_VERSION"));
+        assert_eq!(
+            version_of("0123abc"),
+            format!("{} (0123abc)", env!("CARGO_PKG_VERSION"))
+        );
     }
 }
