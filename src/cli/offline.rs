@@ -230,8 +230,10 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
     let places: Vec<Place> = texts.iter().map(|(name, _)| Place::of(out, name)).collect();
     // Side by side, as each waits for the disk.
     let staged = thread::scope(|scope| {
-        let stage = |(place, (_, text))| scope.spawn(move || Place::stage(place, text));
-        let writers: Vec<_> = places.iter().zip(&texts).map(stage).collect();
+        let mut writers = Vec::with_capacity(places.len());
+        for (place, (_, text)) in places.iter().zip(&texts) {
+            writers.push(scope.spawn(move || place.stage(text)));
+        }
         let ended = writers
             .into_iter()
             .map(|writer| writer.join().unwrap_or_else(|panic| resume_unwind(panic)));
