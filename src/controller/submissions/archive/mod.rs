@@ -20,11 +20,13 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Client, ResourceExt};
 use tokio::sync::Notify;
 use tokio::time::Instant;
+use tracing::Instrument;
 
 use super::failure_log::{LogDemand, Tail};
 use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
 use crate::controller::objects::{Wake, uid_of};
+use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
@@ -186,6 +188,7 @@ impl ArchiveWorkers {
             storage: plan.storage.clone(),
             run_id: plan.run_id.clone(),
             submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
+            log: LogSpan::current(),
         };
         let id = bucket_id(&plan.storage);
         let mut buckets = self.0.buckets();
@@ -270,7 +273,8 @@ impl ArchiveWorker {
         let archive = self
             .archive
             .at_prefix(effective::key_prefix(&target.storage, &target.run_id));
-        let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work).await;
+        let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work);
+        let done = done.instrument(target.log.span().clone()).await;
         (work, done)
     }
 

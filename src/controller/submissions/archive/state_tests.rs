@@ -6,6 +6,7 @@ use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{LogAt, LogPlace, Texts};
+use crate::observability::about::LogSpan;
 
 struct Bench {
     state: State,
@@ -55,6 +56,7 @@ impl Bench {
                 storage,
                 run_id: "7".parse().unwrap(),
                 submission_uid: "u".into(),
+                log: LogSpan::default(),
             }),
         }
     }
