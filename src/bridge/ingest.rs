@@ -11,9 +11,10 @@ use kube::Api;
 use kube::api::{ObjectMeta, Patch, PatchParams, PostParams};
 use serde_json::{Value, json};
 use thiserror::Error;
+use tracing::Span;
 
 use crate::kubernetes::{CallError, call_within};
-use crate::observability::trace_id::TraceId;
+use crate::observability::about;
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
 use leaderboard_api::{
@@ -288,18 +289,49 @@ fn annotation(record: &Ingested) -> (String, String) {
     (names::ANNOTATION_INGESTED.to_owned(), json!(record).to_string())
 }
 
-/// Creates or bumps the Submission in the namespace of `api`, which is that of the Leaderboard.
+/// What all lines about an incoming submission are written in, those of [`apply`] too.
+pub fn span(namespace: &str, leaderboard: &str, submission: i64) -> Span {
+    about::incoming(
+        format_args!("{namespace}/{}", names::submission(submission)),
+        leaderboard,
+    )
+}
+
+/// Creates or bumps the Submission in the namespace of `api`, which is that of the Leaderboard. To be called in a [`span`], which then
+/// has the object's attempt and trace.
 pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming) -> Result<Outcome, IngestError> {
+    let mut known = None;
+    let outcome = rounds(api, leaderboard, incoming, &mut known).await;
+    if let Some(known) = known {
+        about::identify(known.spec.attempt, known.metadata.uid.as_deref().unwrap_or_default());
+    }
+    // The first line of each attempt.
+    match &outcome {
+        Ok(Outcome::Created) => tracing::info!("created"),
+        Ok(Outcome::Bumped(_)) => tracing::info!("resumed"),
+        _ => {}
+    }
+    outcome
+}
+
+/// Leaves in `existing` the object as it was last seen.
+async fn rounds(
+    api: &Api<Submission>,
+    leaderboard: &str,
+    incoming: &Incoming,
+    existing: &mut Option<Submission>,
+) -> Result<Outcome, IngestError> {
     let name = names::submission(incoming.submission);
     // Most are new, so the first try creates; the answer AlreadyExists makes the read necessary.
-    let mut existing = if was_run_before(&incoming.source) {
-        call(&name, "the read", api.get_opt(&name)).await?
-    } else {
-        None
-    };
+    if was_run_before(&incoming.source) {
+        *existing = call(&name, "the read", api.get_opt(&name)).await?;
+    }
     for _ in 0..ROUNDS {
         let done = match decide_ingest(leaderboard, existing.as_ref(), incoming) {
-            Ingest::Create(fresh) => create(api, &name, &fresh).await?.then_some(Outcome::Created),
+            Ingest::Create(fresh) => create(api, &name, &fresh).await?.map(|created| {
+                *existing = Some(created);
+                Outcome::Created
+            }),
             Ingest::Bump {
                 attempt,
                 resource_version,
@@ -308,7 +340,7 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
                 let spec = json!({ "attempt": attempt, "cancel": false });
                 let bumped = note(api, &name, &resource_version, &record, &spec).await?;
                 bumped.map(|bumped| {
-                    log(&bumped, "resumed");
+                    *existing = Some(bumped);
                     Outcome::Bumped(attempt)
                 })
             }
@@ -337,35 +369,19 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
         if let Some(outcome) = done {
             return Ok(outcome);
         }
-        existing = call(&name, "the read", api.get_opt(&name)).await?;
+        *existing = call(&name, "the read", api.get_opt(&name)).await?;
     }
     Err(IngestError::Contended { name })
 }
 
-/// False if there is one of that name.
-async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result<bool, IngestError> {
+/// None if there is one of that name.
+async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result<Option<Submission>, IngestError> {
     let params = PostParams {
         field_manager: Some(names::MANAGER_INGEST.to_owned()),
         ..PostParams::default()
     };
     let request = api.create(&params, fresh);
-    let created = unless_lost(&[409], name, "the creation", request).await?;
-    if let Some(created) = &created {
-        log(created, "created");
-    }
-    Ok(created.is_some())
-}
-
-/// The first line of each attempt: all later ones have the same names.
-fn log(submission: &Submission, what: &'static str) {
-    let meta = &submission.metadata;
-    tracing::info!(
-        submission = %format_args!("{}/{}", meta.namespace.as_deref().unwrap_or_default(), meta.name.as_deref().unwrap_or_default()),
-        leaderboard = submission.spec.leaderboard_name,
-        attempt = submission.spec.attempt,
-        trace_id = %TraceId::of(meta.uid.as_deref().unwrap_or_default()),
-        "{what}"
-    );
+    unless_lost(&[409], name, "the creation", request).await
 }
 
 /// Writes the annotation, and with it what changes of the spec. None if the object is no longer what the decision was made on.

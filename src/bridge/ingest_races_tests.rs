@@ -1,6 +1,10 @@
 //! More races on a mock API server, and requests that fail.
 
+use tracing::Instrument;
+
 use super::*;
+use crate::observability::logging::tests::Lines;
+use crate::observability::trace_id::TraceId;
 
 #[tokio::test]
 async fn the_sweep_leaves_a_hosts_cancel_as_it_is() {
@@ -82,4 +86,34 @@ async fn a_silent_api_server_is_not_waited_for() {
         ),
         "{outcome:?}"
     );
+}
+
+#[tokio::test]
+async fn lines_about_what_comes_in_have_its_attempt_and_its_trace_once_its_object_is_known() {
+    let lines = Lines::default();
+    let _guard = lines.collect();
+    let mut failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    failed.metadata.uid = Some("uid".into());
+    let mut resumed = failed.clone();
+    resumed.spec.attempt = 2;
+    let exists = || refusal(409, "AlreadyExists");
+    for (script, attempt) in [
+        (vec![refusal(403, "Forbidden")], None),
+        (vec![object(&failed)], Some(1)),
+        (vec![exists(), object(&failed), object(&resumed)], Some(2)),
+        (vec![exists(), object(&failed), refusal(403, "Forbidden")], Some(1)),
+    ] {
+        let taken = async {
+            let (outcome, _) = against(script, message("b", 200_000)).await;
+            tracing::info!(is_done = outcome.is_ok(), "taken in");
+        };
+        taken.instrument(span("ns", BOARD, 3)).await;
+        for line in lines.take_json() {
+            let name = ["submission", "leaderboard"].map(|field| &line[field]);
+            assert_eq!(json!(name), json!(["ns/submission-3", BOARD]), "{line}");
+            let trace = attempt.map(|_| TraceId::of("uid").to_string());
+            let expected = [attempt.map(Value::from), trace.map(Value::from)];
+            assert_eq!(["attempt", "trace_id"].map(|field| line.get(field).cloned()), expected);
+        }
+    }
 }

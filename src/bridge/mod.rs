@@ -3,6 +3,7 @@
 //! Started by `leaderboard-operator bridge`. Several replicas may run at once: `ingest` is safe twice and SQS hands
 //! a message to one of them. `route` holds the policy, `ingest` is also the controller's, for its sweep.
 
+pub mod ages;
 pub mod ingest;
 mod leaderboards;
 pub mod message;

@@ -12,17 +12,19 @@ use kube::runtime::events::{Event, EventType};
 use kube::{Api, Resource};
 use tokio::sync::{OnceCell, watch};
 use tokio::time::Instant;
+use tracing::Instrument;
 
+use super::ages::Ages;
 use super::ingest::{self, Incoming, IngestError, Outcome, Source};
 use super::leaderboards::Leaderboards;
 use super::message::{self, Message};
 use super::queue::{QueueError, Reader, Received, batch_size};
-use super::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
+use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Rules};
 use super::{PULSE_LIMIT, Shared};
 use crate::backoff::Backoff;
 use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Leaderboard, names, reasons};
+use leaderboard_api::{Leaderboard, reasons};
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);
@@ -32,6 +34,8 @@ const EXTENSION: i32 = 30;
 const LONGEST_VISIBILITY: i32 = 43_200;
 /// How often the queue's attributes are read anew.
 const REOPEN: Duration = Duration::from_mins(10);
+/// A message that can be received again is, within so long: a receive looks into a part of the queue.
+const SEEN_AGAIN: Duration = Duration::from_mins(1);
 /// Pauses after failures in a row.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(1), Duration::from_mins(1));
 /// Time between two events with the same reason about one queue.
@@ -46,6 +50,7 @@ pub struct Poller {
     reader: Option<(Reader, Instant)>,
     /// Mean time that a message takes.
     each: Duration,
+    ages: Ages,
     events: HashMap<&'static str, Instant>,
 }
 
@@ -68,6 +73,7 @@ impl Poller {
             stop,
             reader: None,
             each: Duration::from_millis(50),
+            ages: Ages::default(),
             events: HashMap::new(),
         }
     }
@@ -93,6 +99,7 @@ impl Poller {
             }
             let _ = tokio::time::timeout(pause, self.stop.wait_for(|stop| *stop)).await;
         }
+        self.shared.telemetry.metrics.set_oldest_message(&self.url, None);
     }
 
     /// Receives once and processes what came.
@@ -108,10 +115,29 @@ impl Poller {
             self.reader = None;
             error.to_string()
         })?;
+        self.remember(&received);
         if !received.is_empty() {
             self.batch(received).await;
+            self.show_oldest();
         }
         Ok(())
+    }
+
+    /// What was received is in hand; what was to come back by now, and did not, is gone.
+    fn remember(&mut self, received: &[Received]) {
+        let now = Instant::now();
+        let visibility = self.reader.as_ref().map(|(reader, _)| reader.visibility());
+        let until = now + visibility.unwrap_or_default() + SEEN_AGAIN;
+        for message in received {
+            self.ages.keep(&message.id, message.sent_ms, until);
+        }
+        self.ages.expire(now);
+        self.show_oldest();
+    }
+
+    fn show_oldest(&self) {
+        let oldest = self.ages.oldest_ms();
+        self.shared.telemetry.metrics.set_oldest_message(&self.url, oldest);
     }
 
     async fn receive(&mut self) -> Result<Vec<Received>, QueueError> {
@@ -154,18 +180,44 @@ impl Poller {
             self.shared.telemetry.metrics.sqs_message(outcome.as_str());
             held_back = held_back.saturating_add(u32::from(outcome.is_held_back()));
             match outcome {
-                MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message.receipt.as_str()),
-                MessageOutcome::Later { seconds, .. } => report(reader.hold(&[&message.receipt], seconds).await),
+                MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message),
+                MessageOutcome::Later { seconds, why } => {
+                    self.left(message, seconds, why);
+                    report(reader.hold(&[&message.receipt], seconds).await);
+                }
                 MessageOutcome::Lapse | MessageOutcome::Ingest { .. } => {}
             }
         }
-        report(reader.delete(&deletes).await);
+        self.delete(&reader, &deletes).await;
         if held_back > 0 {
             // The controller does not take what is in flight for another reader's then.
             let note = format!("{held_back} messages of the queue cannot be used yet and are received again later.");
             self.publish(&readers, reasons::MESSAGES_HELD_BACK, &note).await;
         }
         self.reader = Some((reader, since));
+    }
+
+    /// A message stays in the queue and comes back after so many seconds. How long another reader takes is not ours to show.
+    fn left(&mut self, message: &Received, seconds: i32, why: Later) {
+        let hidden = Duration::from_secs(u64::try_from(seconds).unwrap_or_default());
+        match why {
+            Later::Foreign => self.ages.forget(&message.id),
+            Later::Unknown | Later::Deleting | Later::Refused | Later::Blocked => {
+                let until = Instant::now() + hidden + SEEN_AGAIN;
+                self.ages.keep(&message.id, message.sent_ms, until);
+            }
+        }
+    }
+
+    async fn delete(&mut self, reader: &Reader, messages: &[&Received]) {
+        let receipts: Vec<_> = messages.iter().map(|message| message.receipt.as_str()).collect();
+        let deleted = reader.delete(&receipts).await;
+        if deleted.is_ok() {
+            for message in messages {
+                self.ages.forget(&message.id);
+            }
+        }
+        report(deleted);
     }
 
     /// Decides on all messages at once; extends their visibility if half of it is over before all are decided.
@@ -195,7 +247,8 @@ impl Poller {
         match (&envelope.content, outcome) {
             (Ok(content), MessageOutcome::Ingest { namespace, leaderboard }) => {
                 let incoming = incoming(content, received);
-                let ingested = self.ingest(&namespace, &leaderboard, &incoming).await;
+                let span = ingest::span(&namespace, &leaderboard, incoming.submission);
+                let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
                     route::settle(&envelope, &ingested, &readers.rules, now_ms())
                 })
@@ -213,13 +266,8 @@ impl Poller {
     ) -> Option<Result<Outcome, IngestError>> {
         let api = Api::namespaced(self.shared.client.clone(), namespace);
         let applied = tokio::time::timeout(MESSAGE_LIMIT, ingest::apply(&api, leaderboard, incoming)).await;
-        let submission = format!("{namespace}/{}", names::submission(incoming.submission));
         let Ok(outcome) = applied else {
-            tracing::warn!(
-                submission,
-                leaderboard,
-                "the API server is too slow; the message will come back"
-            );
+            tracing::warn!("the API server is too slow; the message will come back");
             return None;
         };
         match &outcome {
@@ -229,16 +277,14 @@ impl Poller {
                 self.shared.telemetry.metrics.sqs_message_waited(waited);
             }
             Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => {
-                tracing::debug!(submission, leaderboard, "a repeat");
+                tracing::debug!("a repeat");
             }
-            Ok(Outcome::Deleting) => tracing::info!(submission, leaderboard, "the old one is still being deleted"),
+            Ok(Outcome::Deleting) => tracing::info!("the old one is still being deleted"),
             Ok(Outcome::IdTaken(owner)) => tracing::warn!(
-                submission,
-                leaderboard,
                 owner,
                 "another object has the name of this submission; rename or delete it"
             ),
-            Err(error) => tracing::warn!(submission, leaderboard, %error, "not ingested"),
+            Err(error) => tracing::warn!(%error, "not ingested"),
         }
         Some(outcome)
     }

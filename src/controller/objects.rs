@@ -4,10 +4,12 @@ use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
+use tracing::Span;
 
 use crate::kubernetes::objects::{Job, Pod};
+use crate::observability::about;
 use crate::services::ObjectKey;
-use leaderboard_api::names;
+use leaderboard_api::{Submission, names};
 
 /// Puts an object into its work queue.
 pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;
@@ -24,6 +26,18 @@ pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
         name: object.name_any(),
         uid: object.uid().unwrap_or_default(),
     }
+}
+
+/// What all log lines about a submission are written in.
+pub fn span_of(submission: &Submission) -> Span {
+    let meta = &submission.metadata;
+    let (namespace, name) = (meta.namespace.as_deref(), meta.name.as_deref());
+    about::submission(
+        format_args!("{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()),
+        &submission.spec.leaderboard_name,
+        submission.spec.attempt,
+        meta.uid.as_deref().unwrap_or_default(),
+    )
 }
 
 /// An object that the operator makes for Submissions.

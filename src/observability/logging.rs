@@ -8,7 +8,10 @@ use tracing::Subscriber;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::ParseError;
 use tracing_subscriber::fmt::MakeWriter;
+use tracing_subscriber::fmt::format::JsonFields;
 use tracing_subscriber::util::SubscriberInitExt;
+
+use super::json_lines::JsonLines;
 
 /// What is logged by default. The libraries' own warnings are repeated by us as sentences.
 pub const DEFAULT_FILTER: &str = "info,kube_client=warn,kube_runtime=error,aws_config=warn,aws_smithy_runtime=warn,hyper=warn,hyper_util=warn,tower=warn,rustls=warn";
@@ -67,12 +70,8 @@ where
     if is_text {
         return Ok(Box::new(base.with_ansi(is_terminal).finish()));
     }
-    let json = base
-        .json()
-        .flatten_event(true)
-        .with_current_span(false)
-        .with_span_list(true);
-    Ok(Box::new(json.with_ansi(false).finish()))
+    let json = base.fmt_fields(JsonFields::new()).event_format(JsonLines);
+    Ok(Box::new(json.finish()))
 }
 
 #[cfg(test)]
@@ -81,22 +80,39 @@ pub(crate) mod tests {
     use std::io::Write;
     use std::sync::{Arc, Mutex};
 
+    use tracing::Dispatch;
+
     /// What was logged, as the JSON lines of a program with the usual filter.
     #[derive(Clone, Default)]
     pub(crate) struct Lines(Arc<Mutex<Vec<u8>>>);
 
     impl Lines {
         /// Takes what this thread logs until the guard is dropped.
-        pub(crate) fn collect(&self) -> tracing::subscriber::DefaultGuard {
+        pub(crate) fn collect(&self) -> Collecting {
             let writer = self.clone();
             let subscriber = subscriber(Format::Json, None, move || writer.clone(), false).unwrap();
-            tracing::subscriber::set_default(subscriber)
+            Collecting {
+                _second: Dispatch::new(tracing_subscriber::registry()),
+                _guard: tracing::subscriber::set_default(subscriber),
+            }
         }
 
         /// What has come since the last time.
         pub(crate) fn take(&self) -> String {
             String::from_utf8(std::mem::take(&mut *self.0.lock().unwrap())).unwrap()
         }
+
+        /// The same, line by line.
+        pub(crate) fn take_json(&self) -> Vec<serde_json::Value> {
+            let text = self.take();
+            text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+        }
+    }
+
+    /// With a single subscriber in the process, a line that a thread of another test reaches first is off for good.
+    pub(crate) struct Collecting {
+        _guard: tracing::subscriber::DefaultGuard,
+        _second: Dispatch,
     }
 
     impl Write for Lines {
@@ -131,9 +147,33 @@ pub(crate) mod tests {
                 (&line["message"], &line["attempt"], &line["level"]),
                 (&"started".into(), &2.into(), &"INFO".into())
             );
-            assert_eq!(line["spans"][0]["submission"], "submission-7");
+            assert_eq!(
+                (&line["submission"], line.get("spans")),
+                (&"submission-7".into(), None),
+                "a span's fields stand in the line"
+            );
             assert!(!text.contains('\u{1b}'), "{text}");
         }
+    }
+
+    #[test]
+    fn the_event_wins_over_its_span_and_spans_of_libraries_are_apart() {
+        let lines = Lines::default();
+        let _guard = lines.collect();
+        let _ours = tracing::error_span!("submission", attempt = 1).entered();
+        let _other = tracing::error_span!(target: "hyper::client", "connect", level = "odd").entered();
+        tracing::info!(attempt = 2, took = 0.5, is_last = true, "started");
+        let found = lines.take_json();
+        let fields = ["attempt", "took", "is_last", "level", "target"].map(|name| &found[0][name]);
+        let target = "leaderboard_operator::observability::logging::tests";
+        assert_eq!(
+            serde_json::json!(fields),
+            serde_json::json!([2, 0.5, true, "INFO", target])
+        );
+        assert_eq!(
+            found[0]["spans"],
+            serde_json::json!([{"name": "connect", "level": "odd"}])
+        );
     }
 
     #[test]

@@ -3,7 +3,9 @@
 //! Called by every program that stays: `controller` and `bridge`. Knows no Kubernetes object and no policy; parts report
 //! what they do and what they miss.
 
+pub mod about;
 pub mod health;
+mod json_lines;
 pub mod liveness;
 pub mod logging;
 pub mod metrics;

@@ -166,9 +166,19 @@ impl Bridge {
     /// So many messages had this outcome.
     pub(super) fn count(&self, outcome: &str) -> u64 {
         let sample = format!("leaderboard_sqs_messages_total{{outcome=\"{outcome}\"}} ");
+        self.sample(&sample).map_or(0, |value| value.parse().unwrap())
+    }
+
+    /// When the oldest message of a queue was sent that is not deleted yet, in seconds since 1970.
+    fn oldest(&self, url: &str) -> Option<f64> {
+        let sample = format!("leaderboard_queue_oldest_message_timestamp_seconds{{queue=\"{url}\"}} ");
+        self.sample(&sample).map(|value| value.parse().unwrap())
+    }
+
+    fn sample(&self, start: &str) -> Option<String> {
         let text = self.telemetry.metrics.text().unwrap();
-        let value = text.lines().find_map(|line| line.strip_prefix(&sample));
-        value.map_or(0, |value| value.parse().unwrap())
+        text.lines()
+            .find_map(|line| line.strip_prefix(start).map(str::to_owned))
     }
 
     /// What /readyz shows.
@@ -400,6 +410,7 @@ async fn what_cannot_be_used_becomes_a_dead_letter_with_its_reason() {
         "submission-7 belongs to leaderboard a, challenge 1, phase 2, submission 7"
     );
     world.stand_in.drained(&url).await;
+    eventually("no message is left to be old", async || bridge.oldest(&url).is_none()).await;
     bridge.stop().await;
 }
 
@@ -433,6 +444,11 @@ async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_say
     );
     eventually("it is counted", async || bridge.count("blocked") == 1).await;
     assert_eq!(world.stand_in.depth(&url).await, (0, 1));
+    let now = jiff::Timestamp::now()
+        .duration_since(jiff::Timestamp::UNIX_EPOCH)
+        .as_secs_f64();
+    let sent = bridge.oldest(&url).expect("it is the oldest, and the only one");
+    assert!((now - 120.0..now + 5.0).contains(&sent), "{sent} at {now}");
     bridge.stop().await;
 }
 

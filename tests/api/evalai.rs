@@ -19,6 +19,7 @@ use evalai_stand_in::model::{FileState, Status as Stored};
 use evalai_stand_in::submissions::{NewSubmission, create};
 use evalai_stand_in::{Config, Handle, Knobs};
 use jiff::{SignedDuration, Timestamp};
+use leaderboard_operator::observability::about::LogSpan;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::evalai::{
@@ -276,6 +277,7 @@ fn run(pk: i64, attempt: i64) -> Run {
         by_hand: true,
         has_job: false,
         ended: None,
+        log: LogSpan::default(),
     }
 }
 

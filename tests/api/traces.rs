@@ -2,32 +2,42 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use axum::Router;
 use axum::body::Bytes;
 use axum::routing::post;
+use evalai_stand_in::Knobs;
+use evalai_stand_in::faults::{Failure, Fault, When};
+use evalai_stand_in::model::Status;
 use kube::Api;
-use leaderboard_api::Submission;
+use leaderboard_api::{State, Submission, SubmissionStatus};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::logging::{Format, subscriber};
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::trace_id::TraceId;
 use leaderboard_operator::observability::traces::{Traces, otlp};
+use leaderboard_operator::pod::report::REPORT_KEY;
 use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
 use opentelemetry_proto::tonic::common::v1::any_value::Value as Any;
 use opentelemetry_proto::tonic::trace::v1::Span;
 use prost::Message;
-use serde_json::Value;
+use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tracing::Dispatch;
 
-use super::counts::lifecycle::{Controller, Scenario, Watched, World};
+use super::counts::lifecycle::{Controller, Scenario, Watched, World, make_table};
+use super::{operator, world};
+use crate::support::{apiserver, ministack};
 
 /// Longer than a batch is filled.
 const LIMIT: Duration = Duration::from_mins(1);
+
+/// Far longer than anything here takes.
+const LINES: Duration = Duration::from_mins(2);
 
 /// A collector on loopback.
 struct Collector {
@@ -63,11 +73,11 @@ impl Collector {
 }
 
 #[derive(Clone, Default)]
-struct Lines(Arc<Mutex<Vec<u8>>>);
+struct Lines(Arc<watch::Sender<Vec<u8>>>);
 
 impl Write for Lines {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        self.0.lock().unwrap().extend_from_slice(bytes);
+        self.0.send_modify(|all| all.extend_from_slice(bytes));
         Ok(bytes.len())
     }
 
@@ -82,11 +92,23 @@ impl Lines {
         Dispatch::new(subscriber(Format::Json, None, move || writer.clone(), false).unwrap())
     }
 
+    fn text(&self) -> String {
+        String::from_utf8(self.0.borrow().clone()).unwrap()
+    }
+
     /// Those that name a submission.
     fn of_submissions(&self) -> Vec<Value> {
-        let text = String::from_utf8(self.0.lock().unwrap().clone()).unwrap();
+        let text = self.text();
         let lines = text.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
         lines.filter(|line| line.get("submission").is_some()).collect()
+    }
+
+    /// Once one holds this text.
+    async fn with(&self, text: &str) {
+        let mut written = self.0.subscribe();
+        let holds = |all: &Vec<u8>| String::from_utf8_lossy(all).contains(text);
+        let found = tokio::time::timeout(LINES, written.wait_for(holds)).await.is_ok();
+        assert!(found, "no line holds {text:?}:\n{}", self.text());
     }
 }
 
@@ -218,4 +240,113 @@ async fn a_life_is_one_trace_and_one_line_for_each_transition() {
     check_lines(&lines.of_submissions(), &uid, &world.namespace);
     controller.end().await;
     sending.finish().await;
+}
+
+/// A controller on a thread of its own, which logs there.
+struct Logged {
+    stop: watch::Sender<bool>,
+    thread: JoinHandle<()>,
+}
+
+impl Logged {
+    async fn start(world: &world::World, log: Dispatch) -> Self {
+        let config = apiserver::server().await.config();
+        let (stop, signal) = Stop::new();
+        let (namespace, endpoint) = (world.namespace.clone(), world.aws.endpoint.clone());
+        let thread = std::thread::spawn(move || {
+            let _log = tracing::dispatcher::set_default(&log);
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+            let work = async {
+                let aws = ministack::aws(&endpoint).await;
+                Box::pin(operator::run(&namespace, aws, config, Observability::new(signal))).await
+            };
+            runtime.unwrap().block_on(work).unwrap();
+        });
+        Self { stop, thread }
+    }
+
+    async fn end(self) {
+        self.stop.send_replace(true);
+        let ended = tokio::task::spawn_blocking(|| self.thread.join().unwrap());
+        tokio::time::timeout(LINES, ended).await.expect("it ends").unwrap();
+    }
+}
+
+/// A run whose report cannot be read at first, whose agent crashes, and whose end neither table nor EvalAI takes at once.
+async fn fail(world: &world::World, table: &str, lines: &Lines) -> String {
+    let (pk, name) = world.submit("lb", 1).await;
+    let job = world.job(&name, 0).await;
+    let pod = world.pod(&job, &world::running()).await;
+    let runs = |s: &SubmissionStatus| s.state == Some(State::Running);
+    world.until(&name, "it runs", runs).await;
+    let archive = world.archive(pk);
+    archive.put(REPORT_KEY, b"no report".to_vec()).await.unwrap();
+    lines.with("a stored report is not used").await;
+    let s3 = world.aws.aws.s3(None, Some(&world.aws.endpoint));
+    let key = format!("{pk}/{REPORT_KEY}");
+    s3.delete_object().bucket(&world.bucket).key(key).send().await.unwrap();
+    let dynamo = world.aws.aws.dynamodb(None, Some(&world.aws.endpoint));
+    dynamo.delete_table().table_name(table).send().await.unwrap();
+    world.evalai.set_knobs(Knobs {
+        fail_next: vec![Fault {
+            method: Some("PUT".into()),
+            path_prefix: None,
+            answer: Failure::Status(500),
+            times: 1,
+            when: When::Before,
+        }],
+        ..Knobs::default()
+    });
+    world.pod_status(&pod, &world::crashed()).await;
+    world.stops(&job, &pod).await;
+    let failed = world
+        .evalai
+        .wait_until(|state, _| state.submissions[&pk].status == Status::Failed);
+    tokio::time::timeout(LINES, failed)
+        .await
+        .expect("EvalAI has the failure");
+    name
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_line_about_a_submission_that_fails_has_its_names_and_its_trace() {
+    let world = world::World::new().await;
+    let table = make_table(&world.aws).await;
+    let more = json!({"table": {"name": table, "endpoint": world.aws.endpoint}});
+    world.leaderboard_with("lb", 1, "Hosts", &more).await;
+    let lines = Lines::default();
+    let _second = Dispatch::new(tracing_subscriber::registry());
+    let controller = Logged::start(&world, lines.dispatch()).await;
+    let name = fail(&world, &table, &lines).await;
+    for text in [
+        "EvalAI request failed",
+        "the row is not in the table",
+        "EvalAI has the end",
+    ] {
+        lines.with(text).await;
+    }
+    let api: Api<Submission> = world.api();
+    let trace = TraceId::of(&api.get(&name).await.unwrap().metadata.uid.unwrap()).to_string();
+    let text = lines.text();
+    let about: Vec<&str> = text.lines().filter(|line| line.contains(&name)).collect();
+    assert!(about.len() >= 7, "{text}");
+    for line in about {
+        let found: Value = serde_json::from_str(line).unwrap();
+        let fields = ["submission", "leaderboard", "attempt", "trace_id"].map(|field| &found[field]);
+        let expected = json!([format!("{}/{name}", world.namespace), "lb", 1, trace]);
+        assert_eq!(json!(fields), expected, "{line}");
+    }
+    // No line about it has lost all of its names.
+    for text in [
+        "a stored report is not used",
+        "EvalAI request failed",
+        "the row is not in the table",
+    ] {
+        let nameless = lines.text();
+        let nameless = nameless
+            .lines()
+            .find(|line| line.contains(text) && !line.contains(&name));
+        assert_eq!(nameless, None);
+    }
+    controller.end().await;
 }

@@ -240,8 +240,13 @@ impl World {
         let stored = archive.put("agent/agent1/leaderboard.log", log.into_bytes());
         stored.await.unwrap();
         let pod = self.pod(&job, &crashed()).await;
+        self.stops(&job, &pod).await;
+    }
+
+    /// The Pod is asked to stop, and the Job ends.
+    pub(super) async fn stops(&self, job: &Job, pod: &str) {
         let is_told = |pod: Option<&Pod>| pod.is_some_and(|p| p.annotations().contains_key(names::ANNOTATION_STOP));
-        let told = timeout(LIMIT, await_condition(self.api(), &pod, is_told)).await;
+        let told = timeout(LIMIT, await_condition(self.api(), pod, is_told)).await;
         told.expect("the Pod is asked to stop").unwrap();
         let jobs = self.api::<Job>();
         jobs.delete(&job.name_any(), &DeleteParams::background()).await.unwrap();
@@ -272,12 +277,17 @@ impl World {
             },
         });
         let pod: Pod = serde_json::from_value(pod).unwrap();
-        let (pods, name) = (self.api::<Pod>(), pod.name_any());
-        pods.create(&PostParams::default(), &pod).await.unwrap();
-        let status = Patch::Merge(json!({"status": status}));
-        let patched = pods.patch_status(&name, &PatchParams::default(), &status).await;
-        patched.unwrap();
+        let name = pod.name_any();
+        self.api::<Pod>().create(&PostParams::default(), &pod).await.unwrap();
+        self.pod_status(&name, status).await;
         name
+    }
+
+    pub(super) async fn pod_status(&self, name: &str, status: &Value) {
+        let status = Patch::Merge(json!({"status": status}));
+        let pods = self.api::<Pod>();
+        let patched = pods.patch_status(name, &PatchParams::default(), &status).await;
+        patched.unwrap();
     }
 
     pub(super) async fn until(&self, name: &str, what: &str, holds: impl Fn(&SubmissionStatus) -> bool) {

@@ -11,9 +11,9 @@ use crate::controller::leaderboards::operator;
 use crate::controller::submissions::act::awaits_publication;
 use crate::kubernetes::Store;
 use crate::observability::Observability;
-use crate::observability::metrics::BoardState;
+use crate::observability::metrics::{BoardState, Standing};
 use crate::services::evalai::Hub;
-use leaderboard_api::{Leaderboard, State, Submission, conditions, reasons};
+use leaderboard_api::{FailureClass, Leaderboard, State, Submission, conditions, reasons};
 
 /// How often what is not an event is counted: more often than anybody scrapes.
 const EVERY: Duration = Duration::from_secs(5);
@@ -39,6 +39,7 @@ pub(super) async fn keep(
 ) {
     let mut tick = tokio::time::interval(EVERY);
     let mut shown: BTreeSet<String> = BTreeSet::new();
+    let mut standings: BTreeMap<Standing, usize> = BTreeMap::new();
     loop {
         tokio::select! { _ = tick.tick() => {}, () = telemetry.stop.wait() => return }
         let load = hub.load();
@@ -47,6 +48,14 @@ pub(super) async fn keep(
         for (state, count) in states(&all) {
             telemetry.metrics.set_submissions(state, count);
         }
+        for count in standings.values_mut() {
+            *count = 0;
+        }
+        standings.extend(count_standings(&all));
+        for (standing, count) in &standings {
+            telemetry.metrics.set_standing(*standing, *count);
+        }
+        standings.retain(|_, count| *count > 0);
         for (reason, count) in observed(&all) {
             telemetry.metrics.set_observed(reason, count);
         }
@@ -144,6 +153,30 @@ fn observed(submissions: &[Arc<Submission>]) -> [(&'static str, usize); 4] {
         reasons::AWAITING_OTHER_END,
     ]
     .map(|reason| (reason, submissions.iter().filter(|one| of(one, reason)).count()))
+}
+
+/// Submissions by state, reason and class of failure.
+fn count_standings(submissions: &[Arc<Submission>]) -> BTreeMap<Standing, usize> {
+    let mut written: BTreeMap<(&'static str, &str, &'static str), usize> = BTreeMap::new();
+    for submission in submissions {
+        let status = submission.status.as_ref();
+        let state = status.and_then(|status| status.state).unwrap_or(State::Pending);
+        let failure = status.and_then(|status| status.failure.as_ref());
+        let class = failure.filter(|_| state == State::Failed).map(|failure| failure.class);
+        let reason = status.and_then(|status| status.reason.as_deref());
+        let class = class.map_or("", FailureClass::as_str);
+        let standing = (state.as_str(), reason.unwrap_or_default(), class);
+        *written.entry(standing).or_default() += 1;
+    }
+    let mut counts = BTreeMap::new();
+    for ((state, reason, class), count) in written {
+        let reason = match reason {
+            "" => "None",
+            name => reasons::of(name).map_or("Other", |reason| reason.name),
+        };
+        *counts.entry(Standing { state, reason, class }).or_default() += count;
+    }
+    counts
 }
 
 fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {
@@ -247,6 +280,44 @@ mod tests {
         object.metadata.creation_timestamp = Some(k8s_openapi::apimachinery::pkg::apis::meta::v1::Time(made));
         let found = boards(&[board("a", "us", "True")], &[new], "us", NOW.parse().unwrap());
         assert_eq!(found["one/a"].oldest_pending, Duration::from_mins(1));
+    }
+
+    #[test]
+    fn submissions_are_counted_by_the_reason_and_the_class_of_their_failure() {
+        let with = |state, reason: Option<&str>, class: Option<&str>| {
+            let mut one = submission("a", &[]);
+            let failure = class.map(|class| json!({"class": class, "charged": false, "reason": "R", "message": "M"}));
+            Arc::make_mut(&mut one).status = Some(SubmissionStatus {
+                state: Some(state),
+                reason: reason.map(str::to_owned),
+                failure: serde_json::from_value(json!(failure)).unwrap(),
+                ..SubmissionStatus::default()
+            });
+            one
+        };
+        let mut unseen = submission("a", &[]);
+        Arc::make_mut(&mut unseen).status = None;
+        let all = [
+            unseen,
+            with(State::Failed, Some("AgentCrashed"), Some("Participant")),
+            with(State::Failed, Some("AgentCrashed"), Some("Participant")),
+            with(State::Failed, Some("AgentCrashed"), Some("Infrastructure")),
+            // What failed once is no failure of the attempt that runs now.
+            with(State::Running, Some("Running"), Some("Infrastructure")),
+            with(State::Cancelled, Some("of a version to come"), None),
+        ];
+        let expected = [
+            ("Cancelled", "Other", "", 1),
+            ("Failed", "AgentCrashed", "Infrastructure", 1),
+            ("Failed", "AgentCrashed", "Participant", 2),
+            ("Pending", "None", "", 1),
+            ("Running", "Running", "", 1),
+        ];
+        let found = count_standings(&all).into_iter();
+        let found: Vec<_> = found
+            .map(|(by, count)| (by.state, by.reason, by.class, count))
+            .collect();
+        assert_eq!(found, expected);
     }
 
     #[test]

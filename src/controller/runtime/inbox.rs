@@ -4,24 +4,32 @@
 //! Started by the controller's leader. EvalAI shows neither the id of a message nor when it was sent. The time at which its row asked
 //! to be run takes the place of both, so a message that comes twice is a repeat.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::runtime::events::{Event, EventType, Recorder};
 use kube::{Api, Client, Resource, ResourceExt};
 use tokio::sync::mpsc;
+use tokio::time::{Instant, sleep_until};
+use tracing::Instrument;
 
-use crate::bridge::ingest::{self, Incoming, Source};
+use crate::bridge::ages::Ages;
+use crate::bridge::ingest::{self, Incoming, IngestError, Outcome, Source};
 use crate::bridge::message::{self, Malformed, Message};
 use crate::bridge::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
 use crate::controller::leaderboards::operator;
 use crate::kubernetes::{Watch, call};
+use crate::observability::metrics::Metrics;
 use crate::services::evalai::{Arrival, Arrived, Origin, Settled};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Evalai, EvalaiQueue, Leaderboard, Submission, names, reasons};
+use leaderboard_api::{Evalai, EvalaiQueue, Leaderboard, Submission, reasons};
 
 /// Most characters of a message that an event and the log quote.
 const QUOTED: usize = 500;
+/// A message that is left comes back after EvalAI's 30 s, once those before it were read, which takes three requests each.
+const SEEN_AGAIN: Duration = Duration::from_mins(5);
 
 /// What messages are taken in with.
 pub(super) struct Intake {
@@ -30,6 +38,7 @@ pub(super) struct Intake {
     /// Who drives the Leaderboards that count.
     pub operator: String,
     pub recorder: Recorder,
+    pub metrics: Arc<Metrics>,
 }
 
 /// What a message means, before anything is written.
@@ -43,43 +52,49 @@ enum Verdict {
     },
     /// It is of no use, now or later.
     Drop(DeadReason),
-    /// It may be of use later, or is another reader's.
+    /// It may be of use later.
     Leave,
+    /// It is another reader's.
+    Foreign,
 }
 
 impl Intake {
     /// Takes messages in until their sender is gone.
     pub(super) async fn into_cluster(self, mut arrived: mpsc::UnboundedReceiver<Arrived>) {
-        while let Some(arrived) = arrived.recv().await {
-            let settled = self.take(&arrived.arrival).await;
+        let mut waiting = Waiting::new(&self.metrics);
+        loop {
+            let arrived = tokio::select! {
+                arrived = arrived.recv() => arrived,
+                () = waiting.expired() => continue,
+            };
+            let Some(arrived) = arrived else { return };
+            let settled = self.take(&arrived.arrival, &mut waiting).await;
+            if settled == Settled::Delete {
+                waiting.forget(&arrived.arrival);
+            }
             arrived.settle(settled);
         }
     }
 
-    async fn take(&self, arrival: &Arrival) -> Settled {
+    async fn take(&self, arrival: &Arrival, waiting: &mut Waiting) -> Settled {
         // Asked first: what is complete now has all that is read below.
         let is_complete = self.leaderboards.is_complete();
         let readers = readers(&self.leaderboards.store.state(), &self.operator, arrival);
         let now_ms = Timestamp::now().as_millisecond();
-        match judge(arrival, &readers, now_ms, is_complete) {
-            Verdict::Leave => Settled::Leave,
+        let verdict = judge(arrival, &readers, now_ms, is_complete);
+        if let Some(sent_ms) = sent_ms(arrival, now_ms).filter(|_| verdict != Verdict::Foreign) {
+            waiting.keep(arrival, sent_ms);
+        }
+        match verdict {
+            Verdict::Leave | Verdict::Foreign => Settled::Leave,
             Verdict::Drop(reason) => self.drop(arrival, &readers, &reason).await,
             Verdict::Ingest {
                 namespace,
                 leaderboard,
                 incoming,
             } => {
-                let api: Api<Submission> = Api::namespaced(self.client.clone(), &namespace);
-                let outcome = ingest::apply(&api, &leaderboard, &incoming).await;
-                let submission = format!("{namespace}/{}", names::submission(incoming.submission));
-                match &outcome {
-                    Ok(outcome) => {
-                        tracing::info!(submission, leaderboard, %outcome, "a message of EvalAI was taken in");
-                    }
-                    Err(error) => {
-                        tracing::warn!(submission, leaderboard, %error, "a message of EvalAI was not taken in");
-                    }
-                }
+                let span = ingest::span(&namespace, &leaderboard, incoming.submission);
+                let outcome = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 let envelope = envelope(Ok(message_of(&incoming)), incoming.sent_ms);
                 match route::settle(&envelope, &outcome, &rules(&readers), now_ms) {
                     MessageOutcome::Delete(_) => Settled::Delete,
@@ -90,6 +105,17 @@ impl Intake {
                 }
             }
         }
+    }
+
+    /// Applies it, and logs what came of it.
+    async fn ingest(&self, namespace: &str, leaderboard: &str, incoming: &Incoming) -> Result<Outcome, IngestError> {
+        let api: Api<Submission> = Api::namespaced(self.client.clone(), namespace);
+        let outcome = ingest::apply(&api, leaderboard, incoming).await;
+        match &outcome {
+            Ok(outcome) => tracing::info!(%outcome, "a message of EvalAI was taken in"),
+            Err(error) => tracing::warn!(%error, "a message of EvalAI was not taken in"),
+        }
+        outcome
     }
 
     /// Deletes a message that nothing can be made of. EvalAI has no dead-letter queue: the log and an event keep what it held.
@@ -161,18 +187,14 @@ fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_comple
             .into_iter()
             .all(|evalai| evalai.challenge != message.challenge)
         {
-            return Verdict::Leave;
+            return Verdict::Foreign;
         }
         if arrival.origin == Origin::Missing {
             let why = format!("EvalAI has no submission {}", message.submission);
             return Verdict::Drop(DeadReason::Malformed(why));
         }
     }
-    // A row's times are its participant's to edit: one of the future would keep later resumes from being newer.
-    let sent_ms = match arrival.origin {
-        Origin::Wanted(time) => Some(time.as_millisecond().min(now_ms)),
-        Origin::Missing | Origin::Hidden => None,
-    };
+    let sent_ms = sent_ms(arrival, now_ms);
     let envelope = envelope(content, sent_ms.unwrap_or(now_ms));
     match (
         route::route_by(&rules(readers), &envelope, readers, now_ms, is_complete),
@@ -186,6 +208,57 @@ fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_comple
             incoming: incoming(&message, sent_ms),
         },
         _ => Verdict::Leave,
+    }
+}
+
+/// A row's times are its participant's to edit: one of the future would keep later resumes from being newer.
+fn sent_ms(arrival: &Arrival, now_ms: i64) -> Option<i64> {
+    match arrival.origin {
+        Origin::Wanted(time) => Some(time.as_millisecond().min(now_ms)),
+        Origin::Missing | Origin::Hidden => None,
+    }
+}
+
+/// How old the messages are that were handed over and are not deleted, by queue. EvalAI shows no id of one: its text takes that place.
+struct Waiting {
+    by_queue: BTreeMap<String, Ages>,
+    metrics: Arc<Metrics>,
+}
+
+impl Waiting {
+    fn new(metrics: &Arc<Metrics>) -> Self {
+        Self {
+            by_queue: BTreeMap::new(),
+            metrics: Arc::clone(metrics),
+        }
+    }
+
+    fn keep(&mut self, arrival: &Arrival, sent_ms: i64) {
+        let until = Instant::now() + SEEN_AGAIN;
+        self.change(&arrival.queue, |ages| ages.keep(&arrival.body, sent_ms, until));
+    }
+
+    fn forget(&mut self, arrival: &Arrival) {
+        self.change(&arrival.queue, |ages| ages.forget(&arrival.body));
+    }
+
+    fn change(&mut self, queue: &str, change: impl FnOnce(&mut Ages)) {
+        let ages = self.by_queue.entry(queue.to_owned()).or_default();
+        change(ages);
+        self.metrics.set_oldest_message(queue, ages.oldest_ms());
+    }
+
+    /// Waits until a message has not come back in time, and forgets it.
+    async fn expired(&mut self) {
+        let next = self.by_queue.values().filter_map(Ages::next_expiry).min();
+        let Some(next) = next else {
+            return std::future::pending().await;
+        };
+        sleep_until(next).await;
+        for (queue, ages) in &mut self.by_queue {
+            ages.expire(Instant::now());
+            self.metrics.set_oldest_message(queue, ages.oldest_ms());
+        }
     }
 }
 

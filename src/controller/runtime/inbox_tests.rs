@@ -121,7 +121,7 @@ fn what_is_dropped_and_what_is_left() {
         let verdict = judged(&body, origin);
         let found = match &verdict {
             Verdict::Drop(reason) => Some(reason.as_str()),
-            Verdict::Leave => None,
+            Verdict::Leave | Verdict::Foreign => None,
             Verdict::Ingest { .. } => panic!("{body} is taken in"),
         };
         assert_eq!(found, dropped, "{body} {origin:?}: {verdict:?}");
@@ -152,4 +152,40 @@ fn a_message_waits_as_long_as_the_most_patient_reader_allows() {
     );
     let dropped = judge(&arrival(&message(1, 3), wanted(6000)), &both, NOW, true);
     assert!(matches!(dropped, Verdict::Drop(DeadReason::Unknown(_))), "{dropped:?}");
+}
+
+#[test]
+fn what_is_for_another_challenge_is_no_message_of_ours_that_waits() {
+    assert_eq!(judged(&message(9, 2), wanted(1)), Verdict::Foreign);
+    assert_eq!(judged(&message(1, 3), wanted(1)), Verdict::Leave);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_queue_shows_its_oldest_message_until_that_is_deleted_or_does_not_come_back() {
+    let metrics = Arc::new(Metrics::default());
+    let mut waiting = Waiting::new(&metrics);
+    let oldest = || {
+        let text = metrics.text().unwrap();
+        let sample = "leaderboard_queue_oldest_message_timestamp_seconds{queue=\"q\"} ";
+        text.lines()
+            .find_map(|line| line.strip_prefix(sample).map(str::to_owned))
+    };
+    let (first, second) = (message(1, 2), message(1, 3));
+    let (first, second) = (arrival(&first, wanted(60)), arrival(&second, wanted(0)));
+    for arrival in [&first, &second] {
+        waiting.keep(arrival, sent_ms(arrival, NOW).unwrap());
+    }
+    assert_eq!(oldest().as_deref(), Some("1799999940.0"));
+    waiting.forget(&first);
+    assert_eq!(oldest().as_deref(), Some("1800000000.0"));
+    let began = Instant::now();
+    waiting.expired().await;
+    assert_eq!(oldest(), None);
+    assert_eq!(began.elapsed().as_secs(), SEEN_AGAIN.as_secs());
+}
+
+#[test]
+fn a_time_of_the_future_makes_a_message_no_younger_than_now() {
+    assert_eq!(sent_ms(&arrival(&message(1, 2), wanted(-60)), NOW), Some(NOW));
+    assert_eq!(sent_ms(&arrival(&message(1, 2), Origin::Hidden), NOW), None);
 }

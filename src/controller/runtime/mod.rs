@@ -316,6 +316,7 @@ impl Parts {
             leaderboards: watches.leaderboards.clone(),
             operator: self.settings.operator.clone(),
             recorder: events(&self.client),
+            metrics: Arc::clone(&telemetry.metrics),
         };
         let hub = hub(fence, evalai, intake, telemetry);
         let fence = fence.clone();

@@ -10,13 +10,14 @@ use futures::stream::StreamExt;
 use futures::{FutureExt, Stream};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
+use tracing::Instrument;
 
 use super::Shared;
 use super::events::Events;
 use super::queue::{After, Class, Limits, Queue, Turn, urgency};
 use crate::backoff::jittered;
 use crate::controller::leaderboards::{self, Reconciled, operator};
-use crate::controller::objects::uid_of;
+use crate::controller::objects::{span_of, uid_of};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
 use crate::controller::submissions::decide::{self, Plan, decide};
@@ -24,7 +25,6 @@ use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
 use crate::observability::tasks::panic_message;
-use crate::observability::trace_id::TraceId;
 use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
@@ -127,6 +127,11 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
     let Some(submission) = shared.context.stores.submissions.get(&(&turn.key).into()) else {
         return After::Gone;
     };
+    let span = span_of(&submission);
+    reconcile_known(turn, submission, shared).instrument(span).await
+}
+
+async fn reconcile_known(turn: Turn, submission: Arc<Submission>, shared: Arc<Shared>) -> After {
     let started = Instant::now();
     let context = &shared.context;
     let slots = &context.slots;
@@ -161,13 +166,7 @@ async fn reconcile_submission(turn: Turn, shared: Arc<Shared>) -> After {
         return After::WithPermit;
     };
     let result = result.map_err(|error| {
-        tracing::warn!(
-            submission = %turn.key,
-            leaderboard = submission.spec.leaderboard_name,
-            attempt = submission.spec.attempt,
-            trace_id = %TraceId::of(&uid_of(submission.as_ref())),
-            "{error}"
-        );
+        tracing::warn!("{error}");
         (error, urgency::of_submission(&submission))
     });
     finish(SUBMISSION, submission.as_ref(), started, &shared, result)

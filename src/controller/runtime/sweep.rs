@@ -6,12 +6,13 @@ use std::sync::Arc;
 
 use kube::{Api, Client, ResourceExt};
 use tokio::sync::mpsc;
+use tracing::Instrument;
 
 use crate::bridge::ingest::{self, Incoming, Outcome, Source};
 use crate::controller::leaderboards::shared_queue::is_shown;
 use crate::kubernetes::Store;
 use crate::services::evalai::SweepRow;
-use leaderboard_api::{Evalai, Leaderboard, Submission, names};
+use leaderboard_api::{Evalai, Leaderboard, Submission};
 
 /// Takes rows in until their sender is gone.
 pub(super) async fn into_cluster(
@@ -22,17 +23,19 @@ pub(super) async fn into_cluster(
     while let Some(row) = rows.recv().await {
         let all = leaderboards.state();
         let Some(board) = serving(&all, &row) else { continue };
+        let namespace = board.namespace().unwrap_or_default();
+        let span = ingest::span(&namespace, &board.name_any(), row.submission);
         if let Some(queue) = shared_queue(&all, board) {
-            let (server, submission) = (&row.server, row.submission);
-            tracing::warn!(
-                server,
-                submission,
-                queue,
-                "EvalAI waits for a submission, and another reader of the queue may have its message"
-            );
+            span.in_scope(|| {
+                tracing::warn!(
+                    server = row.server,
+                    queue,
+                    "EvalAI waits for a submission, and another reader of the queue may have its message"
+                );
+            });
             continue;
         }
-        take(&client, board, &row).await;
+        take(&client, board, &row).instrument(span).await;
     }
 }
 
@@ -47,18 +50,17 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
         source: Source::Sweep(row.kind),
         sent_ms: row.time.as_millisecond(),
     };
-    let (server, leaderboard) = (&row.server, board.name_any());
-    let submission = format!("{namespace}/{}", names::submission(row.submission));
-    match ingest::apply(&api, &leaderboard, &incoming).await {
-        Ok(Outcome::Repeat) => tracing::debug!(server, submission, leaderboard, "the submission is known already"),
+    let server = &row.server;
+    match ingest::apply(&api, &board.name_any(), &incoming).await {
+        Ok(Outcome::Repeat) => tracing::debug!(server, "the submission is known already"),
         Ok(outcome @ (Outcome::Refused | Outcome::NotNew | Outcome::IdTaken(_))) => {
-            tracing::warn!(server, submission, leaderboard, %outcome, "EvalAI waits for a run of a submission, and none begins");
+            tracing::warn!(server, %outcome, "EvalAI waits for a run of a submission, and none begins");
         }
         Ok(outcome) => {
-            tracing::info!(server, submission, leaderboard, %outcome, "EvalAI waits for a submission whose message was lost");
+            tracing::info!(server, %outcome, "EvalAI waits for a submission whose message was lost");
         }
         Err(error) => {
-            tracing::warn!(server, submission, leaderboard, %error, "EvalAI waits for a submission that could not be created or resumed");
+            tracing::warn!(server, %error, "EvalAI waits for a submission that could not be created or resumed");
         }
     }
 }

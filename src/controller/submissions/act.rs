@@ -33,7 +33,6 @@ use crate::controller::writes::{apply_status, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use crate::observability::metrics::{FailedAttempt, Metrics};
-use crate::observability::trace_id::TraceId;
 use crate::observability::traces::Traces;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, conditions, names, reasons};
@@ -240,35 +239,13 @@ impl Actor<'_> {
             return;
         }
         tracing::info!(
-            submission = %format_args!("{}/{}", self.namespace, self.name()),
-            leaderboard = self.submission().spec.leaderboard_name,
             attempt = new.attempt,
-            trace_id = %self.trace(),
             from = old.map_or("none", |status| status.state_of_conditions().as_str()),
             to = new.state_of_conditions().as_str(),
             reason = new.reason,
-            "{}", new.message.as_deref().unwrap_or("the submission's state has changed")
+            "{}",
+            new.message.as_deref().unwrap_or("the submission's state has changed")
         );
-    }
-
-    /// What other systems have of an end is a line as well: it changes no state.
-    fn log_delivery(&self, new: &SubmissionStatus, ended: &Ended) {
-        let by = match ended.phase {
-            Phase::Record => "the table has the end",
-            Phase::Publish => "EvalAI has the end",
-            _ => return,
-        };
-        tracing::info!(
-            submission = %format_args!("{}/{}", self.namespace, self.name()),
-            leaderboard = self.submission().spec.leaderboard_name,
-            attempt = new.attempt,
-            trace_id = %self.trace(),
-            "{by}"
-        );
-    }
-
-    fn trace(&self) -> TraceId {
-        TraceId::of(&uid_of(self.submission()))
     }
 
     /// Metrics, log and trace of what has ended with the status that is stored now.
@@ -277,7 +254,7 @@ impl Actor<'_> {
         for one in &ended {
             let took = one.end.duration_since(one.start).unsigned_abs();
             self.uses.metrics.phase_ended(one.phase.as_str(), took);
-            self.log_delivery(new, one);
+            log_delivery(new, one);
         }
         if !ended.is_empty() {
             self.uses.traces.send(|| spans::of(self.view, new, &ended));
@@ -387,13 +364,7 @@ impl Actor<'_> {
             Err(error) if error.is_gone() || error.is_conflict() => return Ok(()),
             other => other.map(|_| ())?,
         }
-        tracing::info!(
-            submission = %format_args!("{}/{name}", self.namespace),
-            leaderboard = self.submission().spec.leaderboard_name,
-            attempt = self.submission().spec.attempt,
-            trace_id = %self.trace(),
-            "the Submission is deleted: retention.finishedSeconds have passed since its end"
-        );
+        tracing::info!("the Submission is deleted: retention.finishedSeconds have passed since its end");
         Ok(())
     }
 
@@ -461,9 +432,19 @@ impl Actor<'_> {
         };
         let published = self.uses.recorder.publish(&note, &reference);
         if let Err(error) = call("an event", &self.name(), published).await {
-            tracing::warn!(submission = %self.name(), reason = %event.reason, "{error}");
+            tracing::warn!(reason = %event.reason, "{error}");
         }
     }
+}
+
+/// What other systems have of an end is a line as well: it changes no state.
+fn log_delivery(new: &SubmissionStatus, ended: &Ended) {
+    let by = match ended.phase {
+        Phase::Record => "the table has the end",
+        Phase::Publish => "EvalAI has the end",
+        _ => return,
+    };
+    tracing::info!(attempt = new.attempt, "{by}");
 }
 
 fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {

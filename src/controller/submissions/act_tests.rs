@@ -2,8 +2,11 @@
 
 use std::sync::Arc;
 
+use tracing::Instrument;
+
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
+use crate::controller::objects::span_of;
 use crate::controller::submissions::decide::Plan;
 use crate::controller::submissions::observe::observe;
 use crate::observability::logging::tests::Lines;
@@ -32,7 +35,11 @@ async fn write(around: &Surroundings, view: &View, status: SubmissionStatus) {
         report: None,
         requeue: None,
     };
-    act(around.context.for_act(), view, plan).await.unwrap();
+    let span = span_of(&view.submission);
+    act(around.context.for_act(), view, plan)
+        .instrument(span)
+        .await
+        .unwrap();
 }
 
 /// The metrics after this status was written; the view has it then.

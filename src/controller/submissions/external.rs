@@ -14,6 +14,7 @@ use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::controller::objects::{key_of, uid_of};
+use crate::observability::about::LogSpan;
 use crate::services::ObjectKey;
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Publisher, Run, Status, Subject, SubmissionState, Target,
@@ -98,7 +99,7 @@ impl ExternalSystems {
         let Some(subject) = self.subject(view) else { return };
         let wants_image = wants_image(&view.submission);
         let asked = self.hub.ask(&subject, wants_image);
-        log_refused(&view.submission, asked);
+        log_refused(asked);
     }
 
     /// Looks for a submission's end in EvalAI from now on, also while it waits before anything of it runs.
@@ -106,7 +107,7 @@ impl ExternalSystems {
         let Some(subject) = self.subject(view) else { return };
         let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
         let followed = self.hub.live(&subject, since);
-        log_refused(&view.submission, followed);
+        log_refused(followed);
     }
 
     /// Updates EvalAI with what the view shows. `memory` notes a partial result, `archive` has the log of a failure.
@@ -135,7 +136,7 @@ impl ExternalSystems {
             EvalaiUpdate::Cancelled => with_end(Outcome::Cancelled),
         };
         if let Some(desired) = desired {
-            log_refused(&view.submission, self.hub.update(&publisher, desired));
+            log_refused(self.hub.update(&publisher, desired));
         }
     }
 
@@ -204,6 +205,7 @@ fn run_of(submission: &Submission) -> Run {
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
         has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
         ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
+        log: LogSpan::current(),
     }
 }
 
@@ -295,9 +297,9 @@ fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
     }
 }
 
-fn log_refused(submission: &Submission, result: Result<(), evalai::ClientError>) {
+fn log_refused(result: Result<(), evalai::ClientError>) {
     if let Err(error) = result {
-        tracing::error!(submission = %submission.name_any(), %error, "cannot create EvalAI client");
+        tracing::error!(%error, "cannot create EvalAI client");
     }
 }
 

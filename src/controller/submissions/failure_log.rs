@@ -95,20 +95,20 @@ enum Look {
 pub(super) async fn keep(
     client: &Client,
     archive: &Archive,
-    (namespace, name): (&str, &str),
+    namespace: &str,
     demand: &LogDemand,
     known: Option<Tail>,
 ) -> LogAnswer {
     let (tail, is_unclear) = match known {
         Some(tail) => (Some(tail), false),
-        None => match look(client, archive, (namespace, name), demand).await {
+        None => match look(client, archive, namespace, demand).await {
             Look::Found(tail) => (Some(tail), false),
             Look::Nothing => (None, false),
             Look::Unclear => (None, true),
         },
     };
     let is_stored = match &tail {
-        Some(tail) if demand.is_over => store(archive, name, tail).await,
+        Some(tail) if demand.is_over => store(archive, tail).await,
         _ => true,
     };
     LogAnswer {
@@ -117,7 +117,7 @@ pub(super) async fn keep(
     }
 }
 
-async fn look(client: &Client, archive: &Archive, (namespace, name): (&str, &str), demand: &LogDemand) -> Look {
+async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogDemand) -> Look {
     let mut look = Look::Nothing;
     for place in &demand.places {
         let read = async {
@@ -135,7 +135,7 @@ async fn look(client: &Client, archive: &Archive, (namespace, name): (&str, &str
             }
             Ok(None) => {}
             Err(why) => {
-                tracing::warn!(submission = %name, container = %place.container, %why, "the log of a failure was not read");
+                tracing::warn!(container = %place.container, %why, "the log of a failure was not read");
                 look = Look::Unclear;
             }
         }
@@ -193,14 +193,14 @@ async fn of_node(
     read.map(|_| Some(bytes)).map_err(|error| error.to_string())
 }
 
-async fn store(archive: &Archive, name: &str, tail: &Tail) -> bool {
+async fn store(archive: &Archive, tail: &Tail) -> bool {
     let put = archive.put(FAILURE_LOG_KEY, tail.for_hosts().into_bytes());
     let why = match tokio::time::timeout(TRY, put).await {
         Ok(Ok(_)) => return true,
         Ok(Err(error)) => error.to_string(),
         Err(_) => "no answer in time".to_owned(),
     };
-    tracing::warn!(submission = %name, %why, "the log of a failure was not stored");
+    tracing::warn!(%why, "the log of a failure was not stored");
     false
 }
 

@@ -10,8 +10,10 @@ use futures::{FutureExt, StreamExt};
 use kube::runtime::reflector::ObjectRef;
 use tokio::sync::Notify;
 use tokio::time::Instant;
+use tracing::Instrument;
 
 use crate::controller::objects::{Wake, uid_of};
+use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
 
@@ -42,6 +44,8 @@ pub enum Observed<A> {
 struct Entry<Q: Question> {
     question: Q,
     by: ObjectRef<Submission>,
+    /// For the log.
+    log: LogSpan,
     asked: Instant,
     is_due: bool,
     is_under_way: bool,
@@ -126,6 +130,7 @@ impl<Q: Question> Shared<Q> {
             let entry = Entry {
                 question,
                 by,
+                log: LogSpan::current(),
                 asked: now,
                 is_due: true,
                 is_under_way: false,
@@ -159,6 +164,11 @@ impl<Q: Question> Shared<Q> {
         Some((uid.clone(), entry.question.clone(), namespace))
     }
 
+    /// What the lines about a question are written in.
+    fn log_of(&self, uid: &str) -> LogSpan {
+        self.lock().get(uid).map(|entry| entry.log.clone()).unwrap_or_default()
+    }
+
     /// Takes an answer in. Returns whom it is for.
     pub(super) fn done(&self, uid: &str, question: &Q, answer: Q::Answer) -> Option<ObjectRef<Submission>> {
         let mut entries = self.lock();
@@ -178,7 +188,7 @@ where
         while under_way.len() < Q::AT_ONCE
             && let Some((uid, question, namespace)) = shared.next()
         {
-            let answer = ask(question.clone(), namespace);
+            let answer = ask(question.clone(), namespace).instrument(shared.log_of(&uid).span().clone());
             under_way.push(answer.map(move |answer| (uid, question, answer)));
         }
         tokio::select! {

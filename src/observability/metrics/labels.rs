@@ -1,4 +1,5 @@
-//! The label sets of the families. Values are kinds, outcomes and other fixed words; the one name of an object is that of a Leaderboard.
+//! The label sets of the families. Values are kinds, outcomes and other fixed words; names are those of
+//! Leaderboards and queues alone.
 
 use prometheus_client::encoding::EncodeLabelSet;
 
@@ -39,6 +40,20 @@ pub(super) struct State {
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
 pub(super) struct OfLeaderboard {
     pub leaderboard: String,
+}
+
+/// A URL of SQS, or the name of a queue in EvalAI.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(super) struct OfQueue {
+    pub queue: String,
+}
+
+/// How submissions stand. `class` is empty for what is no failure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, EncodeLabelSet)]
+pub struct Standing {
+    pub state: &'static str,
+    pub reason: &'static str,
+    pub class: &'static str,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]

@@ -35,6 +35,7 @@ impl Metrics {
             self.submissions.leave_to_the_leader();
             self.boards.leave_to_the_leader();
             self.limits.leave_to_the_leader();
+            self.queues.leave_to_the_leader();
             self.set_evalai_load(0, 0, 0);
         }
     }

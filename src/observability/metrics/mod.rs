@@ -1,7 +1,7 @@
 //! Every metric of the operator, as one typed struct: what is counted, with which labels.
 //!
 //! Parts call the methods; the health server asks for the text. Labels hold kinds, outcomes and other fixed values, and the names of
-//! Leaderboards, which are few: never those of a Submission, a team or an image.
+//! Leaderboards and queues, which are few: never those of a Submission, a team or an image.
 
 mod boards;
 mod labels;
@@ -9,7 +9,9 @@ mod leader;
 mod limits;
 mod phases;
 mod process;
+mod queues;
 mod reconciles;
+mod runtime;
 mod services;
 mod submissions;
 mod watches;
@@ -27,6 +29,7 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Metric, Registry};
 
 pub use boards::BoardState;
+pub use labels::Standing;
 pub use limits::LimitsState;
 pub use reconciles::QueueMetrics;
 pub use submissions::FailedAttempt;
@@ -39,7 +42,9 @@ use leader::Leader;
 use limits::Limits;
 use phases::Phases;
 use process::Process;
+use queues::Queues;
 use reconciles::Reconciles;
+use runtime::Runtime;
 use services::{Cloud, Evalai, Messages};
 use submissions::Submissions;
 use watches::Watches;
@@ -63,6 +68,8 @@ pub enum Program {
 pub struct Metrics {
     registry: Registry,
     process: Process,
+    runtime: Runtime,
+    queues: Queues,
     reconciles: Reconciles,
     watches: Watches,
     leader: Leader,
@@ -123,12 +130,15 @@ impl Metrics {
         };
         both.register("build", "The running program", Info::new(build));
         let (watches, cloud) = (Watches::new(both), Cloud::new(both));
+        let (runtime, queues) = (Runtime::new(both), Queues::new(both));
         let (controller, bridge) = match program {
             Program::Controller => (both, &mut unexported),
             Program::Bridge => (&mut unexported, both),
         };
         Self {
             process,
+            runtime,
+            queues,
             reconciles: Reconciles::new(controller),
             watches,
             leader: Leader::new(controller),
@@ -149,6 +159,7 @@ impl Metrics {
     /// If a metric cannot be written, which is an error of the program.
     pub fn text(&self) -> Result<String, fmt::Error> {
         self.process.read();
+        self.runtime.read();
         let mut text = String::new();
         text::encode(&mut text, &self.registry)?;
         Ok(text)

@@ -5,12 +5,13 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
-use super::labels::{OfFailure, OfTrack, Reason, State};
+use super::labels::{OfFailure, OfTrack, Reason, Standing, State};
 use super::{Metrics, whole, zero};
 
 #[derive(Debug)]
 pub(super) struct Submissions {
     states: Family<State, Gauge>,
+    reasons: Family<Standing, Gauge>,
     observed: Family<Reason, Gauge>,
     repeating_teams: Gauge,
     failures: Family<OfFailure, Counter>,
@@ -21,6 +22,11 @@ impl Submissions {
     pub(super) fn new(r: &mut Registry) -> Self {
         Self {
             states: zero(r, "submissions", "Submissions by state"),
+            reasons: zero(
+                r,
+                "submissions_by_reason",
+                "Submissions by the reason of their state; `class` is that of the failure, or empty",
+            ),
             observed: zero(
                 r,
                 "observed_submissions",
@@ -46,6 +52,7 @@ impl Submissions {
 
     pub(super) fn leave_to_the_leader(&self) {
         self.states.clear();
+        self.reasons.clear();
         self.observed.clear();
         self.repeating_teams.set(0);
     }
@@ -68,6 +75,16 @@ impl Metrics {
             .states
             .get_or_create(&State { state })
             .set(whole(count));
+    }
+
+    /// So many Submissions stand like this; with none the sample goes.
+    pub fn set_standing(&self, standing: Standing, count: usize) {
+        let reasons = &self.submissions.reasons;
+        if count == 0 {
+            reasons.remove(&standing);
+        } else {
+            reasons.get_or_create(&standing).set(whole(count));
+        }
     }
 
     /// So many Submissions that are only observed show this. Reasons with none are to be set, too.

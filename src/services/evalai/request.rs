@@ -8,6 +8,7 @@ use super::answer::Answer;
 use super::row::{DatasetSplit, Phase, Received, Row, Split};
 use super::status::{Outcome, Progress, Status};
 use super::types::{ImageAnswer, Key, Payload};
+use crate::observability::about::LogSpan;
 
 /// Whom a request is about.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,6 +18,8 @@ pub struct SubmissionRef {
     /// Id of the submission.
     pub pk: i64,
     pub attempt: i64,
+    /// For the log.
+    pub log: LogSpan,
 }
 
 /// What a list is asked for.

@@ -15,7 +15,6 @@ use super::client::Client;
 use super::queue::{Next, Now, Queue, Ticket};
 use super::request::Reply;
 use super::types::{Arrival, Changed, Settled, SweepRow, WriteGuard};
-use crate::observability::trace_id::TraceId;
 use crate::services::token::Token;
 
 /// How long answers are waited for at the end: longer than a write may take.
@@ -200,19 +199,16 @@ fn take(shared: &Arc<Shared>, outlets: &Outlets, ticket: &Ticket, reply: Option<
 fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
     let request = ticket.request.name();
     let subject = ticket.request.submission();
-    let submission = subject.map(|subject| subject.key.to_string()).unwrap_or_default();
-    let trace_id = || subject.map(|subject| TraceId::of(&subject.key.uid).to_string());
+    let _lines = subject.map(|subject| subject.log.span().enter());
     let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);
     match answer {
         Answer::Done(()) if ticket.request.is_write() => {
-            tracing::debug!(request, submission, milliseconds, "EvalAI has stored the update");
+            tracing::debug!(request, milliseconds, "EvalAI has stored the update");
         }
-        Answer::Done(()) => tracing::debug!(request, submission, milliseconds, "EvalAI has answered"),
+        Answer::Done(()) => tracing::debug!(request, milliseconds, "EvalAI has answered"),
         Answer::Unanswered(Silence { sent: true, why }) if ticket.request.is_write() => {
             tracing::warn!(
                 request,
-                submission,
-                trace_id = trace_id(),
                 milliseconds,
                 why,
                 "EvalAI has not answered a write; no further write to this submission for a while"
@@ -220,14 +216,7 @@ fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
         }
         other => {
             let why = other.error().unwrap_or_default();
-            tracing::warn!(
-                request,
-                submission,
-                trace_id = trace_id(),
-                milliseconds,
-                why,
-                "EvalAI request failed"
-            );
+            tracing::warn!(request, milliseconds, why, "EvalAI request failed");
         }
     }
 }

@@ -9,6 +9,7 @@ use jiff::Timestamp;
 
 use super::row::Row;
 use super::status::{Outcome, Progress, Status};
+use crate::observability::about::LogSpan;
 pub use crate::services::ObjectKey as Key;
 use crate::services::held_text::HeldText;
 use crate::services::token::Token;
@@ -95,6 +96,8 @@ pub struct Run {
     pub has_job: bool,
     /// When it ended: the oldest end is published first, also by a process that has just begun to lead.
     pub ended: Option<Timestamp>,
+    /// For the log.
+    pub log: LogSpan,
 }
 
 /// What EvalAI is to show.

@@ -9,6 +9,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::{Row, TableError, Written};
+use crate::observability::about::LogSpan;
 use crate::services::ObjectKey;
 use leaderboard_api as api;
 
@@ -51,6 +52,8 @@ pub struct RowState {
 pub struct RowUpdate {
     pub row: Arc<Row>,
     pub end: bool,
+    /// For the log.
+    pub log: LogSpan,
 }
 
 #[derive(Debug)]
@@ -212,7 +215,11 @@ mod tests {
             run_id: "7".into(),
             ..Row::default()
         };
-        RowUpdate { row: row.into(), end }
+        RowUpdate {
+            row: row.into(),
+            end,
+            log: LogSpan::default(),
+        }
     }
 
     fn view(attempt: i64, end_written: bool, error: Option<&str>) -> RowState {

@@ -15,8 +15,8 @@ use tokio::time::Instant;
 use super::ledger::{Ledger, RowState, RowUpdate, TableId};
 use super::{Row, Table, TableError, Written};
 use crate::backoff::Backoff;
+use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
-use crate::observability::trace_id::TraceId;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api as api;
@@ -85,7 +85,11 @@ impl Recorder {
     /// in each reconcile: what is written or waiting already is not written again.
     pub fn record(&self, table: &api::Table, key: &ObjectKey, row: Row, end: bool) {
         let id = TableId::from(table);
-        let update = RowUpdate { row: row.into(), end };
+        let update = RowUpdate {
+            row: row.into(),
+            end,
+            log: LogSpan::current(),
+        };
         if !self.shared.ledger().record(id.clone(), key, update, Instant::now()) {
             return;
         }
@@ -168,7 +172,8 @@ impl Worker {
         let result = self.shared.store.write(&self.table, update.row.clone()).await;
         let is_sick = result.as_ref().is_err_and(TableError::is_of_the_table);
         if let Err(error) = &result {
-            tracing::warn!(submission = %key, trace_id = %TraceId::of(&key.uid), %error, "the row is not in the table");
+            let span = update.log.span();
+            span.in_scope(|| tracing::warn!(%error, "the row is not in the table"));
         }
         if self.shared.ledger().report(&key, &update, result, Instant::now()) {
             // Nobody listens any more once the controller has ended.

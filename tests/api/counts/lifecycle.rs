@@ -202,32 +202,11 @@ impl World {
             });
             spec["agent"] = json!({"images": []});
             spec["tracks"] = json!([{"name": "sensors", "codename": "SENSORS", "phase": 1}]);
-            spec["table"] = json!({"name": self.make_table().await, "endpoint": self.aws.endpoint});
+            spec["table"] = json!({"name": make_table(&self.aws).await, "endpoint": self.aws.endpoint});
         }
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         let board = Kind::Leaderboard.object(BOARD, &[&json!({ "spec": spec })]);
         create(&api, board, false).await.unwrap();
-    }
-
-    async fn make_table(&self) -> String {
-        let name = self.aws.name("counts");
-        let client = self.aws.aws.dynamodb(None, Some(&self.aws.endpoint));
-        let mut request = client
-            .create_table()
-            .table_name(&name)
-            .billing_mode(BillingMode::PayPerRequest);
-        for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
-            let definition = AttributeDefinition::builder()
-                .attribute_name(key)
-                .attribute_type(ScalarAttributeType::S)
-                .build();
-            let element = KeySchemaElement::builder().attribute_name(key).key_type(role).build();
-            request = request
-                .attribute_definitions(definition.unwrap())
-                .key_schema(element.unwrap());
-        }
-        request.send().await.unwrap();
-        name
     }
 
     fn api<K>(&self) -> Api<K>
@@ -298,6 +277,28 @@ impl World {
             .unwrap_or_else(|_| panic!("not after {LIMIT:?}: {what}"))
             .unwrap();
     }
+}
+
+/// An empty table of results, by its name.
+pub async fn make_table(aws: &StandIn) -> String {
+    let name = aws.name("counts");
+    let client = aws.aws.dynamodb(None, Some(&aws.endpoint));
+    let mut request = client
+        .create_table()
+        .table_name(&name)
+        .billing_mode(BillingMode::PayPerRequest);
+    for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
+        let definition = AttributeDefinition::builder()
+            .attribute_name(key)
+            .attribute_type(ScalarAttributeType::S)
+            .build();
+        let element = KeySchemaElement::builder().attribute_name(key).key_type(role).build();
+        request = request
+            .attribute_definitions(definition.unwrap())
+            .key_schema(element.unwrap());
+    }
+    request.send().await.unwrap();
+    name
 }
 
 fn is_read(request: &Request) -> bool {

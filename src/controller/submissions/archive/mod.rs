@@ -20,11 +20,13 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Client, ResourceExt};
 use tokio::sync::Notify;
 use tokio::time::Instant;
+use tracing::Instrument;
 
 use super::failure_log::{LogDemand, Tail};
 use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
 use crate::controller::objects::{Wake, uid_of};
+use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
@@ -185,6 +187,7 @@ impl ArchiveWorkers {
             name: submission.name_any(),
             prefix: effective::key_prefix(&plan.storage, &plan.run_id),
             submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
+            log: LogSpan::current(),
         };
         let id = bucket_id(&plan.storage);
         let mut buckets = self.0.buckets();
@@ -266,7 +269,8 @@ impl ArchiveWorker {
 
     async fn done(&self, work: Work) -> (Work, Done) {
         let archive = self.archive.at_prefix(work.target.prefix.as_str());
-        let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work).await;
+        let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work);
+        let done = done.instrument(work.target.log.span().clone()).await;
         (work, done)
     }
 

@@ -6,6 +6,7 @@ use std::time::Duration;
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
+use crate::observability::about::LogSpan;
 use leaderboard_api::JobNumber;
 
 pub(super) type Uid = Arc<str>;
@@ -33,6 +34,8 @@ pub struct Target {
     pub prefix: String,
     /// UID that its reports name.
     pub submission_uid: String,
+    /// For the log.
+    pub log: LogSpan,
 }
 
 /// Something to do now.

@@ -451,14 +451,17 @@ impl State {
     }
 
     fn run(&mut self, uid: &Uid, target: &Arc<Target>) -> &mut Run {
-        self.runs.entry(uid.clone()).or_insert_with(|| Run {
+        let run = self.runs.entry(uid.clone()).or_insert_with(|| Run {
             target: Arc::clone(target),
             due: [None; KINDS.len()],
             report: None,
             texts: None,
             fence: None,
             log: None,
-        })
+        });
+        // The log names the attempt that asked last.
+        run.target = Arc::clone(target);
+        run
     }
 
     /// Drops a run of which nothing is wanted.

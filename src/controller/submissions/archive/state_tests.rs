@@ -4,6 +4,7 @@ use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{LogAt, LogPlace, Texts};
+use crate::observability::about::LogSpan;
 
 struct Bench {
     state: State,
@@ -51,6 +52,7 @@ impl Bench {
                 name: "sub".into(),
                 prefix: "7/".into(),
                 submission_uid: "u".into(),
+                log: LogSpan::default(),
             }),
         }
     }

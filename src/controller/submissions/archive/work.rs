@@ -45,14 +45,12 @@ pub(super) async fn carry_out(client: &Client, archive: &Archive, budget: &TextB
             let write = archive.put(OWNER_KEY, Owner::new(mark).to_json());
             let written = within(LIMIT.min(*left), archive, write).await;
             if let Err(why) = &written {
-                let (object, why) = (&target.name, why.as_str());
-                tracing::warn!(submission = %object, why, "the fence against a lost Pod was not written");
+                tracing::warn!(why, "the fence against a lost Pod was not written");
             }
             Done::Fence(written.map(|_| ()))
         }
         What::Log { demand, tail } => {
-            let object = (target.namespace.as_str(), target.name.as_str());
-            Done::Log(failure_log::keep(client, archive, object, demand, tail.clone()).await)
+            Done::Log(failure_log::keep(client, archive, &target.namespace, demand, tail.clone()).await)
         }
     }
 }
@@ -90,7 +88,7 @@ async fn report(archive: &Archive, target: &Target, etag: Option<&str>) -> (Answ
         }
         Ok(None) => (Answer::Foreign { etag: object.etag }, None),
         Err(error) => {
-            tracing::warn!(submission = %target.name, %error, "a stored report is not used");
+            tracing::warn!(%error, "a stored report is not used");
             (Answer::Failed(error.to_string()), None)
         }
     }
@@ -118,7 +116,7 @@ async fn texts(
         Err(no_place) => Err(TextProblem::Unread(no_place.to_string())),
     };
     if let Some(why) = read.as_ref().err().map(TextProblem::why).or(left_out.as_deref()) {
-        tracing::warn!(submission = %target.name, why, "the texts of a result were not read");
+        tracing::warn!(why, "the texts of a result were not read");
     }
     let problem = read.as_ref().err().cloned();
     let (stdout, metadata) = read.unwrap_or_default();

@@ -1,4 +1,5 @@
 use super::*;
+use crate::observability::about::LogSpan;
 use crate::observability::shutdown::Stop;
 use crate::services::evalai::types::Run;
 use crate::services::token::Token;
@@ -59,6 +60,7 @@ fn only_a_leaderboard_that_publishes_has_a_publisher() {
             by_hand: false,
             has_job: true,
             ended: None,
+            log: LogSpan::default(),
         };
         let target = Target {
             is_observed,
@@ -90,6 +92,7 @@ async fn nothing_is_remembered_of_a_thousand_submissions_that_are_forgotten() {
             by_hand: false,
             has_job: true,
             ended: None,
+            log: LogSpan::default(),
         },
     };
     for pk in 0..1000 {

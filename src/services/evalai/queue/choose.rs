@@ -349,6 +349,7 @@ impl Queue {
             challenge: sub.challenge,
             pk: sub.pk,
             attempt: sub.run.attempt,
+            log: sub.run.log.clone(),
         };
         let request = match step {
             Step::Get | Step::GetForWrite => Request::Get(subject),

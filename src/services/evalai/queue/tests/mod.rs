@@ -12,6 +12,7 @@ mod simulation;
 use jiff::SignedDuration;
 
 use super::*;
+use crate::observability::about::LogSpan;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
@@ -61,6 +62,7 @@ fn run(pk: i64, attempt: i64) -> Run {
         by_hand: true,
         has_job: false,
         ended: None,
+        log: LogSpan::default(),
     }
 }
 

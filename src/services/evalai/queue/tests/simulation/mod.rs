@@ -361,6 +361,7 @@ impl World {
                 by_hand: true,
                 has_job: actor.began.is_some(),
                 ended: None,
+                log: LogSpan::default(),
             },
         };
         self.queue.ask(&subject, false, now);
