@@ -51,6 +51,7 @@ mod cluster {
     mod matrix_runs;
     mod matrix_stops;
     mod matrix_waits;
+    mod names;
     mod probe_endings;
     mod probes;
     mod publish;

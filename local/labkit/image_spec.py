@@ -55,6 +55,7 @@ class ImageSpec:
     cmd: tuple[str, ...]
     user: str
     workdir: str
+    volumes: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -162,6 +163,7 @@ def parse_image(table: object, place: str) -> ImageSpec:
         cmd=reader.texts("cmd"),
         user=reader.text("user", ""),
         workdir=reader.text("workdir", ""),
+        volumes=reader.texts("volumes"),
     )
     reader.done()
     return spec

@@ -26,6 +26,9 @@ pub const LEASE: &str = "operator";
 /// Between the end of a program and its next start, as the kubelet has it.
 const BACK_OFF: Duration = Duration::from_secs(1);
 
+/// The words of a shell that starts a program with a file in place of `/etc/hosts`.
+const MOUNT_HOSTS: &str = r#"mount --bind "$0" /etc/hosts && exec "$@""#;
+
 /// What the controller writes last when it ends because its Lease could not be renewed.
 const LOST_LEASE: &str = "this process no longer leads";
 
@@ -55,6 +58,8 @@ struct Start {
     logs: PathBuf,
     arguments: Vec<String>,
     variables: Vec<(&'static str, OsString)>,
+    /// What it sees as `/etc/hosts`.
+    hosts: Option<PathBuf>,
 }
 
 /// Starts `leaderboard-operator controller`, and keeps it running.
@@ -70,6 +75,17 @@ pub fn controller_with_nodes(scene: &Scene) -> Kept {
         .iter()
         .position(|argument| argument == "--cluster-rights");
     "true".clone_into(&mut start.arguments[rights.unwrap() + 1]);
+    start.keep(scene)
+}
+
+/// Starts a controller that looks names up in these lines of `/etc/hosts`, and keeps it running.
+pub fn controller_with_hosts(scene: &Scene, hosts: &str) -> Kept {
+    let path = scene.logs.join("hosts");
+    fs::write(&path, hosts).unwrap();
+    let start = Start {
+        hosts: Some(path),
+        ..Start::controller(scene)
+    };
     start.keep(scene)
 }
 
@@ -141,6 +157,7 @@ impl Start {
             logs: scene.logs.clone(),
             arguments: Vec::new(),
             variables: Vec::new(),
+            hosts: None,
         }
     }
 
@@ -173,8 +190,12 @@ impl Start {
         let log = File::create(&path).unwrap();
         // A killed test drops nothing; the kernel ends its children all the same.
         let mut command = Command::new("setpriv");
+        command.args(["--pdeathsig", "KILL"]);
+        if let Some(hosts) = &self.hosts {
+            // A mount that nobody else on this machine sees.
+            command.args(["unshare", "--mount", "sh", "-c", MOUNT_HOSTS]).arg(hosts);
+        }
         command
-            .args(["--pdeathsig", "KILL"])
             .arg(binary())
             .arg(self.program)
             .args(["--namespace", &self.namespace, "--http", "127.0.0.1:0"])

@@ -90,6 +90,24 @@ pub const ENDINGS: &[Ending] = &[
         ..ending("status-content", "a status file with content", Image::User, FINISHED)
     },
     Ending {
+        change: TWICE,
+        ..ending(
+            "status-pipe",
+            "a named pipe in place of a status file",
+            Image::User,
+            FINISHED,
+        )
+    },
+    Ending {
+        change: TWICE,
+        ..ending(
+            "folder-deleted",
+            "delete the own status files in each life, and the folder with them",
+            Image::Root,
+            CRASHED,
+        )
+    },
+    Ending {
         change: r#"{"storage": {"sizeLimit": "16Mi"}}"#,
         ..ending(
             "growing-file",
@@ -136,6 +154,24 @@ pub const ENDINGS: &[Ending] = &[
         "own-done",
         "write the own mark of the end before it",
         Image::User,
+        INVALID,
+    ),
+    ending(
+        "folder-shut",
+        "make the own status folder unreadable, and end with results that say no more than that they are complete",
+        Image::Root,
+        INVALID,
+    ),
+    ending(
+        "folder-listed",
+        "forbid the own status folder to simulator and logcopy by an access control list, and crash",
+        Image::Root,
+        CRASHED,
+    ),
+    ending(
+        "results-shut",
+        "make the folder of the own results unreadable",
+        Image::Root,
         INVALID,
     ),
     ending(

@@ -9,6 +9,7 @@ mod call;
 pub mod document;
 pub mod endings;
 mod files;
+mod folders;
 mod identity;
 mod kernel;
 pub mod modes;

@@ -14,14 +14,23 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use nix::libc;
 use nix::sys::signal::{Signal, kill};
-use nix::unistd::{Pid, setsid};
+use nix::sys::stat::Mode;
+use nix::unistd::{Pid, mkfifo, setsid};
 
 use crate::call::{call, of};
+use crate::folders;
 
 /// The honest agent of the image.
 pub const HONEST: &str = "/usr/bin/challenge-agent";
 const TERMINATION_LOG: &str = "/dev/termination-log";
+const WORK: &str = "/tmp/agent";
 const LOG: &str = "/tmp/agent/leaderboard.log";
+const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
+/// What a runner takes for complete results, and nobody else.
+const COMPLETE: &str = r#"{"_checkpoint": {"global_record": {"index": -1}}}"#;
+/// The users of the operator's image, and of the challenge's simulator.
+const LOGCOPY: u32 = 65532;
+const SIMULATOR: u32 = 1000;
 /// Outlives the container.
 const MARKER: &str = "/tmp/agent/probe-was-here";
 const FIRST_PORT: u16 = 2000;
@@ -76,6 +85,15 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         }
         "status-content" => first_life(|| fs::write(status("start1"), vec![b'x'; 1 << 20])),
         "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
+        "status-pipe" => first_life(|| Ok(mkfifo(Path::new(&status("start1")), Mode::S_IRWXU)?)),
+        "folder-shut" => shut(),
+        "folder-listed" => folders::forbid(&folders::own(), &[LOGCOPY, SIMULATOR]).and_then(|()| exit(1)),
+        // One that can be deleted would be seen: the honest agent's run ends well.
+        "folder-deleted" => match folders::delete(&folders::own()) {
+            Ok(()) => Ok(()),
+            Err(_) => exit(1),
+        },
+        "results-shut" => fs::set_permissions(WORK, Permissions::from_mode(0o700)),
         "growing-file" => background("grow"),
         "replaced-log" => background("replace"),
         // The honest agent's own knob.
@@ -105,7 +123,14 @@ pub fn honest(arguments: &[String], knobs: &str) -> io::Result<Infallible> {
 }
 
 fn status(mark: &str) -> String {
-    format!("/tmp/status/agent-{0}/agent-{0}.{mark}", pair())
+    format!("{}/agent-{}.{mark}", folders::own().display(), pair())
+}
+
+/// Nobody else could see the end, if the folder stayed shut; and nothing but the mark of the end says that no results will come.
+fn shut() -> io::Result<()> {
+    fs::write(CHECKPOINT, COMPLETE)?;
+    fs::set_permissions(folders::own(), Permissions::from_mode(0o700))?;
+    exit(0)
 }
 
 /// Until nothing listens on the port of its simulator any more.
