@@ -9,7 +9,6 @@ mod golden;
 mod help;
 mod messages;
 mod overview;
-mod pages;
 mod requeue;
 mod shown;
 mod why;
