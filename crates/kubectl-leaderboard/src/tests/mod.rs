@@ -9,6 +9,7 @@ mod golden;
 mod help;
 mod messages;
 mod overview;
+mod pages;
 mod requeue;
 mod shown;
 mod why;
