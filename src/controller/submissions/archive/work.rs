@@ -34,7 +34,7 @@ pub(super) async fn carry_out(client: &Client, archive: &Archive, budget: &TextB
             let texts = match (&answer, found) {
                 (Answer::Found { report: digest, .. }, Some(report)) => {
                     let is_end = !sent.as_ref().is_some_and(Sent::is_live);
-                    Ok(texts(archive, target, digest.id, report, budget, is_end).await)
+                    Ok(texts(archive, digest.id, report, budget, is_end).await)
                 }
                 (Answer::Failed(why), _) => Err(why.clone()),
                 _ => Err("the stored report is gone".to_owned()),
@@ -95,14 +95,7 @@ async fn report(archive: &Archive, target: &Target, etag: Option<&str>) -> (Answ
 }
 
 /// Reads the texts once there is a place for both.
-async fn texts(
-    archive: &Archive,
-    target: &Target,
-    of: ReportId,
-    report: Report,
-    budget: &TextBudget,
-    is_end: bool,
-) -> Texts {
+async fn texts(archive: &Archive, of: ReportId, report: Report, budget: &TextBudget, is_end: bool) -> Texts {
     let (named, left_out) = named(&report);
     let bytes = named.iter().map(|(_, file)| file.size).sum();
     let read = match budget.place(bytes, is_end).await {
