@@ -30,9 +30,6 @@ mod render;
 mod statistics;
 mod verdict;
 
-use std::panic::resume_unwind;
-use std::thread;
-
 pub use checkpoint::{Checkpoint, read_worker};
 pub use json::{FileLimits, Limit};
 pub use merge::{Merged, PairProgress, merge};
@@ -47,25 +44,15 @@ pub use verdict::Outcome;
 ///
 /// `inputs` are the files in the order of the workers; `None` is a file that does not exist.
 pub fn offline(plan: &Plan, inputs: &[Option<Vec<u8>>]) -> Result<(Merged, Files), Refusal> {
-    let read = read_all(plan, inputs)?;
+    let mut read = Vec::with_capacity(inputs.len());
+    for (pair, bytes) in inputs.iter().enumerate() {
+        read.push(match bytes {
+            Some(bytes) => read_worker(plan, pair, bytes)?,
+            None => None,
+        });
+    }
     let workers: Vec<Option<&Checkpoint>> = read.iter().map(Option::as_ref).collect();
     let merged = merge(plan, &workers)?;
     let files = render(plan, Some(&merged))?;
     Ok((merged, files))
-}
-
-/// Each worker's file in a thread of its own; the first refusal is that of the first worker.
-fn read_all(plan: &Plan, inputs: &[Option<Vec<u8>>]) -> Result<Vec<Option<Checkpoint>>, Refusal> {
-    thread::scope(|scope| {
-        let mut readers = Vec::with_capacity(inputs.len());
-        for (pair, bytes) in inputs.iter().enumerate() {
-            let read = |bytes| scope.spawn(move || read_worker(plan, pair, bytes));
-            readers.push(bytes.as_deref().map(read));
-        }
-        let ended = readers.into_iter().map(|reader| match reader {
-            Some(reader) => reader.join().unwrap_or_else(|panic| resume_unwind(panic)),
-            None => Ok(None),
-        });
-        ended.collect()
-    })
 }

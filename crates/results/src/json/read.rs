@@ -29,9 +29,9 @@ pub(crate) fn read(bytes: &[u8], limits: FileLimits) -> Result<Value, ReadError>
             ReadError::NotUtf8
         });
     }
+    let shared = bytes.into();
     let mut reader = Reader {
-        bytes,
-        shared: bytes.into(),
+        bytes: &shared,
         at: 0,
         values: limits.values,
         limits,
@@ -49,9 +49,8 @@ pub(crate) fn read(bytes: &[u8], limits: FileLimits) -> Result<Value, ReadError>
 }
 
 struct Reader<'a> {
-    bytes: &'a [u8],
-    /// The same, for the texts.
-    shared: Arc<[u8]>,
+    /// All texts share them.
+    bytes: &'a Arc<[u8]>,
     at: usize,
     /// How many more there may be.
     values: usize,
@@ -185,7 +184,7 @@ impl<'a> Reader<'a> {
         let plain = self.plain()?;
         let end = self.at;
         if self.take(b"\"") {
-            return Text::part(&self.shared, start..end).ok_or(ReadError::Limit(Limit::Text));
+            return Text::part(self.bytes, start..end).ok_or(ReadError::Limit(Limit::Text));
         }
         let mut text = plain.to_vec();
         loop {
