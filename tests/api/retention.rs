@@ -3,9 +3,7 @@
 
 use std::collections::HashMap;
 
-use aws_sdk_dynamodb::types::{
-    AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
-};
+use aws_sdk_dynamodb::types::AttributeValue;
 use evalai_stand_in::model::{Status, User};
 use evalai_stand_in::submissions::resume;
 use jiff::Timestamp;
@@ -18,26 +16,13 @@ use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, names, rea
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
+use super::boards::make_table;
 use super::bridge::LIMIT;
 use super::world::World;
 
 async fn table(world: &World) -> Value {
     let name = world.aws.name("rows");
-    let client = world.aws.aws.dynamodb(None, Some(&world.aws.endpoint));
-    let mut request = client
-        .create_table()
-        .table_name(&name)
-        .billing_mode(BillingMode::PayPerRequest);
-    for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
-        let definition = AttributeDefinition::builder()
-            .attribute_name(key)
-            .attribute_type(ScalarAttributeType::S);
-        let element = KeySchemaElement::builder().attribute_name(key).key_type(role);
-        request = request
-            .attribute_definitions(definition.build().unwrap())
-            .key_schema(element.build().unwrap());
-    }
-    request.send().await.unwrap();
+    make_table(&world.aws, &name).await;
     json!({"name": name, "endpoint": world.aws.endpoint})
 }
 

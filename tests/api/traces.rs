@@ -29,7 +29,8 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tracing::Dispatch;
 
-use super::counts::lifecycle::{Controller, Scenario, Watched, World, make_table};
+use super::boards::make_table;
+use super::counts::lifecycle::{Controller, Scenario, Watched, World};
 use super::{operator, world};
 use crate::support::{apiserver, ministack};
 
@@ -311,7 +312,8 @@ async fn fail(world: &world::World, table: &str, lines: &Lines) -> String {
 #[tokio::test(flavor = "multi_thread")]
 async fn every_line_about_a_submission_that_fails_has_its_names_and_its_trace() {
     let world = world::World::new().await;
-    let table = make_table(&world.aws).await;
+    let table = world.aws.name("traces");
+    make_table(&world.aws, &table).await;
     let more = json!({"table": {"name": table, "endpoint": world.aws.endpoint}});
     world.leaderboard_with("lb", 1, "Hosts", &more).await;
     let lines = Lines::default();

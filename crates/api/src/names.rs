@@ -56,7 +56,7 @@ pub const CONTAINER_CONTENTS: &str = "contents";
 pub const CONTAINER_WORKSPACE: &str = "workspace";
 /// Name of the sidecar that merges, uploads and reports.
 pub const CONTAINER_LOGCOPY: &str = "logcopy";
-/// The init containers of a Pod, in the order in which they start. `logcopy` goes on beside the pairs.
+/// The init containers of a Pod, in the order in which they start. `logcopy` goes on while the pairs run.
 pub const INIT_CONTAINERS: [&str; 3] = [CONTAINER_WORKSPACE, CONTAINER_CONTENTS, CONTAINER_LOGCOPY];
 
 /// Key of the log that explains a failure, below the run's prefix. Of that prefix it is the one text that the controller writes.

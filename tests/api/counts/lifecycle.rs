@@ -4,7 +4,6 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use allocation_counter::AllocationInfo;
-use aws_sdk_dynamodb::types::{AttributeDefinition, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType};
 use evalai_stand_in::model::FileState;
 use evalai_stand_in::submissions::{NewSubmission, create as push};
 use evalai_stand_in::{Config, Handle};
@@ -24,6 +23,7 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, sleep, timeout};
 use tracing::Dispatch;
 
+use super::super::boards::make_table;
 use super::super::bridge::StandIn;
 use super::super::objects::{Kind, create};
 use super::super::operator;
@@ -202,7 +202,9 @@ impl World {
             });
             spec["agent"] = json!({"images": []});
             spec["tracks"] = json!([{"name": "sensors", "codename": "SENSORS", "phase": 1}]);
-            spec["table"] = json!({"name": make_table(&self.aws).await, "endpoint": self.aws.endpoint});
+            let table = self.aws.name("counts");
+            make_table(&self.aws, &table).await;
+            spec["table"] = json!({"name": table, "endpoint": self.aws.endpoint});
         }
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         let board = Kind::Leaderboard.object(BOARD, &[&json!({ "spec": spec })]);
@@ -277,28 +279,6 @@ impl World {
             .unwrap_or_else(|_| panic!("not after {LIMIT:?}: {what}"))
             .unwrap();
     }
-}
-
-/// An empty table of results, by its name.
-pub async fn make_table(aws: &StandIn) -> String {
-    let name = aws.name("counts");
-    let client = aws.aws.dynamodb(None, Some(&aws.endpoint));
-    let mut request = client
-        .create_table()
-        .table_name(&name)
-        .billing_mode(BillingMode::PayPerRequest);
-    for (key, role) in [("team_id", KeyType::Hash), ("submission_id", KeyType::Range)] {
-        let definition = AttributeDefinition::builder()
-            .attribute_name(key)
-            .attribute_type(ScalarAttributeType::S)
-            .build();
-        let element = KeySchemaElement::builder().attribute_name(key).key_type(role).build();
-        request = request
-            .attribute_definitions(definition.unwrap())
-            .key_schema(element.unwrap());
-    }
-    request.send().await.unwrap();
-    name
 }
 
 fn is_read(request: &Request) -> bool {

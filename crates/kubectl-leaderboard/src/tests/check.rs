@@ -37,6 +37,19 @@ pub(super) fn good_leaderboard() -> Leaderboard {
     ]))
 }
 
+/// It is Ready with a note, and its Pods are not isolated.
+pub(super) fn noted_leaderboard() -> Leaderboard {
+    leaderboard(&json!([
+        condition(
+            "Ready",
+            "True",
+            "Ready",
+            "Runs of the track sensors have no time limit."
+        ),
+        condition("Isolated", "False", "NotEnforced", "The Pod could reach 10.96.0.1:443."),
+    ]))
+}
+
 pub(super) fn check(status: &Value) -> Submission {
     let object = json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
@@ -307,15 +320,7 @@ fn a_leaderboard_that_is_not_ready_fails_the_check_of_a_good_run() {
 
 #[test]
 fn what_a_host_allows_is_a_note() {
-    let noted = leaderboard(&json!([
-        condition(
-            "Ready",
-            "True",
-            "Ready",
-            "Runs of the track sensors have no time limit."
-        ),
-        condition("Isolated", "False", "NotEnforced", "The Pod could reach 10.96.0.1:443."),
-    ]));
+    let noted = noted_leaderboard();
     let (text, has_passed) = printed(&noted, &passed(), None, &Readers::Nobody);
     assert!(
         text.contains("! Leaderboard    Ready. Runs of the track sensors have no time limit."),

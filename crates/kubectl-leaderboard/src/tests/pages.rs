@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
-use super::check::{check, failed, good_leaderboard, passed, table};
+use super::check::{check, failed, good_leaderboard, noted_leaderboard, passed, table};
 use super::golden::{assert_golden, assert_shown};
 use super::{condition, crashed, leaderboard, now, ran_with, submission, waiting, with};
 use crate::board::Observed;
@@ -76,17 +76,7 @@ fn a_check_with_notes() {
         what: "EventBridge Pipe old-pipeline".to_owned(),
         stop: "aws pipes stop-pipe --name old-pipeline".to_owned(),
     }]);
-    let mut noted = good_leaderboard();
-    let conditions = json!([
-        condition(
-            "Ready",
-            "True",
-            "Ready",
-            "Runs of the track sensors have no time limit."
-        ),
-        condition("Isolated", "False", "NotEnforced", "The Pod could reach 10.96.0.1:443."),
-    ]);
-    noted.status.as_mut().unwrap().conditions = serde_json::from_value(conditions).unwrap();
+    let noted = noted_leaderboard();
     assert_shown("check-notes", |frame| checked(&noted, &passed(), None, &readers, frame));
 }
 
