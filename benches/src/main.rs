@@ -31,7 +31,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use bench::{Bench, Outcome};
 use cases::Case;
 use machine::Machine;
-use record::Line;
+use raw::Bodies;
+use record::{Figures, Line};
 
 /// Measures leaderboard-operator.
 #[derive(Parser)]
@@ -75,6 +76,9 @@ struct Run {
     /// Part of the submissions; less than 1 only shows that the cases work.
     #[arg(long, default_value_t = 1.0)]
     scale: f64,
+    /// How often each case is measured; its line has the runs of all.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
+    repeat: u32,
     /// Only these cases.
     #[arg(long = "case", value_enum)]
     cases: Vec<Case>,
@@ -135,7 +139,7 @@ async fn measure(run: &Run) -> Outcome<()> {
     let mut failed = Vec::new();
     for case in cases::chosen(&run.cases) {
         let (time, began) = (Timestamp::now().to_string(), Instant::now());
-        match Box::pin(case.measure(&bench, &bodies)).await {
+        match Box::pin(repeated(case, &bench, &bodies, run.repeat)).await {
             Ok(figures) => {
                 let line = Line {
                     profile: run.profile.clone(),
@@ -161,4 +165,12 @@ async fn measure(run: &Run) -> Outcome<()> {
     } else {
         Err(format!("not measured: {}", failed.join(", ")).into())
     }
+}
+
+async fn repeated(case: Case, bench: &Bench, bodies: &Bodies, times: u32) -> Outcome<Figures> {
+    let mut figures = case.measure(bench, bodies).await?;
+    for _ in 1..times {
+        figures.extend(case.measure(bench, bodies).await?);
+    }
+    Ok(figures)
 }

@@ -57,6 +57,17 @@ impl Figures {
         }
     }
 
+    /// Adds the runs of a repetition. Counts and series are of one run: they stay those of the first.
+    pub fn extend(&mut self, other: Self) {
+        for (name, mut runs) in other.runs {
+            self.runs.entry(name).or_default().append(&mut runs);
+        }
+        self.foreign.extend(other.foreign);
+        for note in other.notes {
+            self.note(note);
+        }
+    }
+
     pub fn foreign(&mut self, share: f64) {
         self.foreign.push(share);
     }
@@ -171,5 +182,23 @@ mod tests {
         assert_eq!(lines.len(), 1);
         assert_eq!((lines[0].median("a"), lines[0].median("a/b")), (Some(2.0), Some(0.5)));
         assert_eq!(lines[0].median("c"), None);
+    }
+
+    #[test]
+    fn a_repetition_adds_its_runs_and_the_series_stay_those_of_the_first() {
+        let run = |value: f64| {
+            let mut figures = Figures::default();
+            figures.add("a", value);
+            figures.foreign(value);
+            figures.note("small".into());
+            figures.series.insert("s".into(), vec![(0.0, value)]);
+            figures
+        };
+        let mut figures = run(1.0);
+        figures.extend(run(3.0));
+        let line = figures.into_line("case");
+        assert_eq!(line.figures["a"].runs, [1.0, 3.0]);
+        assert_eq!(line.foreign.map(|share| share.runs.len()), Some(2));
+        assert_eq!((line.series["s"][0].1, line.notes), (1.0, vec!["small".to_owned()]));
     }
 }
