@@ -87,7 +87,7 @@ chart-test: ## Check the chart: its values, what each of them renders, and what 
 	$(LAB) chart-test
 
 .PHONY: chart-docs install-yaml
-chart-docs: ## Write the tables of the chart's values and of the metrics
+chart-docs: ## Write docs/reference and the tables of the chart's values and of the metrics
 	$(LAB) chart-docs
 
 install-yaml: ## Print one file that installs the operator without Helm; ARGS are for helm template

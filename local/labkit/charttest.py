@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import (
+    apidocs,
     apiserver,
     artifacthub,
     chartalerts,
@@ -51,6 +52,7 @@ def run(settings: Settings, update: bool) -> None:
     check("values.yaml and the README's table", lambda: chartdocs.same_table(chart))
     check("values.yaml and its schema", lambda: chartdocs.same_schema(chart))
     check("metrics and their page", lambda: metricdocs.same(settings.repository))
+    check("the API and its pages", lambda: apidocs.same(settings.repository))
     check("what Artifact Hub reads", lambda: artifacthub.check(settings.repository))
     check("one version", lambda: release.version(settings.repository))
     check("a runbook for each alert", lambda: doccheck.runbooks(settings.repository))
