@@ -199,7 +199,11 @@ def between(least: int | None, most: int | None, unit: str) -> Iterator[str]:
 def rules(schema: dict[str, Any]) -> list[str]:
     """What the API server refuses of an object, in the words that it answers with."""
     messages = [message(rule) for rule in schema.get("x-kubernetes-validations", [])]
-    return ["", "With these words the API server refuses an object:", "", *(f"- {one}" for one in messages)] if messages else []
+    return (
+        ["", "With these words the API server refuses an object:", "", *(f"- {one}" for one in messages)]
+        if messages
+        else []
+    )
 
 
 def message(rule: dict[str, Any]) -> str:
@@ -209,5 +213,7 @@ def message(rule: dict[str, Any]) -> str:
 def escaped(text: str) -> str:
     """For a cell of a table. Between backticks Markdown itself leaves everything but the bar alone."""
     parts = text.replace("|", "\\|").split("`")
-    outside = [part.replace("<", "&lt;").replace("*", "\\*") if number % 2 == 0 else part for number, part in enumerate(parts)]
+    outside = [
+        part.replace("<", "&lt;").replace("*", "\\*") if number % 2 == 0 else part for number, part in enumerate(parts)
+    ]
     return "`".join(outside)

@@ -22,6 +22,7 @@ from . import (
     kube,
     metricdocs,
     pagetest,
+    programdocs,
     pythonenv,
     release,
     testrun,
@@ -67,7 +68,9 @@ def parser() -> argparse.ArgumentParser:
     page.add_argument("--pictures", action="store_true", help="take the pictures of docs/images too")
     engine = commands.add_parser("dockerfile", help="build the Dockerfile with buildah and check its image")
     engine.add_argument("--profile", default=build.PROFILE, help=f"cargo profile (default: {build.PROFILE})")
-    commands.add_parser("chart-docs", help="write docs/reference and the tables of the chart's values and of the metrics")
+    commands.add_parser(
+        "chart-docs", help="write docs/reference and the tables of the chart's values and of the metrics"
+    )
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
@@ -134,6 +137,7 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             chartdocs.update(chartrender.folder(settings.repository))
             metricdocs.update(settings.repository)
             apidocs.update(settings.repository)
+            programdocs.update(settings.repository)
         case "install-yaml":
             helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")
