@@ -17,8 +17,8 @@ BENCH_FLAGS ?=
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time)
-	$(LAB) demo
+demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time); REGISTRY=NAME: on the cluster of KUBECONFIG
+	$(LAB) demo $(if $(REGISTRY),--registry $(REGISTRY))
 
 test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; 35 min the first time)
 	$(LAB) test

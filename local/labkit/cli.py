@@ -17,6 +17,7 @@ from . import (
     cluster,
     crash,
     demo,
+    demo_elsewhere,
     dockerfile,
     image,
     kube,
@@ -60,7 +61,14 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser(
         "aws-venv", help="print the folder of programs of the Python environment with ministack and boto3"
     )
-    commands.add_parser("demo", help="start everything, run one submission from message to score, and check it")
+    demonstration = commands.add_parser(
+        "demo", help="start everything, run one submission from message to score, and check it"
+    )
+    demonstration.add_argument(
+        "--registry",
+        metavar="NAME",
+        help="use the cluster of KUBECONFIG in place of one of our own, and push the images there, such as registry.example/demo",
+    )
     add_arguments_of_test(commands.add_parser("test", help="run the tests; prints what each layer took"))
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
@@ -124,7 +132,10 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
         case "aws-venv":
             print(pythonenv.ensure(settings))
         case "demo":
-            demo.run(settings)
+            if arguments.registry:
+                demo_elsewhere.run(settings, arguments.registry)
+            else:
+                demo.run(settings)
         case "test":
             return 0 if testrun.run(settings, arguments.core, arguments.filter, arguments.only) else 1
         case "chart-test":
