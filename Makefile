@@ -17,8 +17,8 @@ BENCH_FLAGS ?=
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time)
-	$(LAB) demo
+demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time); REGISTRY=NAME: on the cluster of KUBECONFIG
+	$(LAB) demo $(if $(REGISTRY),--registry $(REGISTRY))
 
 test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; 35 min the first time)
 	$(LAB) test
@@ -87,7 +87,7 @@ chart-test: ## Check the chart: its values, what each of them renders, and what 
 	$(LAB) chart-test
 
 .PHONY: chart-docs install-yaml
-chart-docs: ## Write the tables of the chart's values and of the metrics
+chart-docs: ## Write docs/reference and the tables of the chart's values and of the metrics
 	$(LAB) chart-docs
 
 install-yaml: ## Print one file that installs the operator without Helm; ARGS are for helm template

@@ -22,6 +22,7 @@ KNOWN = {
     "operatorCapabilities", "prerelease",
 }  # fmt: skip
 IMAGE = re.compile(r"ghcr\.io/[\w.-]+/leaderboard-operator:(\S+)")
+ICON = re.compile(r"^icon: https://github\.com/[\w.-]+/leaderboard-operator/raw/v([^/]+)/(\S+)$", re.MULTILINE)
 LINE = re.compile(r"^  artifacthub\.io/(\w+): ?(.*)$", re.MULTILINE)
 
 
@@ -77,10 +78,22 @@ def of_lists(lists: Mapping[str, list[dict[str, str]]], version: str) -> Iterato
             yield f"an image has a name and a reference of version {version}, not {image}"
 
 
+def icon_faults(chart: str, version: str, repository: Path) -> Iterator[str]:
+    """The icon is a file of this repository, as it is in this version."""
+    icon = ICON.search(chart)
+    if icon is None:
+        yield "Chart.yaml has no icon of this repository"
+    elif icon[1] != version:
+        yield f"the icon is of another version than {version}: {icon[0]}"
+    elif not (repository / icon[2]).is_file():
+        yield f"the icon {icon[2]} does not exist"
+
+
 def check(repository: Path) -> str:
     """For the chart's test: raises with what is wrong."""
     chart, own = ((repository / path).read_text() for path in (CHART, REPOSITORY_FILE))
-    found = list(faults(chart, own, release.version(repository)))
+    version = release.version(repository)
+    found = [*faults(chart, own, version), *icon_faults(chart, version, repository)]
     if found:
         raise LabError("; ".join(found))
     return f"{len(KNOWN)} annotations"

@@ -18,6 +18,7 @@ REFUSED: tuple[tuple[tuple[str, ...], str], ...] = (
     (('controller.concurrency="16"',), "integer"),
     (("controller.concurrency=0",), "concurrency"),
     (("controller.replicas=-1",), "replicas"),
+    (("revisionHistoryLimit=-1",), "revisionHistoryLimit"),
     (("controller.page.enable=true",), "enable"),
     (('controller.page.enabled="yes"',), "boolean"),
     (('image.repository="registry.example/operator@sha256:0"',), "repository"),

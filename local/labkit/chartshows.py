@@ -316,6 +316,11 @@ PROGRAMS = [
         (f"Role/{RELEASE}-page", "rules.1.resources", ["pods/portforward"]),
     ),
     case({"controller.concurrency": 32}, (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CONCURRENCY", "32")])),
+    case(
+        {"revisionHistoryLimit": 3},
+        (CONTROLLER, "spec.revisionHistoryLimit", 3),
+        (BRIDGE, "spec.revisionHistoryLimit", 3),
+    ),
     case({"controller.extraEnv": [env("A", "1")]}, (CONTROLLER, f"{CONTAINER}.env", [env("A", "1")])),
     case({"bridge.extraEnv": [env("A", "1")]}, (BRIDGE, f"{CONTAINER}.env", [env("A", "1")])),
     case(

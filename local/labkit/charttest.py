@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import (
+    apidocs,
     apiserver,
     artifacthub,
     chartalerts,
@@ -22,6 +23,7 @@ from . import (
     docruns,
     kubeversions,
     metricdocs,
+    programdocs,
     release,
     schemas,
     tools,
@@ -51,6 +53,8 @@ def run(settings: Settings, update: bool) -> None:
     check("values.yaml and the README's table", lambda: chartdocs.same_table(chart))
     check("values.yaml and its schema", lambda: chartdocs.same_schema(chart))
     check("metrics and their page", lambda: metricdocs.same(settings.repository))
+    check("the API and its pages", lambda: apidocs.same(settings.repository))
+    check("exit codes, status files and their page", lambda: programdocs.same(settings.repository))
     check("what Artifact Hub reads", lambda: artifacthub.check(settings.repository))
     check("one version", lambda: release.version(settings.repository))
     check("a runbook for each alert", lambda: doccheck.runbooks(settings.repository))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import (
+    apidocs,
     aws,
     build,
     chartdocs,
@@ -16,11 +17,13 @@ from . import (
     cluster,
     crash,
     demo,
+    demo_elsewhere,
     dockerfile,
     image,
     kube,
     metricdocs,
     pagetest,
+    programdocs,
     pythonenv,
     release,
     testrun,
@@ -58,7 +61,14 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser(
         "aws-venv", help="print the folder of programs of the Python environment with ministack and boto3"
     )
-    commands.add_parser("demo", help="start everything, run one submission from message to score, and check it")
+    demonstration = commands.add_parser(
+        "demo", help="start everything, run one submission from message to score, and check it"
+    )
+    demonstration.add_argument(
+        "--registry",
+        metavar="NAME",
+        help="use the cluster of KUBECONFIG in place of one of our own, and push the images there, such as registry.example/demo",
+    )
     add_arguments_of_test(commands.add_parser("test", help="run the tests; prints what each layer took"))
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
@@ -66,7 +76,9 @@ def parser() -> argparse.ArgumentParser:
     page.add_argument("--pictures", action="store_true", help="take the pictures of docs/images too")
     engine = commands.add_parser("dockerfile", help="build the Dockerfile with buildah and check its image")
     engine.add_argument("--profile", default=build.PROFILE, help=f"cargo profile (default: {build.PROFILE})")
-    commands.add_parser("chart-docs", help="write the tables of the chart's values and of the metrics")
+    commands.add_parser(
+        "chart-docs", help="write docs/reference and the tables of the chart's values and of the metrics"
+    )
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
@@ -120,7 +132,10 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
         case "aws-venv":
             print(pythonenv.ensure(settings))
         case "demo":
-            demo.run(settings)
+            if arguments.registry:
+                demo_elsewhere.run(settings, arguments.registry)
+            else:
+                demo.run(settings)
         case "test":
             return 0 if testrun.run(settings, arguments.core, arguments.filter, arguments.only) else 1
         case "chart-test":
@@ -132,6 +147,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
         case "chart-docs":
             chartdocs.update(chartrender.folder(settings.repository))
             metricdocs.update(settings.repository)
+            apidocs.update(settings.repository)
+            programdocs.update(settings.repository)
         case "install-yaml":
             helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")

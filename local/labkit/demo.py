@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ def run(settings: Settings) -> None:
     started = time.monotonic()
     cluster.check_machine(settings)
     say(forecast(settings))
+    if other := foreign_cluster(settings, os.environ):
+        say(other)
     folder = prepare(settings)
     kube = of_lab(settings, folder)
     pinned = make_images(settings)
@@ -70,6 +73,16 @@ def forecast(settings: Settings) -> str:
     total = seconds(sum(each for each, _ in reasons))
     kept = "; what is built is kept, so that the next time takes a minute or two" if len(parts) > 1 else ""
     return f"this takes about {total} on two cores: {', '.join(parts)}{kept}"
+
+
+def foreign_cluster(settings: Settings, env: Mapping[str, str]) -> str:
+    """How to use a cluster that the machine has already; empty without one. It is never changed unasked."""
+    if env.get("KUBECONFIG", str(settings.kubeconfig)) == str(settings.kubeconfig):
+        return ""
+    return (
+        f"the cluster of KUBECONFIG={env['KUBECONFIG']} is left alone, and one is made here; "
+        "`make demo REGISTRY=NAME` uses it, with images pushed to that registry: no Kubernetes to build, no root"
+    )
 
 
 def step(number: int, what: str, usual: str) -> None:

@@ -17,6 +17,8 @@ ALERT = re.compile(r"^\s+- alert: (\w+)$", re.MULTILINE)
 RUNBOOK_PARTS = ("**Meaning.**", "**Impact.**", "**Find out**", "**Fix.**")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+# No link: a pattern such as [a](b)*.
+CODE = re.compile(r"`[^`\n]*`")
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 ROW = re.compile(r"^\| (\d+) \| (.+) \| (\w[\w ]*) \| (.+) \|$", re.MULTILINE)
 TEST = re.compile(r"`([\w./-]+\.(?:rs|py))::(\w+)`")
@@ -82,7 +84,7 @@ def anchors(text: str) -> set[str]:
 
 def link_faults(page: Path) -> Iterator[str]:
     """Links of a page to files, and places in them, that do not exist."""
-    for link in LINK.findall(FENCE.sub("", page.read_text())):
+    for link in LINK.findall(CODE.sub("", FENCE.sub("", page.read_text()))):
         if re.match(r"[a-z]+:", link):
             continue
         target, _, place = link.partition("#")

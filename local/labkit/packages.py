@@ -22,6 +22,7 @@ PROGRAMS = {
     "openssl": "openssl",
     "umount": "mount",
 }
+UPDATE_SECONDS, INSTALL_SECONDS = 5, 15
 CNI_FOLDERS = (Path("/usr/lib/cni"), Path("/opt/cni/bin"), Path("/usr/libexec/cni"))
 CNI_PLUGINS = ("bridge", "host-local", "portmap", "loopback")
 POLICY = Path("/usr/sbin/policy-rc.d")
@@ -58,14 +59,13 @@ def install(settings: Settings, packages: Sequence[str]) -> None:
         raise LabError(
             f"this machine lacks what the Debian packages {names} hold: install them with its own package manager"
         )
-    say(f"installing the Debian packages {names}, usually 20 s")
+    say(f"installing the Debian packages {names}, usually {UPDATE_SECONDS + INSTALL_SECONDS} s")
     env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     with no_services():
-        run_long(
-            ["apt-get", "update", "--quiet"], "updating the package lists", settings.logs / "apt-update.log", env=env
-        )
+        argv = ["apt-get", "update", "--quiet"]
+        run_long(argv, "updating the package lists", settings.logs / "apt-update.log", env=env, usual=UPDATE_SECONDS)
         argv = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
-        run_long(argv, "installing packages", settings.logs / "apt-install.log", env=env)
+        run_long(argv, "installing packages", settings.logs / "apt-install.log", env=env, usual=INSTALL_SECONDS)
 
 
 @contextmanager

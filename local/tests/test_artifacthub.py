@@ -34,6 +34,16 @@ class Shape(unittest.TestCase):
             with self.subTest(word):
                 self.assertTrue(any(word in fault for fault in self.faults(old, new)), self.faults(old, new))
 
+    def test_the_icon_is_a_file_of_this_version(self) -> None:
+        self.assertEqual(list(artifacthub.icon_faults(self.chart, self.version, REPOSITORY)), [])
+        for old, new, word in (
+            ("icon: ", "logo: ", "no icon"),
+            (f"/raw/v{self.version}/", "/raw/v9.9.9/", "another version"),
+            ("logo.svg", "none.svg", "does not exist"),
+        ):
+            found = list(artifacthub.icon_faults(self.chart.replace(old, new), self.version, REPOSITORY))
+            self.assertEqual([word in fault for fault in found], [True], found)
+
     def test_a_repository_without_an_owner(self) -> None:
         found = list(artifacthub.faults(self.chart, "repositoryID: x\n", self.version))
         self.assertEqual(found, [f"{artifacthub.REPOSITORY_FILE} names no owner with an email"])

@@ -173,6 +173,20 @@ class Metrics(unittest.TestCase):
         self.assertEqual(expected - metrics.keys(), set())
         self.assertIn("Pending", literals)
 
+    def test_each_metric_is_asked_for_by_an_alert_or_the_dashboard(self) -> None:
+        metrics, _ = chartmetrics.of_repository(REPOSITORY)
+        queries = (CHART / "files" / "alerts.yaml").read_text() + (CHART / "files" / "dashboard.json").read_text()
+        shown = set(chartmetrics.NAME.findall(queries))
+        # For a closer look by hand.
+        rest = {
+            "leaderboard_reconcile_wait_duration_seconds_bucket",
+            "process_max_fds",
+            "process_start_time_seconds",
+        }
+        # Those of a histogram's bucket.
+        parts = {name for name in metrics if name.endswith(("_sum", "_count"))}
+        self.assertEqual(metrics.keys() - parts - shown, rest)
+
 
 class Rendered(unittest.TestCase):
     THING = {"a": [{"b": 1, "c": 2}, {"d": "1"}], "e": {}}

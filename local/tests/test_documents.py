@@ -1,5 +1,6 @@
 """What the documents promise: runbooks, links, and the tests that the table of attacks names."""
 
+import re
 import unittest
 from pathlib import Path
 
@@ -35,6 +36,20 @@ class Links(unittest.TestCase):
         pages = doccheck.pages(REPOSITORY)
         self.assertGreater(len(pages), 20)
         self.assertEqual([fault for page in pages for fault in doccheck.link_faults(page)], [])
+
+
+class Figures(unittest.TestCase):
+    def test_the_readme_has_the_figures_of_their_pages(self) -> None:
+        readme = (REPOSITORY / "README.md").read_text()
+        aims = (REPOSITORY / "docs" / "performance.md").read_text()
+        for row, written in (
+            ("intake of 300 at once, part of the limit", "**{}** of the rate of a client"),
+            ("last container's end to Finished at 2/s, p50", "**{}** after its last container ended"),
+        ):
+            measured = re.search(rf"^\| {re.escape(row)} \| [^|]+ \| ([^|]+) \|", aims, re.MULTILINE)
+            self.assertIsNotNone(measured, row)
+            self.assertIn(written.format(measured[1] if measured else ""), readme)
+        self.assertIn(f"**{ATTACKS}** attacks", readme)
 
 
 class Security(unittest.TestCase):

@@ -35,14 +35,19 @@ pub struct Cli {
 #[derive(Subcommand, Debug)]
 enum Command {
     /// Run the controller (only the elected leader reconciles).
+    #[command(after_help = serve::EXIT_CODES)]
     Controller(Controller),
     /// Create a Submission for each message of the Leaderboards' queues.
+    #[command(after_help = serve::EXIT_CODES)]
     Bridge(Server),
-    /// Say what an installed operator lacks: kinds, rights, ready programs. Exit code 1: something is missing.
+    /// Say what an installed operator lacks: kinds, rights, ready programs.
+    #[command(after_help = preflight::EXIT_CODES)]
     Preflight(preflight::Preflight),
     /// Prepare the volumes of a submission's Pod (an init container).
+    #[command(after_help = serve::POD_EXIT_CODES)]
     Workspace(InPod),
     /// Merge, upload and report the results of a submission's Pod (a sidecar).
+    #[command(after_help = serve::POD_EXIT_CODES)]
     Logcopy(InPod),
     /// Print the custom resource definitions.
     Crd,

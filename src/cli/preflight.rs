@@ -16,6 +16,9 @@ use crate::kubernetes::Namespaces;
 use crate::observability::logging::Format;
 use leaderboard_api::client_errors;
 
+/// What the exit code says.
+pub(super) const EXIT_CODES: &str =
+    "Exit code 0: nothing is missing. 1: something is. 2: arguments or RUST_LOG are refused.";
 /// Between two looks.
 const PAUSE: Duration = Duration::from_secs(2);
 /// For one answer of a program.

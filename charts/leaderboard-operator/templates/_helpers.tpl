@@ -205,6 +205,7 @@ metadata:
   {{- include "operator.metadata" (dict "root" $root "name" $name "namespace" $root.Release.Namespace "component" .component) | nindent 2 }}
 spec:
   replicas: {{ $own.replicas }}
+  revisionHistoryLimit: {{ $root.Values.revisionHistoryLimit }}
   strategy:
     # Never Recreate: with the API server's defaults of the other type in place, no rollback could go back to it.
     type: RollingUpdate

@@ -278,10 +278,15 @@ pub struct TrackStatus {
 /// Submissions of a Leaderboard by state; `resumed` counts as running.
 #[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
+    /// That wait.
     pub pending: i32,
+    /// That run, also after a resume.
     pub running: i32,
+    /// With results that count.
     pub finished: i32,
+    /// Without results that count.
     pub failed: i32,
+    /// That a person, EvalAI or a deletion ended.
     pub cancelled: i32,
 }
 

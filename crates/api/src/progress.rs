@@ -8,7 +8,9 @@ use serde::{Deserialize, Serialize};
 /// Routes that are done, over all pairs and repetitions.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 pub struct Progress {
+    /// Routes that are done.
     pub done: i32,
+    /// Routes of the run, times repetitions.
     pub total: i32,
     /// `12/20`.
     #[schemars(length(max = 32))]

@@ -272,19 +272,25 @@ pub struct Rerun {
 /// When what happened; from the timestamps of messages, Pods and Jobs.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq)]
 pub struct Times {
+    /// When the participant submitted it to EvalAI; of a local submission, when its object was made.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub submitted: Option<Time>,
+    /// When the operator accepted this attempt.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub accepted: Option<Time>,
+    /// When the present Pod got its node.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scheduled: Option<Time>,
+    /// When the first agent of this attempt started.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub started: Option<Time>,
     /// When it was asked to stop.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stopping: Option<Time>,
+    /// When it ended, in whichever way.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub finished: Option<Time>,
+    /// When EvalAI had the end.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub published: Option<Time>,
 }

@@ -259,7 +259,7 @@ fn without_a_cluster_its_address_is_named() {
         &[&["why"], &["cancel", "submission-42"], &["report"], &["rerun", "--all"]],
     );
     assert!(
-        !Path::new("leaderboard-report-carla.tar").exists(),
+        !Path::new("leaderboard-report-carla.zip").exists(),
         "no empty report is written"
     );
 }
@@ -312,7 +312,7 @@ fn logs_have_the_label_of_their_container_and_come_in_its_order() {
 #[test]
 fn a_report_counts_what_it_has_and_names_what_it_has_not() {
     let stub = Stub::start(cluster);
-    let file = std::env::temp_dir().join(format!("leaderboard-report-{}.tar", std::process::id()));
+    let file = std::env::temp_dir().join(format!("leaderboard-report-{}.zip", std::process::id()));
     let output = plugin(&stub, &["report", "--file", file.to_str().unwrap()]);
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && file.exists(), "{text}");

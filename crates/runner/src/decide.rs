@@ -211,17 +211,23 @@ pub(crate) struct Conclusion {
     pub(crate) code: i32,
 }
 
-/// Exit code after a SIGTERM from outside, as a shell reports it.
+/// Complete, cancelled, or the results are stored already: the container is not started again.
+pub(crate) const CODE_OVER: i32 = 0;
+/// The round ended without complete results.
+pub(crate) const CODE_CRASHED: i32 = 1;
+/// A SIGTERM from outside, as a shell reports it.
 pub(crate) const CODE_TERMINATED: i32 = 143;
-/// Exit code when there is nothing to draw with (EX_UNAVAILABLE).
+/// There is nothing to draw with (EX_UNAVAILABLE).
 pub(crate) const CODE_NO_GRAPHICS: i32 = 69;
-/// Exit code when the status folder cannot be written (EX_IOERR).
+/// The last whole checkpoint cannot be put back, so the command could not go on where it was (EX_CANTCREAT).
+pub(crate) const CODE_NOT_RESUMED: i32 = 73;
+/// The status folder cannot be written (EX_IOERR).
 pub(crate) const CODE_MUTE: i32 = 74;
 
 const SIMULATOR_DONE: Conclusion = Conclusion {
     mark: Some(EndMark::Done),
     hold: Hold::Flush,
-    code: 0,
+    code: CODE_OVER,
 };
 
 /// What the end means, once every process has ended. `complete`: the agent's checkpoint has its global record.
@@ -231,8 +237,8 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
     match cause {
         Cause::Terminated => silent(Hold::Free, CODE_TERMINATED),
         Cause::Mute => silent(Hold::Free, CODE_MUTE),
-        Cause::AlreadyDone => silent(hold(Hold::Flush), 0),
-        Cause::Cancelled => silent(hold(Hold::Cancel), 0),
+        Cause::AlreadyDone => silent(hold(Hold::Flush), CODE_OVER),
+        Cause::Cancelled => silent(hold(Hold::Cancel), CODE_OVER),
         Cause::PeerDone => SIMULATOR_DONE,
         // The agent's image may take an hour to come, and nothing that it does helps.
         Cause::NoGpu | Cause::GraphicsDriverMissing => Conclusion {
@@ -254,12 +260,16 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
                 Conclusion {
                     mark: Some(EndMark::Done),
                     hold: Hold::Peer,
-                    code: 0,
+                    code: CODE_OVER,
                 }
             } else if seen.cancel {
-                silent(hold(Hold::Cancel), 0)
+                silent(hold(Hold::Cancel), CODE_OVER)
             } else {
-                let code = if let Cause::CannotStart(code) = cause { code } else { 1 };
+                let code = if let Cause::CannotStart(code) = cause {
+                    code
+                } else {
+                    CODE_CRASHED
+                };
                 Conclusion {
                     mark: Some(EndMark::Crash),
                     hold: Hold::Peer,
@@ -289,14 +299,14 @@ pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool)
     let cancelled = Conclusion {
         mark: None,
         hold: Hold::Cancel,
-        code: 0,
+        code: CODE_OVER,
     };
     match (hold, side) {
         (Hold::Peer, Side::Simulator) if seen.peer_done => Leave::Hold(SIMULATOR_DONE),
         // Exit 0, since after another code the container would be restarted for nothing.
-        (Hold::Peer, _) if seen.stored => Leave::Exit(0),
+        (Hold::Peer, _) if seen.stored => Leave::Exit(CODE_OVER),
         (Hold::Peer, Side::Simulator) if seen.cancel => Leave::Hold(cancelled),
-        (Hold::Peer, Side::Agent) if seen.cancel => Leave::Exit(0),
+        (Hold::Peer, Side::Agent) if seen.cancel => Leave::Exit(CODE_OVER),
         (Hold::Peer, _) => exit_or_wait(seen.peer_crashed || seen.peer_done || over, code),
         (Hold::Flush, _) if seen.cancel && !seen.stored && !over => Leave::Hold(cancelled),
         _ => exit_or_wait(seen.stored || over, code),

@@ -19,9 +19,18 @@ pub(crate) enum Status {
     Killed(Option<i32>),
 }
 
-/// The exit code of a shell for a command it could not start: 127 not found, 126 anything else.
+/// The command is not there, as a shell reports it.
+const CODE_NOT_FOUND: i32 = 127;
+/// The command is there and cannot be started, as a shell reports it.
+const CODE_NOT_STARTED: i32 = 126;
+
+/// The exit code of a shell for a command it could not start.
 pub(crate) fn spawn_code(error: &io::Error) -> i32 {
-    if error.kind() == ErrorKind::NotFound { 127 } else { 126 }
+    if error.kind() == ErrorKind::NotFound {
+        CODE_NOT_FOUND
+    } else {
+        CODE_NOT_STARTED
+    }
 }
 
 /// The command and all its descendants.

@@ -28,8 +28,6 @@ const SLOW_POLL: Duration = Duration::from_secs(1);
 const PROBE_EVERY: Duration = Duration::from_millis(100);
 /// Shortest pause between two tries of the port. The pauses grow with the time the server takes.
 const FIRST_PROBE: Duration = Duration::from_millis(2);
-/// Exit code when the command could not go on where it was (EX_CANTCREAT).
-const CODE_NOT_RESUMED: i32 = 73;
 /// After SIGKILL, and for the last output: then the rest is given up.
 const LAST_WAIT: Duration = Duration::from_secs(10);
 
@@ -269,7 +267,7 @@ impl Runner {
         }
         if let Some(Err(why)) = self.keeper.as_mut().map(Keeper::prepare) {
             self.detail = Some(why);
-            return Err(Cause::CannotStart(CODE_NOT_RESUMED));
+            return Err(Cause::CannotStart(decide::CODE_NOT_RESUMED));
         }
         self.since = Instant::now();
         match launch::launch(&self.job, self.round) {

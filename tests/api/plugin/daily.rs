@@ -168,14 +168,15 @@ async fn a_report_is_an_archive_without_secrets() {
         .submission("runs", &json!({"team": {"id": "7", "name": "Team Seven"}}), &running())
         .await;
     let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("report.tar");
+    let file = folder.path().join("report.zip");
     let text = terminal.run(&["report", "--file", file.to_str().unwrap()]).await.out;
     let text = text.replace('\n', " ");
     assert_has(
         &text,
-        &["Wrote ", "report.tar", "1 Leaderboard, 1 submission, 0 Pods, "],
+        &["Wrote ", "report.zip", "1 Leaderboard, 1 submission, 0 Pods, "],
     );
-    let archive = String::from_utf8(std::fs::read(&file).unwrap()).unwrap();
+    let archive = std::fs::read(&file).unwrap();
+    let archive = String::from_utf8_lossy(&archive);
     assert_has(
         &archive,
         &[

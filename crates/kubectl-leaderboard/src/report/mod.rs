@@ -1,9 +1,9 @@
-//! `report`: what a person who helps needs of a namespace, in one tar archive, without secrets, routes and names of teams.
+//! `report`: what a person who helps needs of a namespace, in one zip archive, without secrets, routes and names of teams.
 //!
-//! `redact` takes out what is nobody's business, `tar` writes the archive; both are pure.
+//! `redact` takes out what is nobody's business, `zip` writes the archive; both are pure.
 
 mod redact;
-mod tar;
+mod zip;
 
 use std::path::PathBuf;
 
@@ -21,7 +21,7 @@ use crate::text::Frame;
 /// Where the archive goes.
 #[derive(Args, Debug)]
 pub struct Report {
-    /// File to write [default: leaderboard-report-NAMESPACE.tar].
+    /// File to write [default: leaderboard-report-NAMESPACE.zip].
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
 }
@@ -61,9 +61,9 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
         missing.join("\n")
     );
     files.push(("about.txt".to_owned(), about));
-    let default = || PathBuf::from(format!("leaderboard-report-{}.tar", cluster.namespace));
+    let default = || PathBuf::from(format!("leaderboard-report-{}.zip", cluster.namespace));
     let file = wanted.file.clone().unwrap_or_else(default);
-    let archive = tar::archive(&files, now.as_second());
+    let archive = zip::archive(&files, now);
     let path = file.display().to_string();
     std::fs::write(&file, archive).map_err(|error| Error::File(path.clone(), error))?;
     print(&lines(&path, &cluster.namespace, &counts, &missing, frame()));

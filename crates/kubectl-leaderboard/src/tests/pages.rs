@@ -156,7 +156,7 @@ fn a_log_that_is_not_there_is_explained() {
 
 #[test]
 fn a_report() {
-    let file = "leaderboard-report-carla.tar";
+    let file = "leaderboard-report-carla.zip";
     let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
     let all = texts(&["1 Leaderboard", "12 submissions", "3 Pods", "40 events"]);
     assert_shown("report", |frame| report::lines(file, "carla", &all, &[], frame));
