@@ -9,6 +9,7 @@ pub mod cli;
 pub mod controller;
 pub mod crds;
 pub mod kubernetes;
+mod lock;
 pub mod observability;
 pub mod page;
 pub mod pod;

@@ -110,6 +110,22 @@ async fn interruptible(run: &Run) -> Outcome<()> {
     }
 }
 
+/// Prints and stores the line of a case that began then.
+fn keep(run: &Run, machine: &Machine, (time, began): (String, Instant), line: Line) -> Outcome<()> {
+    let line = Line {
+        profile: run.profile.clone(),
+        quick: run.quick,
+        scale: run.scale,
+        time,
+        took_seconds: began.elapsed().as_secs_f64(),
+        machine: machine.clone(),
+        ..line
+    };
+    line.print();
+    line.append(&run.out)?;
+    Ok(())
+}
+
 async fn measure(run: &Run) -> Outcome<()> {
     for file in ["etcd", "kube-apiserver", "kube-controller-manager"].map(|name| run.tools.join(name)) {
         if !file.is_file() {
@@ -138,21 +154,9 @@ async fn measure(run: &Run) -> Outcome<()> {
     );
     let mut failed = Vec::new();
     for case in cases::chosen(&run.cases) {
-        let (time, began) = (Timestamp::now().to_string(), Instant::now());
+        let began = (Timestamp::now().to_string(), Instant::now());
         match Box::pin(repeated(case, &bench, &bodies, run.repeat)).await {
-            Ok(figures) => {
-                let line = Line {
-                    profile: run.profile.clone(),
-                    quick: run.quick,
-                    scale: run.scale,
-                    time,
-                    took_seconds: began.elapsed().as_secs_f64(),
-                    machine: machine.clone(),
-                    ..figures.into_line(case.name())
-                };
-                line.print();
-                line.append(&run.out)?;
-            }
+            Ok(figures) => keep(run, &machine, began, figures.into_line(case.name()))?,
             Err(error) => {
                 eprintln!("bench: {}: {error}", case.name());
                 failed.push(case.name());

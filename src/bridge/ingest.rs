@@ -13,12 +13,13 @@ use serde_json::{Value, json};
 use thiserror::Error;
 use tracing::Span;
 
+use super::message::Message;
 use crate::kubernetes::{CallError, call_within};
 use crate::observability::about;
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
 use leaderboard_api::{
-    EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, conditions, names,
+    EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, names,
 };
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
@@ -70,6 +71,18 @@ pub struct Incoming {
 }
 
 impl Incoming {
+    /// What a message asks for; `id` is the message's own.
+    pub fn of(message: &Message, id: String, sent_ms: i64) -> Self {
+        Self {
+            challenge: message.challenge,
+            phase: message.phase,
+            submission: message.submission,
+            image: message.image.clone(),
+            source: Source::Message(id),
+            sent_ms,
+        }
+    }
+
     fn reference(&self) -> EvalaiRef {
         EvalaiRef {
             challenge: self.challenge,
@@ -199,7 +212,7 @@ fn was_run_before(source: &Source) -> bool {
 /// True if the present attempt has ended in a way that a resume can follow.
 fn is_ended(existing: &Submission) -> bool {
     existing.status.as_ref().is_some_and(|status| {
-        conditions::is_true(&status.conditions, conditions::FINISHED)
+        status.has_ended()
             && matches!(status.state_of_conditions(), State::Failed | State::Cancelled)
             // A raised attempt that the controller has not read yet still shows the end of the one before.
             && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
@@ -348,17 +361,8 @@ async fn rounds(
                 attempt,
                 resource_version,
             } => {
-                let known = existing.as_ref().and_then(Ingested::of).unwrap_or_default();
-                let at = incoming.sent_ms;
-                let refused = Some(RefusedAttempt { attempt, at });
-                let noted = note(
-                    api,
-                    &name,
-                    &resource_version,
-                    &Ingested { refused, ..known },
-                    &json!({}),
-                )
-                .await?;
+                let record = refusal(existing.as_ref(), incoming, attempt);
+                let noted = note(api, &name, &resource_version, &record, &json!({})).await?;
                 noted.map(|_| Outcome::Refused)
             }
             Ingest::NotNew => Some(Outcome::NotNew),
@@ -372,6 +376,15 @@ async fn rounds(
         *existing = call(&name, "the read", api.get_opt(&name)).await?;
     }
     Err(IngestError::Contended { name })
+}
+
+/// What is noted of an attempt that does not begin.
+fn refusal(existing: Option<&Submission>, incoming: &Incoming, attempt: i64) -> Ingested {
+    let at = incoming.sent_ms;
+    Ingested {
+        refused: Some(RefusedAttempt { attempt, at }),
+        ..existing.and_then(Ingested::of).unwrap_or_default()
+    }
 }
 
 /// None if there is one of that name.

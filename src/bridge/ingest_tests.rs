@@ -4,6 +4,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
 use serde_json::Value;
 
 use super::*;
+use leaderboard_api::conditions;
 
 const BOARD: &str = "leaderboard-20";
 

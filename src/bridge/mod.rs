@@ -12,7 +12,7 @@ mod pollers;
 pub mod queue;
 pub mod route;
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::{FutureExt, StreamExt};
@@ -24,6 +24,7 @@ use tokio::time::Instant;
 
 use crate::allowed::Allowed;
 use crate::kubernetes::{Clients, Namespaces, Shape, Watch, call_within, spawn_watch};
+use crate::lock::lock;
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::aws::Aws;
@@ -82,7 +83,7 @@ impl Shared {
 
     /// Makes sure that the API server answers: a message received in vain is a step towards its dead letter.
     async fn check_pulse(&self) -> Result<(), String> {
-        let last = *self.last_pulse.lock().unwrap_or_else(PoisonError::into_inner);
+        let last = *lock(&self.last_pulse);
         if last.is_some_and(|at| at.elapsed() < PULSE_AGE) {
             return Ok(());
         }
@@ -93,7 +94,7 @@ impl Shared {
             .map(|api| call_within(PULSE_LIMIT, "a list", "one Leaderboard", api.list_metadata(&first)));
         let listed = futures::future::try_join_all(asked).await;
         listed.map_err(|error| error.cause())?;
-        *self.last_pulse.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+        *lock(&self.last_pulse) = Some(Instant::now());
         // A watch that stays broken meanwhile is a reason to restart.
         self.telemetry.liveness.answered();
         Ok(())

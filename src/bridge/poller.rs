@@ -15,9 +15,9 @@ use tokio::time::Instant;
 use tracing::Instrument;
 
 use super::ages::Ages;
-use super::ingest::{self, Incoming, IngestError, Outcome, Source};
+use super::ingest::{self, Incoming, IngestError, Outcome};
 use super::leaderboards::Leaderboards;
-use super::message::{self, Message};
+use super::message;
 use super::queue::{QueueError, Reader, Received, batch_size};
 use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Rules};
 use super::{PULSE_LIMIT, Shared};
@@ -246,7 +246,7 @@ impl Poller {
         };
         match (&envelope.content, outcome) {
             (Ok(content), MessageOutcome::Ingest { namespace, leaderboard }) => {
-                let incoming = incoming(content, received);
+                let incoming = Incoming::of(content, received.id.clone(), received.sent_ms);
                 let span = ingest::span(&namespace, &leaderboard, incoming.submission);
                 let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
@@ -279,7 +279,9 @@ impl Poller {
             Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => {
                 tracing::debug!("a repeat");
             }
-            Ok(Outcome::Deleting) => tracing::info!("the old one is still being deleted"),
+            Ok(Outcome::Deleting) => {
+                tracing::info!("the Submission of this name is still being deleted; the message comes back");
+            }
             Ok(Outcome::IdTaken(owner)) => tracing::warn!(
                 owner,
                 "another object has the name of this submission; rename or delete it"
@@ -379,17 +381,6 @@ impl Readers {
     }
 }
 
-fn incoming(content: &Message, received: &Received) -> Incoming {
-    Incoming {
-        challenge: content.challenge,
-        phase: content.phase,
-        submission: content.submission,
-        image: content.image.clone(),
-        source: Source::Message(received.id.clone()),
-        sent_ms: received.sent_ms,
-    }
-}
-
 /// Does the work; extends its lease once if it is not done by half of it.
 async fn extended<T>(work: impl Future<Output = T>, half: Duration, extend: impl Future<Output = ()>) -> T {
     let mut work = std::pin::pin!(work);
@@ -407,7 +398,7 @@ fn now_ms() -> i64 {
 
 fn report(done: Result<(), QueueError>) {
     if let Err(error) = done {
-        tracing::warn!(%error, "messages will come back early");
+        tracing::warn!(%error, "messages could not be held any longer and will come back early");
     }
 }
 

@@ -1,7 +1,7 @@
 //! The pollers, one for each queue that a Leaderboard names: started, stopped, and what keeps them from reading.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use tokio::sync::watch;
@@ -10,6 +10,7 @@ use tokio::task::JoinHandle;
 use super::Shared;
 use super::poller::Poller;
 use super::route;
+use crate::lock::lock;
 use crate::observability::readiness::Readiness;
 use leaderboard_api::Leaderboard;
 
@@ -71,7 +72,7 @@ impl Pollers {
         self.running.retain(|url, running| {
             let keep = desired.get(url) == Some(&running.connection);
             if !keep {
-                tracing::info!(queue = url, "stopped to read the queue in this way");
+                tracing::info!(queue = url, "stopped reading the queue with its former settings");
                 running.stop.send_replace(true);
                 problems.forget(url);
             }
@@ -145,7 +146,7 @@ impl Problems {
     }
 
     fn change(&self, change: impl FnOnce(&mut BTreeMap<String, Option<String>>)) {
-        let mut queues = self.queues.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut queues = lock(&self.queues);
         change(&mut queues);
         let is_cut_off = !queues.is_empty() && queues.values().all(Option::is_some);
         let problems: Vec<_> = queues.values().flatten().map(String::as_str).collect();

@@ -118,7 +118,7 @@ impl Results {
     pub(super) fn run(self) -> ExitCode {
         match self.merge() {
             Ok(summary) => {
-                // Nobody has to listen.
+                // A closed pipe is ignored.
                 let _ = writeln!(std::io::stdout(), "{summary}");
                 ExitCode::SUCCESS
             }

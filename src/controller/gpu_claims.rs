@@ -3,14 +3,12 @@
 //!
 //! Its name holds the hash of what it asks for: a template cannot be edited under the Jobs that are running.
 
-use std::fmt::Write as _;
-
 use kube::core::{ApiResource, DynamicObject, GroupVersionKind};
-use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, LeaderboardSpec, names};
+use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, LeaderboardSpec};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use super::objects::owner_reference;
+use super::objects::child_of;
 
 /// Bytes of the hash in a name.
 const HASH_BYTES: usize = 5;
@@ -32,14 +30,9 @@ pub fn template_name(leaderboard: &str, claim: ClaimOf<'_>) -> String {
     match claim {
         ClaimOf::Template(name) => name.to_owned(),
         ClaimOf::Devices { .. } => {
-            let mut name = format!("{leaderboard}-gpu-");
             // A map in the order of its keys, so that the same claim has the same text.
             let digest = Sha256::digest(spec_of(claim).to_string());
-            for byte in digest.iter().take(HASH_BYTES) {
-                // Writing to a text cannot fail.
-                let _ = write!(name, "{byte:02x}");
-            }
-            name
+            format!("{leaderboard}-gpu-{}", hex::encode(&digest[..HASH_BYTES]))
         }
     }
 }
@@ -50,16 +43,9 @@ pub fn template(leaderboard: &Leaderboard) -> Option<DynamicObject> {
         return None;
     };
     let name = leaderboard.metadata.name.as_deref().unwrap_or_default();
-    let mut template = DynamicObject::new(&template_name(name, claim), &resource());
-    template.metadata.namespace.clone_from(&leaderboard.metadata.namespace);
-    template.metadata.labels = Some(
-        [
-            (names::LABEL_MANAGED_BY.to_owned(), names::OPERATOR.to_owned()),
-            (names::LABEL_LEADERBOARD.to_owned(), name.to_owned()),
-        ]
-        .into(),
-    );
-    template.metadata.owner_references = Some(vec![owner_reference(leaderboard)]);
+    let name = template_name(name, claim);
+    let mut template = DynamicObject::new(&name, &resource());
+    template.metadata = child_of(leaderboard, name);
     template.data = json!({ "spec": { "spec": spec_of(claim) } });
     Some(template)
 }

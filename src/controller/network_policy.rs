@@ -9,10 +9,10 @@ use std::collections::BTreeMap;
 use k8s_openapi::api::networking::v1::{
     IPBlock, NetworkPolicy, NetworkPolicyEgressRule, NetworkPolicyPeer, NetworkPolicyPort, NetworkPolicySpec,
 };
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{LabelSelector, ObjectMeta};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::LabelSelector;
 use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
 
-use super::objects::owner_reference;
+use super::objects::child_of;
 use leaderboard_api::ranges::{self, Range};
 use leaderboard_api::{Dns, Egress, Leaderboard, names};
 
@@ -35,16 +35,7 @@ pub fn name(leaderboard: &Leaderboard) -> String {
 pub fn network_policy(leaderboard: &Leaderboard) -> NetworkPolicy {
     let name = leaderboard.metadata.name.clone().unwrap_or_default();
     NetworkPolicy {
-        metadata: ObjectMeta {
-            name: Some(self::name(leaderboard)),
-            namespace: leaderboard.metadata.namespace.clone(),
-            labels: Some(BTreeMap::from([
-                (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
-                (names::LABEL_LEADERBOARD.into(), name.clone()),
-            ])),
-            owner_references: Some(vec![owner_reference(leaderboard)]),
-            ..ObjectMeta::default()
-        },
+        metadata: child_of(leaderboard, self::name(leaderboard)),
         spec: Some(NetworkPolicySpec {
             pod_selector: Some(LabelSelector {
                 match_labels: Some(BTreeMap::from([(names::LABEL_LEADERBOARD.into(), name)])),

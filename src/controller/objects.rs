@@ -1,15 +1,15 @@
 //! What is read off any object: its key, its owner, and what marks it as ours. Pure.
 
-use k8s_openapi::api::networking::v1::NetworkPolicy;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
+use std::collections::BTreeMap;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 use tracing::Span;
 
-use crate::kubernetes::objects::{Job, Pod};
 use crate::observability::about;
 use crate::services::ObjectKey;
-use leaderboard_api::{Submission, names};
+use leaderboard_api::{Leaderboard, Submission, names};
 
 /// Puts an object into its work queue.
 pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;
@@ -40,49 +40,6 @@ pub fn span_of(submission: &Submission) -> Span {
     )
 }
 
-/// An object that the operator makes for Submissions.
-pub trait Child {
-    fn namespace(&self) -> Option<&str>;
-    /// The name of its Submission, if it has one.
-    fn submission(&self) -> Option<&str>;
-    /// The name of its Leaderboard.
-    fn leaderboard(&self) -> Option<&str>;
-}
-
-macro_rules! child {
-    ($kind:ty) => {
-        impl Child for $kind {
-            fn namespace(&self) -> Option<&str> {
-                self.metadata.namespace.as_deref()
-            }
-
-            fn submission(&self) -> Option<&str> {
-                self.metadata.labels.submission.as_deref()
-            }
-
-            fn leaderboard(&self) -> Option<&str> {
-                self.metadata.labels.leaderboard.as_deref()
-            }
-        }
-    };
-}
-child!(Job);
-child!(Pod);
-
-impl Child for NetworkPolicy {
-    fn namespace(&self) -> Option<&str> {
-        self.metadata.namespace.as_deref()
-    }
-
-    fn submission(&self) -> Option<&str> {
-        None
-    }
-
-    fn leaderboard(&self) -> Option<&str> {
-        self.labels().get(names::LABEL_LEADERBOARD).map(String::as_str)
-    }
-}
-
 /// The reference by which a child goes with its owner.
 pub fn owner_reference<K: Resource<DynamicType = ()>>(owner: &K) -> OwnerReference {
     OwnerReference {
@@ -92,6 +49,21 @@ pub fn owner_reference<K: Resource<DynamicType = ()>>(owner: &K) -> OwnerReferen
         uid: uid_of(owner),
         controller: Some(true),
         block_owner_deletion: Some(true),
+    }
+}
+
+/// The metadata of an object that the operator makes for a Leaderboard.
+pub fn child_of(leaderboard: &Leaderboard, name: String) -> ObjectMeta {
+    let of = leaderboard.metadata.name.clone().unwrap_or_default();
+    ObjectMeta {
+        name: Some(name),
+        namespace: leaderboard.metadata.namespace.clone(),
+        labels: Some(BTreeMap::from([
+            (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
+            (names::LABEL_LEADERBOARD.into(), of),
+        ])),
+        owner_references: Some(vec![owner_reference(leaderboard)]),
+        ..ObjectMeta::default()
     }
 }
 

@@ -7,11 +7,10 @@ use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
 use super::network_policy;
-use super::objects::Child;
 use super::slots::SlotAllocator;
-use crate::kubernetes::objects::{Job, Node, Pod};
+use crate::kubernetes::objects::{Job, Meta, Node, Pod};
 use crate::kubernetes::{Store, Synced};
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission, names};
 
 /// Caches of the API server, filled by one task each.
 pub struct Stores {
@@ -36,6 +35,13 @@ pub struct Nodes {
 }
 
 impl Stores {
+    /// The Leaderboard that a Submission names.
+    pub fn leaderboard_for(&self, submission: &Submission) -> Option<Arc<Leaderboard>> {
+        let namespace = submission.namespace().unwrap_or_default();
+        let reference = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
+        self.leaderboards.get(&reference)
+    }
+
     /// The youngest Pod of a Job.
     pub fn newest_pod(&self, job: &Job) -> Option<Arc<Pod>> {
         let created = |pod: &Arc<Pod>| pod.metadata.creation_timestamp.as_ref().map(|t| t.0);
@@ -78,14 +84,20 @@ impl Stores {
         found.is_some_and(|found| network_policy::is_in_place(&found, leaderboard))
     }
 
-    /// The Submission that a child belongs to.
-    pub fn owner_of(child: &impl Child) -> Option<ObjectRef<Submission>> {
-        Some(ObjectRef::new(child.submission()?).within(child.namespace()?))
+    /// The Submission that a Job or a Pod belongs to.
+    pub fn owner_of(child: &Meta) -> Option<ObjectRef<Submission>> {
+        Some(ObjectRef::new(child.labels.submission.as_deref()?).within(child.namespace.as_deref()?))
     }
 
-    /// The Leaderboard that a Pod or a policy belongs to.
-    pub fn leaderboard_of(child: &impl Child) -> Option<ObjectRef<Leaderboard>> {
-        Some(ObjectRef::new(child.leaderboard()?).within(child.namespace()?))
+    /// The Leaderboard that a Pod belongs to.
+    pub fn leaderboard_of(child: &Meta) -> Option<ObjectRef<Leaderboard>> {
+        Some(ObjectRef::new(child.labels.leaderboard.as_deref()?).within(child.namespace.as_deref()?))
+    }
+
+    /// The Leaderboard that a policy belongs to.
+    pub fn leaderboard_of_policy(policy: &NetworkPolicy) -> Option<ObjectRef<Leaderboard>> {
+        let name = policy.labels().get(names::LABEL_LEADERBOARD)?;
+        Some(ObjectRef::new(name).within(policy.metadata.namespace.as_deref()?))
     }
 }
 

@@ -9,6 +9,14 @@ use super::objects::uid_of;
 use crate::kubernetes::{CallError, Watchable, Writes, call};
 use leaderboard_api::names;
 
+/// Of a patch that is no apply.
+pub fn patch_by(manager: &str) -> PatchParams {
+    PatchParams {
+        field_manager: Some(manager.into()),
+        ..PatchParams::default()
+    }
+}
+
 /// Puts our finalizer on an object, or takes it off.
 pub async fn set_finalizer<K>(client: &Client, object: &K, finalizer: &str, wanted: bool) -> Result<(), CallError>
 where
@@ -20,10 +28,7 @@ where
     // The resource version keeps other controllers' finalizers safe: a concurrent change makes this write fail.
     let version = &object.meta().resource_version;
     let patch = Patch::Merge(json!({ "metadata": { "resourceVersion": version, "finalizers": finalizers } }));
-    let params = PatchParams {
-        field_manager: Some(names::MANAGER_FINALIZER.into()),
-        ..PatchParams::default()
-    };
+    let params = patch_by(names::MANAGER_FINALIZER);
     let (api, name) = (api(client, object), object.name_any());
     match call("the finalizer", &described(object), api.patch(&name, &params, &patch)).await {
         Err(error) if !wanted && error.is_gone() => Ok(()),

@@ -6,13 +6,15 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::task::{Context, Poll, Waker};
 
 use futures::Stream;
 use kube::runtime::reflector::Lookup;
 
 use super::store::key_of;
+
+use crate::lock::lock;
 
 /// An object that was added, changed or deleted.
 #[derive(Debug)]
@@ -146,10 +148,6 @@ impl<K> Stream for WatchEvents<K> {
         lane.waker = Some(context.waker().clone());
         Poll::Pending
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

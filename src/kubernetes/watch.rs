@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeSet, HashSet};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use futures::StreamExt;
 use kube::Api;
@@ -17,6 +17,7 @@ use super::item::{Item, Watchable};
 use super::objects::Texts;
 use super::source::{self, Source, is_refusal};
 use super::store::{Index, Store, Writer, key_of};
+use crate::lock::lock;
 use crate::observability::Observability;
 use crate::observability::metrics::WatchMetrics;
 use crate::observability::readiness::Readiness;
@@ -64,7 +65,7 @@ impl Unreadable {
     }
 
     fn keys(&self) -> MutexGuard<'_, BTreeSet<Box<str>>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

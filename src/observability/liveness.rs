@@ -4,10 +4,12 @@
 //! stuck watch counts only while other calls are answered. A task that ends needs no probe: it ends the process (`tasks`).
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use tokio::time::Instant;
+
+use crate::lock::lock;
 
 /// A watch that is broken for so long does not recover by itself.
 const STUCK_AFTER: Duration = Duration::from_mins(10);
@@ -78,7 +80,7 @@ impl Liveness {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

@@ -4,7 +4,9 @@
 //! all of its checks yet is not ready, so that a probe in its first moments does not read the empty list as "nothing is missing".
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
+
+use crate::lock::lock;
 
 /// Name of the check that stands for those which are not registered yet.
 const START: &str = "process";
@@ -27,7 +29,7 @@ impl Readiness {
     /// Sets a named check: fine, or a sentence about what is missing. A check that was never set is
     /// not asked for, so each part sets its own to an error before it begins.
     pub fn set(&self, name: &str, state: Result<(), String>) {
-        let mut checks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut checks = lock(&self.0);
         let before = checks.insert(name.to_owned(), state.clone());
         drop(checks);
         match (before, state) {
@@ -44,12 +46,12 @@ impl Readiness {
 
     /// A check that no longer applies.
     pub fn remove(&self, name: &str) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(name);
+        lock(&self.0).remove(name);
     }
 
     /// What is missing, one `name: sentence` each, in the order of names. Empty: ready.
     pub fn missing(&self) -> Vec<String> {
-        let checks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let checks = lock(&self.0);
         let failed = checks
             .iter()
             .filter_map(|(name, state)| Some((name, state.as_ref().err()?)));

@@ -57,6 +57,14 @@ impl Tasks {
         self.start(name.into(), true, work)
     }
 
+    /// Starts a task that the stop ends.
+    pub fn until_stop(&self, name: &'static str, work: impl Future<Output = ()> + Send + 'static) {
+        let stop = self.stop.clone();
+        self.stay(name, async move {
+            tokio::select! { () = stop.wait() => {}, () = work => {} }
+        });
+    }
+
     /// Starts a task that may end at any time: it has come to its end, or reports in another way why it did not. Only a panic
     /// of it ends the process.
     pub fn may_end<T: Send + 'static>(

@@ -110,7 +110,7 @@ pub(super) fn state(submission: &Submission) -> Option<State> {
 /// When it ended.
 pub(super) fn end(submission: &Submission) -> Option<Timestamp> {
     let status = submission.status.as_ref()?;
-    let condition = || conditions::get(&status.conditions, conditions::FINISHED).map(|c| c.last_transition_time.0);
+    let condition = || status.condition(conditions::FINISHED).map(|c| c.last_transition_time.0);
     status.times.finished.as_ref().map(|time| time.0).or_else(condition)
 }
 
@@ -158,7 +158,7 @@ impl Waits {
         let created = submission.metadata.creation_timestamp.as_ref().map(|time| time.0);
         with_status(submission, |status| {
             // The attempt begins with this condition.
-            let began = conditions::get(&status.conditions, conditions::FINISHED);
+            let began = status.condition(conditions::FINISHED);
             let since = began.map(|c| c.last_transition_time.0).or(created);
             let waiting = status.waiting.as_ref();
             let meaning = status.reason.as_deref().and_then(reasons::of);
@@ -246,7 +246,7 @@ fn open(status: &SubmissionStatus) -> Vec<&'static str> {
         (conditions::RECORDED, "DynamoDB"),
     ];
     let is_open = |type_: &str| {
-        let condition = conditions::get(&status.conditions, type_);
+        let condition = status.condition(type_);
         condition.is_some_and(|condition| condition.status != "True" && condition.reason != reasons::NOT_REQUIRED)
     };
     let open = systems.into_iter().filter(|(type_, _)| is_open(type_));

@@ -146,12 +146,32 @@ pub(super) fn leaderboards() -> Vec<Arc<Leaderboard>> {
 
 /// A full evening.
 pub(super) fn submissions() -> Vec<Arc<Submission>> {
-    let slot = "All four slots of the Leaderboard are taken";
-    let team = "Its team has one running, and concurrency.perTeam is 1";
-    let node = "0/3 nodes are available: 3 Insufficient nvidia.com/gpu; a node is on its way";
-    let agent = "The agent of pair 2 crashed 3 times, the last time with exit code 1; look at agent/agent2/leaderboard.log of the results";
-    let lost = "The node gpu-3 no longer reports; look at the node";
-    let mut all = vec![
+    let mut all = under_way();
+    all.extend(in_line());
+    all.extend(broken());
+    let scores = ["68.05", "41.77", "55.30", "23.91", "61.18", "47.02"];
+    let teams = [
+        "Autobahn Labs",
+        "Interfuser",
+        "Team Seven",
+        "Équipe Ñandú",
+        "KIT Drivers",
+        "Roach",
+    ];
+    for (at, (score, team)) in (0_i64..).zip(scores.into_iter().zip(teams)) {
+        all.push(finished(
+            &format!("submission-{}", 4199 - at),
+            team,
+            score,
+            9 + 70 * at,
+            3 + at % 3,
+        ));
+    }
+    all
+}
+
+fn under_way() -> Vec<Arc<Submission>> {
+    vec![
         running(
             "submission-4200",
             "Autobahn Labs",
@@ -180,6 +200,14 @@ pub(super) fn submissions() -> Vec<Arc<Submission>> {
             1,
             &[(2, 0), (1, 0), (0, 0), (3, 0)],
         ),
+    ]
+}
+
+fn in_line() -> Vec<Arc<Submission>> {
+    let slot = "All four slots of the Leaderboard are taken";
+    let team = "Its team has one running, and concurrency.perTeam is 1";
+    let node = "0/3 nodes are available: 3 Insufficient nvidia.com/gpu; a node is on its way";
+    vec![
         waiting("submission-4214", "KIT Drivers", Some(1), "WaitingForSlot", slot),
         waiting("submission-4215", "Team Seven", Some(2), "WaitingForSlot", team),
         waiting("submission-4217", "Tübingen Vision", Some(3), "WaitingForSlot", slot),
@@ -192,6 +220,13 @@ pub(super) fn submissions() -> Vec<Arc<Submission>> {
             slot,
         ),
         waiting("submission-4212", "Roach", None, "Unschedulable", node),
+    ]
+}
+
+fn broken() -> Vec<Arc<Submission>> {
+    let agent = "The agent of pair 2 crashed 3 times, the last time with exit code 1; look at agent/agent2/leaderboard.log of the results";
+    let lost = "The node gpu-3 no longer reports; look at the node";
+    vec![
         failed(
             "submission-4198",
             "KIT Drivers",
@@ -208,24 +243,5 @@ pub(super) fn submissions() -> Vec<Arc<Submission>> {
             300,
         ),
         failed("submission-4100", "Roach", "Infrastructure", ("NodeLost", lost), 3000),
-    ];
-    let scores = ["68.05", "41.77", "55.30", "23.91", "61.18", "47.02"];
-    let teams = [
-        "Autobahn Labs",
-        "Interfuser",
-        "Team Seven",
-        "Équipe Ñandú",
-        "KIT Drivers",
-        "Roach",
-    ];
-    for (at, (score, team)) in (0_i64..).zip(scores.into_iter().zip(teams)) {
-        all.push(finished(
-            &format!("submission-{}", 4199 - at),
-            team,
-            score,
-            9 + 70 * at,
-            3 + at % 3,
-        ));
-    }
-    all
+    ]
 }

@@ -84,7 +84,7 @@ impl Object {
         let bytes = bytes.into();
         let digest = StoredFile {
             size: bytes.len() as u64,
-            sha256: hex(&Sha256::digest(&bytes)),
+            sha256: hex::encode(Sha256::digest(&bytes)),
         };
         Self { bytes, digest }
     }
@@ -149,7 +149,7 @@ pub fn fingerprint(file: &File, len: u64) -> io::Result<String> {
         hash_range(&mut digest, file, 0, WINDOW)?;
         hash_range(&mut digest, file, len.saturating_sub(WINDOW), WINDOW)?;
     }
-    Ok(hex(&digest.finalize()))
+    Ok(hex::encode(digest.finalize()))
 }
 
 fn hash_range(digest: &mut Sha256, file: &File, from: u64, len: u64) -> io::Result<()> {
@@ -157,19 +157,6 @@ fn hash_range(digest: &mut Sha256, file: &File, from: u64, len: u64) -> io::Resu
     file.read_exact_at(&mut bytes, from)?;
     digest.update(&bytes);
     Ok(())
-}
-
-/// Hexadecimal digits, as in [`super::report::StoredFile`].
-pub fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write;
-    bytes.iter().fold(
-        String::with_capacity(bytes.len().saturating_mul(2)),
-        |mut text, byte| {
-            // Writing to a String can't fail.
-            let _ = write!(text, "{byte:02x}");
-            text
-        },
-    )
 }
 
 /// What is stored, and what was sent today.

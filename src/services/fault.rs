@@ -26,6 +26,11 @@ pub enum Fault {
 }
 
 impl Fault {
+    /// Whether the same request may succeed later, though nobody acts.
+    pub fn is_passing(self) -> bool {
+        matches!(self, Self::Throttled | Self::Unavailable | Self::Conflict)
+    }
+
     /// The value of a metric's label.
     pub fn as_str(self) -> &'static str {
         match self {

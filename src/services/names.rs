@@ -4,13 +4,15 @@
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use aws_smithy_runtime_api::client::dns::{DnsFuture, ResolveDns, ResolveDnsError};
 use futures::FutureExt;
 use futures::future::BoxFuture;
 use tokio::time::{Instant, timeout};
+
+use crate::lock::lock;
 
 /// Time one look-up may take.
 const LIMIT: Duration = Duration::from_secs(5);
@@ -81,7 +83,7 @@ impl Names {
             Ok(Ok(found)) if found.is_empty() => Err("it has no address".to_owned()),
             Ok(Ok(found)) => Ok(some(found)),
         };
-        let mut known = self.0.known.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut known = lock(&self.0.known);
         known.retain(|_, (since, _)| since.elapsed() < GOOD_FOR);
         if known.len() < MOST_KEPT {
             known.insert(name.to_owned(), (Instant::now(), answer.clone()));
@@ -90,7 +92,7 @@ impl Names {
     }
 
     fn known(&self, name: &str) -> Option<Answer> {
-        let known = self.0.known.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = lock(&self.0.known);
         let (since, answer) = known.get(name)?;
         (since.elapsed() < GOOD_FOR).then(|| answer.clone())
     }

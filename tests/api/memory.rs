@@ -11,7 +11,6 @@ use kube::ResourceExt;
 use kube::api::{Patch, PatchParams};
 use leaderboard_api::{Submission, SubmissionStatus, conditions};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, SCHEMA, StoredFile};
-use leaderboard_operator::pod::upload::hex;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
@@ -69,7 +68,7 @@ fn report(submission_uid: String, text: &str) -> String {
     let accuracies: BTreeMap<_, _> = labels.iter().map(|label| (label.clone(), 1.0)).collect();
     let file = StoredFile {
         size: text.len() as u64,
-        sha256: hex(&Sha256::digest(text.as_bytes())),
+        sha256: hex::encode(Sha256::digest(text.as_bytes())),
     };
     let report = Report {
         schema: SCHEMA,

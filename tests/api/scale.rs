@@ -3,6 +3,7 @@
 //!
 //! The small size belongs to the tests. The full one measures, and takes a quarter of an hour: `make measure-scale`.
 
+mod board;
 pub(super) mod player;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -26,6 +27,7 @@ use super::bridge::StandIn;
 use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
+use board::make_board;
 use player::{Player, Props, ROUTES};
 
 const BOARD: &str = "carla";
@@ -473,29 +475,4 @@ fn most_within(times: &[Timestamp], milliseconds: i64) -> usize {
             .count()
     };
     (0..times.len()).map(from).max().unwrap_or(0)
-}
-
-async fn make_board(client: &Client, namespace: &str, size: &Size, evalai: &Handle, bucket: &str, endpoint: &str) {
-    let secret: Api<k8s_openapi::api::core::v1::Secret> = Api::namespaced(client.clone(), namespace);
-    let token = json!({"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "evalai"}, "stringData": {"token": "local-host-token"}});
-    let token = serde_json::from_value(token).unwrap();
-    secret.create(&kube::api::PostParams::default(), &token).await.unwrap();
-    let spec: Value = json!({"spec": {
-        "evalai": {
-            "apiServer": evalai.url(), "challenge": 1, "requestsPerMinute": size.requests_per_minute,
-            "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
-        },
-        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
-        "agent": {"images": []},
-        "storage": {"bucket": bucket, "endpoint": endpoint},
-        "syncPeriodSeconds": size.period_seconds,
-        "pairs": 1,
-        "routes": ROUTES,
-    }});
-    let api = Kind::Leaderboard.api(client, namespace);
-    create(&api, Kind::Leaderboard.object(BOARD, &[&spec]), false)
-        .await
-        .unwrap();
-    let boards: Api<Leaderboard> = Api::namespaced(client.clone(), namespace);
-    assert!(boards.get(BOARD).await.is_ok());
 }

@@ -1,6 +1,7 @@
 //! 1,000 submissions at once, each with a whole life; with a kill of the operator in the middle if asked for.
 
 use std::collections::HashMap;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
@@ -67,15 +68,18 @@ pub async fn measure(bench: &Bench, bodies: &Bodies, has_restart: bool) -> Outco
     drop(moments);
     if let Some(killed) = killed {
         figures.add("kill to the next end, s", next_end(&world, killed));
-        let jobs = audit::read(&log)?
-            .into_iter()
-            .filter(|entry| entry.verb == "create" && entry.resource() == "jobs");
-        figures.add(
-            "requests for a Job, a submission",
-            jobs.count() as f64 / (count + 1) as f64,
-        );
+        let requests = job_requests(&log)? as f64;
+        figures.add("requests for a Job, a submission", requests / (count + 1) as f64);
     }
     Ok(figures)
+}
+
+fn job_requests(log: &Path) -> Outcome<usize> {
+    let all = audit::read(log)?;
+    let jobs = all
+        .iter()
+        .filter(|entry| entry.verb == "create" && entry.resource() == "jobs");
+    Ok(jobs.count())
 }
 
 /// Kills the operator and starts it again at once, as the kubelet would.

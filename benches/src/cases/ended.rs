@@ -6,7 +6,7 @@ use http::Method;
 use serde_json::{Value, json};
 
 use super::costs;
-use super::latency::add_percentiles;
+use super::latency::{add_percentiles, to_job};
 use super::lifecycles::POD;
 use crate::api::{self, MERGE};
 use crate::bench::{Bench, Outcome};
@@ -76,21 +76,10 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, ended: usize
     costs(figures, bench, &format!("{ended} ended"), &before, &after, count);
     let cost = after.since(&before).operator * 1e3 / count as f64;
     figures.add(&format!("operator CPU, ms a submission, {ended} ended"), cost);
-    let moments = world.observed.get();
-    let to_job = moments.created.iter().filter_map(|(name, created)| {
-        Some(
-            moments
-                .jobs
-                .get(name)?
-                .saturating_duration_since(*created)
-                .as_secs_f64()
-                * 1e3,
-        )
-    });
     add_percentiles(
         figures,
         &format!("created to Job, {ended} ended"),
-        &to_job.collect::<Vec<_>>(),
+        &to_job(&world.observed.get()),
     );
     Ok(cost)
 }

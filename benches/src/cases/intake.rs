@@ -62,12 +62,7 @@ async fn one(
     let after = world.used()?;
     let side = if is_operator { "operator" } else { "limit" };
     costs(figures, bench, side, &before, &after, count);
-    let mut times: Vec<f64> = {
-        let moments = world.observed.get();
-        let measured = moments.jobs.iter().filter(|(name, _)| *name != WARM_NAME);
-        measured.map(|(_, at)| at.duration_since(began).as_secs_f64()).collect()
-    };
-    times.sort_by(f64::total_cmp);
+    let times = to_jobs(&world, began);
     let span = if is_done {
         times.last().copied().unwrap_or_default()
     } else {
@@ -84,4 +79,13 @@ async fn one(
         crate::stats::percentile(&times, 99.0),
     );
     Ok(())
+}
+
+/// Seconds from the beginning to each Job, in order.
+fn to_jobs(world: &World, began: std::time::Instant) -> Vec<f64> {
+    let moments = world.observed.get();
+    let measured = moments.jobs.iter().filter(|(name, _)| *name != WARM_NAME);
+    let mut times: Vec<f64> = measured.map(|(_, at)| at.duration_since(began).as_secs_f64()).collect();
+    times.sort_by(f64::total_cmp);
+    times
 }

@@ -78,19 +78,23 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
             "reconciles a lifecycle",
             (reconciles(&world).await? - known) / count as f64,
         );
-        figures.add(
-            "S3 requests a lifecycle",
-            (world.storage.requests() - s3) as f64 / count as f64,
-        );
-        let all = audit::read(&world.servers.audit_log())?;
-        let each = |requests: usize| requests as f64 / (count + 1) as f64;
-        let writes = audit::writes(&all);
-        figures.add("operator writes a lifecycle", each(writes.values().sum()));
-        figures.counts = writes
-            .into_iter()
-            .map(|(name, writes)| (format!("{name}, a lifecycle"), each(writes)))
-            .collect();
+        let requests = world.storage.requests() - s3;
+        figures.add("S3 requests a lifecycle", requests as f64 / count as f64);
+        add_writes(figures, &world, count)?;
     }
+    Ok(())
+}
+
+/// What the operator has written, by the audit log.
+fn add_writes(figures: &mut Figures, world: &World, count: usize) -> Outcome<()> {
+    let all = audit::read(&world.servers.audit_log())?;
+    let each = |requests: usize| requests as f64 / (count + 1) as f64;
+    let writes = audit::writes(&all);
+    figures.add("operator writes a lifecycle", each(writes.values().sum()));
+    figures.counts = writes
+        .into_iter()
+        .map(|(name, writes)| (format!("{name}, a lifecycle"), each(writes)))
+        .collect();
     Ok(())
 }
 
@@ -102,7 +106,7 @@ async fn reconciles(world: &World) -> Outcome<f64> {
 }
 
 /// Milliseconds from the answer to the create until the Job was observed.
-fn to_job(moments: &Moments) -> Vec<f64> {
+pub fn to_job(moments: &Moments) -> Vec<f64> {
     let job = |name: &String, created: &Instant| Some(millis(*created, *moments.jobs.get(name)?));
     moments
         .created

@@ -42,6 +42,12 @@ pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
     Ok(figures)
 }
 
+/// What the operator has written, by the audit log.
+fn writes(world: &World) -> Outcome<usize> {
+    let all = audit::read(&world.servers.audit_log())?;
+    Ok(audit::writes(&all).values().sum())
+}
+
 async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize, is_operator: bool) -> Outcome<()> {
     let mut world = start(bench, bodies, is_operator).await?;
     let (before, s3) = (world.used()?, world.storage.requests());
@@ -59,9 +65,8 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
             &moments.complete
         };
         let measured = ends.iter().filter(|(name, _)| *name != WARM_NAME);
-        measured
-            .map(|(_, at)| at.duration_since(began).as_secs_f64())
-            .collect::<Vec<_>>()
+        let times = measured.map(|(_, at)| at.duration_since(began).as_secs_f64());
+        times.collect::<Vec<_>>()
     };
     let is_done = world.observed.until(CAP, |moments| ends(moments).len() >= count).await;
     world.check()?;
@@ -79,12 +84,9 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
     }
     figures.add(&format!("{side}, lifecycles/s"), times.len() as f64 / span.max(1e-9));
     if is_operator {
-        figures.add(
-            "S3 requests a lifecycle",
-            (world.storage.requests() - s3) as f64 / count as f64,
-        );
-        let all = audit::read(&world.servers.audit_log())?;
-        let writes: usize = audit::writes(&all).values().sum();
+        let requests = world.storage.requests() - s3;
+        figures.add("S3 requests a lifecycle", requests as f64 / count as f64);
+        let writes = writes(&world)?;
         figures.add(
             "operator writes a lifecycle, all at once",
             writes as f64 / (count + 1) as f64,

@@ -59,17 +59,7 @@ pub async fn measure(bench: &Bench, storm: Storm) -> Outcome<Figures> {
         (IN_TIME + Duration::from_secs(30)).saturating_sub(began.elapsed().saturating_sub(last_job(&world, began)));
     world.observed.until(left, |moments| shown(moments) >= count).await;
     world.check()?;
-    let in_time = {
-        let moments = world.observed.get();
-        let right = moments.reasons.iter().filter(|(_, (reason, _))| reason == expected);
-        let in_time = right.filter(|(name, (_, at))| {
-            moments
-                .jobs
-                .get(*name)
-                .is_some_and(|job| at.saturating_duration_since(*job) <= IN_TIME)
-        });
-        in_time.count()
-    };
+    let in_time = in_time(&world.observed.get(), expected);
     figures.add("reasons right within 60 s, %", 100.0 * in_time as f64 / count as f64);
     figures.note(format!("{count} Jobs; the reason is {expected}"));
     if !has_jobs {
@@ -90,6 +80,16 @@ pub async fn measure(bench: &Bench, storm: Storm) -> Outcome<Figures> {
     );
     rest(bench, &world, &mut figures).await?;
     Ok(figures)
+}
+
+/// Submissions that show the right reason soon after their Job.
+fn in_time(moments: &crate::observed::Moments, expected: &str) -> usize {
+    let right = moments.reasons.iter().filter(|(_, (reason, _))| reason == expected);
+    let in_time = right.filter(|(name, (_, at))| {
+        let job = moments.jobs.get(*name);
+        job.is_some_and(|job| at.saturating_duration_since(*job) <= IN_TIME)
+    });
+    in_time.count()
 }
 
 /// From the first request until the last Job.

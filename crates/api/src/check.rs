@@ -65,14 +65,14 @@ impl Submission {
     /// The end of a check that has nothing left to do.
     pub fn check_end(&self) -> Option<CheckEnd> {
         let status = self.status.as_ref().filter(|_| self.spec.check)?;
-        let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
-        let recorded = conditions::get(&status.conditions, conditions::RECORDED)?;
+        let is_finished = status.has_ended();
+        let recorded = status.condition(conditions::RECORDED)?;
         if !is_finished || recorded.reason == reasons::WAITING {
             return None;
         }
         let is_refused = recorded.reason == reasons::REFUSED;
         let has_result = status.state_of_conditions() == State::Finished;
-        let logged = conditions::get(&status.conditions, conditions::LOGGED);
+        let logged = status.condition(conditions::LOGGED);
         let is_unlogged = logged.is_some_and(|logged| logged.status == "False");
         let reason = match (has_result, is_refused, is_unlogged) {
             (true, true, _) => reasons::TABLE_UNREACHABLE,

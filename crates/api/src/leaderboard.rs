@@ -11,6 +11,7 @@ use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
 use super::check::{CheckImage, LastCheck};
+use super::conditions;
 use super::evalai_mode::EvalaiMode;
 use super::infrastructure_failures::{MAX_TEAMS, TeamFailures};
 use super::leaderboard_parts::{
@@ -169,6 +170,12 @@ pub struct LeaderboardSpec {
 pub const JOB_SECONDS: i32 = 7 * 86_400;
 
 impl LeaderboardSpec {
+    /// Whether its Pods prove their identity with a token of their ServiceAccount.
+    pub fn has_role(&self) -> bool {
+        let identity = self.pod_identity.as_ref();
+        identity.is_some_and(|identity| identity.role_arn.is_some())
+    }
+
     /// Whether nothing of it is written to EvalAI.
     pub fn observes(&self) -> bool {
         self.evalai
@@ -183,6 +190,11 @@ impl LeaderboardSpec {
 }
 
 impl Leaderboard {
+    /// A condition, if it was ever set.
+    pub fn condition(&self, type_: &str) -> Option<&Condition> {
+        conditions::get(&self.status.as_ref()?.conditions, type_)
+    }
+
     /// Whether a phase of an EvalAI challenge is one of its tracks.
     pub fn serves(&self, challenge: i64, phase: i64) -> bool {
         let is_of_challenge = self.spec.evalai.as_ref().is_some_and(|e| e.challenge == challenge);

@@ -3,15 +3,42 @@
 //!
 //! Called by everyone who reads a status. Pure.
 
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
+
 use crate::conditions::{self, FINISHED, RUNNING};
 use crate::{State, SubmissionStatus, reasons};
 
 impl SubmissionStatus {
+    /// A condition, if it was ever set.
+    pub fn condition(&self, type_: &str) -> Option<&Condition> {
+        conditions::get(&self.conditions, type_)
+    }
+
+    /// Whether a condition is True.
+    pub fn is_true(&self, type_: &str) -> bool {
+        conditions::is_true(&self.conditions, type_)
+    }
+
+    /// Whether another system has the end, or is to have none, by this condition.
+    pub fn is_delivered(&self, type_: &str) -> bool {
+        let found = self.condition(type_);
+        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+    }
+
+    /// The condition of the end that the present attempt has come to.
+    pub fn end(&self) -> Option<&Condition> {
+        self.condition(FINISHED).filter(|end| end.status == "True")
+    }
+
+    /// Whether the present attempt has come to its end.
+    pub fn has_ended(&self) -> bool {
+        self.end().is_some()
+    }
+
     /// The state that the conditions show.
     pub fn state_of_conditions(&self) -> State {
-        let end = conditions::get(&self.conditions, FINISHED).filter(|c| c.status == "True");
-        let running = conditions::get(&self.conditions, RUNNING);
-        match end {
+        let running = self.condition(RUNNING);
+        match self.end() {
             Some(end) if end.reason == reasons::FINISHED => State::Finished,
             Some(_) if self.failure.is_some() => State::Failed,
             Some(_) => State::Cancelled,

@@ -1,4 +1,4 @@
-//! The commands that change submissions: asks the cluster, sends what the pure modules have planned, and waits for the end.
+//! The commands that make and change submissions: asks the cluster, sends what the pure modules have planned, and waits for the end.
 
 use std::pin::pin;
 use std::process::ExitCode;
@@ -8,12 +8,12 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 
 use crate::change::{self, Request};
-use crate::cluster::{Cluster, Scope};
+use crate::cluster::{Cluster, Fetched, Scope};
 use crate::commands::{frame, note_interruption, nothing};
 use crate::error::{self, Error};
 use crate::output::{self, note, print};
 use crate::transitions::Waiting;
-use crate::{Change, requeue, rerun};
+use crate::{Change, requeue, rerun, submit};
 use leaderboard_api::{State, Submission};
 
 /// How often a change is tried again after a conflict with somebody else's.
@@ -120,6 +120,27 @@ pub async fn change(cluster: &Cluster, request: Request<'_>, target: &Change) ->
     })
 }
 
+/// `submit`.
+pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCode, Error> {
+    let leaderboard = cluster.leaderboard(&wanted.leaderboard).await?;
+    if matches!(leaderboard, Fetched::Missing) {
+        return Err(cluster.unknown_leaderboard(&wanted.leaderboard).await?);
+    }
+    submit::fits(wanted, leaderboard.observed()).map_err(Error::Unfit)?;
+    let created = cluster.create(&submit::object(wanted)).await?;
+    let name = created.name_any();
+    print(&submit::lines(&created, leaderboard.observed(), frame()));
+    if !wanted.wait {
+        return Ok(ExitCode::SUCCESS);
+    }
+    let end = wait(cluster, &name, 1).await?;
+    Ok(if end == State::Finished {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
+
 /// Sends a request to the API server; returns the attempt whose end fulfils it.
 async fn send(cluster: &Cluster, request: Request<'_>, name: &str) -> Result<i64, Error> {
     for _ in 0..TRIES {
@@ -158,7 +179,7 @@ fn refusal(request: Request<'_>, submission: &Submission, error: kube::Error) ->
 }
 
 /// Waits for the end of an attempt, and prints each state until then.
-pub async fn wait(cluster: &Cluster, name: &str, attempt: i64) -> Result<State, Error> {
+async fn wait(cluster: &Cluster, name: &str, attempt: i64) -> Result<State, Error> {
     let mut waiting = Waiting::new(attempt).within(output::width());
     let mut changes = pin!(cluster.changes(name));
     let mut printed = String::new();

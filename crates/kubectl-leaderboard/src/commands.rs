@@ -1,4 +1,4 @@
-//! The commands that show something, and `submit`: asks the cluster, and prints what the pure modules make of it.
+//! The commands that show something: asks the cluster, and prints what the pure modules make of it.
 
 use std::pin::pin;
 use std::process::ExitCode;
@@ -6,17 +6,15 @@ use std::time::Duration;
 
 use futures::StreamExt;
 use jiff::Timestamp;
-use kube::ResourceExt;
 use serde_json::Value;
 
-use crate::changes::wait;
 use crate::cluster::{Cluster, Fetched, Scope};
 use crate::error::{self, Error};
 use crate::output::{self, Format, Screen, note, print};
 use crate::text::Frame;
-use crate::{Show, facts, overview, status, submit, top, why};
+use crate::{Show, facts, overview, status, top, why};
+use leaderboard_api::Submission;
 use leaderboard_api::client_errors::watch as watch_error;
-use leaderboard_api::{State, Submission};
 
 /// How often the times on a screen go on.
 const TICK: Duration = Duration::from_secs(1);
@@ -150,27 +148,6 @@ pub async fn top(cluster: &Cluster, scope: &Scope, format: Format) -> Result<Exi
     };
     print(&lines);
     Ok(ExitCode::SUCCESS)
-}
-
-/// `submit`.
-pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCode, Error> {
-    let leaderboard = cluster.leaderboard(&wanted.leaderboard).await?;
-    if matches!(leaderboard, Fetched::Missing) {
-        return Err(cluster.unknown_leaderboard(&wanted.leaderboard).await?);
-    }
-    submit::fits(wanted, leaderboard.observed()).map_err(Error::Unfit)?;
-    let created = cluster.create(&submit::object(wanted)).await?;
-    let name = created.name_any();
-    print(&submit::lines(&created, leaderboard.observed(), frame()));
-    if !wanted.wait {
-        return Ok(ExitCode::SUCCESS);
-    }
-    let end = wait(cluster, &name, 1).await?;
-    Ok(if end == State::Finished {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
 }
 
 /// Says that a watch was interrupted, and goes on, unless going on does not help.

@@ -232,7 +232,7 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         }) => commands::survey(cluster, &scope, output.format).await,
         Command::Status(Watched { show, watch }) => Box::pin(commands::show_status(cluster, &show, watch)).await,
         Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
-        Command::Submit(wanted) => commands::submit(cluster, &wanted).await,
+        Command::Submit(wanted) => changes::submit(cluster, &wanted).await,
         Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
             .await
             .map(|()| ExitCode::SUCCESS),

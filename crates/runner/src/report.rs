@@ -28,6 +28,21 @@ pub(crate) struct End<'a> {
     pub(crate) detail: Option<&'a str>,
 }
 
+impl<'a> End<'a> {
+    /// Without what only the command and its results show.
+    pub(crate) fn of(side: Side, round: u32, cause: Cause, detail: Option<&'a str>) -> Self {
+        Self {
+            side,
+            round,
+            cause,
+            status: None,
+            out_of_memory: false,
+            results: None,
+            detail,
+        }
+    }
+}
+
 /// The verdict on it.
 pub(crate) fn verdict(end: &End<'_>) -> Verdict {
     let (exit_code, signal) = match end.status {

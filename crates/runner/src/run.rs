@@ -376,17 +376,12 @@ impl Runner {
             _ => None,
         };
         let complete = matches!(&results, Some(Ok(found)) if found.complete);
-        let verdict = report::verdict(&report::End {
-            side: self.me.side,
-            round: self.round,
-            cause,
+        self.report(&report::End {
             status: self.group.as_ref().and_then(Group::status),
             out_of_memory: ran && memory::kills() > self.memory_kills,
             results: results.as_ref(),
-            detail: self.detail.as_deref(),
+            ..self.end(cause)
         });
-        self.write_verdict(&verdict);
-        self.say(&verdict.why);
         let seen = self.look();
         self.announce_end(decide::conclude(self.me.side, cause, complete, &seen))
     }
@@ -399,19 +394,7 @@ impl Runner {
             Some(EndMark::Crash) => Mark::Crash(self.round),
         };
         let Err(cause) = self.mark(mark) else { return conclusion };
-        let detail = self.detail.as_deref();
-        let end = report::End {
-            side: self.me.side,
-            round: self.round,
-            cause,
-            status: None,
-            out_of_memory: false,
-            results: None,
-            detail,
-        };
-        let verdict = report::verdict(&end);
-        self.write_verdict(&verdict);
-        self.say(&verdict.why);
+        self.report(&self.end(cause));
         Conclusion {
             mark: None,
             hold: Hold::Free,
@@ -488,6 +471,17 @@ impl Runner {
             Err(error) => return Err(error),
         }
         Ok(input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true))
+    }
+
+    /// An end of which nothing but its cause is known.
+    fn end(&self, cause: Cause) -> report::End<'_> {
+        report::End::of(self.me.side, self.round, cause, self.detail.as_deref())
+    }
+
+    fn report(&self, end: &report::End<'_>) {
+        let verdict = report::verdict(end);
+        self.write_verdict(&verdict);
+        self.say(&verdict.why);
     }
 
     fn write_verdict(&self, verdict: &Verdict) {

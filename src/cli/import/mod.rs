@@ -240,7 +240,7 @@ fn file(path: &Path) -> Result<String, Failure> {
     })
 }
 
-/// Writes to standard output. Nobody has to listen.
+/// Writes to standard output. A closed pipe is ignored.
 fn write_out(text: &str) -> std::io::Result<()> {
     match std::io::stdout().write_all(text.as_bytes()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error),

@@ -17,6 +17,12 @@ const INSTANCE_TYPE: &str = "g5.12xlarge";
 const GPU: &str = "nvidia.com/gpu";
 /// The key of the token in its entry.
 const TOKEN_KEY: &str = "auth_token";
+const NO_ROLE: &str = "podIdentity: the role that may write to bucket and log group (--role-arn); without it the Pods have no \
+                       credentials of their own";
+const NO_EGRESS: &str = "network.egress: the addresses of the VPC's interface endpoints of S3, STS and CloudWatch Logs (--egress, each as \
+                         address/32); where policies are enforced, nothing is stored without them";
+const NO_TAINTS: &str = "tracks[].tolerations: do the GPU nodes have a taint (--taint)? The original's had none; with one that is not \
+                         tolerated submissions stay Unschedulable";
 
 /// What the entries do not hold.
 #[derive(Clone, Debug)]
@@ -328,59 +334,43 @@ fn simulator_note(board: &BoardEntry) -> String {
 }
 
 fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
-    let mut decide = vec![token(entries, now)];
-    decide.push(match &options.queue {
+    let queue = match &options.queue {
         None => "queue: the URL of the SQS queue that EvalAI writes to (--queue), and its region".to_owned(),
         Some(queue) => format!(
             "queue: is {} the region of the queue? The original's was in us-west-2, its participants' images in us-east-1",
             queue.arn.region()
         ),
-    });
-    if options.queue.is_some() && options.dead_letter.is_none() {
-        decide.push(
-            "queue.deadLetterURL: a queue for messages that cannot be used (--dead-letter); the original had none, and without \
-             one they stay in the queue until it drops them"
-                .to_owned(),
-        );
-    }
-    decide.push(format!(
+    };
+    let challenge = format!(
         "evalai.challenge: is {} the challenge of these phases? No entry holds it",
         options.challenge
-    ));
-    if options.role_arn.is_none() {
-        decide.push(
-            "podIdentity: the role that may write to bucket and log group (--role-arn); without it the Pods have no \
-             credentials of their own"
+    );
+    let open = |is_open: bool, question: &str| is_open.then(|| question.to_owned());
+    let questions = [
+        Some(token(entries, now)),
+        Some(queue),
+        open(
+            options.queue.is_some() && options.dead_letter.is_none(),
+            "queue.deadLetterURL: a queue for messages that cannot be used (--dead-letter); the original had none, and without \
+             one they stay in the queue until it drops them",
+        ),
+        Some(challenge),
+        open(options.role_arn.is_none(), NO_ROLE),
+        open(options.egress.is_empty(), NO_EGRESS),
+        Some("tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?".to_owned()),
+        Some("concurrency: how many submissions may run at once, in all and of one team".to_owned()),
+        Some(
+            "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else"
                 .to_owned(),
-        );
-    }
-    if options.egress.is_empty() {
-        decide.push(
-            "network.egress: the addresses of the VPC's interface endpoints of S3, STS and CloudWatch Logs (--egress, each as \
-             address/32); where policies are enforced, nothing is stored without them"
-                .to_owned(),
-        );
-    }
-    decide.extend([
-        "tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?".to_owned(),
-        "concurrency: how many submissions may run at once, in all and of one team".to_owned(),
-        "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else"
-            .to_owned(),
-        "deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original".to_owned(),
-    ]);
-    if options.taints.is_empty() {
-        decide.push(
-            "tracks[].tolerations: do the GPU nodes have a taint (--taint)? The original's had none; with one that is not tolerated \
-             submissions stay Unschedulable"
-                .to_owned(),
-        );
-    }
-    if options.two_operators {
-        decide.push(
-            "which cluster gets which Leaderboard: apply only one of the two in each (--only prints one)".to_owned(),
-        );
-    }
-    decide
+        ),
+        Some("deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original".to_owned()),
+        open(options.taints.is_empty(), NO_TAINTS),
+        open(
+            options.two_operators,
+            "which cluster gets which Leaderboard: apply only one of the two in each (--only prints one)",
+        ),
+    ];
+    questions.into_iter().flatten().collect()
 }
 
 fn token(entries: &Entries, now: Timestamp) -> String {

@@ -139,7 +139,7 @@ pub async fn restore<F: Future<Output = ()>>(
 ) {
     // The reconcile of a Leaderboard has a moment to do it itself.
     let of_spec = leaderboards.map(|event| (Some(ObjectRef::from_obj(event.object.as_ref())), false));
-    let of_policy = policies.map(|event| (Stores::leaderboard_of(event.object.as_ref()), true));
+    let of_policy = policies.map(|event| (Stores::leaderboard_of_policy(&event.object), true));
     let keep = &keep;
     let restored =
         select(of_spec, of_policy).for_each_concurrent(RESTORED_AT_ONCE, |(reference, at_once)| async move {
@@ -291,16 +291,20 @@ pub(super) fn condition(
                 let message = "The NetworkPolicy is in place. The next run measures whether it is enforced.";
                 (Truth::Unknown, reasons::NOT_MEASURED, message.into())
             },
-            |found| (truth(found.reason), reason(found.reason), found.message.clone()),
+            |found| {
+                let (truth, reason) = shown(found.reason);
+                (truth, reason, found.message.clone())
+            },
         ),
     }
 }
 
 /// What the condition says that a Pod which is gone had found, for this generation.
 fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
-    let status = leaderboard.status.as_ref()?;
-    let known = conditions::get(&status.conditions, conditions::ISOLATED)
-        .filter(|known| known.observed_generation == leaderboard.metadata.generation)?;
+    let known = leaderboard.condition(conditions::ISOLATED)?;
+    if known.observed_generation != leaderboard.metadata.generation {
+        return None;
+    }
     let reason = match known.reason.as_str() {
         reasons::ENFORCED => WorkspaceReason::Enforced,
         reasons::NOT_ENFORCED => WorkspaceReason::NotEnforced,
@@ -310,19 +314,11 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     Some(WorkspaceVerdict { reason, message })
 }
 
-fn truth(found: WorkspaceReason) -> Truth {
+fn shown(found: WorkspaceReason) -> (Truth, &'static str) {
     match found {
-        WorkspaceReason::Enforced => Truth::True,
-        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => Truth::Unknown,
-        _ => Truth::False,
-    }
-}
-
-fn reason(found: WorkspaceReason) -> &'static str {
-    match found {
-        WorkspaceReason::Enforced => reasons::ENFORCED,
-        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => reasons::NOT_MEASURED,
-        _ => reasons::NOT_ENFORCED,
+        WorkspaceReason::Enforced => (Truth::True, reasons::ENFORCED),
+        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => (Truth::Unknown, reasons::NOT_MEASURED),
+        _ => (Truth::False, reasons::NOT_ENFORCED),
     }
 }
 

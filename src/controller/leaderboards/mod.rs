@@ -65,12 +65,10 @@ pub enum Reconciled {
 /// One reconcile.
 pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Reconciled, CallError> {
     let Policies { client, state, .. } = uses.policies;
-    let key = key_of(leaderboard.as_ref());
     match operator::ours(client, state, Arc::clone(&leaderboard), &uses.settings.operator).await? {
         Ok(ours) => drive(ours, uses).await.map(Reconciled::Done),
         Err(wait) => {
-            uses.external.set_target(&leaderboard, None);
-            uses.external.hub.retire(&key);
+            uses.external.retire(&leaderboard);
             Ok(Reconciled::LeftAlone(wait))
         }
     }
@@ -98,8 +96,7 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
     }
     if plan.finalizer == Some(false) {
-        uses.external.set_target(&leaderboard, None);
-        uses.external.hub.retire(&key_of(leaderboard.as_ref()));
+        uses.external.retire(&leaderboard);
         return Ok(RESYNC);
     }
     let again = write_status(client, state, &leaderboard, &plan, now).await?;
@@ -111,28 +108,26 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
 
 /// Shows what it has left, in metrics.
 fn show_limits(uses: Uses<'_>, view: &LeaderboardView, probe: &Probe) {
-    let key = key_of(view.leaderboard.as_ref());
     let total = view.leaderboard.spec.concurrency.total;
     let state = LimitsState {
         slots_in_use: view.in_use,
         slots: total.and_then(|total| usize::try_from(total).ok()),
         ..probe.limits()
     };
-    let name = format!("{}/{}", key.namespace, key.name);
+    let name = key_of(view.leaderboard.as_ref()).to_string();
     uses.metrics.set_limits(&name, state);
 }
 
 /// What was tried of it. Where it names what it may not, nothing is asked, and EvalAI is no longer spoken to.
 async fn probed(uses: Uses<'_>, leaderboard: &Arc<Leaderboard>, refusal: Option<&Refusal>, now: Timestamp) -> Probe {
     if refusal.is_some() {
-        uses.external.set_target(leaderboard, None);
-        uses.external.hub.retire(&key_of(leaderboard.as_ref()));
+        uses.external.retire(leaderboard);
         return Probe::default();
     }
     let known = uses.policies.state.probe(&uid_of(leaderboard.as_ref()));
     let probe = known.refresh(uses, leaderboard, now).await;
     if let Some(target) = probe.target() {
-        uses.external.set_target(leaderboard, Some(target));
+        uses.external.set_target(leaderboard, target);
     }
     probe
 }

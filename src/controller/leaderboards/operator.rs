@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::api::coordination::v1::Lease;
-use kube::api::{Patch, PatchParams};
+use kube::api::Patch;
 use kube::{Api, Client, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
@@ -17,6 +17,7 @@ use tokio::time::Instant;
 use super::foreign::Foreign;
 use super::state::{LeaderboardState, SOONEST};
 use crate::controller::objects::{key_of, uid_of};
+use crate::controller::writes::patch_by;
 use crate::kubernetes::{CallError, call};
 use leaderboard_api::{Leaderboard, names, reasons};
 
@@ -132,10 +133,7 @@ async fn claim(
         "metadata": { "uid": uid_of(leaderboard), "resourceVersion": leaderboard.metadata.resource_version },
         "status": { "operator": us },
     }));
-    let params = PatchParams {
-        field_manager: Some(names::MANAGER_STATUS.into()),
-        ..PatchParams::default()
-    };
+    let params = patch_by(names::MANAGER_STATUS);
     let object = format!("Leaderboard {name}");
     match call("the claim", &object, api.patch_status(&name, &params, &patch)).await {
         Ok(claimed) => Ok(Ok(Arc::new(claimed))),

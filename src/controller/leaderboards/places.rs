@@ -2,6 +2,7 @@
 //!
 //! Called by `probe`. When to ask, and what follows, is `reach`'s to say.
 
+use std::fmt::Display;
 use std::time::Duration;
 
 use futures::future::{BoxFuture, FutureExt, join_all};
@@ -108,11 +109,9 @@ fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFutur
         (Place::Bucket, ..) => {
             let prefix = format!("{}{NO_RUN}", spec.storage.prefix.as_deref().unwrap_or_default());
             let archive = Archive::of_storage(aws, &spec.storage).at_prefix(prefix);
-            async move { (of_bucket(archive.prefix_is_empty().await.map(|_| ())), None) }.boxed()
+            async move { (of_bucket(archive.prefix_is_empty().await), None) }.boxed()
         }
-        (Place::Table, Some(table), _) => {
-            async move { (of_table(Table::describe(aws, table).await.map(|_| ())), None) }.boxed()
-        }
+        (Place::Table, Some(table), _) => async move { (of_table(Table::describe(aws, table).await), None) }.boxed(),
         (Place::Queue, _, Some(queue)) => async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed(),
         (Place::DeadLetterQueue, _, Some(queue)) => {
             let url = queue.dead_letter_url.as_deref().unwrap_or_default();
@@ -123,44 +122,34 @@ fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFutur
     }
 }
 
-fn of_bucket(answer: Result<(), ArchiveError>) -> Finding {
+/// What an answer means; a cause that passes is as none.
+fn finding<T, E: Display>(answer: Result<T, E>, is_passing: impl Fn(&E) -> bool) -> Finding {
     match answer {
-        Ok(()) => Finding::Good,
-        Err(error) if error.cause.is_transient() => Finding::Silent(error.to_string()),
+        Ok(_) => Finding::Good,
+        Err(error) if is_passing(&error) => Finding::Silent(error.to_string()),
         Err(error) => Finding::Bad(error.to_string()),
     }
 }
 
-fn of_table(answer: Result<(), TableError>) -> Finding {
-    match answer {
-        Ok(()) => Finding::Good,
-        Err(error @ TableError::Passing { .. }) => Finding::Silent(error.to_string()),
-        Err(error) => Finding::Bad(error.to_string()),
-    }
+fn of_bucket<T>(answer: Result<T, ArchiveError>) -> Finding {
+    finding(answer, |error| error.cause.is_transient())
+}
+
+fn of_table<T>(answer: Result<T, TableError>) -> Finding {
+    finding(answer, |error| matches!(error, TableError::Passing { .. }))
 }
 
 /// The bridge reads the queue, with rights of its own.
 fn of_queue(answer: Result<Reading, QueueError>) -> (Finding, Option<Reading>) {
-    let error = match answer {
-        Ok(reading) => return (Finding::Good, Some(reading)),
-        Err(error) => error,
-    };
-    let found = match error.fault {
-        Fault::Denied => Finding::Hidden(error.to_string()),
-        Fault::Throttled | Fault::Unavailable | Fault::Conflict => Finding::Silent(error.to_string()),
-        Fault::Missing | Fault::Refused => Finding::Bad(error.to_string()),
-    };
-    (found, None)
+    match answer {
+        Ok(reading) => (Finding::Good, Some(reading)),
+        Err(error) if error.fault == Fault::Denied => (Finding::Hidden(error.to_string()), None),
+        failed => (finding(failed, |error| error.fault.is_passing()), None),
+    }
 }
 
 fn of_log_group(answer: Result<(), LogGroupError>) -> Finding {
-    match answer {
-        Ok(()) => Finding::Good,
-        Err(error) => match error.fault {
-            Fault::Throttled | Fault::Unavailable | Fault::Conflict => Finding::Silent(error.to_string()),
-            Fault::Denied | Fault::Missing | Fault::Refused => Finding::Bad(error.to_string()),
-        },
-    }
+    finding(answer, |error| error.fault.is_passing())
 }
 
 #[cfg(test)]
@@ -195,19 +184,19 @@ mod tests {
             discriminant(&Finding::Silent(String::new())),
         );
         let cases = [
-            (of_bucket(Err(archive(Cause::NoBucket))), bad),
-            (of_bucket(Err(archive(Cause::Denied("403".into())))), bad),
-            (of_bucket(Err(archive(Cause::Away("503".into())))), silent),
+            (of_bucket::<()>(Err(archive(Cause::NoBucket))), bad),
+            (of_bucket::<()>(Err(archive(Cause::Denied("403".into())))), bad),
+            (of_bucket::<()>(Err(archive(Cause::Away("503".into())))), silent),
             (
-                of_table(Err(TableError::Missing {
+                of_table::<()>(Err(TableError::Missing {
                     table: table(),
                     text: "gone".into(),
                 })),
                 bad,
             ),
-            (of_table(Err(TableError::NoSortKey { table: table() })), bad),
+            (of_table::<()>(Err(TableError::NoSortKey { table: table() })), bad),
             (
-                of_table(Err(TableError::Passing {
+                of_table::<()>(Err(TableError::Passing {
                     table: table(),
                     action: "DescribeTable",
                     text: "503".into(),

@@ -16,7 +16,7 @@ use super::places::{self, Readings};
 use super::pod_notes::{TrackPods, notes};
 use super::priority::{self, Asked};
 use super::queue_readers;
-use super::reach::{Reach, Unreachable, sentence};
+use super::reach::{Reach, Unreachable, capitalized};
 use super::shared_queue::SharedQueue;
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
@@ -236,14 +236,13 @@ impl Probe {
     /// When something has to be tried again.
     pub(super) fn next(&self, now: Timestamp) -> Option<Timestamp> {
         let waits = self.token.as_ref().is_some_and(Result::is_err);
-        let token = self.token_at.filter(|_| waits).and_then(|at| at.checked_add(SOON).ok());
+        let token = self.token_at.filter(|_| waits);
         let has_bad_class = self.priority.refused.is_some();
-        let priority = self
-            .priority_at
-            .filter(|_| has_bad_class)
-            .and_then(|at| at.checked_add(SOON).ok());
+        let priority = self.priority_at.filter(|_| has_bad_class);
+        let is_wrong = |claims: &Claims| matches!(claims, Claims::NotServed | Claims::Missing(_));
         let claims = self.claims.as_ref().filter(|(_, _, found)| is_wrong(found));
-        let claims = claims.and_then(|(_, at, _)| at.checked_add(SOON).ok());
+        let claims = claims.map(|(_, at, _)| *at);
+        let [token, priority, claims] = [token, priority, claims].map(|at| at?.checked_add(SOON).ok());
         let queue = self.queue.as_ref().and_then(SharedQueue::next);
         [self.reach.next(now), token, claims, priority, queue]
             .into_iter()
@@ -289,13 +288,9 @@ impl Probe {
     }
 }
 
-fn is_wrong(claims: &Claims) -> bool {
-    matches!(claims, Claims::NotServed | Claims::Missing(_))
-}
-
 /// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
 fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
-    let of_labels = labels.problems.iter().map(|problem| sentence(&problem.to_string()));
+    let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
     let notes: Vec<String> = of_labels.chain(of_token).collect();
     (!notes.is_empty()).then(|| notes.join(" "))
 }
@@ -371,7 +366,7 @@ fn serve(hub: &Hub, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Toke
             .unwrap_or_default(),
     };
     if let Err(error) = hub.serve(&key_of(leaderboard), &target) {
-        tracing::error!(leaderboard = %leaderboard.name_any(), %error, "EvalAI cannot be spoken to");
+        tracing::error!(leaderboard = %leaderboard.name_any(), %error, "cannot create EvalAI client");
     }
     Arc::new(target)
 }

@@ -12,6 +12,7 @@ use jiff::{SignedDuration, Timestamp};
 use crate::backoff::Backoff;
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::reasons;
+use leaderboard_api::text::sentence;
 
 /// What was good is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -151,7 +152,7 @@ impl Reach {
             reason,
             message: said
                 .iter()
-                .map(|(_, _, why)| sentence(why))
+                .map(|(_, _, why)| capitalized(why))
                 .collect::<Vec<_>>()
                 .join(" "),
         })
@@ -161,7 +162,7 @@ impl Reach {
     pub fn notes(&self, now: Timestamp) -> Vec<String> {
         let optional = self.0.iter().filter(|(place, _)| place.reason().is_none());
         let said = optional.filter_map(|(_, known)| known.said(now));
-        said.map(|(_, why)| sentence(why)).collect()
+        said.map(|(_, why)| capitalized(why)).collect()
     }
 }
 
@@ -191,12 +192,11 @@ fn later(at: Timestamp, by: SignedDuration) -> Timestamp {
     at.checked_add(by).unwrap_or(Timestamp::MAX)
 }
 
-/// A text of ours as a sentence.
-pub(super) fn sentence(text: &str) -> String {
-    let text = text.trim().trim_end_matches('.');
-    let mut letters = text.chars();
+/// A text of ours, which begins with a small letter, as a sentence.
+pub(super) fn capitalized(text: &str) -> String {
+    let mut letters = text.trim().chars();
     let first = letters.next().map(|c| c.to_uppercase().to_string()).unwrap_or_default();
-    format!("{first}{}.", letters.as_str())
+    sentence(&format!("{first}{}", letters.as_str()))
 }
 
 #[cfg(test)]

@@ -130,8 +130,7 @@ impl SharedQueue {
 
 /// Whether the status of a Leaderboard shows it.
 pub(crate) fn is_shown(leaderboard: &Leaderboard) -> bool {
-    let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
-    let ready = conditions::get(conditions.unwrap_or_default(), conditions::READY);
+    let ready = leaderboard.condition(conditions::READY);
     ready.is_some_and(|ready| ready.reason == reasons::QUEUE_SHARED)
 }
 

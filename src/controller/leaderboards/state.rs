@@ -1,13 +1,14 @@
 //! What is remembered of each Leaderboard between two reconciles, by UID.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 use std::time::Duration;
 
 use jiff::Timestamp;
 
 use super::foreign::Foreign;
 use super::probe::Probe;
+use crate::lock::lock;
 use crate::pod::workspace::WorkspaceVerdict;
 
 /// A status whose counts alone have changed is written at most this often.
@@ -69,11 +70,11 @@ struct Entry {
 impl LeaderboardState {
     /// Drops a Leaderboard that is gone.
     pub fn forget(&self, uid: &str) {
-        self.lock().remove(uid);
+        lock(&self.0).remove(uid);
     }
 
     pub(super) fn probe(&self, uid: &str) -> Probe {
-        self.lock()
+        lock(&self.0)
             .get(uid)
             .map(|entry| entry.probe.clone())
             .unwrap_or_default()
@@ -88,7 +89,7 @@ impl LeaderboardState {
     }
 
     pub(super) fn applied(&self, uid: &str) -> Option<Applied> {
-        self.lock().get(uid)?.applied.clone()
+        lock(&self.0).get(uid)?.applied.clone()
     }
 
     pub(super) fn note_applied(&self, uid: &str, applied: Applied) {
@@ -105,7 +106,7 @@ impl LeaderboardState {
     }
 
     pub(super) fn measured(&self, uid: &str) -> Option<Measured> {
-        self.lock().get(uid)?.measured.clone()
+        lock(&self.0).get(uid)?.measured.clone()
     }
 
     pub(super) fn note_measured(&self, uid: &str, found: Measured) {
@@ -113,7 +114,7 @@ impl LeaderboardState {
     }
 
     pub(super) fn foreign(&self, uid: &str) -> Option<Foreign> {
-        self.lock().get(uid)?.foreign.clone()
+        lock(&self.0).get(uid)?.foreign.clone()
     }
 
     pub(super) fn note_foreign(&self, uid: &str, found: Foreign) {
@@ -122,16 +123,12 @@ impl LeaderboardState {
 
     /// Whether its status was not written for so long.
     pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
-        let written = self.lock().get(uid).and_then(|entry| entry.written);
+        let written = lock(&self.0).get(uid).and_then(|entry| entry.written);
         written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
     }
 
     fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
-        change(self.lock().entry(uid.to_owned()).or_default());
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        change(lock(&self.0).entry(uid.to_owned()).or_default());
     }
 }
 

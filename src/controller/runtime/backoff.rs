@@ -4,10 +4,11 @@
 //! Knows no client and no clock.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 use std::time::Duration;
 
 use crate::backoff::Backoff;
+use crate::lock::lock;
 
 /// Its pauses: half of one of these and more.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(1), Duration::from_mins(5));
@@ -19,29 +20,15 @@ pub struct BackoffMap(Mutex<HashMap<String, u32>>);
 impl BackoffMap {
     /// A pass has failed: the time until the next one.
     pub fn failed(&self, uid: &str) -> Duration {
-        let mut map = self.lock();
+        let mut map = lock(&self.0);
         let failures = map.entry(uid.to_owned()).or_default();
         *failures = failures.saturating_add(1);
         RETRY.after(*failures)
     }
 
-    /// A pass has succeeded: the next failure counts as the first.
-    pub fn succeeded(&self, uid: &str) {
-        self.lock().remove(uid);
-    }
-
-    /// The object is gone.
-    pub fn dropped(&self, uid: &str) {
-        self.lock().remove(uid);
-    }
-
-    /// Failures in a row, 0 for an object that is well.
-    pub fn failures(&self, uid: &str) -> u32 {
-        self.lock().get(uid).copied().unwrap_or(0)
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, u32>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    /// A pass has succeeded, so that the next failure counts as the first; or the object is gone.
+    pub fn forget(&self, uid: &str) {
+        lock(&self.0).remove(uid);
     }
 }
 
@@ -56,11 +43,11 @@ mod tests {
             assert!(map.failed("a") <= Duration::from_secs(4));
         }
         map.failed("b");
-        assert_eq!((map.failures("a"), map.failures("b"), map.failures("c")), (3, 1, 0));
-        map.succeeded("a");
-        map.dropped("b");
-        assert_eq!((map.failures("a"), map.failures("b")), (0, 0));
+        let known = HashMap::from([("a".to_owned(), 3), ("b".to_owned(), 1)]);
+        assert_eq!(*lock(&map.0), known);
+        map.forget("a");
+        map.forget("b");
+        assert!(lock(&map.0).is_empty(), "what is well or gone takes no memory");
         assert!(map.failed("a") <= Duration::from_secs(1));
-        assert_eq!(map.lock().len(), 1, "what is well or gone takes no memory");
     }
 }

@@ -84,8 +84,9 @@ fn boards(
         .iter()
         .filter(|leaderboard| operator::is_ours(leaderboard, us));
     let state = |leaderboard: &Leaderboard| BoardState {
-        is_ready: (leaderboard.status.as_ref())
-            .is_some_and(|status| conditions::is_true(&status.conditions, conditions::READY)),
+        is_ready: leaderboard
+            .condition(conditions::READY)
+            .is_some_and(|ready| ready.status == "True"),
         ..BoardState::default()
     };
     let name = |namespace: Option<String>, name: &str| format!("{}/{name}", namespace.unwrap_or_default());
@@ -121,7 +122,7 @@ fn boards(
 fn stands_since(submission: &Submission, now: Timestamp) -> Timestamp {
     let status = submission.status.as_ref();
     let since = |name| {
-        let condition = status.and_then(|status| conditions::get(&status.conditions, name));
+        let condition = status.and_then(|status| status.condition(name));
         condition.map(|condition| &condition.last_transition_time)
     };
     let changes = [since(conditions::FINISHED), since(conditions::RUNNING)];
@@ -143,7 +144,7 @@ fn repeating_teams(leaderboards: &[Arc<Leaderboard>]) -> usize {
 fn observed(submissions: &[Arc<Submission>]) -> [(&'static str, usize); 4] {
     let of = |submission: &&Arc<Submission>, reason: &str| {
         let status = submission.status.as_ref();
-        let compared = status.and_then(|status| conditions::get(&status.conditions, conditions::COMPARED));
+        let compared = status.and_then(|status| status.condition(conditions::COMPARED));
         compared.is_some_and(|compared| compared.reason == reason)
     };
     [

@@ -86,7 +86,7 @@ fn ranked(
 pub(super) fn of_leaderboards(watches: &Watches, shared: &Arc<Shared>) -> Events<Leaderboard> {
     let slots = Arc::clone(&shared.context.slots);
     let of_policy = move |event: WatchEvent<NetworkPolicy>| {
-        let board = Stores::leaderboard_of(event.object.as_ref())?;
+        let board = Stores::leaderboard_of_policy(&event.object)?;
         slots.wake_pending(&board);
         Some((board, Class::Urgent))
     };
@@ -128,7 +128,7 @@ fn of_job(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Job>) -> Option<(ObjectR
     move |event| {
         let job = event.object.as_ref();
         shared.context.slots.job(job, event.is_gone);
-        let owner = Stores::owner_of(job).filter(|_| marks.job_has_news(job, event.is_gone));
+        let owner = Stores::owner_of(&job.metadata).filter(|_| marks.job_has_news(job, event.is_gone));
         owner.map(|owner| (owner, urgency::of_job(job, event.is_gone)))
     }
 }
@@ -160,8 +160,10 @@ fn of_leaderboard(
 /// What of a Leaderboard's status may hold its submissions up.
 fn standing(leaderboard: &Leaderboard) -> String {
     let status = leaderboard.status.as_ref();
-    let conditions = status.map(|status| status.conditions.as_slice()).unwrap_or_default();
-    let condition = |type_: &str| conditions::get(conditions, type_).map(|c| (&c.status, &c.reason, &c.message));
+    let condition = |type_: &str| {
+        let found = leaderboard.condition(type_);
+        found.map(|c| (&c.status, &c.reason, &c.message))
+    };
     format!(
         "{:?} {:?} {:?}",
         status.and_then(|status| status.operator.as_deref()),
@@ -176,7 +178,7 @@ fn of_pod(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Pod>) -> Option<(ObjectR
     move |event| {
         let pod = event.object.as_ref();
         let uid = pod.metadata.uid.clone();
-        let board = Stores::leaderboard_of(pod);
+        let board = Stores::leaderboard_of(&pod.metadata);
         // A Leaderboard that is being deleted waits for the end of its last Pod.
         let known = board
             .as_ref()
@@ -191,7 +193,7 @@ fn of_pod(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Pod>) -> Option<(ObjectR
         if let Some(board) = board.filter(|_| is_awaited || is_measured) {
             shared.queues.leaderboards.add(&board, Class::Refresh);
         }
-        Stores::owner_of(pod).map(|owner| (owner, urgency::of_pod(pod, event.is_gone)))
+        Stores::owner_of(&pod.metadata).map(|owner| (owner, urgency::of_pod(pod, event.is_gone)))
     }
 }
 

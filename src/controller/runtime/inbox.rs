@@ -16,7 +16,7 @@ use tokio::time::{Instant, sleep_until};
 use tracing::Instrument;
 
 use crate::bridge::ages::Ages;
-use crate::bridge::ingest::{self, Incoming, IngestError, Outcome, Source};
+use crate::bridge::ingest::{self, Incoming, IngestError, Outcome};
 use crate::bridge::message::{self, Malformed, Message};
 use crate::bridge::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
 use crate::controller::leaderboards::operator;
@@ -48,7 +48,8 @@ enum Verdict {
     Ingest {
         namespace: String,
         leaderboard: String,
-        incoming: Incoming,
+        message: Message,
+        sent_ms: i64,
     },
     /// It is of no use, now or later.
     Drop(DeadReason),
@@ -91,11 +92,13 @@ impl Intake {
             Verdict::Ingest {
                 namespace,
                 leaderboard,
-                incoming,
+                message,
+                sent_ms,
             } => {
-                let span = ingest::span(&namespace, &leaderboard, incoming.submission);
+                let span = ingest::span(&namespace, &leaderboard, message.submission);
+                let incoming = incoming(&message, sent_ms);
                 let outcome = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
-                let envelope = envelope(Ok(message_of(&incoming)), incoming.sent_ms);
+                let envelope = envelope(Ok(message), sent_ms);
                 match route::settle(&envelope, &outcome, &rules(&readers), now_ms) {
                     MessageOutcome::Delete(_) => Settled::Delete,
                     MessageOutcome::Dead(reason) => self.drop(arrival, &readers, &reason).await,
@@ -205,7 +208,8 @@ fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_comple
         (MessageOutcome::Ingest { namespace, leaderboard }, Ok(message), Some(sent_ms)) => Verdict::Ingest {
             namespace,
             leaderboard,
-            incoming: incoming(&message, sent_ms),
+            message,
+            sent_ms,
         },
         _ => Verdict::Leave,
     }
@@ -262,31 +266,16 @@ impl Waiting {
     }
 }
 
+/// EvalAI shows no id of a message.
+fn incoming(message: &Message, sent_ms: i64) -> Incoming {
+    Incoming::of(message, format!("evalai-{sent_ms}"), sent_ms)
+}
+
 fn envelope(content: Result<Message, Malformed>, sent_ms: i64) -> Envelope {
     Envelope {
         content,
         sent_ms,
         receives: 1,
-    }
-}
-
-fn incoming(message: &Message, sent_ms: i64) -> Incoming {
-    Incoming {
-        challenge: message.challenge,
-        phase: message.phase,
-        submission: message.submission,
-        image: message.image.clone(),
-        source: Source::Message(format!("evalai-{sent_ms}")),
-        sent_ms,
-    }
-}
-
-fn message_of(incoming: &Incoming) -> Message {
-    Message {
-        challenge: incoming.challenge,
-        phase: incoming.phase,
-        submission: incoming.submission,
-        image: incoming.image.clone(),
     }
 }
 

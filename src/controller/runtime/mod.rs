@@ -89,7 +89,7 @@ impl Shared {
     /// Drops everything that is remembered of an object that is gone.
     fn forget(&self, key: &ObjectKey) {
         self.context.forget(key);
-        self.backoff.dropped(&key.uid);
+        self.backoff.forget(&key.uid);
     }
 }
 
@@ -104,48 +104,38 @@ pub async fn run(
 ) -> Result<(), RunError> {
     preflight::register(&telemetry);
     let tasks = telemetry.tasks.clone();
-    let work = Box::pin(work(clients, lease, settings, aws, page, telemetry));
+    let work = Box::pin(async move {
+        if !await_kinds(&clients.api, &KINDS, &telemetry).await {
+            return Ok(());
+        }
+        let rights = watch_rights(clients.api.clone(), settings.clone(), lease.clone(), telemetry.clone());
+        telemetry.tasks.may_end("permissions", rights);
+        let watches = Watches::start(&clients.watch, &settings, &telemetry);
+        telemetry.readiness.registered();
+        let leader = leader::start(clients.lease, lease, &telemetry);
+        if let Some(page) = page {
+            page.start(watches.for_page(&leader), &telemetry);
+        }
+        let parts = Parts {
+            client: clients.api,
+            settings,
+            aws: aws.counted_by(Meter::for_metrics(&telemetry.metrics)),
+            watches,
+            telemetry,
+        };
+        let result = parts.lead(&leader).await;
+        if result.is_ok()
+            && let Err(error) = leader.release().await
+        {
+            tracing::warn!("{error}");
+        }
+        result
+    });
     tokio::select! {
         biased;
         failed = tasks.failed() => Err(failed.into()),
         result = work => result,
     }
-}
-
-async fn work(
-    clients: Clients,
-    lease: leader::Settings,
-    settings: Settings,
-    aws: Aws,
-    page: Option<Page>,
-    telemetry: Observability,
-) -> Result<(), RunError> {
-    let client = &clients.api;
-    if !await_kinds(client, &KINDS, &telemetry).await {
-        return Ok(());
-    }
-    let rights = watch_rights(client.clone(), settings.clone(), lease.clone(), telemetry.clone());
-    telemetry.tasks.may_end("permissions", rights);
-    let watches = Watches::start(&clients.watch, &settings, &telemetry);
-    telemetry.readiness.registered();
-    let leader = leader::start(clients.lease, lease, &telemetry);
-    if let Some(page) = page {
-        page.start(watches.for_page(&leader), &telemetry);
-    }
-    let parts = Parts {
-        client: clients.api,
-        settings,
-        aws: aws.counted_by(Meter::for_metrics(&telemetry.metrics)),
-        watches,
-        telemetry,
-    };
-    let result = parts.lead(&leader).await;
-    if result.is_ok()
-        && let Err(error) = leader.release().await
-    {
-        tracing::warn!("{error}");
-    }
-    result
 }
 
 /// What a controller of this scope lacks in the cluster, one sentence each.
@@ -436,14 +426,6 @@ async fn lost(leadership: &mut tokio::sync::watch::Receiver<Leadership>) -> Stri
     }
 }
 
-/// Runs a task that the stop ends.
-fn until_stop(telemetry: &Observability, name: &'static str, work: impl Future<Output = ()> + Send + 'static) {
-    let stop = telemetry.stop.clone();
-    telemetry.tasks.stay(name, async move {
-        tokio::select! { () = stop.wait() => {}, () = work => {} }
-    });
-}
-
 fn hub(
     fence: &leader::Fence,
     changed: mpsc::UnboundedSender<Changed>,
@@ -453,8 +435,9 @@ fn hub(
     let (sweep, rows) = mpsc::unbounded_channel::<SweepRow>();
     let (arrived, messages) = mpsc::unbounded_channel::<Arrived>();
     let (client, leaderboards) = (intake.client.clone(), intake.leaderboards.store.clone());
-    until_stop(telemetry, "sweep", sweep::into_cluster(client, leaderboards, rows));
-    until_stop(telemetry, "inbox", intake.into_cluster(messages));
+    let tasks = &telemetry.tasks;
+    tasks.until_stop("sweep", sweep::into_cluster(client, leaderboards, rows));
+    tasks.until_stop("inbox", intake.into_cluster(messages));
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
@@ -466,7 +449,7 @@ fn hub(
         timing: Timing::default(),
         timeouts: Timeouts::default(),
         meter: Meter::for_metrics(&telemetry.metrics),
-        tasks: telemetry.tasks.clone(),
+        tasks: tasks.clone(),
     })
 }
 

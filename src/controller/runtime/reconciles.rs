@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use futures::stream::StreamExt;
 use futures::{FutureExt, Stream};
+use kube::Resource;
 use kube::runtime::reflector::ObjectRef;
-use kube::{Resource, ResourceExt};
 use tracing::Instrument;
 
 use super::Shared;
@@ -25,7 +25,6 @@ use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
 use crate::observability::tasks::panic_message;
-use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 
@@ -135,8 +134,7 @@ async fn reconcile_known(turn: Turn, submission: Arc<Submission>, shared: Arc<Sh
     let started = Instant::now();
     let context = &shared.context;
     let slots = &context.slots;
-    let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&submission.namespace().unwrap_or_default());
-    let board = context.stores.leaderboards.get(&board);
+    let board = context.stores.leaderboard_for(&submission);
     if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
         let metrics = &shared.telemetry.metrics;
         metrics.reconciled(SUBMISSION, OTHER_OPERATOR, started.elapsed());
@@ -187,7 +185,7 @@ async fn limited<T>(work: impl Future<Output = Result<T, ReconcileError>>) -> Re
 /// Gives the slot back of a submission that does not start after all, or has come to its end: a later attempt stands in line
 /// like anyone. One that stays in line renews its place in `act`.
 fn settle(slots: &SlotAllocator, submission: &Submission, plan: &Plan) {
-    let is_over = conditions::is_true(&plan.status.conditions, FINISHED);
+    let is_over = plan.status.has_ended();
     if plan.status.job_name.is_some() && !is_over {
         slots.starts(submission);
     } else if !plan.actions.iter().any(|a| matches!(a, decide::Action::JoinLine(_))) {
@@ -227,7 +225,7 @@ fn finish(
     let (uid, metrics) = (uid_of(object), &shared.telemetry.metrics);
     match result {
         Ok((requeue, class)) => {
-            shared.backoff.succeeded(&uid);
+            shared.backoff.forget(&uid);
             metrics.reconciled(kind, "ok", started.elapsed());
             After::In(requeue.unwrap_or_else(jittered_resync), class)
         }

@@ -56,7 +56,7 @@ impl Member {
         let none = SubmissionStatus::default();
         let status = submission.status.as_ref().unwrap_or(&none);
         let name = submission.metadata.name.clone().unwrap_or_default();
-        let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
+        let is_finished = status.has_ended();
         let known = status.attempt.unwrap_or(spec.attempt);
         let is_over = is_finished && spec.attempt <= known;
         let number = if is_finished && !is_over {
@@ -119,13 +119,8 @@ impl Member {
 }
 
 fn needs_leaderboard(status: &SubmissionStatus) -> bool {
-    let waits = |type_: &str| {
-        let condition = conditions::get(&status.conditions, type_);
-        condition.is_some_and(|c| c.status != "True" && c.reason != reasons::NOT_REQUIRED)
-    };
-    !conditions::is_true(&status.conditions, conditions::FINISHED)
-        || waits(conditions::PUBLISHED)
-        || waits(conditions::RECORDED)
+    let waits = |type_: &str| status.condition(type_).is_some() && !status.is_delivered(type_);
+    !status.has_ended() || waits(conditions::PUBLISHED) || waits(conditions::RECORDED)
 }
 
 /// Whether a change of its Leaderboard may let it start: it has no Job, or the one that it asked for may not be made.

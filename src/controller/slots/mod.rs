@@ -12,7 +12,7 @@ pub mod turns;
 pub use member::check_team;
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::{Stream, StreamExt, stream};
@@ -21,8 +21,10 @@ use kube::runtime::reflector::ObjectRef;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
+use crate::controller::objects::uid_of;
 use crate::controller::slots::turns::{InLine, Limits, Turn};
 use crate::kubernetes::objects::Job;
+use crate::lock::lock;
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{CheckEnd, Leaderboard, Submission};
 use line::Line;
@@ -59,7 +61,7 @@ impl SlotAllocator {
         for object in submissions {
             self.submission(object, false);
         }
-        self.lock().is_synced = true;
+        lock(&self.lines).is_synced = true;
         self.changed.notify_one();
     }
 
@@ -100,7 +102,7 @@ impl SlotAllocator {
         if limits(leaderboard) == Limits::default() {
             return Turn::Go;
         }
-        let lines = self.lock();
+        let lines = lock(&self.lines);
         let line = lines.by_board.get(&board_of(submission));
         let uid = submission.metadata.uid.as_deref().unwrap_or_default();
         line.map_or(Turn::NotInLine, |line| line.turn(uid, submission.spec.attempt))
@@ -130,7 +132,7 @@ impl SlotAllocator {
     /// The Leaderboard has changed: wakes those that may have waited for that.
     pub fn wake_pending(&self, board: &ObjectRef<Leaderboard>) {
         let key = (board.namespace.clone().unwrap_or_default(), board.name.clone());
-        let mut lines = self.lock();
+        let mut lines = lock(&self.lines);
         let names: Vec<String> = lines.by_board.get(&key).map(Line::pending).unwrap_or_default();
         lines
             .woken
@@ -140,13 +142,13 @@ impl SlotAllocator {
 
     /// The check of a Leaderboard that ended last, as far as the watch has shown one.
     pub fn last_check(&self, leaderboard: &Leaderboard) -> Option<CheckEnd> {
-        let lines = self.lock();
+        let lines = lock(&self.lines);
         lines.by_board.get(&key_of(leaderboard))?.last_check.clone()
     }
 
     /// How many Submissions of a Leaderboard there are by state, and how many still need it.
     pub fn census(&self, leaderboard: &Leaderboard) -> (Counts, usize) {
-        let lines = self.lock();
+        let lines = lock(&self.lines);
         lines
             .by_board
             .get(&key_of(leaderboard))
@@ -172,7 +174,7 @@ impl SlotAllocator {
 
     /// Grants what is free. Returns those that have to know.
     fn allocate(&self) -> Vec<ObjectRef<Submission>> {
-        let mut lines = self.lock();
+        let mut lines = lock(&self.lines);
         let mut woken = std::mem::take(&mut lines.woken);
         if !lines.is_synced {
             return woken;
@@ -185,7 +187,7 @@ impl SlotAllocator {
     }
 
     fn change<T>(&self, key: &Key, change: impl FnOnce(&mut Line) -> T) -> T {
-        let mut lines = self.lock();
+        let mut lines = lock(&self.lines);
         let line = lines.by_board.entry(key.clone()).or_default();
         let result = change(line);
         if line.is_dirty {
@@ -195,10 +197,6 @@ impl SlotAllocator {
             lines.by_board.remove(key);
         }
         result
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Lines> {
-        self.lines.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -211,10 +209,6 @@ fn board_of(submission: &Submission) -> Key {
         submission.namespace().unwrap_or_default(),
         submission.spec.leaderboard_name.clone(),
     )
-}
-
-fn uid_of(submission: &Submission) -> String {
-    submission.uid().unwrap_or_default()
 }
 
 fn limits(leaderboard: &Leaderboard) -> Limits {

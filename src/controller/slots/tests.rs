@@ -167,7 +167,7 @@ fn one_that_is_gone_before_it_joins_holds_nothing() {
     world.slots.submission(&b, true);
     world.slots.leaderboard(&world.leaderboard, true);
     assert!(
-        world.slots.lock().by_board.is_empty(),
+        lock(&world.slots.lines).by_board.is_empty(),
         "nothing is kept of what is gone"
     );
 }

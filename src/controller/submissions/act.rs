@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
-use kube::api::{DeleteParams, Patch, PatchParams, PostParams, Preconditions};
+use kube::api::{DeleteParams, Patch, PostParams, Preconditions};
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Client, Resource, ResourceExt};
@@ -25,15 +25,16 @@ use super::phases::{self, Ended, Phase};
 use super::significance::{Change, change, patience};
 use super::spans;
 use super::view::{LogPlace, ObservedTexts, View};
-use crate::controller::objects::uid_of;
+use crate::controller::objects::{key_of, uid_of};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
-use crate::controller::writes::{apply_status, set_finalizer};
+use crate::controller::writes::{apply_status, patch_by, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use crate::observability::metrics::{FailedAttempt, Metrics};
 use crate::observability::traces::Traces;
+use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, conditions, names, reasons};
 
@@ -98,7 +99,7 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
         actor.publish(event).await;
     }
     uses.archive.demand(&view.submission, &plan.status, plan.report);
-    for action in &plan.actions {
+    for action in plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
     if view.texts != ObservedTexts::NotRead && !awaits_publication(&plan.status) {
@@ -109,10 +110,10 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
 
 /// Whether an end is still to be sent to EvalAI, with the texts that were read. Those of a live run are with EvalAI's side already.
 pub fn awaits_publication(status: &SubmissionStatus) -> bool {
-    let published = conditions::get(&status.conditions, conditions::PUBLISHED);
+    let published = status.condition(conditions::PUBLISHED);
     let is_open =
         |c: &Condition| c.status == "False" && ![reasons::NOT_REQUIRED, reasons::REFUSED].contains(&c.reason.as_str());
-    conditions::is_true(&status.conditions, conditions::FINISHED) && published.is_some_and(is_open)
+    status.has_ended() && published.is_some_and(is_open)
 }
 
 struct Actor<'a> {
@@ -134,40 +135,32 @@ impl Actor<'_> {
         Writes::new(self.uses.client.clone(), &self.namespace)
     }
 
-    async fn carry_out(&self, action: &Action, status: &SubmissionStatus) -> Result<(), ActError> {
+    /// Carries one action out. What others do is only handed on: to the slots, the workers of S3, EvalAI and the table.
+    async fn carry_out(&self, action: Action, status: &SubmissionStatus) -> Result<(), ActError> {
+        let (uses, submission) = (self.uses, self.submission());
         match action {
-            Action::ReleaseFinalizer => self.set_finalizer(false).await,
-            Action::CreateJob(number) => self.create_job(status, *number).await,
+            // It went before the status.
+            Action::AddFinalizer => {}
+            Action::ReleaseFinalizer => self.set_finalizer(false).await?,
+            Action::CreateJob(number) => self.create_job(status, number).await?,
             Action::DeleteJob {
                 name,
                 uid,
                 grace_seconds,
-            } => self.delete_job(name, uid, *grace_seconds).await,
-            Action::ForceDeletePod { name, uid } => self.delete_pod(name, uid, 0).await,
-            Action::AnnotateStop { pod, stop } => {
-                let patch = json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } });
-                self.patch::<Pod>("the stop annotation", pod, &patch).await
+            } => self.delete_job(&name, &uid, grace_seconds).await?,
+            Action::ForceDeletePod { name, uid } => self.delete_pod(&name, &uid, 0).await?,
+            Action::AnnotateStop { pod, stop } => self.annotate_stop(&pod, stop).await?,
+            Action::DeleteSubmission { uid, resource_version } => {
+                self.delete_submission(uid, resource_version).await?;
             }
-            Action::DeleteSubmission { uid, resource_version } => self.delete_submission(uid, resource_version).await,
-            other => {
-                self.request(other, status);
-                Ok(())
-            }
-        }
-    }
-
-    /// Hands on what others do: the slots, the workers of S3, EvalAI and the table. Nothing here waits.
-    fn request(&self, action: &Action, status: &SubmissionStatus) {
-        let (uses, submission) = (self.uses, self.submission());
-        match action {
-            Action::JoinLine(place) => uses.slots.join(submission, place.clone()),
-            Action::LookUpImage(question) => uses.images.want(submission, question.clone()),
-            Action::LookForForeignRun(question) => uses.foreign_runs.want(submission, (**question).clone()),
-            Action::ReadOtherResults(question) => uses.other_results.want(submission, (**question).clone()),
-            Action::LookUpNames(question) => uses.addresses.want(submission, (**question).clone()),
+            Action::JoinLine(place) => uses.slots.join(submission, place),
+            Action::LookUpImage(question) => uses.images.want(submission, question),
+            Action::LookForForeignRun(question) => uses.foreign_runs.want(submission, *question),
+            Action::ReadOtherResults(question) => uses.other_results.want(submission, *question),
+            Action::LookUpNames(question) => uses.addresses.want(submission, *question),
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
-            Action::ReadTexts { of } => uses.archive.want_texts(submission, status, *of),
+            Action::ReadTexts { of } => uses.archive.want_texts(submission, status, of),
             Action::AskEvalai => {
                 uses.memory.asks_evalai(submission);
                 uses.external.ask(self.view);
@@ -175,23 +168,16 @@ impl Actor<'_> {
             Action::FollowEvalai => uses.external.follow(self.view, status),
             Action::UpdateEvalai(update) => {
                 uses.external
-                    .update_evalai(uses.memory, uses.archive, self.view, status, *update);
+                    .update_evalai(uses.memory, uses.archive, self.view, status, update);
             }
-            Action::ForgetEvalai => uses.external.forget_evalai(submission),
+            Action::ForgetEvalai => uses.external.hub.forget(&key_of(submission)),
             Action::Forget => {
-                uses.external.forget(submission);
+                uses.external.gone(&key_of(submission));
                 uses.archive.forget(&uid_of(submission));
             }
-            Action::Record { end } => uses.external.record(self.view, status, *end),
-            // The finalizer goes before the status; the others are requests to the API server.
-            Action::AddFinalizer
-            | Action::ReleaseFinalizer
-            | Action::CreateJob(_)
-            | Action::DeleteJob { .. }
-            | Action::ForceDeletePod { .. }
-            | Action::DeleteSubmission { .. }
-            | Action::AnnotateStop { .. } => {}
+            Action::Record { end } => uses.external.record(self.view, status, end),
         }
+        Ok(())
     }
 
     async fn set_finalizer(&self, wanted: bool) -> Result<(), ActError> {
@@ -335,7 +321,8 @@ impl Actor<'_> {
             DeleteParams::background()
         };
         self.uses.memory.forget_job(self.submission());
-        self.delete::<Job>("deleting the Job", name, uid, params).await?;
+        let params = params.preconditions(of_uid(uid));
+        self.delete::<Job>("deleting the Job", name, &params).await?;
         let reference = ObjectRef::<Job>::new(name).within(&self.namespace);
         let Some(job) = self.uses.stores.jobs.get(&reference) else {
             return Ok(());
@@ -348,71 +335,47 @@ impl Actor<'_> {
     }
 
     /// The Job goes with it. A change since the decision, a resume for example, makes this fail, and the next reconcile decides anew.
-    async fn delete_submission(&self, uid: &str, resource_version: &str) -> Result<(), ActError> {
-        let name = self.name();
+    async fn delete_submission(&self, uid: String, resource_version: String) -> Result<(), ActError> {
         let params = DeleteParams::background().preconditions(Preconditions {
-            uid: Some(uid.into()),
-            resource_version: Some(resource_version.into()),
+            uid: Some(uid),
+            resource_version: Some(resource_version),
         });
-        match call(
-            "the deletion",
-            &name,
-            self.writes::<Submission>().delete(&name, &params),
-        )
-        .await
-        {
-            Err(error) if error.is_gone() || error.is_conflict() => return Ok(()),
-            other => other.map(|_| ())?,
+        if self.delete::<Submission>("the deletion", &self.name(), &params).await? {
+            tracing::info!("the Submission is deleted: retention.finishedSeconds have passed since its end");
         }
-        tracing::info!("the Submission is deleted: retention.finishedSeconds have passed since its end");
         Ok(())
     }
 
     async fn delete_pod(&self, name: &str, uid: &str, grace_seconds: i64) -> Result<(), ActError> {
         let params = DeleteParams {
             grace_period_seconds: u32::try_from(grace_seconds).ok(),
+            preconditions: Some(of_uid(uid)),
             ..DeleteParams::default()
         };
-        self.delete::<Pod>("deleting the Pod", name, uid, params).await
+        self.delete::<Pod>("deleting the Pod", name, &params).await?;
+        Ok(())
     }
 
-    /// Deletes the object of this UID. Nothing is left to do where it is gone, or another one has its name.
+    /// Deletes what these parameters ask for; false where it is gone, or another object has its name.
     async fn delete<K: Watchable>(
         &self,
         what: &'static str,
         name: &str,
-        uid: &str,
-        params: DeleteParams,
-    ) -> Result<(), ActError> {
-        let params = params.preconditions(Preconditions {
-            uid: Some(uid.into()),
-            resource_version: None,
-        });
-        match call(what, name, self.writes::<K>().delete(name, &params)).await {
-            Err(error) if !error.is_gone() && !error.is_conflict() => Err(error.into()),
-            _ => Ok(()),
+        params: &DeleteParams,
+    ) -> Result<bool, ActError> {
+        match call(what, name, self.writes::<K>().delete(name, params)).await {
+            Ok(_) => Ok(true),
+            Err(error) if error.is_gone() || error.is_conflict() => Ok(false),
+            Err(error) => Err(error.into()),
         }
     }
 
-    async fn patch<K: Watchable>(
-        &self,
-        what: &'static str,
-        name: &str,
-        patch: &serde_json::Value,
-    ) -> Result<(), ActError> {
-        let params = PatchParams {
-            field_manager: Some(names::MANAGER_CHILDREN.into()),
-            ..PatchParams::default()
-        };
-        match call(
-            what,
-            name,
-            self.writes::<K>().patch(name, &params, &Patch::Merge(patch)),
-        )
-        .await
-        {
-            Err(error) if error.is_gone() => Ok(()),
-            other => Ok(other.map(|_| ())?),
+    async fn annotate_stop(&self, pod: &str, stop: Stop) -> Result<(), ActError> {
+        let patch = Patch::Merge(json!({ "metadata": { "annotations": { names::ANNOTATION_STOP: stop.as_str() } } }));
+        let (api, params) = (self.writes::<Pod>(), patch_by(names::MANAGER_CHILDREN));
+        match call("the stop annotation", pod, api.patch(pod, &params, &patch)).await {
+            Err(error) if !error.is_gone() => Err(error.into()),
+            _ => Ok(()),
         }
     }
 
@@ -447,10 +410,18 @@ fn log_delivery(new: &SubmissionStatus, ended: &Ended) {
     tracing::info!(attempt = new.attempt, "{by}");
 }
 
-fn log_demand(places: &[LogPlace], status: &SubmissionStatus) -> LogDemand {
+/// The object of this UID alone.
+fn of_uid(uid: &str) -> Preconditions {
+    Preconditions {
+        uid: Some(uid.into()),
+        resource_version: None,
+    }
+}
+
+fn log_demand(places: Vec<LogPlace>, status: &SubmissionStatus) -> LogDemand {
     LogDemand {
         job: status.job_number(),
-        places: places.to_vec(),
+        places,
         is_over: status.times.finished.is_some(),
     }
 }

@@ -93,10 +93,7 @@ pub fn question(leaderboard: &LeaderboardSpec, storage: &Storage, attempt: i64) 
         attempt,
         storage: storage.clone(),
         log_group: leaderboard.log_group.clone(),
-        has_role: leaderboard
-            .pod_identity
-            .as_ref()
-            .is_some_and(|identity| identity.role_arn.is_some()),
+        has_role: leaderboard.has_role(),
     }
 }
 

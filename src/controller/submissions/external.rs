@@ -2,7 +2,7 @@
 //! wants into updates and rows. Never waits for either. Decides nothing.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use jiff::Timestamp;
 use kube::ResourceExt;
@@ -14,13 +14,14 @@ use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::controller::objects::{key_of, uid_of};
+use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::services::ObjectKey;
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Publisher, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
-use leaderboard_api::{Ingested, JobNumber, Leaderboard, Rerun, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{Ingested, JobNumber, Leaderboard, Rerun, Submission, SubmissionStatus, names};
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct ExternalSystems {
@@ -39,20 +40,18 @@ impl ExternalSystems {
     }
 
     /// A Leaderboard's way to EvalAI, renewed whenever its spec or token changes.
-    pub fn set_target(&self, leaderboard: &Leaderboard, target: Option<Arc<Target>>) {
-        let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
-        match target {
-            Some(target) => targets.insert(uid_of(leaderboard), target),
-            None => targets.remove(&uid_of(leaderboard)),
-        };
+    pub fn set_target(&self, leaderboard: &Leaderboard, target: Arc<Target>) {
+        lock(&self.targets).insert(uid_of(leaderboard), target);
+    }
+
+    /// Nothing more of a Leaderboard goes to EvalAI.
+    pub fn retire(&self, leaderboard: &Leaderboard) {
+        lock(&self.targets).remove(&uid_of(leaderboard));
+        self.hub.retire(&key_of(leaderboard));
     }
 
     fn target(&self, leaderboard: &Leaderboard) -> Option<Arc<Target>> {
-        self.targets
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .get(&uid_of(leaderboard))
-            .cloned()
+        lock(&self.targets).get(&uid_of(leaderboard)).cloned()
     }
 
     /// What EvalAI is known to say of a submission.
@@ -150,16 +149,6 @@ impl ExternalSystems {
         Some(DesiredUpdate::Partial(Arc::new(payload)))
     }
 
-    /// Both systems have what this object has for them.
-    pub fn forget(&self, submission: &Submission) {
-        self.gone(&key_of(submission));
-    }
-
-    /// Nothing more is wanted of EvalAI; what is known is forgotten.
-    pub fn forget_evalai(&self, submission: &Submission) {
-        self.hub.forget(&key_of(submission));
-    }
-
     /// Writes the row, or lets the next write carry it.
     pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
@@ -177,7 +166,7 @@ impl ExternalSystems {
         }
     }
 
-    /// Drops everything of an object that is gone.
+    /// Drops everything of an object that is gone, or whose end both systems have.
     pub fn gone(&self, key: &ObjectKey) {
         self.hub.forget(key);
         self.recorder.forget(key);
@@ -222,7 +211,7 @@ fn final_update(archive: &ArchiveWorkers, view: &View, status: &SubmissionStatus
 /// Whether it is run only with an image that EvalAI names.
 fn wants_image(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
-    let has_ended = status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
+    let has_ended = status.is_some_and(SubmissionStatus::has_ended);
     submission.spec.image.is_none() && !has_ended
 }
 

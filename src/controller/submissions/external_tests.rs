@@ -18,6 +18,7 @@ use crate::controller::submissions::view::{
     ObservedRoutes, ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::State;
+use leaderboard_api::conditions;
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);

@@ -81,16 +81,6 @@ pub struct LogAnswer {
     pub is_unclear: bool,
 }
 
-/// What became of looking for a log.
-#[derive(Debug, PartialEq, Eq)]
-enum Look {
-    Found(Tail),
-    /// Nobody has one.
-    Nothing,
-    /// One that may have it did not answer.
-    Unclear,
-}
-
 /// Keeps the tail of the first log that is there. Stores it once the submission has come to its end.
 pub(super) async fn keep(
     client: &Client,
@@ -101,11 +91,7 @@ pub(super) async fn keep(
 ) -> LogAnswer {
     let (tail, is_unclear) = match known {
         Some(tail) => (Some(tail), false),
-        None => match look(client, archive, namespace, demand).await {
-            Look::Found(tail) => (Some(tail), false),
-            Look::Nothing => (None, false),
-            Look::Unclear => (None, true),
-        },
+        None => look(client, archive, namespace, demand).await,
     };
     let is_stored = match &tail {
         Some(tail) if demand.is_over => store(archive, tail).await,
@@ -117,8 +103,9 @@ pub(super) async fn keep(
     }
 }
 
-async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogDemand) -> Look {
-    let mut look = Look::Nothing;
+/// The first log that is there, or else whether one that may have it did not answer.
+async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogDemand) -> (Option<Tail>, bool) {
+    let mut is_unclear = false;
     for place in &demand.places {
         let read = async {
             match &place.at {
@@ -130,17 +117,17 @@ async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogD
         match read.unwrap_or_else(|_| Err("no answer in time".into())) {
             Ok(Some(bytes)) => {
                 if let Some(found) = found(demand.job.attempt, place, &bytes) {
-                    return Look::Found(found);
+                    return (Some(found), false);
                 }
             }
             Ok(None) => {}
             Err(why) => {
                 tracing::warn!(container = %place.container, %why, "the log of a failure was not read");
-                look = Look::Unclear;
+                is_unclear = true;
             }
         }
     }
-    look
+    (None, is_unclear)
 }
 
 fn found(attempt: i64, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {

@@ -2,7 +2,7 @@
 //! for once for each attempt, before its first Job, and again while the submission waits for the other program.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -10,6 +10,7 @@ use jiff::Timestamp;
 use super::questions::{self, Observed, Questions};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::report_digest::StoredReport;
+use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use crate::pod::report::{MAX_BYTES, OWNER_KEY, REPORT_KEY};
 use crate::services::archive::{Archive, ArchiveError, Cause, Listed};
@@ -98,7 +99,10 @@ pub type ObservedTraces = Observed<Looked>;
 impl ForeignRuns {
     /// Starts the task that looks.
     pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake<Submission>) -> Self {
-        let places = Arc::new(Places::new(aws.clone()));
+        let places = Arc::new(Places {
+            aws: aws.clone(),
+            tables: Mutex::default(),
+        });
         let look = move |question, _namespace| {
             let places = Arc::clone(&places);
             async move { look(&places, &question).await }
@@ -126,13 +130,6 @@ struct Places {
 }
 
 impl Places {
-    fn new(aws: Aws) -> Self {
-        Self {
-            aws,
-            tables: Mutex::default(),
-        }
-    }
-
     async fn traces(&self, question: &Question) -> Result<Traces, Unread> {
         let (row, stored) = tokio::join!(self.row(question), self.stored(question));
         let stored = stored?;
@@ -166,25 +163,21 @@ impl Places {
             return Ok(None);
         };
         let id = TableId::from(table);
-        let known = self.tables().get(&id).cloned();
+        let known = lock(&self.tables).get(&id).cloned();
         let read = async {
             let described = match known {
                 Some(described) => described,
                 None => Table::describe(&self.aws, table).await?,
             };
-            self.tables().insert(id.clone(), described.clone());
+            lock(&self.tables).insert(id.clone(), described.clone());
             described.read(&question.team, question.run_id.as_str()).await
         };
         let read = read.await;
         if read.is_err() {
             // It may have been made again with other keys.
-            self.tables().remove(&id);
+            lock(&self.tables).remove(&id);
         }
         read.or_else(|error| of_table(&error))
-    }
-
-    fn tables(&self) -> MutexGuard<'_, HashMap<TableId, Table>> {
-        self.tables.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     async fn stored(&self, question: &Question) -> Result<StoredRun, Unread> {

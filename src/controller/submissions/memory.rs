@@ -3,13 +3,14 @@
 //! Needed because a cache may lag behind our own writes: a reconcile must never decide on a status older than its own.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use kube::ResourceExt;
 use tokio::time::Instant;
 
 use crate::controller::objects::uid_of;
+use crate::lock::lock;
 use leaderboard_api::{Submission, SubmissionStatus};
 
 /// Places in line that are written without waiting for their turn.
@@ -51,7 +52,7 @@ impl Memory {
     /// The object with the status that we wrote last, where the cache does not have it yet.
     pub fn with_own_status(&self, submission: Arc<Submission>) -> Arc<Submission> {
         self.is_shown(&submission);
-        let entries = self.lock();
+        let entries = lock(&self.entries);
         let written = entries
             .get(&uid_of(submission.as_ref()))
             .and_then(|e| e.written.as_ref()?.status.as_deref());
@@ -72,12 +73,12 @@ impl Memory {
             at: Instant::now(),
             status: Some(Box::new(status.clone())),
         };
-        self.lock().entry(uid_of(submission)).or_default().written = Some(written);
+        lock(&self.entries).entry(uid_of(submission)).or_default().written = Some(written);
     }
 
     /// The cache shows an object: our own status goes once that is as new.
     pub fn is_shown(&self, submission: &Submission) {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let entry = entries.get_mut(&uid_of(submission));
         if let Some(written) = entry.and_then(|e| e.written.as_mut())
             && version(submission) >= written.version
@@ -88,7 +89,7 @@ impl Memory {
 
     /// Time since our last write of its status; None if this process has not written it.
     pub fn since_write(&self, submission: &Submission) -> Option<Duration> {
-        let entries = self.lock();
+        let entries = lock(&self.entries);
         entries
             .get(&uid_of(submission))
             .and_then(|e| e.written.as_ref())
@@ -98,14 +99,14 @@ impl Memory {
     /// How long a changed place has to wait for its write; None: not at all. The first in line are written at once; of the others
     /// each has a moment of its own, so that a step of a thousand is not a thousand writes.
     pub fn place_waits(&self, submission: &Submission, position: i32, now: Instant) -> Option<Duration> {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let entry = entries.entry(uid_of(submission)).or_default();
         if position <= FIRST_PLACES {
             entry.place_at = None;
             return None;
         }
         let at = *entry.place_at.get_or_insert_with(|| {
-            let mut next = self.next_place.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut next = lock(&self.next_place);
             let at = next.unwrap_or(now).max(now);
             *next = Some(at + PLACE_PACE);
             at
@@ -119,30 +120,30 @@ impl Memory {
 
     /// Routes of the last partial result of the present attempt.
     pub fn partial_sent(&self, submission: &Submission) -> Option<u32> {
-        let (attempt, done) = self.lock().get(&uid_of(submission))?.partial?;
+        let (attempt, done) = lock(&self.entries).get(&uid_of(submission))?.partial?;
         (Some(attempt) == submission.status.as_ref()?.attempt).then_some(done)
     }
 
     /// Remembers a partial result.
     pub fn sent_partial(&self, submission: &Submission, attempt: i64, done: u32) {
-        self.lock().entry(uid_of(submission)).or_default().partial = Some((attempt, done));
+        lock(&self.entries).entry(uid_of(submission)).or_default().partial = Some((attempt, done));
     }
 
     /// Remembers a Job that was created.
     pub fn created_job(&self, submission: &Submission, name: String) {
-        self.lock().entry(uid_of(submission)).or_default().job = Some((name, Instant::now()));
+        lock(&self.entries).entry(uid_of(submission)).or_default().job = Some((name, Instant::now()));
     }
 
     /// Forgets the Job that was created: the cache shows it, or it is being deleted.
     pub fn forget_job(&self, submission: &Submission) {
-        if let Some(entry) = self.lock().get_mut(&uid_of(submission)) {
+        if let Some(entry) = lock(&self.entries).get_mut(&uid_of(submission)) {
             entry.job = None;
         }
     }
 
     /// Whether the cache may not show yet that the Job of this name was created.
     pub fn awaits_job(&self, submission: &Submission, name: &str) -> bool {
-        let entries = self.lock();
+        let entries = lock(&self.entries);
         let job = entries.get(&uid_of(submission)).and_then(|entry| entry.job.as_ref());
         job.is_some_and(|(known, at)| known == name && at.elapsed() < JOB_SHOWS)
     }
@@ -150,7 +151,7 @@ impl Memory {
     /// Remembers since when EvalAI has been asked about an attempt.
     pub fn asks_evalai(&self, submission: &Submission) {
         let attempt = submission.spec.attempt;
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let entry = entries.entry(uid_of(submission)).or_default();
         if entry.asked.is_none_or(|(of, _)| of != attempt) {
             entry.asked = Some((attempt, Instant::now()));
@@ -159,7 +160,7 @@ impl Memory {
 
     /// How long EvalAI has been asked about the present attempt.
     pub fn evalai_waited(&self, submission: &Submission) -> Duration {
-        let entries = self.lock();
+        let entries = lock(&self.entries);
         let asked = entries.get(&uid_of(submission)).and_then(|entry| entry.asked);
         let asked = asked.filter(|(of, _)| *of == submission.spec.attempt);
         asked.map_or(Duration::ZERO, |(_, at)| at.elapsed())
@@ -167,11 +168,7 @@ impl Memory {
 
     /// Drops an object that is gone.
     pub fn forget(&self, uid: &str) {
-        self.lock().remove(uid);
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry>> {
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.entries).remove(uid);
     }
 }
 
@@ -270,7 +267,7 @@ mod tests {
         let memory = Memory::default();
         let old = object("9", "old");
         memory.wrote(&old, old.status.as_ref().unwrap(), "12");
-        let keeps = || memory.lock()["u"].written.as_ref().unwrap().status.is_some();
+        let keeps = || lock(&memory.entries)["u"].written.as_ref().unwrap().status.is_some();
         assert!(keeps());
         memory.is_shown(&object("12", "new"));
         assert!(!keeps() && memory.since_write(&old).is_some());

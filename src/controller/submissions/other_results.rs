@@ -1,7 +1,6 @@
 //! How many routes another program's run of a submission has, for a Leaderboard that only observes: read once, after both have ended,
 //! from the results that the original pipeline stores below the prefix of the run.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Deserialize;
@@ -58,9 +57,9 @@ pub type ObservedRoutes = Observed<Answer>;
 impl OtherResults {
     /// Starts the task that reads.
     pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake<Submission>) -> Self {
-        let aws = Arc::new(aws.clone());
+        let aws = aws.clone();
         let read = move |question: Question, _namespace| {
-            let aws = Arc::clone(&aws);
+            let aws = aws.clone();
             async move {
                 let read = tokio::time::timeout(LIMIT, read(&aws, &question)).await;
                 read.unwrap_or_else(|_| {

@@ -4,10 +4,9 @@
 //! controller that was restarted in the middle of a phase finds its beginning. Kubernetes keeps most of them in whole seconds.
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 
 use super::view::View;
-use leaderboard_api::conditions::{self, ARCHIVED, FINISHED, PUBLISHED, RECORDED, RUNNING};
+use leaderboard_api::conditions::{ARCHIVED, FINISHED, PUBLISHED, RECORDED, RUNNING};
 use leaderboard_api::{Ingested, SubmissionStatus, reasons};
 
 /// What a submission goes through.
@@ -137,15 +136,15 @@ impl Step<'_> {
             found.add(Phase::Start, scheduled, started);
         }
         if is_over {
-            let end = self.new.times.finished.as_ref().filter(|_| is_finished(self.new));
+            let end = self.new.times.finished.as_ref().filter(|_| self.new.has_ended());
             let end = end.map(|time| time.0).or(self.view.ended_at());
             found.add(Phase::Run, Some(started), end.unwrap_or(self.view.now));
         }
     }
 
     fn to_end(&self, found: &mut Found) {
-        let finished = condition(self.new, FINISHED).filter(|end| end.status == "True");
-        if let Some(end) = finished.filter(|_| !self.old.is_some_and(is_finished)) {
+        let finished = self.new.end();
+        if let Some(end) = finished.filter(|_| !self.old.is_some_and(SubmissionStatus::has_ended)) {
             found.add(Phase::Attempt, self.begun(), end.last_transition_time.0);
         }
         let over = self.new.times.finished.as_ref().map(|time| time.0);
@@ -154,8 +153,11 @@ impl Step<'_> {
             (RECORDED, Phase::Record),
             (PUBLISHED, Phase::Publish),
         ] {
-            let was = self.old.is_some_and(|old| conditions::is_true(&old.conditions, type_));
-            let is = condition(self.new, type_).filter(|found| found.status == "True" && !was && finished.is_some());
+            let was = self.old.is_some_and(|old| old.is_true(type_));
+            let is = self
+                .new
+                .condition(type_)
+                .filter(|found| found.status == "True" && !was && finished.is_some());
             let Some(is) = is else { continue };
             let published = self.new.times.published.as_ref().filter(|_| phase == Phase::Publish);
             let end = published.unwrap_or(&is.last_transition_time).0;
@@ -168,8 +170,8 @@ impl Step<'_> {
         if self.new.attempt == Some(1) {
             return Some(created(self.view));
         }
-        let unfinished = |status| condition(status, FINISHED).filter(|end| end.status != "True");
-        let shown = self.old.and_then(unfinished).or_else(|| unfinished(self.new));
+        let mut known = self.old.into_iter().chain([self.new]);
+        let shown = known.find_map(|status| status.condition(FINISHED).filter(|end| end.status != "True"));
         shown.map(|end| end.last_transition_time.0)
     }
 
@@ -181,7 +183,7 @@ impl Step<'_> {
         let scheduled = known.times.scheduled.as_ref().map(|time| time.0);
         let of_status = of_status.filter(|started| scheduled.is_some_and(|scheduled| *started >= scheduled));
         let seen = || {
-            let running = condition(known, RUNNING).filter(|running| running.status == "True");
+            let running = known.condition(RUNNING).filter(|running| running.status == "True");
             running.map(|running| running.last_transition_time.0)
         };
         of_pod.or(of_status).or_else(seen)
@@ -190,24 +192,18 @@ impl Step<'_> {
     /// Whether no further run of the present Job comes.
     fn is_job_over(&self) -> bool {
         let Some(old) = self.old else {
-            return is_finished(self.new);
+            return self.new.has_ended();
         };
         let is_replaced = self.new.retry > old.retry || self.new.recreated > old.recreated;
-        is_replaced || (is_finished(self.new) && !is_finished(old))
+        is_replaced || (self.new.has_ended() && !old.has_ended())
     }
-}
-
-fn condition<'a>(status: &'a SubmissionStatus, type_: &str) -> Option<&'a Condition> {
-    conditions::get(&status.conditions, type_)
-}
-
-fn is_finished(status: &SubmissionStatus) -> bool {
-    conditions::is_true(&status.conditions, FINISHED)
 }
 
 /// Whether agents of the present Job run, or have run and may come back.
 fn has_run(status: &SubmissionStatus) -> bool {
-    condition(status, RUNNING).is_some_and(|running| running.status == "True" || running.reason == reasons::REPLACING)
+    status
+        .condition(RUNNING)
+        .is_some_and(|running| running.status == "True" || running.reason == reasons::REPLACING)
 }
 
 fn created(view: &View) -> Timestamp {

@@ -16,12 +16,8 @@ pub use rules::{OverlayError, validate, validate_overlay};
 /// Names that stand for the containers of all pairs.
 const ALIASES: [&str; 2] = ["simulator", "agent"];
 
-/// Lays `overlay` over a PodTemplateSpec. Only for overlays that [`validate_overlay`] accepts.
-pub(super) fn apply(template: &mut Value, overlay: &Value) {
-    merge(template, overlay);
-}
-
-fn merge(base: &mut Value, overlay: &Value) {
+/// Lays `overlay` over a PodTemplateSpec, or a part of one. Only for overlays that [`validate_overlay`] accepts.
+pub(super) fn apply(base: &mut Value, overlay: &Value) {
     match (base, overlay) {
         (Value::Object(base), Value::Object(overlay)) => merge_objects(base, overlay),
         (base, overlay) => *base = without_nulls(overlay),
@@ -35,7 +31,7 @@ fn merge_objects(base: &mut Map<String, Value>, overlay: &Map<String, Value>) {
                 base.remove(key);
             }
             (Some(Value::Array(known)), Value::Array(added)) => merge_lists(key, known, added),
-            (Some(known), value) => merge(known, value),
+            (Some(known), value) => apply(known, value),
             (None, value) => {
                 base.insert(key.clone(), without_nulls(value));
             }
@@ -51,10 +47,10 @@ fn merge_lists(field: &str, base: &mut Vec<Value>, overlay: &[Value]) {
             base.extend(added);
         }
         "containers" => merge_containers(base, overlay),
-        "volumeMounts" => merge_by("mountPath", base, overlay, merge),
+        "volumeMounts" => merge_by("mountPath", base, overlay, apply),
         // Merged deep, a variable could end up with both a value and a source.
         "env" => merge_by("name", base, overlay, |known, item| *known = without_nulls(item)),
-        _ if named(base) && named(overlay) => merge_by("name", base, overlay, merge),
+        _ if named(base) && named(overlay) => merge_by("name", base, overlay, apply),
         _ => *base = overlay.iter().map(without_nulls).collect(),
     }
 }
@@ -79,7 +75,7 @@ fn merge_containers(base: &mut [Value], overlay: &[Value]) {
         for known in base.iter_mut() {
             let own = name(known);
             if addresses(&addressed, &own) {
-                merge(known, item);
+                apply(known, item);
                 known["name"] = own.into();
             }
         }

@@ -2,7 +2,7 @@
 //! reconcile waits for such a service.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::stream::FuturesUnordered;
@@ -13,6 +13,7 @@ use tokio::time::Instant;
 use tracing::Instrument;
 
 use crate::controller::objects::{Wake, uid_of};
+use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
@@ -75,11 +76,7 @@ impl<Q: Question> Questions<Q> {
         F: Future<Output = Q::Answer> + Send + 'static,
     {
         let shared = Arc::new(Shared::default());
-        let stop = tasks.stop().clone();
-        let asking = ask_all(ask, Arc::clone(&shared), wake);
-        tasks.stay(name, async move {
-            tokio::select! { () = stop.wait() => {}, () = asking => {} }
-        });
+        tasks.until_stop(name, ask_all(ask, Arc::clone(&shared), wake));
         Self(shared)
     }
 
@@ -97,7 +94,7 @@ impl<Q: Question> Questions<Q> {
 
     /// Drops what is known for an object that is gone.
     pub fn forget(&self, uid: &str) {
-        self.0.lock().remove(uid);
+        lock(&self.0.entries).remove(uid);
     }
 }
 
@@ -111,14 +108,10 @@ impl<Q: Question> Default for Shared<Q> {
 }
 
 impl<Q: Question> Shared<Q> {
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, Entry<Q>>> {
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     pub(super) fn want(&self, uid: String, by: ObjectRef<Submission>, question: Q) {
         let now = Instant::now();
         let age = |entry: &Entry<Q>| now.saturating_duration_since(entry.asked);
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         entries.retain(|_, entry| entry.answer.is_none() || age(entry) < KEPT);
         if let Some(entry) = entries.get_mut(&uid).filter(|entry| entry.question == question) {
             // The old answer stays until there is another one: what is shown does not flap.
@@ -142,7 +135,7 @@ impl<Q: Question> Shared<Q> {
     }
 
     pub(super) fn observe(&self, uid: &str, attempt: i64) -> Observed<Q::Answer> {
-        let entries = self.lock();
+        let entries = lock(&self.entries);
         let Some(entry) = entries.get(uid).filter(|entry| entry.question.attempt() == attempt) else {
             return Observed::NotAsked;
         };
@@ -154,7 +147,7 @@ impl<Q: Question> Shared<Q> {
 
     /// The question that has waited longest, with the UID and the namespace of its submission.
     pub(super) fn next(&self) -> Option<(String, Q, String)> {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let due = entries
             .iter_mut()
             .filter(|(_, entry)| entry.is_due && !entry.is_under_way);
@@ -166,12 +159,15 @@ impl<Q: Question> Shared<Q> {
 
     /// What the lines about a question are written in.
     fn log_of(&self, uid: &str) -> LogSpan {
-        self.lock().get(uid).map(|entry| entry.log.clone()).unwrap_or_default()
+        lock(&self.entries)
+            .get(uid)
+            .map(|entry| entry.log.clone())
+            .unwrap_or_default()
     }
 
     /// Takes an answer in. Returns whom it is for.
     pub(super) fn done(&self, uid: &str, question: &Q, answer: Q::Answer) -> Option<ObjectRef<Submission>> {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let entry = entries.get_mut(uid).filter(|entry| entry.question == *question)?;
         entry.is_under_way = false;
         entry.answer = Some(Arc::new(answer));

@@ -7,6 +7,7 @@ use sha2::{Digest, Sha256};
 use crate::pod::report::{Logs, Report, ReportError, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
+use leaderboard_api::{Progress, Score};
 
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
@@ -77,6 +78,26 @@ impl ReportDigest {
         Ok(is_of.then(|| (Self::of(&report, ReportId::of(bytes)), report)))
     }
 
+    /// Whether all routes are done, and nothing more comes.
+    pub fn is_complete(&self) -> bool {
+        self.is_final && self.done == self.total && self.total > 0
+    }
+
+    /// Whether it says how a run came to its own end, whatever becomes of its Job.
+    pub fn is_verdict(&self) -> bool {
+        self.is_complete() || (self.is_final && self.why.is_some())
+    }
+
+    pub fn progress(&self) -> Progress {
+        Progress::new(clamp(self.done), clamp(self.total))
+    }
+
+    /// The score so far, or of all routes.
+    pub fn score(&self, is_final: bool) -> Option<Score> {
+        let (completion, penalty) = (self.route_completion, self.infraction_penalty);
+        Some(Score::new(self.score?, completion, penalty, is_final))
+    }
+
     pub fn of(report: &Report, id: ReportId) -> Self {
         Self {
             id,
@@ -110,6 +131,11 @@ fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
     let columns = [Format::V1, Format::V2].into_iter().flat_map(metrics);
     let kept = columns.filter_map(|metric| all.remove_entry(metric.name));
     Some(Box::new(kept.collect()))
+}
+
+/// A number of a report as the status has it.
+pub fn clamp(number: u32) -> i32 {
+    i32::try_from(number).unwrap_or(i32::MAX)
 }
 
 fn cut(text: &str) -> String {

@@ -5,12 +5,13 @@
 //! original takes it from here. Pure; knows no client.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
+use crate::lock::lock;
 use crate::services::evalai::row::Row;
 use leaderboard_api::{Rerun, Submission, names};
 
@@ -40,7 +41,7 @@ pub(super) fn original(
                 && other.status.as_ref().and_then(|s| s.team.as_ref()?.id.as_ref()) == team.as_ref()
         })
         .collect();
-    let mut names = row.jobs.iter().rev().filter_map(|job| submission_of(job));
+    let mut names = row.jobs.iter().rev().filter_map(|job| Some(split(job)?.0));
     let named = names.find(|name| others.iter().any(|other| other.metadata.name.as_deref() == Some(*name)));
     let name = named.map(str::to_owned).or_else(|| copied(row, submission, &others))?;
     Some(Rerun {
@@ -73,11 +74,6 @@ pub(super) fn last_attempt(row: &Row) -> i64 {
     attempts.map(|(_, attempt)| attempt).max().unwrap_or(0)
 }
 
-/// The Submission of the first Job of an attempt.
-fn submission_of(job: &str) -> Option<&str> {
-    split(job).map(|(name, _)| name)
-}
-
 /// Submission and attempt of a first Job, `<name>-<attempt>`.
 fn split(job: &str) -> Option<(&str, i64)> {
     let (name, attempt) = job.rsplit_once('-')?;
@@ -98,7 +94,7 @@ impl Reruns {
             submission_name: submission.name_any(),
             time: of.time.clone(),
         };
-        let mut known = self.lock();
+        let mut known = lock(&self.0);
         if is_gone {
             if known.get(&key) == Some(&rerun) {
                 known.remove(&key);
@@ -112,11 +108,7 @@ impl Reruns {
     /// What a submission was re-run as.
     pub fn of(&self, submission: &Submission) -> Option<Rerun> {
         let key = (submission.namespace().unwrap_or_default(), submission.name_any());
-        self.lock().get(&key).cloned()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<(String, String), Rerun>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0).get(&key).cloned()
     }
 }
 

@@ -22,18 +22,12 @@ fn texts(view: &View) -> Option<&Texts> {
 
 /// The payload of a final result: without results of its own where none are stored.
 pub(super) fn payload(view: &View) -> Payload {
-    let Some(texts) = texts(view) else {
-        return Payload {
-            phase: phase(view),
-            result: "[]".into(),
-            ..Payload::default()
-        };
-    };
+    let texts = texts(view);
     Payload {
         phase: phase(view),
-        result: texts.result.clone(),
-        stdout: texts.stdout.clone(),
-        metadata: texts.metadata.clone(),
+        result: texts.map_or_else(|| "[]".to_owned(), |texts| texts.result.clone()),
+        stdout: texts.map(|texts| texts.stdout.clone()).unwrap_or_default(),
+        metadata: texts.map(|texts| texts.metadata.clone()).unwrap_or_default(),
         ..Payload::default()
     }
 }

@@ -153,7 +153,7 @@ fn number(failures: &InfrastructureFailures) -> usize {
 /// When it ended with results that count.
 fn finish(submission: &Submission) -> Option<Timestamp> {
     let status = submission.status.as_ref()?;
-    let end = conditions::get(&status.conditions, conditions::FINISHED)?;
+    let end = status.condition(conditions::FINISHED)?;
     let is_finish = end.status == "True" && end.reason == reasons::FINISHED;
     is_finish.then(|| status.times.finished.as_ref().map(|time| time.0))?
 }

@@ -15,7 +15,7 @@ use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
-use leaderboard_api::{JobNumber, Leaderboard, Rerun, Submission};
+use leaderboard_api::{JobNumber, Leaderboard, Rerun, Submission, names};
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]
@@ -201,6 +201,13 @@ pub struct ContainerView {
     pub last: Option<EndView>,
 }
 
+impl ContainerView {
+    /// Whether it belongs to the Pod's own ones, which run before the agents.
+    pub fn is_before_agents(&self) -> bool {
+        names::INIT_CONTAINERS.contains(&self.name.as_str())
+    }
+}
+
 /// How a container last ended.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EndView {
@@ -216,6 +223,13 @@ pub struct EndView {
     pub own_reason: Option<String>,
     /// The sentence of a container of the host's, or Kubernetes' own.
     pub why: Option<String>,
+}
+
+impl EndView {
+    /// Whether the kubelet could not even start it.
+    pub fn is_start_error(&self) -> bool {
+        matches!(self.reason.as_str(), "StartError" | "ContainerCannotRun")
+    }
 }
 
 /// What was known of a run when its report was asked for. What is stored later than that is not in the answer.
@@ -277,11 +291,6 @@ impl ObservedReport {
             Self::Ours(report) => Some(report),
             _ => None,
         }
-    }
-
-    /// Nothing was stored for this attempt.
-    pub fn is_nothing(&self) -> bool {
-        matches!(self, Self::Absent | Self::Foreign)
     }
 }
 

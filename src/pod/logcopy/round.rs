@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hyper::body::Bytes;
@@ -13,6 +13,7 @@ use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
 use super::{LANDING, LAST_FLUSH, LogcopyError, create};
+use crate::lock::lock;
 use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
@@ -232,7 +233,7 @@ impl Rounds {
         let status = self.setting.places.status();
         let pairs = self.pairs();
         let read = move || {
-            let gathered = reader.lock().unwrap_or_else(PoisonError::into_inner).round();
+            let gathered = lock(&reader).round();
             let files = Files::find(&tree, pairs);
             Found {
                 logs: files.wanted(&gathered.refused),

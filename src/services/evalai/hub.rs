@@ -4,7 +4,7 @@
 //! each, which ends when nothing uses the token any more. Knows no policy.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
@@ -20,6 +20,7 @@ use super::types::{
     Changed, DesiredUpdate, InboxTrouble, Key, Load, Publisher, Subject, SubmissionState, SweepRow, Target, Usage,
     WriteGuard,
 };
+use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use crate::services::meter::Meter;
 
@@ -127,7 +128,7 @@ impl State {
 
 impl Inner {
     fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Started by `hub`, one for each server and token. Holds the queue's lock only for moments, never while it waits.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use futures::stream::{FuturesUnordered, StreamExt};
@@ -15,6 +15,7 @@ use super::client::Client;
 use super::queue::{Next, Now, Queue, Ticket};
 use super::request::Reply;
 use super::types::{Arrival, Changed, Settled, SweepRow, WriteGuard};
+use crate::lock::lock;
 use crate::services::token::Token;
 
 /// How long answers are waited for at the end: longer than a write may take.
@@ -73,12 +74,12 @@ impl Shared {
 
     /// The queue. A panic elsewhere leaves it whole: every change of it is one call.
     pub fn queue(&self) -> MutexGuard<'_, Queue> {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.queue)
     }
 
     /// Takes a renewed token. Returns whether it is another one.
     pub fn renew(&self, token: &Arc<Token>) -> bool {
-        let mut kept = self.token.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut kept = lock(&self.token);
         let other = *kept != *token;
         if other {
             *kept = token.clone();
@@ -87,7 +88,7 @@ impl Shared {
     }
 
     fn token(&self) -> Arc<Token> {
-        self.token.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.token).clone()
     }
 
     /// Reports what has changed.

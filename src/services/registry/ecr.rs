@@ -2,7 +2,7 @@
 //! ECR, whose client would be the largest crate of the program.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use aws_credential_types::provider::ProvideCredentials;
@@ -12,6 +12,7 @@ use serde_json::Value;
 use tokio::time::Instant;
 
 use super::auth::Credentials;
+use crate::lock::lock;
 use crate::services::aws::Aws;
 
 /// How long a password is kept at most; it usually holds for twelve hours.
@@ -105,7 +106,7 @@ impl Ecr {
     }
 
     fn kept(&self) -> MutexGuard<'_, HashMap<String, Kept>> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.kept)
     }
 
     fn known(&self, region: &str) -> Option<Credentials> {

@@ -10,8 +10,7 @@ mod ecr;
 mod manifest;
 
 use std::collections::HashMap;
-use std::fmt::Write;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 use std::time::Duration;
 
 use reqwest::header::{ACCEPT, AUTHORIZATION, LOCATION, WWW_AUTHENTICATE};
@@ -21,6 +20,7 @@ use tokio::time::{Instant, timeout};
 
 use super::aws::Aws;
 use super::public::{self, Reach};
+use crate::lock::lock;
 use auth::Challenge;
 pub use auth::Credentials;
 use ecr::Ecr;
@@ -138,13 +138,13 @@ impl Registries {
     }
 
     fn known_silence(&self, registry: &str) -> Option<String> {
-        let known = self.left_alone.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = lock(&self.left_alone);
         let (since, why) = known.get(registry)?;
         (since.elapsed() < LEFT_ALONE).then(|| why.clone())
     }
 
     fn leave_alone(&self, registry: &str, why: &str) {
-        let mut known = self.left_alone.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut known = lock(&self.left_alone);
         known.retain(|_, (since, _)| since.elapsed() < LEFT_ALONE);
         if known.len() < MOST_LEFT_ALONE {
             known
@@ -337,7 +337,7 @@ impl<'a> Session<'a> {
     }
 
     fn authorization(&self) -> Option<String> {
-        let known = self.authorization.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = lock(&self.authorization);
         known.clone()
     }
 
@@ -375,7 +375,7 @@ impl<'a> Session<'a> {
             }
             _ => return Err(self.refusal(answer.status(), 0)),
         };
-        *self.authorization.lock().unwrap_or_else(PoisonError::into_inner) = Some(header);
+        *lock(&self.authorization) = Some(header);
         Ok(())
     }
 
@@ -427,11 +427,7 @@ async fn body(mut answer: Response, largest: usize) -> Result<Vec<u8>, &'static 
 
 /// The digest of what was read, which has to be the one that was asked for. Another one is the registry's fault, or its network's.
 fn checked(body: &[u8], wanted: Option<&str>) -> Result<String, Fault> {
-    let mut digest = String::from("sha256:");
-    for byte in Sha256::digest(body) {
-        // A text takes whatever is written.
-        let _ = write!(digest, "{byte:02x}");
-    }
+    let digest = format!("sha256:{}", hex::encode(Sha256::digest(body)));
     if wanted.is_some_and(|wanted| wanted != digest) {
         return Err(Fault::Unusable("its answer is not what its digest says".into()));
     }

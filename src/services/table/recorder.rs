@@ -4,7 +4,7 @@
 //! chooses what is written next.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use futures::FutureExt;
@@ -15,6 +15,7 @@ use tokio::time::Instant;
 use super::ledger::{Ledger, RowState, RowUpdate, TableId};
 use super::{Row, Table, TableError, Written};
 use crate::backoff::Backoff;
+use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use crate::services::ObjectKey;
@@ -123,10 +124,6 @@ impl Shared {
     fn ledger(&self) -> MutexGuard<'_, Ledger> {
         lock(&self.ledger)
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Writes the rows of one table.

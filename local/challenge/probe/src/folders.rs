@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 use nix::libc;
 
 use crate::call::{call, of};
-use crate::modes;
 
 /// An access control list's name as an extended attribute.
 const ACCESS_LIST: &CStr = c"system.posix_acl_access";
@@ -20,9 +19,9 @@ const GROUP: u16 = 0x04;
 const MASK: u16 = 0x10;
 const OTHERS: u16 = 0x20;
 
-/// The status folder of this container's pair.
-pub(crate) fn own() -> PathBuf {
-    format!("/tmp/status/agent-{}", modes::pair()).into()
+/// The status folder of a pair's agent.
+pub(crate) fn of_agent(pair: u16) -> PathBuf {
+    format!("/tmp/status/agent-{pair}").into()
 }
 
 /// Deletes all that is in it, and then tries to delete it or to move it away.

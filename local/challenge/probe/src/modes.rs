@@ -87,9 +87,9 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
         "status-pipe" => first_life(|| Ok(mkfifo(Path::new(&status("start1")), Mode::S_IRWXU)?)),
         "folder-shut" => shut(),
-        "folder-listed" => folders::forbid(&folders::own(), &[LOGCOPY, SIMULATOR]).and_then(|()| exit(1)),
+        "folder-listed" => folders::forbid(&folders::of_agent(pair()), &[LOGCOPY, SIMULATOR]).and_then(|()| exit(1)),
         // One that can be deleted would be seen: the honest agent's run ends well.
-        "folder-deleted" => match folders::delete(&folders::own()) {
+        "folder-deleted" => match folders::delete(&folders::of_agent(pair())) {
             Ok(()) => Ok(()),
             Err(_) => exit(1),
         },
@@ -123,13 +123,14 @@ pub fn honest(arguments: &[String], knobs: &str) -> io::Result<Infallible> {
 }
 
 fn status(mark: &str) -> String {
-    format!("{}/agent-{}.{mark}", folders::own().display(), pair())
+    let pair = pair();
+    format!("{}/agent-{pair}.{mark}", folders::of_agent(pair).display())
 }
 
 /// Nobody else could see the end, if the folder stayed shut; and nothing but the mark of the end says that no results will come.
 fn shut() -> io::Result<()> {
     fs::write(CHECKPOINT, COMPLETE)?;
-    fs::set_permissions(folders::own(), Permissions::from_mode(0o700))?;
+    fs::set_permissions(folders::of_agent(pair()), Permissions::from_mode(0o700))?;
     exit(0)
 }
 

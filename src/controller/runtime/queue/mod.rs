@@ -9,7 +9,7 @@ pub mod urgency;
 
 use std::fmt;
 use std::pin::pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use kube::Resource;
 use kube::runtime::reflector::ObjectRef;
@@ -17,6 +17,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
+use crate::lock::lock;
 use crate::observability::metrics::QueueMetrics;
 use crate::observability::shutdown::Stop;
 pub use lanes::Class;
@@ -71,13 +72,13 @@ impl Queue {
 
     /// Something has happened to an object.
     pub fn add(&self, key: impl Into<Key>, class: Class) {
-        self.state().add(key.into(), class, Instant::now());
+        lock(&self.state).add(key.into(), class, Instant::now());
         self.changed.notify_one();
     }
 
     /// An object was deleted.
     pub fn forget(&self, key: &Key) {
-        self.state().forget(key);
+        lock(&self.state).forget(key);
     }
 
     /// Reconciles until the stop, and returns once those are done that have begun. Dropped, it ends them.
@@ -97,7 +98,7 @@ impl Queue {
                 });
                 running.spawn(async move { (key, reconcile.await) });
             }
-            let next = self.state().next_time();
+            let next = lock(&self.state).next_time();
             let due = async {
                 match next {
                     Some(at) => sleep_until(at).await,
@@ -120,7 +121,7 @@ impl Queue {
     }
 
     fn begin(&self) -> Option<Key> {
-        let mut state = self.state();
+        let mut state = lock(&self.state);
         let begun = state.begin(Instant::now());
         self.metrics.waiting(state.depth());
         let Begun { key, class, waited } = begun?;
@@ -130,12 +131,8 @@ impl Queue {
 
     fn finish(&self, ended: Option<(Key, After)>) {
         if let Some((key, after)) = ended {
-            self.state().finish(&key, after, Instant::now());
+            lock(&self.state).finish(&key, after, Instant::now());
         }
-    }
-
-    fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -150,7 +147,7 @@ impl Turn {
     /// Whether it may continue, once it knows whether it creates a Job. If not, it changes nothing and ends with
     /// `After::WithPermit`.
     pub fn may_continue(&self, creates_job: bool) -> bool {
-        let may_continue = self.queue.state().may_continue(&self.key, creates_job);
+        let may_continue = lock(&self.queue.state).may_continue(&self.key, creates_job);
         if !creates_job {
             self.queue.changed.notify_one();
         }

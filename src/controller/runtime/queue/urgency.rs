@@ -4,7 +4,6 @@ use super::Class;
 use crate::controller::submissions::decide::Plan;
 use crate::controller::submissions::view::Stage;
 use crate::kubernetes::objects::{ContainerStatus, Job, Pod};
-use leaderboard_api::conditions::{self, FINISHED};
 use leaderboard_api::{Submission, SubmissionStatus};
 
 /// Conditions of a Job that has ended, or is about to.
@@ -17,7 +16,7 @@ pub fn of_submission(submission: &Submission) -> Class {
 
 /// An answer of S3, of the table or of the API server.
 pub fn of_answer(submission: &Submission) -> Class {
-    if submission.status.as_ref().is_some_and(is_finished) {
+    if submission.status.as_ref().is_some_and(SubmissionStatus::has_ended) {
         return Class::Urgent;
     }
     of_submission(submission)
@@ -53,7 +52,7 @@ pub fn of_pod(pod: &Pod, is_gone: bool) -> Class {
 /// What a reconcile has decided, for all that follows it.
 pub fn after(submission: &Submission, plan: &Plan) -> Class {
     let awaits_report_of_end = plan.report.as_ref().is_some_and(|demand| demand.stage > Stage::Live);
-    if awaits_report_of_end && !is_finished(&plan.status) {
+    if awaits_report_of_end && !plan.status.has_ended() {
         return Class::Urgent;
     }
     of(submission, Some(&plan.status))
@@ -65,16 +64,12 @@ fn of(submission: &Submission, status: Option<&SubmissionStatus>) -> Class {
         return urgent_or(is_deleting || submission.spec.cancel, Class::New);
     };
     let is_behind = status.attempt.is_some_and(|present| submission.spec.attempt > present);
-    if is_finished(status) {
+    if status.has_ended() {
         return urgent_or(is_deleting, if is_behind { Class::New } else { Class::Refresh });
     }
     let stops = submission.spec.cancel || status.failure.is_some() || status.times.stopping.is_some();
     let has_job = status.job_name.is_some();
     urgent_or(is_deleting || stops, if has_job { Class::Refresh } else { Class::New })
-}
-
-fn is_finished(status: &SubmissionStatus) -> bool {
-    conditions::is_true(&status.conditions, FINISHED)
 }
 
 fn urgent_or(is_urgent: bool, other: Class) -> Class {

@@ -11,7 +11,7 @@ mod text_budget;
 mod work;
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::stream::FuturesUnordered;
@@ -26,6 +26,7 @@ use super::failure_log::{LogDemand, Tail};
 use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
 use crate::controller::objects::{Wake, uid_of};
+use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
@@ -47,14 +48,8 @@ struct Shared {
     wake: Wake<Submission>,
     tasks: Tasks,
     texts: TextBudget,
-    buckets: Mutex<HashMap<String, Arc<Bucket>>>,
-}
-
-impl Shared {
     /// A worker ends under this lock, and is asked for more under it.
-    fn buckets(&self) -> MutexGuard<'_, HashMap<String, Arc<Bucket>>> {
-        lock(&self.buckets)
-    }
+    buckets: Mutex<HashMap<String, Arc<Bucket>>>,
 }
 
 /// What one worker shares with those that ask it.
@@ -62,12 +57,6 @@ impl Shared {
 struct Bucket {
     state: Mutex<State>,
     notify: Notify,
-}
-
-impl Bucket {
-    fn state(&self) -> MutexGuard<'_, State> {
-        lock(&self.state)
-    }
 }
 
 /// The key of a bucket.
@@ -100,11 +89,11 @@ impl ArchiveWorkers {
     pub fn observe(&self, submission: &Submission, pod: Option<&str>, is_over: bool) -> Observed {
         let now = Instant::now();
         let status = submission.status.as_ref();
-        let job = job_of(status);
+        let job = status.map_or(JobNumber::first(1), SubmissionStatus::job_number);
         let found = status.and_then(|status| self.known_bucket(status));
         let uid = uid_of(submission);
         let nothing = State::default();
-        let guard = found.as_ref().map(|bucket| bucket.state());
+        let guard = found.as_ref().map(|bucket| lock(&bucket.state));
         let state = guard.as_deref().unwrap_or(&nothing);
         Observed {
             report: state.report(&uid, job, pod, now),
@@ -133,7 +122,7 @@ impl ArchiveWorkers {
     /// Drops the texts of a report: they are with EvalAI's side, or nobody wants them.
     pub fn drop_texts(&self, submission: &Submission, status: &SubmissionStatus) {
         if let Some(bucket) = self.known_bucket(status) {
-            bucket.state().drop_texts(&uid_of(submission));
+            lock(&bucket.state).drop_texts(&uid_of(submission));
             bucket.notify.notify_one();
         }
     }
@@ -157,21 +146,21 @@ impl ArchiveWorkers {
     /// The log of the failure that a status describes.
     pub fn tail(&self, submission: &Submission, status: &SubmissionStatus) -> Option<Tail> {
         let bucket = self.known_bucket(status)?;
-        let state = bucket.state();
+        let state = lock(&bucket.state);
         state.tail(&uid_of(submission), status.job_number())
     }
 
     /// Drops all that is known of an object.
     pub fn forget(&self, uid: &str) {
-        for bucket in self.0.buckets().values() {
-            bucket.state().forget(uid);
+        for bucket in lock(&self.0.buckets).values() {
+            lock(&bucket.state).forget(uid);
             bucket.notify.notify_one();
         }
     }
 
     fn known_bucket(&self, status: &SubmissionStatus) -> Option<Arc<Bucket>> {
         let plan = status.plan.as_ref()?;
-        self.0.buckets().get(&bucket_id(&plan.storage)).cloned()
+        lock(&self.0.buckets).get(&bucket_id(&plan.storage)).cloned()
     }
 
     /// Changes what the worker of a run's bucket has to do. Nothing, without a plan.
@@ -190,22 +179,14 @@ impl ArchiveWorkers {
             log: LogSpan::current(),
         };
         let id = bucket_id(&plan.storage);
-        let mut buckets = self.0.buckets();
+        let mut buckets = lock(&self.0.buckets);
         let bucket = buckets
             .entry(id.clone())
             .or_insert_with(|| ArchiveWorker::start(&self.0, id, &plan.storage));
         let uid = uid_of(submission).into();
-        change(&mut bucket.state(), &uid, &Arc::new(target), Instant::now());
+        change(&mut lock(&bucket.state), &uid, &Arc::new(target), Instant::now());
         bucket.notify.notify_one();
     }
-}
-
-fn job_of(status: Option<&SubmissionStatus>) -> JobNumber {
-    status.map_or(JobNumber::first(1), SubmissionStatus::job_number)
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Does the work of one bucket until the stop, or until nobody uses the bucket.
@@ -237,16 +218,16 @@ impl ArchiveWorker {
         let mut under_way = FuturesUnordered::new();
         let mut idle_since = None;
         loop {
-            while let Some(work) = self.next() {
+            while let Some(work) = lock(&self.bucket.state).next(Instant::now()) {
                 under_way.push(self.done(work).boxed());
             }
-            let is_idle = self.bucket.state().is_idle();
+            let is_idle = lock(&self.bucket.state).is_idle();
             idle_since = is_idle.then(|| idle_since.unwrap_or_else(Instant::now));
             let ends_at = idle_since.map(|since| since + LINGERS);
             if ends_at.is_some_and(|at| at <= Instant::now()) && self.leaves() {
                 return;
             }
-            let wake_at = self.bucket.state().wake_at().or(ends_at);
+            let wake_at = lock(&self.bucket.state).wake_at().or(ends_at);
             let due = async {
                 match wake_at {
                     Some(at) => tokio::time::sleep_until(at).await,
@@ -257,7 +238,7 @@ impl ArchiveWorker {
                 () = stop.wait() => return,
                 () = self.bucket.notify.notified() => {}
                 Some((work, done)) = under_way.next() => {
-                    let is_new = self.bucket.state().done(&work, done, Instant::now());
+                    let is_new = lock(&self.bucket.state).done(&work, done, Instant::now());
                     if is_new {
                         (self.shared.wake)(ObjectRef::new(&work.target.name).within(&work.target.namespace));
                     }
@@ -276,16 +257,12 @@ impl ArchiveWorker {
 
     /// Takes the bucket away, unless somebody has asked for something meanwhile.
     fn leaves(&self) -> bool {
-        let mut buckets = self.shared.buckets();
-        let is_idle = self.bucket.state().is_idle();
+        let mut buckets = lock(&self.shared.buckets);
+        let is_idle = lock(&self.bucket.state).is_idle();
         if is_idle {
             buckets.remove(&self.id);
         }
         is_idle
-    }
-
-    fn next(&self) -> Option<Work> {
-        self.bucket.state().next(Instant::now())
     }
 }
 

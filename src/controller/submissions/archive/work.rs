@@ -12,7 +12,6 @@ use crate::controller::submissions::failure_log;
 use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
 use crate::controller::submissions::view::{TextProblem, Texts};
 use crate::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, StoredFile};
-use crate::pod::upload::hex;
 use crate::services::archive::{Archive, ArchiveError, Fetched};
 use crate::services::held_text::{HeldText, Place};
 
@@ -155,7 +154,7 @@ async fn text(
     };
     let object = read.map_err(TextProblem::Unread)?;
     let object = object.ok_or_else(|| TextProblem::unfit(key, "is missing although the report names it"))?;
-    if hex(&Sha256::digest(&object.bytes)) != expected.sha256 {
+    if hex::encode(Sha256::digest(&object.bytes)) != expected.sha256 {
         return Err(another());
     }
     let text = String::from_utf8(object.bytes).map_err(|_| TextProblem::unfit(key, "is not text"))?;

@@ -12,7 +12,6 @@ use tokio::time::timeout;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{ObservedReport, Stage, TextProblem};
-use crate::pod::upload::hex;
 
 /// Longer than a read takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -27,7 +26,7 @@ async fn answer(Shared(objects): Shared<Objects>, uri: Uri, headers: HeaderMap) 
         let error = "<Error><Code>NoSuchKey</Code><Message>no</Message></Error>";
         return (StatusCode::NOT_FOUND, error).into_response();
     };
-    let etag = format!("\"{}\"", hex(&Sha256::digest(body)));
+    let etag = format!("\"{}\"", hex::encode(Sha256::digest(body)));
     if headers.get("if-none-match").is_some_and(|known| known == etag.as_str()) {
         return StatusCode::NOT_MODIFIED.into_response();
     }
@@ -58,7 +57,7 @@ fn report(stdout: &str) -> String {
     json!({
         "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
         "pairs": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": "[1]",
-        "files": {"evalai/stdout.txt": {"size": stdout.len(), "sha256": hex(&Sha256::digest(stdout))}},
+        "files": {"evalai/stdout.txt": {"size": stdout.len(), "sha256": hex::encode(Sha256::digest(stdout))}},
     })
     .to_string()
 }
@@ -212,6 +211,6 @@ async fn a_worker_ends_when_nobody_uses_its_bucket_and_begins_anew_with_the_next
         tokio::time::sleep(LINGERS / 2).await;
         assert!(runs(), "the next submission may come");
         tokio::time::sleep(2 * LINGERS).await;
-        assert!(!runs() && workers.0.buckets().is_empty());
+        assert!(!runs() && lock(&workers.0.buckets).is_empty());
     }
 }

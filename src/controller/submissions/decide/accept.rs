@@ -1,4 +1,4 @@
-//! Acceptance: a Leaderboard, a track, an image, and EvalAI's word that the submission wants to run. Pins the plan.
+//! Acceptance: a Leaderboard, a track, an image, and EvalAI's word that the submission wants to run. Then the plan is pinned.
 
 use std::time::Duration;
 
@@ -7,16 +7,13 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
-use super::plan_builder::{PlanBuilder, after};
-use super::{addresses, end, foreign, image, isolation, restored};
+use super::plan_builder::{PlanBuilder, Terms, after};
+use super::{addresses, end, foreign, image, isolation, pin, restored, stored};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
-use leaderboard_api::check::first_route;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, effective, reasons};
+use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, reasons};
 
-/// How long EvalAI may take before its silence is shown: an answer within it costs no write.
-const SILENCE: Duration = Duration::from_secs(5);
 /// When EvalAI is asked again, should its answer not come.
 const RETRY: Duration = Duration::from_secs(30);
 /// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
@@ -36,28 +33,32 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         Answer::NotNeeded => None,
         Answer::Waiting => return false,
         Answer::Ended(status) => {
-            end::cancelled(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(&status));
+            end::cancelled(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(status));
             return false;
         }
-        Answer::Wanted(info) => Some(*info),
+        Answer::Wanted(info) => Some(info),
     };
-    take_team(draft, info.as_ref());
+    take_team(draft, info);
     let Some(track) = find_track(draft, leaderboard) else {
         let message = missing_track(draft, leaderboard);
         return refuse(draft, reasons::TRACK_NOT_FOUND, &message);
     };
     draft.status.track = Some(track.name.clone());
-    if let Some(what) = foreign_phase(draft, info.as_ref()) {
-        return wait_for_phase(draft, &what);
-    }
-    // Before anything that could end it: an end is written over what the other program writes.
-    if foreign::waits(draft, leaderboard, track, info.as_ref()) {
+    let terms = Terms {
+        leaderboard,
+        track,
+        info,
+    };
+    // Before anything that could end it comes the look for another program: an end is written over what that one writes.
+    if waits_for_phase(draft, info) || foreign::waits(draft, terms) || restored::ends(draft, terms) {
         return false;
     }
-    if restored::ends(draft, leaderboard, track, info.as_ref()) {
-        return false;
-    }
-    let Some(image) = allowed_image(draft, leaderboard, track, info.as_ref()) else {
+    decide_run(draft, terms)
+}
+
+/// Whether a submission that is wanted, and that nobody else runs, may go on to its turn.
+fn decide_run(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
+    let Some(image) = allowed_image(draft, terms) else {
         return false;
     };
     if let Some(message) = not_ready(draft) {
@@ -66,30 +67,28 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if let Some(missing) = isolation::missing(draft) {
         return wait_for_policy(draft, &missing);
     }
-    match addresses::decide(draft, leaderboard) {
+    match addresses::decide(draft, terms.leaderboard) {
         addresses::Step::Go => {}
         addresses::Step::Wait => return false,
         addresses::Step::Refuse(message) => return refuse(draft, reasons::NAME_NOT_RESOLVED, &message),
     }
-    let note = match image::decide(draft, leaderboard, &image) {
+    let note = match image::decide(draft, terms.leaderboard, &image) {
         image::Step::Go(note) => note,
         image::Step::Wait => return false,
-        image::Step::Refuse(found) => {
-            return refuse_image(draft, leaderboard, track, image, info.as_ref(), found);
-        }
+        image::Step::Refuse(found) => return refuse_image(draft, terms, image, found),
     };
-    pin(draft, leaderboard, track, image, info.as_ref());
+    pin::pin(draft, terms, image);
     take(draft, note);
     true
 }
 
 /// Accepts it, with what there is to say: that its image has no digest (`unpinned`), or that it was restored.
 fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
-    let known = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let known = draft.status.condition(conditions::ACCEPTED);
     let known = known
         .filter(|c| c.reason == reasons::RESTORED)
         .map(|c| c.message.clone());
-    let (reason, note) = match (unpinned, known.or_else(|| restored::note(draft))) {
+    let (reason, note) = match (unpinned, known.or_else(|| stored::note(draft))) {
         (Some(note), _) => (reasons::IMAGE_NOT_PINNED, note),
         (None, Some(note)) => (reasons::RESTORED, note),
         (None, None) => (reasons::ACCEPTED, String::new()),
@@ -99,26 +98,26 @@ fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
 
 /// Whether EvalAI's own end is ours, of an object that has lost its status, or that is still being found out.
 pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
-    let evalai = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
-    let Some((leaderboard, info)) = draft.leaderboard().zip(evalai) else {
+    let Some((leaderboard, info)) = draft.leaderboard().zip(draft.evalai_info()) else {
         return false;
     };
-    let track = find_track(draft, leaderboard).filter(|_| restored::may_have_ended(draft, info));
+    let track = find_track(draft, leaderboard).filter(|_| stored::may_have_ended(draft, info));
     let Some(track) = track else { return false };
-    take_team(draft, Some(info));
-    foreign::look(draft, leaderboard, Some(info)).is_none() || restored::ends(draft, leaderboard, track, Some(info))
+    let info = Some(info);
+    take_team(draft, info);
+    let terms = Terms {
+        leaderboard,
+        track,
+        info,
+    };
+    foreign::look(draft, terms).is_none() || restored::ends(draft, terms)
 }
 
 /// The image, if one is named that the Leaderboard allows. Otherwise the draft says why not.
-fn allowed_image(
-    draft: &mut PlanBuilder<'_>,
-    leaderboard: &LeaderboardSpec,
-    track: &Track,
-    info: Option<&EvalaiInfo>,
-) -> Option<String> {
-    let (image, fault) = match named_image(draft, info) {
+fn allowed_image(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> Option<String> {
+    let (image, fault) = match named_image(draft, terms.info) {
         Image::Named(image) => {
-            let fault = image::not_allowed(draft, leaderboard, &image);
+            let fault = image::not_allowed(draft, terms.leaderboard, &image);
             (image, fault)
         }
         Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
@@ -130,22 +129,15 @@ fn allowed_image(
         }
     };
     if let Some(found) = fault {
-        refuse_image(draft, leaderboard, track, image, info, found);
+        refuse_image(draft, terms, image, found);
         return None;
     }
     Some(image)
 }
 
 /// Ends a submission whose image can never run. The plan makes it a row of the table, as any other failure.
-fn refuse_image(
-    draft: &mut PlanBuilder<'_>,
-    leaderboard: &LeaderboardSpec,
-    track: &Track,
-    image: String,
-    info: Option<&EvalaiInfo>,
-    found: Failure,
-) -> bool {
-    pin(draft, leaderboard, track, image, info);
+fn refuse_image(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String, found: Failure) -> bool {
+    pin::pin(draft, terms, image);
     draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
     end::failed(draft, found);
     false
@@ -188,8 +180,8 @@ pub(super) fn no_leaderboard(draft: &PlanBuilder<'_>) -> String {
 
 /// Faults of the Leaderboard with which no Job can be made, or none may. The others speak for themselves where they hurt.
 fn not_ready(draft: &PlanBuilder<'_>) -> Option<String> {
-    let status = draft.view.leaderboard.as_ref()?.status.as_ref()?;
-    let ready = conditions::get(&status.conditions, conditions::READY).filter(|c| c.status == "False")?;
+    let ready = draft.view.leaderboard.as_ref()?.condition(conditions::READY);
+    let ready = ready.filter(|c| c.status == "False")?;
     let blocks = [
         reasons::CLAIMS_NOT_SERVED,
         reasons::CLAIM_TEMPLATE_MISSING,
@@ -262,9 +254,12 @@ fn foreign_phase(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Option<S
     ))
 }
 
-/// Waits until the row is of our phase again. The object may have been applied with a wrong phase, so nothing is reported at
-/// once; but the participant's submission does not wait for an end without limit.
-fn wait_for_phase(draft: &mut PlanBuilder<'_>, what: &str) -> bool {
+/// Whether the row is of another phase, and has to be of ours again. The object may have been applied with a wrong phase, so nothing
+/// is reported at once; but the participant's submission does not wait for an end without limit.
+fn waits_for_phase(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bool {
+    let Some(what) = foreign_phase(draft, info) else {
+        return false;
+    };
     let message = format!(
         "{what} Set phase {} back in EvalAI, or delete this Submission and apply it with the right phase; after {} min it \
          fails, uncharged.",
@@ -275,41 +270,37 @@ fn wait_for_phase(draft: &mut PlanBuilder<'_>, what: &str) -> bool {
     let since = draft.stalled_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
     let until = after(since, PHASE_SECONDS);
     if draft.now() >= until {
-        end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, what));
-        return false;
+        end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, &what));
+    } else {
+        draft.requeue_at(until);
+        refuse(draft, reasons::PHASE_DIFFERS, &message);
     }
-    draft.requeue_at(until);
-    refuse(draft, reasons::PHASE_DIFFERS, &message)
+    true
 }
 
-enum Answer {
+enum Answer<'a> {
     NotNeeded,
     Waiting,
-    Ended(String),
-    Wanted(Box<EvalaiInfo>),
+    Ended(&'a str),
+    Wanted(&'a EvalaiInfo),
 }
 
-fn ask_evalai(draft: &mut PlanBuilder<'_>) -> Answer {
+fn ask_evalai<'a>(draft: &mut PlanBuilder<'a>) -> Answer<'a> {
     if draft.spec().evalai.is_none() {
         return Answer::NotNeeded;
     }
-    let view = draft.view.evalai.clone().unwrap_or_default();
-    match view.info {
-        Some(info) if info.standing == Standing::Ended => Answer::Ended(info.status),
-        Some(info) => Answer::Wanted(Box::new(info)),
+    match draft.evalai_info() {
+        Some(info) if info.standing == Standing::Ended => Answer::Ended(&info.status),
+        Some(info) => Answer::Wanted(info),
         None => {
             draft.act(Action::AskEvalai);
-            if let Some(left) = SILENCE
-                .checked_sub(draft.view.evalai_waited)
-                .filter(|left| !left.is_zero())
-            {
-                draft.keeps_status();
-                draft.requeue_in(left);
+            if draft.waits_quietly(draft.view.evalai_waited) {
                 return Answer::Waiting;
             }
             draft.requeue_in(RETRY);
-            let message = match view.error {
-                Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(&error))),
+            let view = draft.view.evalai.as_ref();
+            let message = match view.and_then(|view| view.error.as_deref()) {
+                Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(error))),
                 None => asking(None),
             };
             draft.show(reasons::ASKING_EVALAI, message);
@@ -374,55 +365,6 @@ fn take_team(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) {
     if draft.status.times.submitted.is_none() {
         draft.status.times.submitted = draft.submission().metadata.creation_timestamp.clone();
     }
-}
-
-pub(super) fn pin(
-    draft: &mut PlanBuilder<'_>,
-    leaderboard: &LeaderboardSpec,
-    track: &Track,
-    image: String,
-    info: Option<&EvalaiInfo>,
-) {
-    let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
-    let plan = match draft.status.plan.take() {
-        // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
-        // made; all else belongs to the submission.
-        Some(pinned) if draft.status.retry == 0 && draft.status.job_name.is_none() => leaderboard_api::RunPlan {
-            // The same, unless an earlier attempt had none.
-            image,
-            contents_image: leaderboard.contents.image.clone(),
-            simulator_image: leaderboard.simulator.image.clone(),
-            ..pinned
-        },
-        Some(pinned) => pinned,
-        None => {
-            let resume =
-                resumed || draft.spec().attempt > 1 || foreign::is_adopted(draft) || restored::takes_up(draft, info);
-            let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
-            let plan = if draft.spec().check { first_route(plan) } else { plan };
-            leaderboard_api::RunPlan {
-                earlier_attempts: earlier_attempts(draft, info).max(restored::attempts_ahead(draft)),
-                submission_uid: draft.submission().metadata.uid.clone(),
-                ..plan
-            }
-        }
-    };
-    if draft.spec().check && draft.status.checked_generation.is_none() {
-        let checked = draft.view.leaderboard.as_ref();
-        draft.status.checked_generation = checked.and_then(|leaderboard| leaderboard.metadata.generation);
-    }
-    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
-    draft.status.plan = Some(plan);
-    if draft.status.times.accepted.is_none() {
-        draft.status.times.accepted = Some(draft.time());
-    }
-}
-
-/// How many attempts the table's row of a resumed run counts before ours: those of a Submission that was deleted after its end.
-/// The row takes no attempt that is not above its own.
-fn earlier_attempts(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
-    let resumed = info.filter(|info| info.standing == Standing::Resumed);
-    resumed.map_or(0, |info| (info.last_attempt + 1 - draft.spec().attempt).max(0))
 }
 
 fn refuse(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) -> bool {

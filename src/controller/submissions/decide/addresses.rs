@@ -9,9 +9,6 @@ use crate::controller::submissions::view::ObservedAddresses;
 use crate::services::names::GOOD_FOR;
 use leaderboard_api::{Dns, LeaderboardSpec, reasons};
 
-/// How long a look-up may take before that is shown: an answer within it costs no write.
-const SILENCE: Duration = Duration::from_secs(5);
-
 /// Whether a Job may be made.
 pub(super) enum Step {
     Go,
@@ -48,9 +45,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec)
         ObservedAddresses::Answered(_) | ObservedAddresses::NotAsked => Duration::ZERO,
         ObservedAddresses::Asked(waited) => *waited,
     };
-    if let Some(left) = SILENCE.checked_sub(waited).filter(|left| !left.is_zero()) {
-        draft.keeps_status();
-        draft.requeue_in(left);
+    if draft.waits_quietly(waited) {
         return Step::Wait;
     }
     draft.requeue_in(GOOD_FOR);

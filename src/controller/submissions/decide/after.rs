@@ -125,13 +125,16 @@ pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
 fn farewell(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
     pod.run_ended?;
-    let end = conditions::get(&draft.status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
+    let end = draft.status.end()?;
     let until = after(end.last_transition_time.0, FAREWELL_SECONDS);
     (draft.now() < until).then_some(until)
 }
 
 fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
-    conditions::get(&draft.status.conditions, type_).is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
+    draft
+        .status
+        .condition(type_)
+        .is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
 }
 
 /// A Leaderboard that is gone can't say what is wanted: what was decided before stands, and what never ran needs nothing.
@@ -156,7 +159,7 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     };
     let evalai = draft.view.evalai.as_ref();
-    let Some(info) = evalai.and_then(|evalai| evalai.info.as_ref()) else {
+    let Some(info) = draft.evalai_info() else {
         draft.act(Action::AskEvalai);
         return true;
     };
@@ -169,7 +172,7 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
         }
         return is_old;
     }
-    let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
+    let is_recorded = draft.status.is_true(conditions::RECORDED);
     if is_recorded && matches!(row_of_end(draft), Reading::Waits(_)) {
         return true;
     }
@@ -179,7 +182,7 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
     );
     let ended = draft.status.message.take().unwrap_or_default();
     draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
-    if let Some(published) = conditions::get(&draft.status.conditions, conditions::PUBLISHED).cloned() {
+    if let Some(published) = draft.status.condition(conditions::PUBLISHED).cloned() {
         let truth = Truth::from(published.status == "True");
         draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
     }
@@ -190,7 +193,7 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
 
 /// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
 fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
-    let is_recorded = conditions::is_true(&draft.status.conditions, conditions::RECORDED);
+    let is_recorded = draft.status.is_true(conditions::RECORDED);
     if is_recorded {
         draft.act(Action::Record { end: true });
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
@@ -208,7 +211,7 @@ fn may_be_older(read_at: Option<Timestamp>, rerun: Option<&Time>, now: Timestamp
 }
 
 fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery {
-    let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
+    let end = draft.status.condition(conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
@@ -217,9 +220,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
         return Delivery::Done;
     }
-    if conditions::is_true(&draft.status.conditions, conditions::PUBLISHED)
-        || is_not_wanted(draft, conditions::PUBLISHED)
-    {
+    if draft.status.is_delivered(conditions::PUBLISHED) {
         return Delivery::Done;
     }
     if draft.leaderboard().is_none() {
@@ -295,7 +296,7 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
 
 /// Whether it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
 fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
-    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let accepted = draft.status.condition(conditions::ACCEPTED);
     let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
     differs && draft.status.plan.is_none() && draft.status.state_of_conditions() == State::Cancelled
 }
@@ -312,7 +313,7 @@ pub fn previous_controller(until: Timestamp) -> String {
 /// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
 fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     const BEGINS: &str = "The stored result cannot be read:";
-    let known = conditions::get(&draft.status.conditions, type_).map(|c| c.message.clone());
+    let known = draft.status.condition(type_).map(|c| c.message.clone());
     let known = known.filter(|message| message.starts_with(BEGINS));
     known.unwrap_or_else(|| {
         format!(
@@ -324,7 +325,7 @@ fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
 
 /// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
 fn is_overtaken(draft: &PlanBuilder<'_>) -> bool {
-    let published = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
+    let published = draft.status.condition(conditions::PUBLISHED);
     draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
         || published.is_some_and(|c| c.reason == reasons::CONCURRENT_UPDATE)
 }
@@ -335,7 +336,7 @@ fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
          from time to time.",
         sentence(message)
     );
-    let known = conditions::get(&draft.status.conditions, conditions::PUBLISHED);
+    let known = draft.status.condition(conditions::PUBLISHED);
     let is_new = known.is_none_or(|c| c.reason != reasons::REFUSED);
     draft.condition(conditions::PUBLISHED, Truth::False, reasons::REFUSED, &message);
     if is_new {
@@ -353,7 +354,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     let message = format!("EvalAI says {status}, so the result is not published.");
     draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
     draft.show(reasons::ENDED_IN_EVALAI, message);
-    if !conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
+    if !draft.status.is_true(conditions::RECORDED) {
         return Delivery::Done;
     }
     // While EvalAI refused the result, its row was written with the outcome that no longer holds.
@@ -363,7 +364,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
 }
 
 fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
-    if conditions::is_true(&draft.status.conditions, conditions::RECORDED) {
+    if draft.status.is_true(conditions::RECORDED) {
         return Delivery::Done;
     }
     if draft.leaderboard().is_none() {
@@ -455,7 +456,7 @@ fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
         draft.event(
             true,
             reasons::RELEASED_UNPUBLISHED,
-            "It was deleted and its end could not be published in time; it is released.",
+            "The submission was deleted, and its end was not published within deadlines.finalizeSeconds: the finalizer is removed.",
         );
         draft.act(Action::Forget);
         draft.act(Action::ReleaseFinalizer);

@@ -161,7 +161,7 @@ fn of_simulator(end: &EndView) -> EndReason {
         Some(What::PortTaken) => EndReason::PortTaken,
         Some(What::NoGpu) => EndReason::NoGPU,
         Some(What::GraphicsDriverMissing) => EndReason::GraphicsDriverMissing,
-        None if is_start_error(end) => EndReason::SimulatorNotStarted,
+        None if end.is_start_error() => EndReason::SimulatorNotStarted,
         _ => EndReason::SimulatorCrashed,
     }
 }
@@ -184,11 +184,7 @@ fn of_agent(end: &EndView) -> EndReason {
         Some(What::Exited) if exit_code == Some(0) => EndReason::Incomplete,
         Some(What::Exited) => EndReason::Exited,
         Some(What::SilentDeath) => EndReason::SilentDeath,
-        None if is_start_error(end) => EndReason::StartError,
+        None if end.is_start_error() => EndReason::StartError,
         _ => EndReason::Killed,
     }
-}
-
-fn is_start_error(end: &EndView) -> bool {
-    matches!(end.reason.as_str(), "StartError" | "ContainerCannotRun")
 }

@@ -48,7 +48,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
         ObservedReport::Unreadable(why) if wait_for_bucket(draft, why) => return,
         _ => None,
     };
-    let complete = report.filter(|r| is_complete(r));
+    let complete = report.filter(|r| r.is_complete());
     if let Some(report) = complete.filter(|r| r.eligible) {
         return finished(draft, report);
     }
@@ -87,20 +87,11 @@ pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     }
     let report = view.report.ours().filter(|r| r.pod_uid == pod.uid);
-    let Some(report) = report.filter(|r| is_complete(r) && r.eligible) else {
+    let Some(report) = report.filter(|r| r.is_complete() && r.eligible) else {
         return false;
     };
     finished(draft, report);
     true
-}
-
-pub(super) fn is_complete(report: &ReportDigest) -> bool {
-    report.is_final && report.done == report.total && report.total > 0
-}
-
-/// Whether a report says how a run came to its own end, whatever becomes of its Job.
-pub(super) fn is_verdict(report: &ReportDigest) -> bool {
-    is_complete(report) || (report.is_final && report.why.is_some())
 }
 
 /// Whether the end still waits until the bucket can be read.

@@ -6,8 +6,8 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use super::plan::Action;
-use super::plan_builder::{PlanBuilder, after};
-use super::restored;
+use super::plan_builder::{PlanBuilder, Terms, after};
+use super::stored;
 use crate::controller::submissions::foreign_runs::{
     AGAIN, Looked, ObservedTraces, Question, StoredRun, Traces, Unread, question,
 };
@@ -15,10 +15,8 @@ use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use crate::services::table::ObservedRow;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{LeaderboardSpec, Track, effective, names, reasons};
+use leaderboard_api::{effective, names, reasons};
 
-/// How long the look may take before that is shown: an answer within it costs no write.
-const SILENCE: Duration = Duration::from_secs(5);
 /// The old pipeline writes its end to the row and to EvalAI, one after the other: EvalAI is read again so long after the row was.
 const SETTLED_SECONDS: i64 = 15;
 /// How long an object may be the newest of a run that has no time limit and still goes on.
@@ -26,44 +24,33 @@ const DAY_SECONDS: i64 = 86_400;
 /// What the old pipeline's row shows of a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 
-/// A person has handed the submission over: it takes up what is stored, by whatever program.
-pub(super) fn is_adopted(draft: &PlanBuilder<'_>) -> bool {
-    let annotations = draft.submission().metadata.annotations.as_ref();
-    annotations.is_some_and(|all| all.get(names::ANNOTATION_ADOPT).is_some_and(|text| text == "true"))
-}
-
 /// Whether the submission has to wait, because another program runs it or that is not known yet. Only EvalAI hands a submission
 /// to more than one program; others, and those that a person hands over, are looked for if they may have lost their status.
-pub(super) fn waits(
-    draft: &mut PlanBuilder<'_>,
-    leaderboard: &LeaderboardSpec,
-    track: &Track,
-    info: Option<&EvalaiInfo>,
-) -> bool {
-    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+pub(super) fn waits(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
+    let accepted = draft.status.condition(conditions::ACCEPTED);
     let is_accepted = accepted.is_some_and(|c| c.status == "True");
     let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
     // One that observes stores below a prefix of its own, and runs what another program runs on purpose.
     let is_settled = is_accepted || has_run || draft.observes();
-    let is_asked = if is_adopted(draft) || info.is_none() {
-        restored::may_be(draft) && restored::is_marked(draft)
+    let is_asked = if draft.is_adopted() || terms.info.is_none() {
+        stored::may_be(draft) && stored::is_marked(draft)
     } else {
         true
     };
     if is_settled || !is_asked {
         return false;
     }
-    let Some(answer) = look(draft, leaderboard, info) else {
+    let Some(answer) = look(draft, terms) else {
         return true;
     };
-    let question = ask(draft, leaderboard, info);
-    let why = match (&answer.found, info) {
+    let question = ask(draft, terms);
+    let why = match (&answer.found, terms.info) {
         // A person's word stands above what was found of another program.
-        _ if is_adopted(draft) => return false,
+        _ if draft.is_adopted() => return false,
         (Err(unread), _) => not_known(draft, unread),
         (Ok(_), None) => return false,
         (Ok(traces), Some(info)) => {
-            let window = match effective::deadlines(leaderboard, Some(track)).run_seconds {
+            let window = match effective::deadlines(terms.leaderboard, Some(terms.track)).run_seconds {
                 0 => DAY_SECONDS,
                 seconds => seconds,
             };
@@ -84,7 +71,7 @@ pub(super) fn waits(
 /// Whether a submission that was held back waits for EvalAI's own word on how the other run has ended: what is known of it may be
 /// older than that end.
 fn is_unsettled(draft: &mut PlanBuilder<'_>, looked_at: Timestamp) -> bool {
-    let accepted = conditions::get(&draft.status.conditions, conditions::ACCEPTED);
+    let accepted = draft.status.condition(conditions::ACCEPTED);
     let was_held = accepted.is_some_and(|c| c.reason == reasons::FOREIGN);
     let settled = after(looked_at, SETTLED_SECONDS);
     let read_at = draft.view.evalai.as_ref().and_then(|evalai| evalai.read_at);
@@ -102,34 +89,28 @@ fn is_unsettled(draft: &mut PlanBuilder<'_>, looked_at: Timestamp) -> bool {
 }
 
 /// What was found in table and bucket; none yet: the submission waits.
-pub(super) fn look<'a>(
-    draft: &mut PlanBuilder<'a>,
-    leaderboard: &LeaderboardSpec,
-    info: Option<&EvalaiInfo>,
-) -> Option<&'a Looked> {
+pub(super) fn look<'a>(draft: &mut PlanBuilder<'a>, terms: Terms<'_>) -> Option<&'a Looked> {
     let view = draft.view;
     let waited = match &view.traces {
         ObservedTraces::Answered(answer) => return Some(answer),
         ObservedTraces::NotAsked => Duration::ZERO,
         ObservedTraces::Asked(waited) => *waited,
     };
-    let question = ask(draft, leaderboard, info);
+    let question = ask(draft, terms);
     looks(draft, question, waited);
     None
 }
 
-fn ask(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, info: Option<&EvalaiInfo>) -> Question {
+fn ask(draft: &PlanBuilder<'_>, terms: Terms<'_>) -> Question {
     let attempt = draft.status.attempt.unwrap_or(1);
     let team = draft.status.team.as_ref().and_then(|team| team.id.clone());
-    let team = info.map_or(team, |info| Some(info.team_id.clone()));
-    question(draft.submission(), leaderboard, attempt, team.unwrap_or_default())
+    let team = terms.info.map_or(team, |info| Some(info.team_id.clone()));
+    question(draft.submission(), terms.leaderboard, attempt, team.unwrap_or_default())
 }
 
 fn looks(draft: &mut PlanBuilder<'_>, question: Question, waited: Duration) {
     draft.act(Action::LookForForeignRun(Box::new(question)));
-    if let Some(left) = SILENCE.checked_sub(waited).filter(|left| !left.is_zero()) {
-        draft.keeps_status();
-        draft.requeue_in(left);
+    if draft.waits_quietly(waited) {
         return;
     }
     draft.requeue_in(AGAIN);

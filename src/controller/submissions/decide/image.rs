@@ -17,8 +17,6 @@ use leaderboard_api::{
     Failure, ImagePattern, ImageReference, LeaderboardSpec, PinnedImage, Repository, image_pattern, reasons,
 };
 
-/// How long a registry may take before that is shown: an answer within it costs no write.
-const SILENCE: Duration = Duration::from_secs(5);
 /// When it is looked again, should an answer not come.
 const RETRY: Duration = Duration::from_secs(30);
 /// Most of a host's own words about a registry.
@@ -82,7 +80,10 @@ fn patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Ve
 
 /// Whether the image may run by what its registry says. The registry is asked once, before the first Job of an attempt.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, image: &str) -> Step {
-    let known = conditions::get(&draft.status.conditions, conditions::ACCEPTED).filter(|c| c.status == "True");
+    let known = draft
+        .status
+        .condition(conditions::ACCEPTED)
+        .filter(|c| c.status == "True");
     if let Some(known) = known {
         let note = (known.reason == reasons::IMAGE_NOT_PINNED).then(|| known.message.clone());
         return Step::Go(note);
@@ -126,9 +127,7 @@ fn ask(
         secrets: pull_secrets(leaderboard),
     };
     draft.act(Action::LookUpImage(question));
-    if let Some(left) = SILENCE.checked_sub(waited).filter(|left| !left.is_zero()) {
-        draft.keeps_status();
-        draft.requeue_in(left);
+    if draft.waits_quietly(waited) {
         return Step::Wait;
     }
     draft.requeue_in(RETRY);

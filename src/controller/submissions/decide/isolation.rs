@@ -22,8 +22,7 @@ pub(super) fn missing(draft: &PlanBuilder<'_>) -> Option<Missing> {
         return None;
     }
     let name = &draft.spec().leaderboard_name;
-    let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
-    let isolated = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
+    let isolated = leaderboard.condition(conditions::ISOLATED);
     let why = isolated.filter(|c| c.status == "False" && c.observed_generation == leaderboard.metadata.generation);
     let is_refused = why.is_some();
     let message = match why {

@@ -4,16 +4,15 @@ use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, EvalaiUpdate, job_name};
+use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after};
-use super::{accept, addresses, crashes, end, failure, interruption, isolation, line, reading, requeue, start, stop};
+use super::{
+    accept, addresses, crashes, end, failure, interruption, isolation, line, reading, reported, requeue, start, stop,
+};
 use crate::controller::submissions::job_spec;
-use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
-use crate::pod::report::Logs;
 use leaderboard_api::conditions::{self, Truth};
-use leaderboard_api::text::sentence;
-use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, PairStatus, Progress, Score, reasons};
+use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
@@ -31,7 +30,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let has_job = draft.status.job_name.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
     match &view.job {
         // What was seen is of an earlier try; the next pass looks at the present one.
-        ObservedJob::Ours(job) if job.name != own_job_name(draft) => draft.requeue_in(Duration::from_secs(1)),
+        ObservedJob::Ours(job) if job.name != draft.job_name() => draft.requeue_in(Duration::from_secs(1)),
         ObservedJob::Ours(job) => with_job(draft, job),
         ObservedJob::Created => draft.requeue_in(LOOK),
         ObservedJob::Foreign if !draft.is_to_stop() => name_taken(draft),
@@ -43,10 +42,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
 
 /// Looks for its end in EvalAI also while it waits and nothing is sent to EvalAI, whatever it waits for.
 fn follow(draft: &mut PlanBuilder<'_>) {
-    let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
     // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
     let is_known = draft.status.times.submitted.is_some();
-    let may_run = is_known && info.is_some_and(|info| info.standing != Standing::Ended);
+    let may_run = is_known && draft.evalai_info().is_some_and(|info| info.standing != Standing::Ended);
     if may_run && !draft.is_finished() && !draft.is_to_stop() && !draft.does(is_progress) {
         draft.act(Action::FollowEvalai);
     }
@@ -60,15 +58,10 @@ fn is_progress(action: &Action) -> bool {
     )
 }
 
-pub(super) fn own_job_name(draft: &PlanBuilder<'_>) -> String {
-    let name = draft.submission().metadata.name.as_deref().unwrap_or_default();
-    job_name(name, &draft.status)
-}
-
 fn name_taken(draft: &mut PlanBuilder<'_>) {
     let message = format!(
         "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
-        own_job_name(draft)
+        draft.job_name()
     );
     let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
     draft.show(reasons::JOB_NAME_TAKEN, message);
@@ -111,9 +104,8 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
 
 /// Remembers which submission this one re-runs, so that the other learns of it.
 fn note_original(draft: &mut PlanBuilder<'_>) {
-    let info = draft.view.evalai.as_ref().and_then(|evalai| evalai.info.as_ref());
     if draft.status.rerun_of.is_none() {
-        draft.status.rerun_of = info.and_then(|info| info.rerun_of.clone());
+        draft.status.rerun_of = draft.evalai_info().and_then(|info| info.rerun_of.clone());
     }
 }
 
@@ -135,7 +127,7 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
 }
 
 fn start_job(draft: &mut PlanBuilder<'_>) {
-    let name = own_job_name(draft);
+    let name = draft.job_name();
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
     draft.status.job_name = Some(name);
@@ -178,7 +170,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         return draft.requeue_in(left);
     }
     // A report from before this Job was seen is its predecessor's.
-    let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| end::is_verdict(r));
+    let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| r.is_verdict());
     if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
         return end::decide(draft, None);
     }
@@ -186,21 +178,8 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         draft.fail(failure::job_expired());
         return end::decide(draft, None);
     }
-    let Some(leaderboard) = draft.leaderboard() else {
-        let message = accept::no_leaderboard(draft);
-        let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
-        draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
-        return draft.requeue_in(BACKSTOP);
-    };
-    if let Some(missing) = isolation::missing(draft) {
-        draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
-        draft.show(reasons::NOT_ISOLATED, missing.message);
-        return draft.requeue_in(BACKSTOP);
-    }
-    match addresses::decide(draft, leaderboard) {
-        addresses::Step::Go => {}
-        addresses::Step::Wait => return,
-        addresses::Step::Refuse(message) => return draft.show(reasons::NAME_NOT_RESOLVED, message),
+    if is_held_up(draft) {
+        return;
     }
     if let Some(left) = reading::requested_fence_left(draft) {
         return draft.requeue_in(left);
@@ -220,6 +199,29 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         );
     }
     start_job(draft);
+}
+
+/// Whether no Job may be made at the moment, because of its Leaderboard.
+fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
+    let Some(leaderboard) = draft.leaderboard() else {
+        let message = accept::no_leaderboard(draft);
+        let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
+        draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
+        draft.requeue_in(BACKSTOP);
+        return true;
+    };
+    if let Some(missing) = isolation::missing(draft) {
+        draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
+        draft.show(reasons::NOT_ISOLATED, missing.message);
+        draft.requeue_in(BACKSTOP);
+        return true;
+    }
+    match addresses::decide(draft, leaderboard) {
+        addresses::Step::Go => return false,
+        addresses::Step::Wait => {}
+        addresses::Step::Refuse(message) => draft.show(reasons::NAME_NOT_RESOLVED, message),
+    }
+    true
 }
 
 /// Whether Kubernetes may have removed the Job by its time to live, after an end that nobody has read.
@@ -244,7 +246,7 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
         take_pod(draft, pod);
     }
     if let Some(report) = view.report.ours() {
-        take_report(draft, report);
+        reported::take(draft, report);
     }
     if let Some(job_end) = &job.end {
         return end::decide(draft, Some(job_end));
@@ -290,65 +292,6 @@ fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     times.started = times.started.take().or(pod.agent_started.map(Time));
     let now = draft.now();
     crashes::note(&mut draft.status, pod, now);
-}
-
-pub(super) fn take_report(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
-    let clamp = |n: u32| i32::try_from(n).unwrap_or(i32::MAX);
-    draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total)));
-    if let Some(score) = report.score {
-        let complete = report.is_final && report.done == report.total;
-        let (completion, penalty) = (report.route_completion, report.infraction_penalty);
-        draft.status.score = Some(Score::new(score, completion, penalty, complete));
-    }
-    // Until the present Pod's first round the report is its predecessor's, whose crashes are forgiven or counted already.
-    let is_present = draft.view.pod.as_ref().is_some_and(|p| p.uid == report.pod_uid);
-    let old = std::mem::take(&mut draft.status.pairs);
-    draft.status.pairs = report
-        .pairs
-        .iter()
-        .map(|pair| {
-            let known = old.iter().find(|p| p.id == clamp(pair.id));
-            let told = if is_present { clamp(pair.crashes) } else { 0 };
-            PairStatus {
-                id: clamp(pair.id),
-                done: clamp(pair.done),
-                total: clamp(pair.total),
-                crashes: told.max(known.map_or(0, |k| k.crashes)),
-                state: pair.state,
-                last: known.and_then(|k| k.last.clone()),
-            }
-        })
-        .collect();
-    note_scores(draft, report);
-    note_logs(draft, report);
-}
-
-/// Says that scores do not follow from the infractions, and that they do again.
-fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
-    let (truth, reason, message) = match &report.warning {
-        Some(first) => {
-            let message = format!("Scores do not follow from the infractions: {}", sentence(first));
-            (Truth::False, reasons::UNEXPLAINED_SCORES, message)
-        }
-        None if conditions::get(&draft.status.conditions, conditions::PLAUSIBLE).is_none() => return,
-        None => (Truth::True, reasons::SCORES_EXPLAINED, String::new()),
-    };
-    draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
-}
-
-/// Says that CloudWatch refuses the lines of the run, and that it takes them again; of a check, whether it takes them at all.
-fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
-    let is_known = conditions::get(&draft.status.conditions, conditions::LOGGED).is_some();
-    match &report.logs {
-        Some(Logs::Refused(why)) => {
-            let why = sentence(why);
-            draft.condition(conditions::LOGGED, Truth::False, reasons::LOGS_REFUSED, &why);
-        }
-        Some(Logs::Sent) if is_known || draft.spec().check => {
-            draft.condition(conditions::LOGGED, Truth::True, reasons::LOGS_SENT, "");
-        }
-        _ => {}
-    }
 }
 
 /// Limits of a run under way: disk, crashes, time.

@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
+use super::plan_builder::{PlanBuilder, left_of};
 use super::trouble;
 use crate::controller::submissions::view::{LogAt, LogPlace, ObservedLog, PodView};
 use crate::pod::run::console;
@@ -35,7 +35,7 @@ pub(super) fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> 
 fn left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
     match log {
         ObservedLog::NotRequested => at_first,
-        ObservedLog::Pending(waited) => LONGEST.checked_sub(waited).filter(|left| !left.is_zero()),
+        ObservedLog::Pending(waited) => left_of(LONGEST, waited),
         ObservedLog::Kept | ObservedLog::None | ObservedLog::GivenUp => None,
     }
 }
@@ -44,9 +44,8 @@ fn left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
 /// long EvalAI waits for it.
 pub(super) fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     let before = draft.view.submission.status.as_ref();
-    let has_just_ended = !before.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED));
-    let published = before.and_then(|s| conditions::get(&s.conditions, conditions::PUBLISHED));
-    let is_published = published.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED);
+    let has_just_ended = !before.is_some_and(SubmissionStatus::has_ended);
+    let is_published = before.is_some_and(|s| s.is_delivered(conditions::PUBLISHED));
     let is_answered = draft.view.evalai.as_ref().is_some_and(|e| e.end.is_some());
     let is_awaited = draft.spec().evalai.is_some() && !is_published && !is_answered;
     if is_awaited || (has_just_ended && !is_answered) {

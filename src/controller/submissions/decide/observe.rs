@@ -16,14 +16,16 @@ const OLD: SignedDuration = SignedDuration::from_mins(5);
 
 /// Compares, and returns whether the other run's end is still to come. What never ran here has nothing to compare.
 pub(super) fn awaits_end(draft: &mut PlanBuilder<'_>) -> bool {
-    let is_compared =
-        conditions::get(&draft.status.conditions, conditions::COMPARED).is_some_and(|c| c.status != "Unknown");
+    let is_compared = draft
+        .status
+        .condition(conditions::COMPARED)
+        .is_some_and(|c| c.status != "Unknown");
     let has_run = draft.status.job_name.is_some();
     if !draft.observes() || draft.is_deleting() || draft.spec().evalai.is_none() || !has_run || is_compared {
         return false;
     }
     let evalai = draft.view.evalai.as_ref();
-    let Some(info) = evalai.and_then(|evalai| evalai.info.as_ref()) else {
+    let Some(info) = draft.evalai_info() else {
         draft.act(Action::AskEvalai);
         return waits(draft);
     };

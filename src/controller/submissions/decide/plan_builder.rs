@@ -5,12 +5,12 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, Event, Plan};
-use crate::controller::submissions::view::{ReportDemand, View};
+use super::plan::{Action, Event, Plan, job_name};
+use crate::controller::submissions::view::{EvalaiInfo, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
     BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Requeued, Retries, Score, State, Submission,
-    SubmissionSpec, SubmissionStatus, effective, names, reasons,
+    SubmissionSpec, SubmissionStatus, Track, effective, names, reasons,
 };
 
 /// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
@@ -20,6 +20,18 @@ const WITHOUT_EVENT: [&str; 4] = [
     reasons::RUNNING,
     reasons::RESUMED,
 ];
+
+/// How long what was asked for may take before that is shown: an answer within it costs no write.
+const SILENCE: Duration = Duration::from_secs(5);
+
+/// What a submission is run by.
+#[derive(Clone, Copy)]
+pub(super) struct Terms<'a> {
+    pub(super) leaderboard: &'a LeaderboardSpec,
+    pub(super) track: &'a Track,
+    /// What EvalAI says of it; none of a submission that is not EvalAI's.
+    pub(super) info: Option<&'a EvalaiInfo>,
+}
 
 /// A plan in the making.
 pub(super) struct PlanBuilder<'a> {
@@ -56,6 +68,20 @@ impl<'a> PlanBuilder<'a> {
 
     pub(super) fn leaderboard(&self) -> Option<&'a LeaderboardSpec> {
         self.view.leaderboard.as_ref().map(|l| &l.spec)
+    }
+
+    /// Name of the Job that the present attempt has or will have.
+    pub(super) fn job_name(&self) -> String {
+        job_name(
+            self.submission().metadata.name.as_deref().unwrap_or_default(),
+            &self.status,
+        )
+    }
+
+    /// A person has handed the submission over: it takes up what is stored, by whatever program.
+    pub(super) fn is_adopted(&self) -> bool {
+        let annotations = self.submission().metadata.annotations.as_ref();
+        annotations.is_some_and(|all| all.get(names::ANNOTATION_ADOPT).is_some_and(|text| text == "true"))
     }
 
     /// Nothing is written to EvalAI, where another program runs the submission too.
@@ -98,6 +124,11 @@ impl<'a> PlanBuilder<'a> {
         is_stopping || self.spec().cancel || self.is_deleting() || self.is_ended_in_evalai()
     }
 
+    /// What EvalAI last said of it.
+    pub(super) fn evalai_info(&self) -> Option<&'a EvalaiInfo> {
+        self.view.evalai.as_ref()?.info.as_ref()
+    }
+
     pub(super) fn is_ended_in_evalai(&self) -> bool {
         self.view.evalai.as_ref().is_some_and(|e| e.cancelled)
     }
@@ -108,7 +139,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     pub(super) fn is_finished(&self) -> bool {
-        conditions::is_true(&self.status.conditions, conditions::FINISHED)
+        self.status.has_ended()
     }
 
     /// Its results count.
@@ -158,7 +189,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     fn may_be_resumed(&self) -> bool {
-        let end = conditions::get(&self.status.conditions, conditions::FINISHED).filter(|c| c.status == "True");
+        let end = self.status.end();
         end.is_some_and(|end| end.reason != reasons::FINISHED)
     }
 
@@ -227,6 +258,16 @@ impl<'a> PlanBuilder<'a> {
         self.requeue = Some(self.requeue.map_or(delay, |present| present.min(delay)));
     }
 
+    /// Shows nothing new while an answer that was waited for so long may still come soon. Returns whether it may.
+    pub(super) fn waits_quietly(&mut self, waited: Duration) -> bool {
+        let left = left_of(SILENCE, waited);
+        if let Some(left) = left {
+            self.keeps_status();
+            self.requeue_in(left);
+        }
+        left.is_some()
+    }
+
     /// Asks for another look at this time.
     pub(super) fn requeue_at(&mut self, at: Timestamp) {
         let left = at.duration_since(self.now());
@@ -270,10 +311,12 @@ impl<'a> PlanBuilder<'a> {
         self.status.message = (!message.is_empty()).then_some(message);
     }
 
-    /// Shows that nothing moves. The first words stand while the reason does, so that a changing detail of an error
+    /// Shows that nothing moves. The first message is kept while the reason stays, so that a changing detail of an error
     /// (a time, a request id) is not a write to the API each pass.
     pub(super) fn stall(&mut self, reason: &str, message: &str) -> String {
-        let known = conditions::get(&self.status.conditions, conditions::STALLED)
+        let known = self
+            .status
+            .condition(conditions::STALLED)
             .filter(|c| c.status == "True" && c.reason == reason)
             .map(|c| c.message.clone());
         let message = known.unwrap_or_else(|| message.to_owned());
@@ -349,6 +392,11 @@ impl<'a> PlanBuilder<'a> {
 pub(super) fn seconds(milliseconds: i64) -> String {
     let at = Timestamp::from_millisecond(milliseconds).unwrap_or_default();
     format!("{at:.0}")
+}
+
+/// What is left of a time of which so much has passed.
+pub(super) fn left_of(time: Duration, passed: Duration) -> Option<Duration> {
+    time.checked_sub(passed).filter(|left| !left.is_zero())
 }
 
 /// The moment `seconds` after another.

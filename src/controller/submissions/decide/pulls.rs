@@ -46,10 +46,7 @@ pub(super) fn limit(pod: &PodView, deadlines: &Deadlines, stalled: Option<Timest
 /// The containers that wait for an image, if the Pod is at a pull.
 pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
     // Ours before the agents go one by one. Those of an overlay hold them up, wherever they stand.
-    let mut before = pod
-        .containers
-        .iter()
-        .filter(|container| is_before_agents(&container.name));
+    let mut before = pod.containers.iter().filter(|container| container.is_before_agents());
     match before.find(|container| !is_through(container)) {
         Some(next) if is_before_its_pull(next) => vec![&next.name],
         Some(_) => Vec::new(),
@@ -63,10 +60,7 @@ pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
 
 /// Seconds in which containers before the agents have run: no pull was under way then.
 fn run_seconds(pod: &PodView) -> i64 {
-    let before = pod
-        .containers
-        .iter()
-        .filter(|container| is_before_agents(&container.name));
+    let before = pod.containers.iter().filter(|container| container.is_before_agents());
     before
         .filter_map(|container| {
             let end = container.last.as_ref().filter(|end| end.exit_code == 0)?;
@@ -80,10 +74,6 @@ fn last_begun(pod: &PodView) -> Option<Timestamp> {
     let first_lives = pod.containers.iter().filter(|container| container.restarts == 0);
     let begun = first_lives.filter_map(|container| container.began.or_else(|| container.last.as_ref()?.began));
     begun.max()
-}
-
-fn is_before_agents(name: &str) -> bool {
-    names::INIT_CONTAINERS.contains(&name)
 }
 
 fn is_of_pair(name: &str) -> bool {

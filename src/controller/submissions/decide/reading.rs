@@ -8,7 +8,7 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
+use super::plan_builder::{PlanBuilder, left_of};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
@@ -88,9 +88,7 @@ pub(super) fn is_of(draft: &PlanBuilder<'_>, stage: Stage) -> bool {
 
 /// How long is still waited for an answer before anything is shown.
 pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
-    ANSWER
-        .checked_sub(draft.view.report_waited)
-        .filter(|left| !left.is_zero())
+    left_of(ANSWER, draft.view.report_waited)
 }
 
 /// How long a lost Pod still waits for the fence.
@@ -102,7 +100,7 @@ pub(super) fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
         ObservedFence::NotRequested => Duration::ZERO,
         ObservedFence::Pending(waited) | ObservedFence::Failed(waited) => waited,
     };
-    FENCE.checked_sub(waited).filter(|left| !left.is_zero())
+    left_of(FENCE, waited)
 }
 
 /// The same for what follows the Pod: only a fence that was requested is waited for.
@@ -167,7 +165,7 @@ pub(super) fn has_texts(draft: &mut PlanBuilder<'_>, report: &ReportDigest) -> b
 
 /// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
 fn may_wait(draft: &PlanBuilder<'_>, longest: SignedDuration) -> bool {
-    let end = conditions::get(&draft.status.conditions, conditions::FINISHED);
+    let end = draft.status.condition(conditions::FINISHED);
     let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
     let patience = until(end.map_or(draft.now(), |c| c.last_transition_time.0), longest);
     let Some(deleted) = &draft.submission().metadata.deletion_timestamp else {

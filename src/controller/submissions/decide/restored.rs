@@ -1,203 +1,55 @@
-//! A submission that was run before its object lost its status, as a restore from a backup leaves it: what EvalAI, the table and the
-//! bucket hold says whether it has ended, and from where it goes on.
+//! A submission that was run before its object lost its status, as a restore from a backup leaves it: what is `stored` of it says whether
+//! it has ended, and from where it goes on.
 
 use std::time::Duration;
 
-use super::plan_builder::PlanBuilder;
-use super::{accept, end, failure, foreign, live};
-use crate::controller::submissions::foreign_runs::Traces;
+use super::plan_builder::{PlanBuilder, Terms};
+use super::stored::{Found, found, may_be, note, stop, traces};
+use super::{failure, pin, reported};
 use crate::controller::submissions::report_digest::{ReportDigest, StoredReport};
-use crate::controller::submissions::view::{EvalaiInfo, ObservedTraces, Standing};
 use crate::pod::run::Stop;
 use leaderboard_api::conditions::{self, Truth};
-use leaderboard_api::{
-    ImportedEnd, ImportedState, LeaderboardSpec, Score, SubmissionStatus, Times, Track, effective, names, reasons,
-};
-
-/// What is known of a submission that was run before.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Found {
-    /// Nothing of ours: it begins.
-    Nothing,
-    /// A run of ours that has not ended.
-    Run,
-    /// The bucket holds an end that not every system may have.
-    Stored,
-    /// Every system has this end.
-    Ended(ImportedState),
-}
-
-/// Whether the object has no status of a run, so that one may be stored of which it knows nothing.
-pub(super) fn may_be(draft: &PlanBuilder<'_>) -> bool {
-    draft.status.plan.is_none() && has_not_run(draft)
-}
-
-fn has_not_run(draft: &PlanBuilder<'_>) -> bool {
-    let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
-    // What is only observed and what is checked have places of their own.
-    !has_run && !draft.observes() && !draft.spec().check
-}
-
-/// Whether it is marked as one that was run before. EvalAI's are looked for anyway; of a local one nothing else says so.
-pub(super) fn is_marked(draft: &PlanBuilder<'_>) -> bool {
-    let labels = draft.submission().metadata.labels.as_ref();
-    let by_velero = labels.is_some_and(|all| all.contains_key(names::LABEL_VELERO_RESTORE));
-    let is_local = draft.spec().evalai.is_none();
-    // The finalizer comes with the first Job.
-    foreign::is_adopted(draft) || by_velero || (is_local && draft.has_finalizer())
-}
-
-/// Whether EvalAI's own end may be one of ours.
-pub(super) fn may_have_ended(draft: &PlanBuilder<'_>, info: &EvalaiInfo) -> bool {
-    may_be(draft) && info.standing == Standing::Ended && state_of(&info.status).is_some()
-}
+use leaderboard_api::{ImportedEnd, ImportedState, SubmissionStatus, Times, effective, reasons};
 
 /// Takes the end over that is stored, if there is one. Returns whether the submission does not go on to its turn.
-pub(super) fn ends(
-    draft: &mut PlanBuilder<'_>,
-    leaderboard: &LeaderboardSpec,
-    track: &Track,
-    info: Option<&EvalaiInfo>,
-) -> bool {
+pub(super) fn ends(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
     let Some(traces) = traces(draft).filter(|_| may_be(draft)) else {
         return false;
     };
     let report = traces.report.as_deref();
-    match found(traces, draft.spec().attempt, info) {
+    match found(traces, draft.spec().attempt, terms.info) {
         Found::Nothing => false,
         Found::Run => {
             if let Some(report) = report {
-                live::take_report(draft, &report.digest);
+                reported::take(draft, &report.digest);
             }
             false
         }
         Found::Ended(state) => {
-            show_end(draft, leaderboard, track, state, report.map(|report| &report.digest));
+            show_end(draft, terms, state, report.map(|report| &report.digest));
             true
         }
         Found::Stored => {
             let Some(report) = report else { return false };
-            let image = draft
-                .spec()
-                .image
-                .clone()
-                .or_else(|| info.and_then(|info| info.image.clone()));
-            accept::pin(draft, leaderboard, track, image.unwrap_or_default(), info);
+            let named = draft.spec().image.as_ref();
+            let image = named.or_else(|| terms.info?.image.as_ref()).cloned();
+            pin::pin(draft, terms, image.unwrap_or_default());
             take_end(draft, report);
             true
         }
     }
 }
 
-/// Whether what is stored is taken up, although no attempt was asked for that does so.
-pub(super) fn takes_up(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bool {
-    let found = traces(draft).map(|traces| found(traces, draft.spec().attempt, info));
-    matches!(found, Some(Found::Run | Found::Stored))
-}
-
-/// By how many attempts row and report are ahead of the object: it may be older than the last resume. The row takes no attempt that
-/// is not above its own, or the same before its end.
-pub(super) fn attempts_ahead(draft: &PlanBuilder<'_>) -> i64 {
-    let Some(traces) = traces(draft) else { return 0 };
-    let row = traces.row.as_ref().filter(|row| row.is_ours);
-    let of_row = row.and_then(|row| Some(row.attempt?.saturating_add(i64::from(row_end(&row.status).is_some()))));
-    let of_report = traces.report.as_ref().map(|report| report.digest.attempt);
-    let latest = of_row.into_iter().chain(of_report).max();
-    latest.map_or(0, |attempt| attempt.saturating_sub(draft.spec().attempt).max(0))
-}
-
-/// What to say of a run that goes on; none for one that begins.
-pub(super) fn note(draft: &PlanBuilder<'_>) -> Option<String> {
-    let plan = draft.status.plan.as_ref()?;
-    let report = traces(draft)?.report.as_ref()?;
-    let place = effective::results_url(&plan.storage, &plan.run_id);
-    Some(format!(
-        "It was run before and had lost its status; it goes on from {place}, where {} of {} routes are done.",
-        report.digest.done, report.digest.total
-    ))
-}
-
-fn traces<'a>(draft: &PlanBuilder<'a>) -> Option<&'a Traces> {
-    let is_asked = draft.spec().evalai.is_some() || is_marked(draft);
-    let view = draft.view;
-    match &view.traces {
-        ObservedTraces::Answered(answer) if is_asked && has_not_run(draft) => answer.found.as_ref().ok(),
-        _ => None,
-    }
-}
-
-/// What table, bucket and EvalAI together say of attempt `wanted`.
-pub(super) fn found(traces: &Traces, wanted: i64, info: Option<&EvalaiInfo>) -> Found {
-    let row = traces.row.as_ref().filter(|row| row.is_ours);
-    let row_end = row
-        .filter(|row| row.attempt >= Some(wanted))
-        .and_then(|row| row_end(&row.status));
-    let report = traces.report.as_ref().map(|report| &report.digest);
-    let is_complete = report.is_some_and(|report| end::is_complete(report) && report.eligible);
-    let has_end =
-        report.is_some_and(|report| report.attempt >= wanted && (end::is_verdict(report) || stop(report).is_some()));
-    let run = if traces.stored.is_ours {
-        Found::Run
-    } else {
-        Found::Nothing
-    };
-    let Some(info) = info else {
-        return match row_end {
-            Some(state) => Found::Ended(state),
-            None if has_end => Found::Stored,
-            None => run,
-        };
-    };
-    match (info.standing, state_of(&info.status)) {
-        (Standing::Wanted, _) if has_end => Found::Stored,
-        // EvalAI resumes only what has failed: what is stored is of an earlier attempt.
-        (Standing::Resumed | Standing::Wanted, _) => run,
-        (Standing::Ended, Some(ImportedState::Finished)) if is_complete && row.is_some() && row_end.is_none() => {
-            Found::Stored
-        }
-        // Participants can write `finished` too: it counts with the results alone.
-        (Standing::Ended, Some(ImportedState::Finished)) if is_complete || row_end == Some(ImportedState::Finished) => {
-            Found::Ended(ImportedState::Finished)
-        }
-        (Standing::Ended, Some(ImportedState::Failed)) if row.is_some() || traces.stored.is_ours => {
-            Found::Ended(ImportedState::Failed)
-        }
-        // A host's re-run cancels what was finished; its state stays.
-        (Standing::Ended, Some(ImportedState::Cancelled)) => row_end.map_or(Found::Nothing, Found::Ended),
-        (Standing::Ended, _) => Found::Nothing,
-    }
-}
-
-/// The end that EvalAI's status names.
-fn state_of(status: &str) -> Option<ImportedState> {
-    match status {
-        "finished" => Some(ImportedState::Finished),
-        "failed" => Some(ImportedState::Failed),
-        "cancelled" => Some(ImportedState::Cancelled),
-        _ => None,
-    }
-}
-
-fn row_end(status: &str) -> Option<ImportedState> {
-    state_of(&status.to_ascii_lowercase())
-}
-
-/// The stop with which a run has ended for good; one whose node was taken away goes on.
-fn stop(report: &ReportDigest) -> Option<Stop> {
-    let stop = report.stopped.filter(|_| report.is_final)?;
-    (stop != Stop::Interruption).then_some(stop)
-}
-
 /// As if its Job had been seen and were gone: all that follows an end is then the same.
 fn take_end(draft: &mut PlanBuilder<'_>, report: &StoredReport) {
-    live::take_report(draft, &report.digest);
+    reported::take(draft, &report.digest);
     if let Some(plan) = draft.status.plan.as_mut() {
         plan.submission_uid = Some(report.submission_uid.clone());
     }
     let note = note(draft).unwrap_or_default();
-    draft.status.job_name = Some(live::own_job_name(draft));
+    draft.status.job_name = Some(draft.job_name());
     draft.condition(conditions::ACCEPTED, Truth::True, reasons::RESTORED, &note);
-    match stop(&report.digest).filter(|_| !end::is_verdict(&report.digest)) {
+    match stop(&report.digest).filter(|_| !report.digest.is_verdict()) {
         Some(Stop::Cancel) => draft.status.times.stopping = Some(draft.time()),
         Some(Stop::Retries | Stop::RunDeadline) => draft.fail(failure::before_restore()),
         Some(Stop::Interruption) | None => {}
@@ -206,29 +58,15 @@ fn take_end(draft: &mut PlanBuilder<'_>, report: &StoredReport) {
 }
 
 /// Shows an end that every system has: nothing is run, published or recorded again.
-fn show_end(
-    draft: &mut PlanBuilder<'_>,
-    leaderboard: &LeaderboardSpec,
-    track: &Track,
-    state: ImportedState,
-    report: Option<&ReportDigest>,
-) {
-    let clamp = |number: u32| i32::try_from(number).unwrap_or(i32::MAX);
-    let complete = report.filter(|report| end::is_complete(report) && report.eligible);
+fn show_end(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, state: ImportedState, report: Option<&ReportDigest>) {
+    let complete = report.filter(|report| report.is_complete() && report.eligible);
     let score = complete.filter(|_| state == ImportedState::Finished);
     let end = ImportedEnd {
         state,
-        track: track.name.clone(),
-        results_url: report.map(|_| effective::results_url(&leaderboard.storage, &draft.submission().run_id())),
-        progress: report.map(|report| leaderboard_api::Progress::new(clamp(report.done), clamp(report.total))),
-        score: score.and_then(|report| {
-            Some(Score::new(
-                report.score?,
-                report.route_completion,
-                report.infraction_penalty,
-                true,
-            ))
-        }),
+        track: terms.track.name.clone(),
+        results_url: report.map(|_| effective::results_url(&terms.leaderboard.storage, &draft.submission().run_id())),
+        progress: report.map(ReportDigest::progress),
+        score: score.and_then(|report| report.score(true)),
         times: Times {
             submitted: draft.status.times.submitted.clone(),
             ..Times::default()

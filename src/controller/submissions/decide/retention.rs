@@ -10,7 +10,7 @@ use jiff::Timestamp;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
 use crate::controller::submissions::view::ObservedJob;
-use leaderboard_api::{SubmissionStatus, conditions, reasons};
+use leaderboard_api::conditions;
 
 /// A deletion that has not succeeded is tried again after this long.
 const AGAIN: Duration = Duration::from_secs(30);
@@ -38,17 +38,11 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
 fn until(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let kept = draft.leaderboard()?.retention.finished_seconds;
     let status = &draft.status;
-    let end = conditions::get(&status.conditions, conditions::FINISHED).filter(|c| c.status == "True")?;
+    let end = status.end()?;
     let is_present = status.attempt == Some(draft.spec().attempt);
-    let has_all = is_delivered(status, conditions::PUBLISHED) && is_delivered(status, conditions::RECORDED);
+    let has_all = status.is_delivered(conditions::PUBLISHED) && status.is_delivered(conditions::RECORDED);
     let may_go = kept > 0 && !draft.is_deleting() && is_present && has_all && !has_job(draft);
     may_go.then(|| after(end.last_transition_time.0, kept))
-}
-
-/// Whether a system has the end, or is to have none.
-fn is_delivered(status: &SubmissionStatus, type_: &str) -> bool {
-    let condition = conditions::get(&status.conditions, type_);
-    condition.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
 }
 
 /// Whether its Job has not ended: with the Submission its Pod would go.

@@ -2,7 +2,7 @@
 //!
 //! Called by `start`. Agents and simulators that started and crashed are judged by `failure`, not here.
 
-use crate::controller::submissions::view::{ContainerView, EndView, PodView};
+use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{names, reasons};
 
@@ -32,7 +32,7 @@ pub(super) struct Trouble {
 pub(super) fn of_pod(pod: &PodView) -> Option<Trouble> {
     let has_started = pod.agent_started.is_some();
     pod.containers.iter().find_map(|container| {
-        let is_init = is_before_agents(&container.name);
+        let is_init = container.is_before_agents();
         if is_init && has_started {
             return None;
         }
@@ -47,13 +47,8 @@ pub(super) fn of_pod(pod: &PodView) -> Option<Trouble> {
 
 /// The container before the agents that fails.
 pub(super) fn failing_before_agents(pod: &PodView) -> Option<&str> {
-    let is_failing =
-        |c: &&ContainerView| is_before_agents(&c.name) && c.last.as_ref().is_some_and(|l| l.exit_code != 0);
+    let is_failing = |c: &&ContainerView| c.is_before_agents() && c.last.as_ref().is_some_and(|l| l.exit_code != 0);
     pod.containers.iter().find(is_failing).map(|c| c.name.as_str())
-}
-
-fn is_before_agents(name: &str) -> bool {
-    names::INIT_CONTAINERS.contains(&name)
 }
 
 fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {
@@ -85,7 +80,7 @@ fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {
             Some(trouble(reasons::CONTAINER_CONFIG, &message, false))
         }
         "CreateContainerError" | "RunContainerError" => {
-            let told = container.last.as_ref().filter(|end| is_start_error(end));
+            let told = container.last.as_ref().filter(|end| end.is_start_error());
             let words = told.and_then(|end| end.why.as_deref()).unwrap_or(words);
             Some(cannot_start(name, words))
         }
@@ -97,24 +92,23 @@ fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {
 fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     let end = container.last.as_ref().filter(|end| end.exit_code != 0)?;
     let name = &container.name;
-    if is_start_error(end) {
+    if end.is_start_error() {
         return Some(cannot_start(name, end.why.as_deref().unwrap_or(&end.reason)));
     }
     if !is_init {
         return None;
     }
-    if name == names::CONTAINER_WORKSPACE && end.own_reason.as_deref() == Some(reasons::PREFIX_IN_USE) {
-        let why = end.why.as_deref().unwrap_or(PREFIX_IN_USE);
+    // Another try of the same Pod would find the same; the next Pod may get another node.
+    let of_workspace = [
+        (reasons::PREFIX_IN_USE, PREFIX_IN_USE),
+        (reasons::NOT_ISOLATED, NOT_ISOLATED),
+    ];
+    let own_reason = end.own_reason.as_deref().filter(|_| name == names::CONTAINER_WORKSPACE);
+    let found = of_workspace.into_iter().find(|(reason, _)| own_reason == Some(*reason));
+    if let Some((reason, usual)) = found {
         return Some(Trouble {
             is_hopeless: true,
-            ..trouble(reasons::PREFIX_IN_USE, why, false)
-        });
-    }
-    if name == names::CONTAINER_WORKSPACE && end.own_reason.as_deref() == Some(reasons::NOT_ISOLATED) {
-        // Another try of the same Pod would find the same; the next Pod may get another node.
-        return Some(Trouble {
-            is_hopeless: true,
-            ..trouble(reasons::NOT_ISOLATED, end.why.as_deref().unwrap_or(NOT_ISOLATED), false)
+            ..trouble(reason, end.why.as_deref().unwrap_or(usual), false)
         });
     }
     let code = || format!("it ended with code {} ({})", end.exit_code, end.reason);
@@ -139,10 +133,6 @@ fn cannot_start(name: &str, words: &str) -> Trouble {
 
 fn is_agent(name: &str) -> bool {
     name.starts_with("agent-")
-}
-
-fn is_start_error(end: &EndView) -> bool {
-    matches!(end.reason.as_str(), "StartError" | "ContainerCannotRun")
 }
 
 /// The cause in a kubelet's words: `ErrImagePull` and `ImagePullBackOff` alternate, and differ only in what is before it.

@@ -29,9 +29,10 @@ impl Adapter {
     }
 }
 
-/// A command with its arguments.
-pub(super) fn words(command: &[String], arguments: Option<&[String]>) -> Vec<String> {
-    command.iter().chain(arguments.unwrap_or_default()).cloned().collect()
+/// The host's own command with its arguments, if there is one.
+pub(super) fn of_host(command: Option<&[String]>, arguments: Option<&[String]>) -> Option<Vec<String>> {
+    let words = command?.iter().chain(arguments.unwrap_or_default());
+    Some(words.cloned().collect())
 }
 
 /// Writes a word so that Kubernetes hands it on unchanged.

@@ -24,10 +24,7 @@ const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
 /// Copies the private contents into their volumes.
 pub(super) fn contents(input: &JobInput<'_>) -> Container {
     let spec = &input.spec().contents;
-    let host = spec
-        .command
-        .as_deref()
-        .map(|command| commands::words(command, spec.args.as_deref()));
+    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     Container {
         name: names::CONTAINER_CONTENTS.into(),
         image: Some(input.plan.contents_image.clone()),

@@ -107,31 +107,20 @@ impl JobInput<'_> {
 /// survive there.
 ///
 /// An overlay that `pod_overlay::validate_overlay` refuses is not applied at all, so that nothing gets around its rules.
-fn build_json(input: &JobInput<'_>) -> Value {
-    // Maps with text as keys and finite numbers always become JSON.
-    let mut job = serde_json::to_value(ours(input)).unwrap_or_default();
-    let overlay = input
-        .spec()
-        .pod_overrides
-        .as_ref()
-        .filter(|pod| pod_overlay::validate_overlay(pod).is_ok());
-    if let Some(template) = job.pointer_mut("/spec/template") {
-        if let Some(overlay) = overlay {
-            pod_overlay::apply(template, overlay);
-        }
-        settle(template, input);
-        skip_strangers(template);
-    }
-    job
-}
-
-/// [`build_json`] for `kube::Api::<DynamicObject>::create`.
 pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
-    let mut job = build_json(input);
+    // Maps with text as keys and finite numbers always become JSON.
+    let mut spec = serde_json::to_value(ours(input)).unwrap_or_default();
+    let template = &mut spec["template"];
+    let overlay = input.spec().pod_overrides.as_ref();
+    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {
+        pod_overlay::apply(template, overlay);
+    }
+    settle(template, input);
+    skip_strangers(template);
     DynamicObject {
         types: Some(TypeMeta::resource::<Job>()),
         metadata: metadata(input),
-        data: json!({ "spec": job["spec"].take() }),
+        data: json!({ "spec": spec }),
     }
 }
 
@@ -167,9 +156,7 @@ fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
         return None;
     }
-    let conditions = leaderboard.status.as_ref().map(|status| status.conditions.as_slice());
-    let found = conditions::get(conditions.unwrap_or_default(), conditions::ISOLATED);
-    let is_open = found.is_some_and(|found| {
+    let is_open = leaderboard.condition(conditions::ISOLATED).is_some_and(|found| {
         let age = now.duration_since(found.last_transition_time.0).unsigned_abs();
         found.reason == reasons::NOT_ENFORCED
             && found.observed_generation == leaderboard.metadata.generation
@@ -184,20 +171,16 @@ fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     })
 }
 
-fn ours(input: &JobInput<'_>) -> Job {
-    Job {
-        metadata: metadata(input),
-        spec: Some(JobSpec {
-            completions: Some(1),
-            parallelism: Some(1),
-            backoff_limit: Some(backoff_limit(input)),
-            // The default starts the next Pod while the old one still writes.
-            pod_replacement_policy: Some("Failed".into()),
-            ttl_seconds_after_finished: Some(input.spec().job_seconds()),
-            template: template(input),
-            ..JobSpec::default()
-        }),
-        status: None,
+fn ours(input: &JobInput<'_>) -> JobSpec {
+    JobSpec {
+        completions: Some(1),
+        parallelism: Some(1),
+        backoff_limit: Some(backoff_limit(input)),
+        // The default starts the next Pod while the old one still writes.
+        pod_replacement_policy: Some("Failed".into()),
+        ttl_seconds_after_finished: Some(input.spec().job_seconds()),
+        template: template(input),
+        ..JobSpec::default()
     }
 }
 

@@ -43,10 +43,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
     ];
     let flags = flags.into_iter().chain(gpu::check(gpus, needs(spec, version)));
-    let host = spec
-        .command
-        .as_deref()
-        .map(|command| commands::words(command, spec.args.as_deref()));
+    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     let words = host.unwrap_or_else(|| commands::simulator(version, adapter(spec, gpus)));
     let env = [variable("CARLA_PORT", &port(pair).to_string())].into_iter();
     let env = env
@@ -95,10 +92,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         format!("--log-limit={}", spec.log_size_limit.bytes()),
         format!("--python-path={}", python_path()),
     ];
-    let host = spec
-        .command
-        .as_deref()
-        .map(|command| commands::words(command, spec.args.as_deref()));
+    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     let words = host.unwrap_or_else(|| commands::agent(input.plan.leaderboard_version));
     // The runner expands these words, so that RESUME is what it is in this round.
     let words = words.iter().map(|word| commands::literal(word)).collect();

@@ -92,7 +92,7 @@ impl Case {
     }
 
     pub(super) fn json(&self) -> Value {
-        build_json(&self.input())
+        serde_json::to_value(build_object(&self.input())).unwrap()
     }
 }
 
@@ -167,12 +167,11 @@ fn the_job_of_leaderboard_2_is_as_committed() {
 }
 
 #[test]
-fn typed_and_dynamic_job_are_the_same() {
+fn the_job_has_no_field_that_kubernetes_does_not_know() {
     let case = Case::new("V2", json!({"podIdentity": role()}));
     let json = case.json();
     let typed: Job = serde_json::from_value(json.clone()).unwrap();
     assert_eq!(serde_json::to_value(typed).unwrap(), json);
-    assert_eq!(serde_json::to_value(build_object(&case.input())).unwrap(), json);
 }
 
 #[test]
@@ -185,7 +184,6 @@ fn a_field_that_this_client_does_not_know_survives() {
         case.json()["spec"]["template"]["spec"]["fieldOfTheFuture"],
         json!({"on": true})
     );
-    assert_eq!(serde_json::to_value(build_object(&case.input())).unwrap(), case.json());
 }
 
 #[test]

@@ -28,7 +28,7 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
         empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
         podinfo(),
     ];
-    let identity = has_role(input).then(identity);
+    let identity = input.spec().has_role().then(identity);
     let shared = input.spec().agent.shm_size.iter();
     let shared = shared.flat_map(|size| (1..=input.pairs()).map(|pair| memory(pair, size)));
     let display = display::volume(input);
@@ -46,15 +46,6 @@ fn memory(pair: usize, size: &ByteQuantity) -> Volume {
         }),
         ..Volume::default()
     }
-}
-
-/// Whether the Pod proves its identity with a token of its ServiceAccount.
-pub(super) fn has_role(input: &JobInput<'_>) -> bool {
-    input
-        .spec()
-        .pod_identity
-        .as_ref()
-        .is_some_and(|identity| identity.role_arn.is_some())
 }
 
 /// Most bytes of the `logs` volume.
@@ -184,7 +175,10 @@ fn runner_and_status(container: &str) -> [VolumeMount; 3] {
 }
 
 fn token(input: &JobInput<'_>) -> Option<VolumeMount> {
-    has_role(input).then(|| read_only(mount(IDENTITY_VOLUME, IDENTITY)))
+    input
+        .spec()
+        .has_role()
+        .then(|| read_only(mount(IDENTITY_VOLUME, IDENTITY)))
 }
 
 fn mount(volume: &str, path: &str) -> VolumeMount {

@@ -3,7 +3,7 @@
 //! for it.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::stream::FuturesUnordered;
@@ -19,6 +19,7 @@ use super::{node, scale_up};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::view::{NodeView, ScaleUp};
 use crate::kubernetes::CALL_TIMEOUT;
+use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
@@ -78,11 +79,7 @@ impl Lookups {
     /// Starts the task that asks.
     pub fn start(client: Client, tasks: &Tasks, wake: Wake<Submission>) -> Self {
         let shared = Arc::new(Shared::default());
-        let stop = tasks.stop().clone();
-        let asking = ask(client, Arc::clone(&shared), wake);
-        tasks.stay("lookups", async move {
-            tokio::select! { () = stop.wait() => {}, () = asking => {} }
-        });
+        tasks.until_stop("lookups", ask(client, Arc::clone(&shared), wake));
         Self(shared)
     }
 
@@ -120,12 +117,8 @@ impl Lookups {
 }
 
 impl Shared {
-    fn lock(&self) -> MutexGuard<'_, HashMap<Question, Entry>> {
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     fn want(&self, question: Question, by: ObjectRef<Submission>) -> Option<Answer> {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let entry = entries.entry(question).or_default();
         entry.wanted_by.insert(by, Instant::now());
         if entry.asked.is_none() {
@@ -136,7 +129,7 @@ impl Shared {
 
     /// The next question that is due.
     fn next(&self, now: Instant) -> Option<Question> {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         entries.retain(|_, entry| {
             entry
                 .wanted_by
@@ -155,7 +148,7 @@ impl Shared {
 
     /// Takes an answer in. Returns whom it is new to.
     fn done(&self, question: &Question, answer: Answer) -> Vec<ObjectRef<Submission>> {
-        let mut entries = self.lock();
+        let mut entries = lock(&self.entries);
         let Some(entry) = entries.get_mut(question) else {
             return Vec::new();
         };
@@ -282,6 +275,6 @@ mod tests {
         assert_eq!(shared.done(&question, refused), [by("1")]);
         tokio::time::advance(FORGOTTEN).await;
         assert_eq!(shared.next(Instant::now()), None);
-        assert!(shared.lock().is_empty());
+        assert!(lock(&shared.entries).is_empty());
     }
 }

@@ -27,7 +27,7 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
 use leaderboard_api::check::without_retries;
-use leaderboard_api::{Leaderboard, Submission, SubmissionStatus, conditions};
+use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use lookups::Lookups;
 
 /// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
@@ -58,18 +58,13 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let submission = uses.memory.with_own_status(submission);
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
-    let board = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
-    let leaderboard = uses.stores.leaderboards.get(&board);
-    let leaderboard = leaderboard.map(|found| {
-        if submission.spec.check {
-            Arc::new(without_retries(&found))
-        } else {
-            found
-        }
-    });
+    let mut leaderboard = uses.stores.leaderboard_for(&submission);
+    if submission.spec.check {
+        leaderboard = leaderboard.map(|found| Arc::new(without_retries(&found)));
+    }
     let (job, pod) = children(uses, &submission, now);
     let status = submission.status.as_ref();
-    let is_over = status.is_some_and(|status| conditions::is_true(&status.conditions, conditions::FINISHED));
+    let is_over = status.is_some_and(SubmissionStatus::has_ended);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
     let node = node(uses, &submission, pod.as_ref());
     let archive = uses.archive.observe(&submission, pod_uid, is_over);
@@ -166,7 +161,7 @@ fn team_of(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Tim
         ObservedJob::Absent | ObservedJob::Foreign => false,
     };
     let may_end = submission.status.as_ref().is_some_and(|status| {
-        let is_finished = conditions::is_true(&status.conditions, conditions::FINISHED);
+        let is_finished = status.has_ended();
         status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
     });
     if !may_end {

@@ -47,7 +47,9 @@ pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Sub
         if before.unwrap_or_else(healthy) != now {
             let pods = pods.state();
             let of_node = pods.iter().filter(|pod| pod.spec.node_name.as_deref() == Some(name));
-            of_node.filter_map(|pod| Stores::owner_of(pod.as_ref())).for_each(&wake);
+            of_node
+                .filter_map(|pod| Stores::owner_of(&pod.metadata))
+                .for_each(&wake);
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::builders::*;
-use crate::controller::submissions::decide::restored::{Found, found};
+use crate::controller::submissions::decide::stored::{Found, found};
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::foreign_runs::{StoredRun, Traces};
 use crate::controller::submissions::report_digest::{ReportDigest, StoredReport};

@@ -1,0 +1,54 @@
+//! Pins the plan of a submission: what is run stays as it was accepted, however its Leaderboard is edited.
+
+use super::plan_builder::{PlanBuilder, Terms};
+use super::stored;
+use crate::controller::submissions::view::{EvalaiInfo, Standing};
+use leaderboard_api::check::first_route;
+use leaderboard_api::{RunPlan, effective};
+
+pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) {
+    let Terms {
+        leaderboard,
+        track,
+        info,
+    } = terms;
+    let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
+    let plan = match draft.status.plan.take() {
+        // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
+        // made; all else belongs to the submission.
+        Some(pinned) if draft.status.retry == 0 && draft.status.job_name.is_none() => RunPlan {
+            // The same, unless an earlier attempt had none.
+            image,
+            contents_image: leaderboard.contents.image.clone(),
+            simulator_image: leaderboard.simulator.image.clone(),
+            ..pinned
+        },
+        Some(pinned) => pinned,
+        None => {
+            let resume = resumed || draft.spec().attempt > 1 || draft.is_adopted() || stored::takes_up(draft, info);
+            let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
+            let plan = if draft.spec().check { first_route(plan) } else { plan };
+            RunPlan {
+                earlier_attempts: earlier_attempts(draft, info).max(stored::attempts_ahead(draft)),
+                submission_uid: draft.submission().metadata.uid.clone(),
+                ..plan
+            }
+        }
+    };
+    if draft.spec().check && draft.status.checked_generation.is_none() {
+        let checked = draft.view.leaderboard.as_ref();
+        draft.status.checked_generation = checked.and_then(|leaderboard| leaderboard.metadata.generation);
+    }
+    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
+    draft.status.plan = Some(plan);
+    if draft.status.times.accepted.is_none() {
+        draft.status.times.accepted = Some(draft.time());
+    }
+}
+
+/// How many attempts the table's row of a resumed run counts before ours: those of a Submission that was deleted after its end.
+/// The row takes no attempt that is not above its own.
+fn earlier_attempts(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
+    let resumed = info.filter(|info| info.standing == Standing::Resumed);
+    resumed.map_or(0, |info| (info.last_attempt + 1 - draft.spec().attempt).max(0))
+}

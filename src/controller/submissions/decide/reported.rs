@@ -1,0 +1,64 @@
+//! What a report shows of a run: progress, score, pairs, and what its host should know of scores and logs.
+
+use super::plan_builder::PlanBuilder;
+use crate::controller::submissions::report_digest::{ReportDigest, clamp};
+use crate::pod::report::Logs;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{PairStatus, reasons};
+
+/// Takes in how far the run is.
+pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+    draft.status.progress = Some(report.progress());
+    let is_complete = report.is_final && report.done == report.total;
+    draft.status.score = report.score(is_complete).or(draft.status.score.take());
+    // Until the present Pod's first round the report is its predecessor's, whose crashes are forgiven or counted already.
+    let is_present = draft.view.pod.as_ref().is_some_and(|p| p.uid == report.pod_uid);
+    let old = std::mem::take(&mut draft.status.pairs);
+    draft.status.pairs = report
+        .pairs
+        .iter()
+        .map(|pair| {
+            let known = old.iter().find(|p| p.id == clamp(pair.id));
+            let told = if is_present { clamp(pair.crashes) } else { 0 };
+            PairStatus {
+                id: clamp(pair.id),
+                done: clamp(pair.done),
+                total: clamp(pair.total),
+                crashes: told.max(known.map_or(0, |k| k.crashes)),
+                state: pair.state,
+                last: known.and_then(|k| k.last.clone()),
+            }
+        })
+        .collect();
+    note_scores(draft, report);
+    note_logs(draft, report);
+}
+
+/// Says that scores do not follow from the infractions, and that they do again.
+fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+    let (truth, reason, message) = match &report.warning {
+        Some(first) => {
+            let message = format!("Scores do not follow from the infractions: {}", sentence(first));
+            (Truth::False, reasons::UNEXPLAINED_SCORES, message)
+        }
+        None if draft.status.condition(conditions::PLAUSIBLE).is_none() => return,
+        None => (Truth::True, reasons::SCORES_EXPLAINED, String::new()),
+    };
+    draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
+}
+
+/// Says that CloudWatch refuses the lines of the run, and that it takes them again; of a check, whether it takes them at all.
+fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+    let is_known = draft.status.condition(conditions::LOGGED).is_some();
+    match &report.logs {
+        Some(Logs::Refused(why)) => {
+            let why = sentence(why);
+            draft.condition(conditions::LOGGED, Truth::False, reasons::LOGS_REFUSED, &why);
+        }
+        Some(Logs::Sent) if is_known || draft.spec().check => {
+            draft.condition(conditions::LOGGED, Truth::True, reasons::LOGS_SENT, "");
+        }
+        _ => {}
+    }
+}
