@@ -95,6 +95,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         format!("--log-limit={}", spec.log_size_limit.bytes()),
         format!("--python-path={}", python_path()),
     ];
+    let flags = flags.into_iter().chain(gpu::report(source(input.spec())));
     let host = spec
         .command
         .as_deref()
