@@ -327,6 +327,16 @@ fn simulator_note(board: &BoardEntry) -> String {
     )
 }
 
+/// What no entry holds, whatever the options.
+const ALWAYS: [&str; 4] = [
+    "tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?",
+    "concurrency: how many submissions may run at once, in all and of one team",
+    "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else",
+    "deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original",
+];
+const FLUENTD: &str = "logGroup: does the original's FluentD run on these nodes? Then each line is stored twice: leave logGroup out, or take \
+                       the namespace out of FluentD's source (docs/migrate.md, Logs twice)";
+
 fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
     let mut decide = vec![token(entries, now)];
     decide.push(match &options.queue {
@@ -361,13 +371,10 @@ fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
                 .to_owned(),
         );
     }
-    decide.extend([
-        "tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?".to_owned(),
-        "concurrency: how many submissions may run at once, in all and of one team".to_owned(),
-        "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else"
-            .to_owned(),
-        "deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original".to_owned(),
-    ]);
+    decide.extend(ALWAYS.map(str::to_owned));
+    if entries.boards.iter().any(|board| board.log_group.is_some()) {
+        decide.push(FLUENTD.to_owned());
+    }
     if options.taints.is_empty() {
         decide.push(
             "tracks[].tolerations: do the GPU nodes have a taint (--taint)? The original's had none; with one that is not tolerated \
