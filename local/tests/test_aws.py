@@ -269,6 +269,31 @@ class Cluster(unittest.TestCase):
         # Where the plugin runs.
         self.assertTrue(any(f'"{key}"' in json.dumps(plugin["affinity"]) for key in gpu["labels"]))
 
+    def test_the_first_pod_says_what_the_driver_lacks_to_draw(self) -> None:
+        (test,) = parsed("gpu-test.yaml")
+        (container,) = test["spec"]["containers"]
+        vulkan, opengl = "usr/share/vulkan/icd.d/nvidia_icd.x86_64.json", "usr/lib64/libGLX_nvidia.so.0"
+        for files, missing in [
+            ([vulkan, opengl], []),
+            ([vulkan], ["MISSING libGLX_nvidia.so.0"]),
+            ([opengl], ["MISSING nvidia_icd*.json"]),
+            ([], ["MISSING nvidia_icd*.json", "MISSING libGLX_nvidia.so.0"]),
+        ]:
+            with tempfile.TemporaryDirectory() as root:
+                for name in ["dev/nvidia0", "etc/hosts", "lib/x", "usr/x", *files]:
+                    path = Path(root) / name
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.touch()
+                ran = subprocess.run(
+                    container["command"], env={**os.environ, "ROOT": root}, capture_output=True, text=True
+                )
+            self.assertEqual(ran.returncode, 0, ran.stderr)
+            found = [line for line in ran.stdout.splitlines() if line.startswith("MISSING")]
+            self.assertEqual(found, missing)
+        with tempfile.TemporaryDirectory() as root:
+            ran = subprocess.run(container["command"], env={**os.environ, "ROOT": root}, capture_output=True, text=True)
+        self.assertEqual(ran.returncode, 1, "a Pod without a GPU does not succeed")
+
     def test_no_pod_gets_the_nodes_role_and_policies_are_enforced(self) -> None:
         groups = [*self.cluster["managedNodeGroups"], *self.cluster["nodeGroups"]]
         self.assertTrue(all(group["disablePodIMDS"] and group["privateNetworking"] for group in groups))

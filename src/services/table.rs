@@ -74,6 +74,8 @@ pub struct Row {
     pub results: String,
     /// `12/20`.
     pub progress: String,
+    /// GPUs times seconds that it has used.
+    pub gpu_seconds: String,
     /// Name of the Submission that a host made of it by a re-run in EvalAI.
     pub rerun_as: String,
     /// Nothing is written: DynamoDB is only asked whether it would take a row.
@@ -96,6 +98,7 @@ impl Row {
             ("end_time", &self.end_time),
             ("results", &self.results),
             ("progress", &self.progress),
+            ("gpu_seconds", &self.gpu_seconds),
             (RERUN, &self.rerun_as),
         ];
         let metrics = self

@@ -130,6 +130,7 @@ async fn a_row_holds_all_columns_under_whatever_keys_the_table_has() {
         start_time: "2026-11-20 10:01:00 UTC".into(),
         end_time: "2026-11-20 12:00:00 UTC".into(),
         results: "s3://bucket/7".into(),
+        gpu_seconds: "14400".into(),
         metrics: vec![
             ("driving_score".into(), Some("41.2".into())),
             ("name".into(), Some("a reserved word".into())),
@@ -145,7 +146,8 @@ async fn a_row_holds_all_columns_under_whatever_keys_the_table_has() {
             let table = Table::describe(&stand_in.aws, &spec).await.unwrap();
             assert_eq!(table.write(&full).await, Ok(Written::Stored));
             let stored = rows(&stand_in, &spec.name).await.remove(0);
-            assert_eq!(stored.len(), 15, "{stored:?}");
+            assert_eq!(stored.len(), 16, "{stored:?}");
+            assert_eq!(stored["gpu_seconds"], "14400");
             assert_eq!(
                 (stored[team].clone(), stored[submission].clone()),
                 (format!("{number}12"), format!("{number}7"))

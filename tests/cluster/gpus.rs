@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 
 use super::matrix;
 use crate::operator::controller;
-use crate::scene::{Scene, USER_AGENT, containers, scenario, state};
+use crate::scene::{Scene, USER_AGENT, containers, lay_over, scenario, state};
 
 const LIMIT: Duration = Duration::from_mins(4);
 const VARIABLE: &str = "NVIDIA_VISIBLE_DEVICES";
@@ -69,7 +69,9 @@ async fn simulator_and_agent_get_a_gpu_each_of_a_device_plugin() {
 /// It keeps every other submission away from the node: `restarts` runs it, alone.
 pub async fn both_containers_have_the_index_of_their_gpu() {
     scenario("gpu-node-index", async |scene: &Scene| {
-        let got = run(scene, json!({"mode": "NodeIndex", "resourceName": RESOURCE})).await;
+        // Each agent gets a device of the plugin too, in place of the one that NVIDIA's runtime would add by the variable.
+        let agents = json!({"agent": {"resources": {"limits": {RESOURCE: "1"}}}});
+        let got = run_with(scene, by_index(), agents).await;
         for (pair, index) in [("1", "0"), ("2", "1")] {
             let simulator = &got[format!("simulator-{pair}").as_str()];
             assert_eq!(
@@ -78,18 +80,49 @@ pub async fn both_containers_have_the_index_of_their_gpu() {
                 "ours stands behind the plugin's"
             );
             assert_eq!(simulator.devices.len(), 1, "simulator-{pair}: {simulator}");
-            // NVIDIA's runtime, which is not here, would add the device that the variable names.
-            assert_eq!(got[format!("agent-{pair}").as_str()], none(index));
+            let agent = &got[format!("agent-{pair}").as_str()];
+            assert_eq!(
+                agent.variable.as_deref(),
+                Some(index),
+                "ours stands behind the plugin's"
+            );
+            assert_eq!(agent.devices.len(), 1, "agent-{pair}: {agent}");
         }
         assert_eq!(got["logcopy"], none("void"));
         show("NodeIndex", &got);
-        // The scheduler notices late that such a Pod has gone: no Pod of another test may meet it.
-        let pod = scene.pod("one").await.name_any();
-        let submissions = scene.api::<Submission>();
-        submissions.delete("one", &DeleteParams::default()).await.unwrap();
-        scene.wait::<Pod>(&pod, "it is gone", LIMIT, |pod| pod.is_none()).await;
+        leave_the_node(scene).await;
     })
     .await;
+}
+
+/// This node's runtime obeys no variable, as one whose toolkit is set up otherwise than the mode needs. `restarts` runs it, alone.
+pub async fn an_agent_that_gets_no_gpu_by_its_index_is_not_charged() {
+    scenario("gpu-node-index-none", async |scene: &Scene| {
+        leaderboard(scene, by_index(), json!({})).await;
+        let _controller = controller(scene);
+        scene.submit("one", "agent:standard").await;
+        let failure = finds_no_gpu(scene).await;
+        matrix::as_expected("GPU, NodeIndex, agents without a device", reasons::NO_GPU, &failure);
+        leave_the_node(scene).await;
+    })
+    .await;
+}
+
+fn by_index() -> Value {
+    json!({"mode": "NodeIndex", "resourceName": RESOURCE})
+}
+
+/// The scheduler notices late that a Pod with the node to itself has gone: no Pod of another test may meet it.
+async fn leave_the_node(scene: &Scene) {
+    let pods: Api<Pod> = scene.api();
+    let pods = pods.list(&ListParams::default()).await.unwrap();
+    let submissions = scene.api::<Submission>();
+    submissions.delete("one", &DeleteParams::default()).await.unwrap();
+    for pod in pods {
+        scene
+            .wait::<Pod>(&pod.name_any(), "it is gone", LIMIT, |pod| pod.is_none())
+            .await;
+    }
 }
 
 #[tokio::test]
@@ -98,10 +131,12 @@ async fn both_containers_of_a_pair_share_one_claim() {
         device_class(scene).await;
         let gpu = json!({"mode": "Claim", "claim": {"deviceClassName": CLASS}});
         if !knows_cdi(scene).await {
-            leaderboard(scene, gpu).await;
+            leaderboard(scene, gpu, json!({})).await;
             let _controller = controller(scene);
             scene.submit("one", "agent:standard").await;
-            finds_no_gpu(scene).await;
+            // Claims are allocated and the Pod starts, but no container has a device: the engine ignores what the kubelet asks for.
+            let failure = finds_no_gpu(scene).await;
+            matrix::as_expected("GPU, Claim, an engine without CDI", reasons::NO_GPU, &failure);
             return;
         }
         let got = run(scene, gpu).await;
@@ -121,8 +156,8 @@ async fn both_containers_of_a_pair_share_one_claim() {
     .await;
 }
 
-/// Claims are allocated and the Pod starts, but no container has a device: an engine without CDI ignores what the kubelet asks for.
-async fn finds_no_gpu(scene: &Scene) {
+/// Waits for the end as `NoGPU`, which costs no attempt; its message.
+async fn finds_no_gpu(scene: &Scene) -> String {
     let failed = scene.settled("one", LIMIT).await;
     assert_eq!(state(&failed), Some(State::Failed));
     let failure = failed.status.unwrap().failure.unwrap();
@@ -132,12 +167,17 @@ async fn finds_no_gpu(scene: &Scene) {
         "{}",
         failure.message
     );
-    matrix::as_expected("GPU, Claim, an engine without CDI", reasons::NO_GPU, &failure.message);
+    failure.message
 }
 
 /// Runs two pairs whose agents go silent, and reads what each container got.
 async fn run(scene: &Scene, gpu: Value) -> Containers {
-    leaderboard(scene, gpu).await;
+    run_with(scene, gpu, json!({})).await
+}
+
+/// The same, of a Leaderboard with a change more.
+async fn run_with(scene: &Scene, gpu: Value, more: Value) -> Containers {
+    leaderboard(scene, gpu, more).await;
     let _controller = controller(scene);
     scene.submit("one", "agent:standard").await;
     scene.running("one", LIMIT).await;
@@ -164,8 +204,8 @@ async fn run(scene: &Scene, gpu: Value) -> Containers {
     CONTAINERS.map(of).into()
 }
 
-async fn leaderboard(scene: &Scene, gpu: Value) {
-    let change = json!({
+async fn leaderboard(scene: &Scene, gpu: Value, more: Value) {
+    let mut change = json!({
         "pairs": 2,
         "routes": 2,
         "gpu": gpu,
@@ -174,6 +214,7 @@ async fn leaderboard(scene: &Scene, gpu: Value) {
         "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]},
         "retries": {"infrastructure": 0, "perPair": 0},
     });
+    lay_over(&mut change, more);
     scene.leaderboard("lb", change).await;
 }
 

@@ -42,6 +42,12 @@ async fn both_containers_of_a_pair_have_the_index_of_its_gpu_on_a_node_of_their_
 
 #[tokio::test]
 #[ignore = "it disturbs all other tests: make test runs it after them"]
+async fn an_agent_that_gets_no_gpu_by_its_index_is_not_charged() {
+    gpus::an_agent_that_gets_no_gpu_by_its_index_is_not_charged().await;
+}
+
+#[tokio::test]
+#[ignore = "it disturbs all other tests: make test runs it after them"]
 async fn a_killed_api_server_costs_nothing() {
     crashed("API server's process killed", "kube-apiserver").await;
 }

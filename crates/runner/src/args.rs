@@ -24,16 +24,18 @@ both:       --ready-seconds 3600   how long a server may take until its port ans
             --log-limit 2147483648 bytes of output that are kept in the log
             --termination-log /dev/termination-log  where the verdict is written
             --inotify true         false: files are looked for once a second
+            --root /               where devices and drivers are looked for
 simulator:  --flush-seconds 1800   how long to hold the exit until the results are stored
             --cancel-seconds 120   the same after a cancel
             --answer-seconds 10    how long a server may take to answer when its agent has crashed
             --log FILE             where output is kept, too
             --gpu any|vulkan|opengl  the server needs a GPU, and the driver for what it draws with
+            --agent-gpu false      true: the agent is to see one too; the server is not announced before its runner has looked
             --unset A,B            variables that the server does not get
-            --root /               where devices and drivers are looked for
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
             --python-path A:B:C    put in front of the image's own PYTHONPATH
+            --report-gpu false     true: looks for a GPU before anything else, and reports it to the simulator
 ";
 
 /// Where agents keep their results, as everywhere in the CARLA Leaderboard's cloud.
@@ -55,6 +57,8 @@ pub struct Job {
     pub termination_log: PathBuf,
     /// Whether changed files wake it; else it looks once a second.
     pub inotify: bool,
+    /// Where devices and drivers are looked for.
+    pub root: PathBuf,
     pub role: Role,
     /// The command and its arguments; never empty.
     pub command: Vec<OsString>,
@@ -71,16 +75,18 @@ pub enum Role {
         log: Option<PathBuf>,
         /// What the server draws with, if it is to have a GPU.
         gpu: Option<Needs>,
+        /// Whether its agent is to see a GPU.
+        agent_gpu: bool,
         /// Variables that the server does not get.
         unset: Vec<OsString>,
-        /// Where devices and drivers are looked for.
-        root: PathBuf,
     },
     Agent {
         work: PathBuf,
         checkpoint: PathBuf,
         idle: Duration,
         python_path: Option<OsString>,
+        /// Whether it reports that it sees a GPU.
+        report_gpu: bool,
     },
 }
 
@@ -164,6 +170,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
             .take("--termination-log")?
             .map_or_else(|| TERMINATION_LOG.into(), PathBuf::from),
         inotify: options.optional("--inotify", "true or false")?.unwrap_or(true),
+        root: options.take("--root")?.map_or_else(|| "/".into(), PathBuf::from),
         role: role(side, &mut options)?,
         command,
     };
@@ -202,14 +209,15 @@ fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
                 .filter(|path| !path.is_empty())
                 .map(PathBuf::from),
             gpu: options.optional("--gpu", "any, vulkan or opengl")?,
+            agent_gpu: options.optional("--agent-gpu", "true or false")?.unwrap_or(false),
             unset: options.list("--unset")?,
-            root: options.take("--root")?.map_or_else(|| "/".into(), PathBuf::from),
         },
         Side::Agent => Role::Agent {
             work: options.take("--work")?.map_or_else(|| WORK.into(), PathBuf::from),
             checkpoint: options.path("--checkpoint")?,
             idle: options.seconds("--idle-seconds", 800)?,
             python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
+            report_gpu: options.optional("--report-gpu", "true or false")?.unwrap_or(false),
         },
     })
 }
@@ -338,8 +346,8 @@ mod tests {
                 answer: Duration::from_secs(10),
                 log: None,
                 gpu: None,
+                agent_gpu: false,
                 unset: Vec::new(),
-                root: "/".into(),
             }
         );
         assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
@@ -353,11 +361,15 @@ mod tests {
 
     #[test]
     fn a_simulator_has_a_gpu_and_loses_variables() {
-        let line = "simulator --pair 1 --status /s --port 1 --gpu=vulkan --unset=DISPLAY,XAUTHORITY --root /r -- a";
-        let Role::Simulator { gpu, unset, root, .. } = job(line).role else {
+        let line = "simulator --pair 1 --status /s --port 1 --gpu=vulkan --agent-gpu=true --unset=DISPLAY,XAUTHORITY --root /r -- a";
+        let job = job(line);
+        let Role::Simulator {
+            gpu, agent_gpu, unset, ..
+        } = job.role
+        else {
             panic!("a simulator's line");
         };
-        assert_eq!((gpu, root), (Some(Needs::Vulkan), "/r".into()));
+        assert_eq!((gpu, agent_gpu, job.root), (Some(Needs::Vulkan), true, "/r".into()));
         assert_eq!(unset, ["DISPLAY", "XAUTHORITY"]);
     }
 
@@ -369,15 +381,19 @@ mod tests {
                 work,
                 idle,
                 python_path,
+                report_gpu,
                 ..
-            } => (work, idle.as_secs(), job.log_limit, python_path),
+            } => (work, idle.as_secs(), job.log_limit, python_path, report_gpu),
             Role::Simulator { .. } => panic!("an agent's line"),
         };
-        assert_eq!(role(job(&format!("{line} -- a"))), (WORK.into(), 800, 2 << 30, None));
+        assert_eq!(
+            role(job(&format!("{line} -- a"))),
+            (WORK.into(), 800, 2 << 30, None, false)
+        );
         let more = job(&format!(
-            "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b -- a"
+            "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b --report-gpu=true -- a"
         ));
-        assert_eq!(role(more), ("/w".into(), 3, 9, Some("/a:/b".into())));
+        assert_eq!(role(more), ("/w".into(), 3, 9, Some("/a:/b".into()), true));
     }
 
     #[test]

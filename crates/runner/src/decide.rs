@@ -31,6 +31,17 @@ pub(crate) enum Child {
     Ended,
 }
 
+/// What a simulator knows of its agent's GPU.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum AgentGpu {
+    /// It does not matter, or the agent's command may have begun: from then on what lies in its folder is its own word.
+    NotAsked,
+    /// Its runner has not looked yet.
+    Awaited,
+    Seen,
+    Missing,
+}
+
 /// The world at one moment. All of the peer is about this side's present round.
 #[expect(clippy::struct_excessive_bools, reason = "each is one independent observation")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,6 +55,7 @@ pub(crate) struct Seen {
     /// `logcopy.done`: the final results are stored.
     pub(crate) stored: bool,
     pub(crate) child: Child,
+    pub(crate) agent_gpu: AgentGpu,
     /// SIGTERM came from outside.
     pub(crate) terminated: bool,
     /// The agent has printed nothing for too long.
@@ -78,6 +90,8 @@ pub(crate) enum Cause {
     PortTaken,
     /// The server was to have a GPU and there is none.
     NoGpu,
+    /// The agent was to have a GPU and there is none. It has not begun.
+    AgentHasNoGpu,
     /// There is a GPU, and no driver for what the server draws with.
     GraphicsDriverMissing,
     /// With the exit code of a shell that cannot start a command.
@@ -140,10 +154,15 @@ fn booting(seen: &Seen) -> Action {
         Action::End(Cause::PeerDone)
     } else if seen.cancel || seen.stored {
         Action::End(Cause::Cancelled)
+    } else if seen.agent_gpu == AgentGpu::Missing {
+        Action::End(Cause::AgentHasNoGpu)
     } else if seen.child == Child::Ended {
         Action::End(Cause::ChildEnded)
     } else if seen.peer_crashed {
         Action::Skip(Skip::CatchUp)
+    } else if seen.child == Child::Ready && seen.agent_gpu == AgentGpu::Awaited {
+        // The agent's image may take an hour to come, and until then the server is not late.
+        Action::Wait
     } else if seen.child == Child::Ready {
         Action::Announce
     } else if seen.overdue {
@@ -241,7 +260,7 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
         Cause::Cancelled => silent(hold(Hold::Cancel), CODE_OVER),
         Cause::PeerDone => SIMULATOR_DONE,
         // The agent's image may take an hour to come, and nothing that it does helps.
-        Cause::NoGpu | Cause::GraphicsDriverMissing => Conclusion {
+        Cause::NoGpu | Cause::AgentHasNoGpu | Cause::GraphicsDriverMissing => Conclusion {
             mark: Some(EndMark::Crash),
             hold: Hold::Free,
             code: CODE_NO_GRAPHICS,

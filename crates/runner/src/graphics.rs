@@ -119,7 +119,7 @@ pub fn adapter(root: &Path, needs: Needs, variable: impl Fn(&str) -> Option<OsSt
 }
 
 /// GPUs that have a device node here.
-fn devices(root: &Path) -> usize {
+pub fn devices(root: &Path) -> usize {
     let entries = fs::read_dir(root.join("dev")).into_iter().flatten().flatten();
     let is_device = |name: &OsStr| {
         let number = name.as_bytes().strip_prefix(DEVICE.as_bytes());

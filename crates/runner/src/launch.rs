@@ -73,13 +73,13 @@ pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), Cann
 
 /// The command of a simulator's server, on its own GPU and without the screen of its image.
 fn server(job: &Job) -> Result<Command, NoGraphics> {
-    let Role::Simulator { gpu, unset, root, .. } = &job.role else {
+    let Role::Simulator { gpu, unset, .. } = &job.role else {
         return Ok(group::command(&job.command, &[]));
     };
     let mut command = match gpu {
         None => group::command(&job.command, &[]),
         Some(needs) => {
-            let adapter = graphics::adapter(root, *needs, |name| env::var_os(name))?;
+            let adapter = graphics::adapter(&job.root, *needs, |name| env::var_os(name))?;
             let words: Vec<OsString> = job
                 .command
                 .iter()

@@ -156,6 +156,9 @@ pub enum Mark {
 pub enum StatusFile {
     /// `<member>/<member>.start<c>`, `.crash<c>` or `.done`, written by that member.
     Of(Member, Mark),
+    /// `<agent>/<agent>.gpu` or `.nogpu`, written by an agent's runner before it begins anything, and read by its simulator alone:
+    /// whether the agent's container sees a GPU.
+    Gpu(Member, bool),
     /// `logcopy/simulation.cancel`, written by `logcopy`: everybody stops.
     Cancel,
     /// `logcopy/logcopy.done`, written by `logcopy`: the final results are stored.
@@ -166,7 +169,7 @@ impl StatusFile {
     /// The sub-folder it lies in, which is also the only one its writer can write.
     pub fn folder(&self) -> String {
         match self {
-            Self::Of(member, _) => member.to_string(),
+            Self::Of(member, _) | Self::Gpu(member, _) => member.to_string(),
             Self::Cancel | Self::Stored => LOGCOPY_FOLDER.to_owned(),
         }
     }
@@ -177,6 +180,8 @@ impl StatusFile {
             Self::Of(member, Mark::Start(round)) => format!("{member}.start{round}"),
             Self::Of(member, Mark::Crash(round)) => format!("{member}.crash{round}"),
             Self::Of(member, Mark::Done) => format!("{member}.done"),
+            Self::Gpu(member, true) => format!("{member}.gpu"),
+            Self::Gpu(member, false) => format!("{member}.nogpu"),
             Self::Cancel => "simulation.cancel".to_owned(),
             Self::Stored => "logcopy.done".to_owned(),
         }
@@ -187,7 +192,8 @@ impl StatusFile {
         root.join(self.folder()).join(self.name())
     }
 
-    /// The file `name` in the sub-folder `folder`; `None` for every other name, and for one in a foreign folder.
+    /// The file `name` in the sub-folder `folder`; `None` for every other name, and for one in a foreign folder. What a pair reports
+    /// of GPUs is of use to that pair alone.
     pub fn parse(folder: &str, name: &str) -> Option<Self> {
         if folder == LOGCOPY_FOLDER {
             return [Self::Cancel, Self::Stored]

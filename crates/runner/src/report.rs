@@ -76,7 +76,7 @@ const fn what(end: &End<'_>) -> What {
         Cause::NotReady => What::NotReady,
         Cause::ServerSilent => What::ServerSilent,
         Cause::PortTaken => What::PortTaken,
-        Cause::NoGpu => What::NoGpu,
+        Cause::NoGpu | Cause::AgentHasNoGpu => What::NoGpu,
         Cause::GraphicsDriverMissing => What::GraphicsDriverMissing,
         Cause::CannotStart(_) | Cause::Mute => What::CannotStart,
         Cause::ChildEnded => match end.status {
@@ -103,6 +103,10 @@ fn reason(end: &End<'_>) -> String {
             "the simulator was not ready in time",
         ),
         Cause::ServerSilent => "the agent crashed, and the server does not answer any more".to_owned(),
+        Cause::AgentHasNoGpu => {
+            "the agent's container sees no GPU (no /dev/nvidia0 or any other number), and its Leaderboard gives it one; it was not begun"
+                .to_owned()
+        }
         Cause::PortTaken => "another process of the Pod listens on the server's port".to_owned(),
         Cause::CannotStart(_) | Cause::Mute | Cause::NoGpu | Cause::GraphicsDriverMissing => {
             end.detail.unwrap_or("the command could not be started").to_owned()

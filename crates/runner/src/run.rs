@@ -2,6 +2,9 @@
 //!
 //! All waiting is one `poll` over signals, folders and output; a look once a second stands behind it. Policy is `decide`'s.
 
+mod agent_gpu;
+mod own_server;
+
 use std::io;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
@@ -16,7 +19,7 @@ use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave
 use crate::group::{self, Group};
 use crate::keep::Keeper;
 use crate::launch;
-use crate::server::{self, Listener, Question};
+use crate::server;
 use crate::tee::Tee;
 use crate::wake::{Folders, Signals};
 use crate::{checkpoint, memory, own_folder, report, say};
@@ -51,6 +54,8 @@ pub(crate) struct Runner {
     memory_kills: u64,
     /// Another container listened on the server's port.
     is_port_taken: bool,
+    /// A simulator's server has answered once.
+    has_answered: bool,
     detail: Option<String>,
 }
 
@@ -85,6 +90,7 @@ impl Runner {
             keeper,
             memory_kills: memory::kills(),
             is_port_taken: false,
+            has_answered: false,
             detail: None,
         }
     }
@@ -104,6 +110,9 @@ impl Runner {
     fn live(&mut self) -> Cause {
         if self.round >= MAX_ROUNDS {
             return self.too_many_crashes();
+        }
+        if let Err(cause) = self.report_gpu() {
+            return cause;
         }
         loop {
             let seen = self.look();
@@ -141,6 +150,7 @@ impl Runner {
             cancel: StatusFile::Cancel.exists(&self.job.status),
             stored: StatusFile::Stored.exists(&self.job.status),
             child,
+            agent_gpu: self.agent_gpu(),
             terminated: self.terminated,
             idle: self.idle_left() == Some(Duration::ZERO),
             overdue: self.ready_left() == Some(Duration::ZERO),
@@ -151,15 +161,13 @@ impl Runner {
         if self.group.as_ref().is_some_and(|group| group.status().is_some()) {
             return Child::Ended;
         }
-        if let (Phase::Booting, Some((port, _))) = (self.phase, self.server())
+        if let (Phase::Booting, Some((port, _)), false) = (self.phase, self.server(), self.has_answered)
             && Instant::now() >= self.next_probe
         {
             self.next_probe = Instant::now() + (self.since.elapsed() / 8).clamp(FIRST_PROBE, PROBE_EVERY);
-            if server::answers(port) && self.is_own_server(port) {
-                return Child::Ready;
-            }
+            self.has_answered = server::answers(port) && self.is_own_server(port);
         }
-        Child::Quiet
+        if self.has_answered { Child::Ready } else { Child::Quiet }
     }
 
     /// A simulator's port, and how long its server may take to answer.
@@ -167,51 +175,6 @@ impl Runner {
         match self.job.role {
             Role::Simulator { port, answer, .. } => Some((port, answer)),
             Role::Agent { .. } => None,
-        }
-    }
-
-    /// Whether it is this container's server that listens. Another container's listener is no readiness.
-    fn is_own_server(&mut self, port: u16) -> bool {
-        let listener = server::listener(port);
-        if listener == Listener::Foreign && !self.is_port_taken {
-            self.is_port_taken = true;
-            self.say(&format!("a process of another container listens on port {port}"));
-        }
-        listener == Listener::Own
-    }
-
-    /// What only the network shows of the end of a simulator: that its port is taken, or that its server hangs.
-    fn of_the_server(&mut self, cause: Cause) -> Cause {
-        let Some((port, answer)) = self.server() else {
-            return cause;
-        };
-        match (self.phase, cause) {
-            (Phase::Booting, Cause::ChildEnded | Cause::NotReady) => {
-                self.is_own_server(port);
-                if self.is_port_taken && server::may_agents_run(&self.job.status) {
-                    Cause::PortTaken
-                } else {
-                    cause
-                }
-            }
-            (Phase::Running, Cause::PeerCrashed) if self.is_server_silent(port, answer) => Cause::ServerSilent,
-            _ => cause,
-        }
-    }
-
-    /// Whether the server hangs. One that ends while it is asked does not.
-    fn is_server_silent(&mut self, port: u16, answer: Duration) -> bool {
-        let begin = Instant::now();
-        let mut question = Question::ask(port);
-        loop {
-            let has_ended = self.group.as_ref().is_none_or(|group| group.status().is_some());
-            if has_ended || self.terminated || question.as_mut().is_ok_and(Question::is_answered) {
-                return false;
-            }
-            if begin.elapsed() >= answer {
-                return true;
-            }
-            self.wait(Duration::from_millis(20));
         }
     }
 
@@ -235,7 +198,7 @@ impl Runner {
 
     fn patience(&self) -> Duration {
         let probe = self.next_probe.saturating_duration_since(Instant::now());
-        let probe = (self.phase == Phase::Booting).then_some(probe);
+        let probe = (self.phase == Phase::Booting && !self.has_answered).then_some(probe);
         let copy = self.keeper.as_ref().and_then(Keeper::pause);
         [probe, copy, self.idle_left(), self.ready_left()]
             .into_iter()
@@ -308,7 +271,10 @@ impl Runner {
     }
 
     fn mark(&mut self, mark: Mark) -> Result<(), Cause> {
-        let file = StatusFile::Of(self.me, mark);
+        self.write(&StatusFile::Of(self.me, mark))
+    }
+
+    fn write(&mut self, file: &StatusFile) -> Result<(), Cause> {
         let created = file.create(&self.job.status);
         created.map_err(|error| self.mute(format!("the status file {} cannot be created: {error}", file.name())))
     }

@@ -39,7 +39,7 @@ pub enum What {
     ServerSilent,
     /// Another process of the Pod listens on the port of the simulator's server.
     PortTaken,
-    /// The simulator was to have a GPU and sees none.
+    /// The simulator, or its agent, was to have a GPU and sees none. A simulator's word for both; of an agent it counts for nothing.
     NoGpu,
     /// The simulator sees a GPU, and no driver for what its server draws with.
     GraphicsDriverMissing,

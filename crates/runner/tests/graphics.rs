@@ -1,15 +1,17 @@
-//! A simulator that is to have a GPU, as a real process: what stops it, and what its server gets.
+//! A pair that is to have a GPU, as real processes: what stops it, what is believed of it, and what the server gets.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on fails")]
 
 mod support;
 
 use std::fs;
+use std::net::TcpStream;
 use std::os::unix::fs::symlink;
+use std::time::{Duration, Instant};
 
 use leaderboard_runner::protocol::{Mark, StatusFile};
 use leaderboard_runner::verdict::What;
-use support::{Pod, SIMULATOR};
+use support::{AGENT, COMPLETE, Pod, SIMULATOR};
 
 /// A Pod whose simulator sees these devices, and a root for it.
 fn pod_with(devices: &[&str]) -> (Pod, String) {
@@ -111,4 +113,84 @@ fn a_simulator_without_a_gpu_of_the_leaderboard_checks_nothing_and_changes_no_wo
     pod.write(StatusFile::Cancel);
     pod.write(StatusFile::Stored);
     assert_eq!(simulator.code(), 0, "{}", simulator.stderr());
+}
+
+const ASKS: &str = "--agent-gpu=true";
+const REPORTS: &str = "--report-gpu=true";
+/// What the command of an agent leaves that it ran.
+const RUNS: &str = "touch \"$CHECKPOINT.ran\"; printf '%s' \"$RESULTS\" > \"$CHECKPOINT\"";
+
+fn server_of(pod: &Pod) -> [String; 3] {
+    let server = pod.path("server.py").display().to_string();
+    ["python3".to_owned(), server, pod.port.to_string()]
+}
+
+fn simulator_that_asks(pod: &Pod) -> support::Container {
+    let server = server_of(pod);
+    pod.simulator_running(&server.each_ref().map(String::as_str), &[ASKS])
+}
+
+fn has_run(pod: &Pod) -> bool {
+    pod.path("work/agent_results.json.ran").exists()
+}
+
+#[test]
+fn an_agent_without_its_gpu_is_the_simulators_word_and_nothing_of_its_image_runs() {
+    let (mut pod, root) = pod_with(&["nvidiactl"]);
+    pod.environment.push(("RESULTS".into(), COMPLETE.into()));
+    let mut simulator = simulator_that_asks(&pod);
+    let _agent = pod.agent_running(&["sh", "-c", RUNS], &[&root, REPORTS]);
+    assert_eq!(simulator.code(), 69, "{}", simulator.stderr());
+    let verdict = simulator.verdict();
+    assert_eq!((verdict.what, verdict.round), (What::NoGpu, Some(0)));
+    assert!(
+        verdict.why.starts_with("the agent's container sees no GPU"),
+        "{}",
+        verdict.why
+    );
+    assert_eq!(pod.files(SIMULATOR), ["simulator-1.crash0"]);
+    // Restarted by the kubelet before the Job is ended, it comes to the same end.
+    let mut again = simulator_that_asks(&pod);
+    assert_eq!((again.code(), again.verdict().what), (69, What::NoGpu));
+    assert!(!has_run(&pod));
+}
+
+#[test]
+fn nothing_is_announced_before_the_agents_runner_has_seen_its_gpu() {
+    let (mut pod, root) = pod_with(&["nvidia0"]);
+    pod.environment.push(("RESULTS".into(), COMPLETE.into()));
+    let mut simulator = simulator_that_asks(&pod);
+    let begin = Instant::now();
+    while TcpStream::connect(("127.0.0.1", pod.port)).is_err() {
+        assert!(begin.elapsed() < support::LIMIT, "{}", simulator.stderr());
+        std::thread::yield_now();
+    }
+    assert!(simulator.stays(Duration::from_secs(2)));
+    assert_eq!(pod.files(SIMULATOR), [""; 0]);
+    let mut agent = pod.agent_running(&["sh", "-c", RUNS], &[&root, REPORTS]);
+    pod.until(SIMULATOR, Mark::Done);
+    assert_eq!(agent.code(), 0, "{}", agent.stderr());
+    assert!(has_run(&pod));
+    assert_eq!(pod.files(AGENT), ["agent-1.done", "agent-1.gpu", "agent-1.start0"]);
+    pod.write(StatusFile::Stored);
+    assert_eq!(simulator.code(), 0, "{}", simulator.stderr());
+}
+
+/// Its folder is its own from then on. It could save itself the charge of every crash.
+#[test]
+fn what_an_agent_writes_of_its_gpu_once_it_has_begun_is_not_read() {
+    let (pod, root) = pod_with(&["nvidia0"]);
+    let mut simulator = simulator_that_asks(&pod);
+    let forged = StatusFile::Gpu(AGENT, false).path(&pod.status());
+    let script = format!("touch {}; exit 3", forged.display());
+    let mut agent = pod.agent_running(&["sh", "-c", &script], &[&root, REPORTS]);
+    assert_eq!((simulator.code(), agent.code()), (1, 1));
+    assert!(forged.exists());
+    assert_eq!(simulator.verdict().what, What::PeerCrashed);
+    // Nor after a restart of both.
+    let mut simulator = simulator_that_asks(&pod);
+    pod.until(SIMULATOR, Mark::Start(1));
+    let mut agent = pod.agent_running(&["sh", "-c", "exit 3"], &[&root, REPORTS]);
+    assert_eq!((simulator.code(), agent.code()), (1, 1));
+    assert_eq!(simulator.verdict().what, What::PeerCrashed);
 }

@@ -333,6 +333,9 @@ fn simulator_note(board: &BoardEntry) -> String {
     )
 }
 
+const FLUENTD: &str = "logGroup: does the original's FluentD run on these nodes? Then each line is stored twice: leave logGroup out, or take \
+                       the namespace out of FluentD's source (docs/migrate.md, Logs twice)";
+
 fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
     let queue = match &options.queue {
         None => "queue: the URL of the SQS queue that EvalAI writes to (--queue), and its region".to_owned(),
@@ -364,6 +367,7 @@ fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
                 .to_owned(),
         ),
         Some("deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original".to_owned()),
+        open(entries.boards.iter().any(|board| board.log_group.is_some()), FLUENTD),
         open(options.taints.is_empty(), NO_TAINTS),
         open(
             options.two_operators,

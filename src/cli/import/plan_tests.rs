@@ -214,6 +214,8 @@ fn what_is_not_given_is_left_out_and_asked_for() {
     for what in ["podIdentity:", "network.egress:", "queue: the URL"] {
         assert!(asks(&import, what) && !asks(&given, what), "{what}");
     }
+    assert!(asks(&given, "logGroup: does the original's FluentD run"));
+    assert!(!asks(&import, "logGroup:"), "there is none");
     for what in [
         "evalai.challenge:",
         "concurrency:",

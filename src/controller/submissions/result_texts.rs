@@ -117,6 +117,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         end_time: text(status.times.finished.as_ref()),
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
+        gpu_seconds: gpu_seconds(status),
         is_trial: false,
         rerun_as: status
             .rerun_as
@@ -125,6 +126,16 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
             .unwrap_or_default(),
         metrics: columns(report.filter(|_| is_finished(status)), plan.leaderboard_version),
     })
+}
+
+/// What the submission has used, of one that has ended: before, each Job would cost a write more.
+fn gpu_seconds(status: &SubmissionStatus) -> String {
+    let used = status
+        .usage
+        .map(|usage| usage.gpu_seconds)
+        .filter(|seconds| *seconds > 0);
+    let used = used.filter(|_| status.state_of_conditions().is_terminal());
+    used.map(|seconds| seconds.to_string()).unwrap_or_default()
 }
 
 /// The attempt as the row counts it: also those of an earlier Submission of the same run, which is gone.
@@ -194,6 +205,28 @@ mod tests {
         assert_eq!(get("off_road_infractions"), Some("0.0"));
         assert_eq!(get("agent_blocked"), Some("0"));
         assert_eq!(found.len(), 15);
+    }
+
+    #[test]
+    fn the_row_of_an_ended_submission_has_what_it_used() {
+        for (type_, reason, used, expected) in [
+            ("Running", "Running", json!({"gpus": 4, "gpuSeconds": 7200}), ""),
+            ("Finished", "Finished", json!({"gpus": 4, "gpuSeconds": 7200}), "7200"),
+            (
+                "Finished",
+                "AgentCrashed",
+                json!({"gpus": 4, "gpuSeconds": 7200}),
+                "7200",
+            ),
+            ("Finished", "Finished", json!({"gpus": 0, "gpuSeconds": 0}), ""),
+            ("Finished", "Finished", Value::Null, ""),
+        ] {
+            let condition = json!({"type": type_, "status": "True", "reason": reason, "message": "",
+                                   "lastTransitionTime": "2026-01-01T00:00:00Z"});
+            let status = json!({"conditions": [condition], "team": {"id": "3"}, "plan": plan(), "use": used});
+            let row = row(None, &serde_json::from_value(status).unwrap()).unwrap();
+            assert_eq!(row.gpu_seconds, expected, "{type_} {reason} {used}");
+        }
     }
 
     #[test]

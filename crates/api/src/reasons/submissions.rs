@@ -207,8 +207,9 @@ reasons! {
             "Look at the simulator's log, then resume the submission; it repeats the route it was at.",
             log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";
         NO_GPU = "NoGPU",
-            "A simulator saw no GPU on its node although `gpu` of the Leaderboard gives it one: it was not started. The Job ends at \
-             once, and another one follows; after two on one node the Jobs of this attempt avoid it.",
+            "A simulator, or with `gpu.mode: NodeIndex` an agent that had not begun, saw no GPU on its node although `gpu` of the \
+             Leaderboard gives it one; the simulator's log says which. The Job ends at once, and another one follows; after two on one \
+             node the Jobs of this attempt avoid it.",
             "Look at the node: driver, device plugin, container runtime, and what docs/gpu.md asks for the Leaderboard's `gpu.mode`. Then \
              resume the submission.";
         GRAPHICS_DRIVER_MISSING = "GraphicsDriverMissing",

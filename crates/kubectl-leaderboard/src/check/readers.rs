@@ -111,7 +111,7 @@ async fn try_ask(queue: &Queue) -> Result<Vec<Reader>, String> {
     let attributes = run(&arn_command(queue)).await?;
     let arn = attributes.pointer("/Attributes/QueueArn").and_then(Value::as_str);
     let arn = arn.ok_or("aws sqs named no ARN of the queue")?.to_owned();
-    let mut found = pipes(&run(&pipes_command(queue, &arn)).await?);
+    let mut found = pipes(&run(&pipes_command(queue, &arn)).await?, &arn);
     found.extend(mappings(&run(&mappings_command(queue, &arn)).await?));
     Ok(found)
 }
@@ -139,10 +139,13 @@ async fn run(arguments: &[String]) -> Result<Value, String> {
     serde_json::from_slice(&output.stdout).map_err(|_| format!("aws {what} printed no JSON"))
 }
 
-/// The Pipes that run, in the answer of `aws pipes list-pipes`.
-fn pipes(answer: &Value) -> Vec<Reader> {
+/// The Pipes of this very queue that run, in the answer of `aws pipes list-pipes`, which has those of all queues whose names begin alike.
+fn pipes(answer: &Value, arn: &str) -> Vec<Reader> {
     let all = answer["Pipes"].as_array().map(Vec::as_slice).unwrap_or_default();
-    let names = all.iter().filter_map(|pipe| pipe["Name"].as_str()).map(clean);
+    let of_queue = all
+        .iter()
+        .filter(|pipe| pipe["Source"].as_str().is_none_or(|source| source == arn));
+    let names = of_queue.filter_map(|pipe| pipe["Name"].as_str()).map(clean);
     names
         .map(|name| Reader {
             what: format!("EventBridge Pipe {name}"),
@@ -244,15 +247,18 @@ mod tests {
 
     #[test]
     fn only_what_is_on_is_a_reader() {
-        let answer = json!({"Pipes": [{"Name": "old-pipeline", "CurrentState": "RUNNING"}, {"Arn": "x"}]});
+        let arn = "arn:aws:sqs:eu-west-1:1:carla";
+        let pipe = |name: &str, queue: &str| json!({"Name": name, "Source": queue, "CurrentState": "RUNNING"});
+        let of_dead_letters = pipe("of-dead-letters", "arn:aws:sqs:eu-west-1:1:carla-dead");
+        let answer = json!({"Pipes": [of_dead_letters, pipe("old-pipeline", arn), {"Arn": "x"}]});
         assert_eq!(
-            pipes(&answer),
+            pipes(&answer, arn),
             [Reader {
                 what: "EventBridge Pipe old-pipeline".into(),
                 stop: "aws pipes stop-pipe --name old-pipeline".into()
             }]
         );
-        assert_eq!(pipes(&json!({})), []);
+        assert_eq!(pipes(&json!({}), arn), []);
         let mapping = |state: &str| json!({"UUID": state, "FunctionArn": "arn:f", "State": state});
         let answer = json!({"EventSourceMappings": [mapping("Enabled"), mapping("Disabled"), mapping("Creating")]});
         let found: Vec<String> = mappings(&answer).into_iter().map(|reader| reader.stop).collect();

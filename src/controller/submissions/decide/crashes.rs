@@ -159,7 +159,10 @@ fn of_graphics(id: i32, cause: EndReason, node: Option<&str>) -> Option<(&'stati
     match cause {
         EndReason::NoGPU => Some((
             reasons::NO_GPU,
-            format!("Simulator {id} saw no GPU on {node}, although the Leaderboard gives it one."),
+            format!(
+                "Pair {id} lacks a GPU on {node}, although the Leaderboard gives it one: its simulator or its agent saw none. The \
+                 simulator's log says which."
+            ),
         )),
         EndReason::GraphicsDriverMissing => Some((
             reasons::GRAPHICS_DRIVER_MISSING,

@@ -63,9 +63,8 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::REQUEUED => "The challenge's hosts have put the submission back in line.",
         reasons::RESULTS_NOT_STORED => "The results could not be stored.",
         reasons::SIMULATION_CRASHED => "The simulator crashed.",
-        reasons::NO_GPU | reasons::GRAPHICS_DRIVER_MISSING => {
-            "The machine that ran the submission could not run the simulator."
-        }
+        reasons::NO_GPU => "The machine that ran the submission had no GPU for it.",
+        reasons::GRAPHICS_DRIVER_MISSING => "The machine that ran the submission could not run the simulator.",
         reasons::START_DEADLINE => "The run could not be started in time.",
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
         reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",

@@ -325,8 +325,8 @@ fn the_runner_is_told_the_deadlines() {
             answer: Duration::from_secs(10),
             log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
             gpu: Some(graphics::Needs::Vulkan),
+            agent_gpu: false,
             unset: vec!["DISPLAY".into(), "XAUTHORITY".into()],
-            root: "/".into(),
         }
     );
     assert_eq!(simulator.log_limit, 64 << 20);
@@ -350,6 +350,7 @@ fn the_runner_is_told_the_deadlines() {
         checkpoint: "/tmp/agent/agent_results.json".into(),
         idle: seconds(30),
         python_path: Some(FRONT.into()),
+        report_gpu: false,
     };
     assert_eq!((agent.role, agent.log_limit), (role, 2_097_152));
 }

@@ -96,9 +96,21 @@ fn claim_name(pair: usize) -> String {
     format!("gpu-{pair}")
 }
 
-/// What the runner of a simulator checks before it starts the server: nothing where the operator gives no GPU.
-pub(super) fn check(source: GpuSource<'_>, needs: Needs) -> Option<String> {
-    (source != GpuSource::None).then(|| format!("--gpu={needs}"))
+/// What the runner of a simulator checks before it starts the server: nothing where the operator gives no GPU. By its index the agent
+/// has one only if the node's runtime obeys the variable, and else it would be charged for the lack of it.
+pub(super) fn check(source: GpuSource<'_>, needs: Needs) -> impl Iterator<Item = String> {
+    let own = (source != GpuSource::None).then(|| format!("--gpu={needs}"));
+    let of_agent = is_by_index(source).then(|| "--agent-gpu=true".to_owned());
+    own.into_iter().chain(of_agent)
+}
+
+/// The same for the runner of an agent, which reports to its simulator.
+pub(super) fn report(source: GpuSource<'_>) -> Option<String> {
+    is_by_index(source).then(|| "--report-gpu=true".to_owned())
+}
+
+fn is_by_index(source: GpuSource<'_>) -> bool {
+    matches!(source, GpuSource::NodeIndex(_))
 }
 
 /// Hides the node's GPUs from a container that neither requests one nor has the variable. It comes first, so that the container's
@@ -172,7 +184,7 @@ pub(super) fn avoided(nodes: &[NodeWithoutGpu]) -> Vec<&str> {
 /// Keeps a Pod whose pairs know their GPU by its index away from nodes with another submission's Pod, whatever its namespace, and
 /// every Pod away from nodes that gave it no GPU. It comes after the overlay, whose lists would take the place of these.
 pub(super) fn place(pod: &mut Value, source: GpuSource<'_>, avoided: &[&str]) {
-    if let GpuSource::NodeIndex(_) = source {
+    if is_by_index(source) {
         let others = json!({
             "topologyKey": HOSTNAME,
             "namespaceSelector": {},

@@ -193,6 +193,30 @@ fn drawn_with(version: &str, more: Value) -> (Option<String>, Option<String>) {
     (value("--gpu="), value("r.GraphicsAdapter="))
 }
 
+/// Only there the agent's GPU depends on the node's runtime alone. One side with the flag and the other without would wait permanently.
+#[test]
+fn an_agent_that_knows_its_gpu_by_its_index_reports_to_its_simulator_whether_it_sees_one() {
+    for (gpu, asks) in [
+        (json!({"mode": "None"}), false),
+        (json!({"resourceName": GPU}), false),
+        (json!({"mode": "NodeIndex", "resourceName": GPU}), true),
+        (
+            json!({"mode": "Claim", "claim": {"resourceClaimTemplateName": "t"}}),
+            false,
+        ),
+    ] {
+        let job = Case::new("V2", json!({"gpu": gpu})).json();
+        let has = |name: &str, flag: &str| words(container(&job, name)).contains(&flag);
+        for pair in 1..=4 {
+            let found = [
+                has(&format!("simulator-{pair}"), "--agent-gpu=true"),
+                has(&format!("agent-{pair}"), "--report-gpu=true"),
+            ];
+            assert_eq!(found, [asks, asks], "pair {pair}: {gpu}");
+        }
+    }
+}
+
 #[test]
 fn the_runner_checks_what_the_server_draws_with_and_finds_its_adapter() {
     let found = "$$(LEADERBOARD_GRAPHICS_ADAPTER)";

@@ -92,6 +92,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
         format!("--log-limit={}", spec.log_size_limit.bytes()),
         format!("--python-path={}", python_path()),
     ];
+    let flags = flags.into_iter().chain(gpu::report(source(input.spec())));
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     let words = host.unwrap_or_else(|| commands::agent(input.plan.leaderboard_version));
     // The runner expands these words, so that RESUME is what it is in this round.

@@ -1,0 +1,48 @@
+//! Whether an agent that is given a GPU of its node by its number sees one, which only its own container shows. For `run`.
+//!
+//! Nothing of the agent's image runs before its simulator has announced its server for the first time, and nobody else can write
+//! into its folder. So the simulator asks for the report of the agent's runner before that, believes it, and asks no more afterwards.
+
+use leaderboard_runner::args::Role;
+use leaderboard_runner::graphics;
+use leaderboard_runner::protocol::{Mark, StatusFile};
+
+use super::Runner;
+use crate::decide::{AgentGpu, Cause, Phase};
+
+impl Runner {
+    /// An agent reports what it sees, before it does anything else.
+    pub(super) fn report_gpu(&mut self) -> Result<(), Cause> {
+        if !matches!(self.job.role, Role::Agent { report_gpu: true, .. }) {
+            return Ok(());
+        }
+        let is_there = graphics::devices(&self.job.root) > 0;
+        if !is_there {
+            self.say(
+                "the container sees no GPU (no /dev/nvidia0 or any other number), and its Leaderboard gives it one",
+            );
+        }
+        self.write(&StatusFile::Gpu(self.me, is_there))
+    }
+
+    /// What a simulator knows of its agent's.
+    pub(super) fn agent_gpu(&self) -> AgentGpu {
+        let is_asked = matches!(self.job.role, Role::Simulator { agent_gpu: true, .. });
+        if !is_asked || self.phase != Phase::Booting || self.has_announced() {
+            return AgentGpu::NotAsked;
+        }
+        let reported = |is_there| StatusFile::Gpu(self.me.peer(), is_there).exists(&self.job.status);
+        if reported(false) {
+            AgentGpu::Missing
+        } else if reported(true) {
+            AgentGpu::Seen
+        } else {
+            AgentGpu::Awaited
+        }
+    }
+
+    /// Whether the agent's command may have begun, in whatever round.
+    fn has_announced(&self) -> bool {
+        (0..=self.round).any(|round| StatusFile::Of(self.me, Mark::Start(round)).exists(&self.job.status))
+    }
+}
