@@ -70,7 +70,8 @@ async fn simulator_and_agent_get_a_gpu_each_of_a_device_plugin() {
 pub async fn both_containers_have_the_index_of_their_gpu() {
     scenario("gpu-node-index", async |scene: &Scene| {
         // Each agent gets a device of the plugin too, in place of the one that NVIDIA's runtime would add by the variable.
-        let agents = json!({"agent": {"resources": {"limits": {RESOURCE: "1"}}}});
+        let agents = json!([{"name": "agent", "resources": {"limits": {RESOURCE: "1"}}}]);
+        let agents = json!({"podOverrides": {"spec": {"containers": agents}}});
         let got = run_with(scene, by_index(), agents).await;
         for (pair, index) in [("1", "0"), ("2", "1")] {
             let simulator = &got[format!("simulator-{pair}").as_str()];
