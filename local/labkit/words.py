@@ -1,7 +1,7 @@
 """Words that a reader does not search for, and the usual ones of the field.
 
-Only words without another use are listed, so that a finding is never a matter of taste. Code is left out: only the comments
-and strings of Rust and Python, and the whole of any other text file.
+Only words without another use are listed, so that a finding is never a matter of taste. Of Rust and Python these are read: comments,
+strings and the names of functions, since that of a test is a sentence. Any other text file is read as a whole.
 """
 
 import io
@@ -36,8 +36,8 @@ PATTERN = re.compile(
     + "|".join(rf"\b(?:{word})\b".replace(" ", r"\s+") for word in USUAL)
     + ")"
 )
-# A comment, a raw string, a string, or a character, which may be a quotation mark.
-RUST = re.compile(r"//[^\n]*|/\*.*?\*/|\br(#*)\".*?\"\1|\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^\\'\n])'", re.DOTALL)
+# A comment, a raw string, a string, a character, which may be a quotation mark, or the name of a function.
+RUST = re.compile(r"\bfn\s+\w+|//[^\n]*|/\*.*?\*/|\br(#*)\".*?\"\1|\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^\\'\n])'", re.DOTALL)
 # Written by programs, or about these words.
 LEFT_OUT = ("Cargo.lock", "go.sum", "words.py", "words.allow", "test_words.py")
 
@@ -65,11 +65,17 @@ def parts(path: str, text: str) -> Iterator[tuple[int, str]]:
     """What people read of a file, with the line it starts in."""
     if path.endswith(".rs"):
         for match in RUST.finditer(text):
-            yield text.count("\n", 0, match.start()) + 1, match.group()
+            is_name = match.group().startswith("fn")
+            part = match.group().replace("_", " ") if is_name else match.group()
+            yield text.count("\n", 0, match.start()) + 1, part
     elif path.endswith(".py") or text.startswith("#!/usr/bin/env python3"):
+        before = ""
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
-            if token.type not in (tokenize.NAME, tokenize.OP, tokenize.NUMBER):
+            if before == "def":
+                yield token.start[0], token.string.replace("_", " ")
+            elif token.type not in (tokenize.NAME, tokenize.OP, tokenize.NUMBER):
                 yield token.start[0], token.string
+            before = token.string
     else:
         yield 1, text
 

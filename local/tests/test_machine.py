@@ -191,7 +191,7 @@ class Configuration(unittest.TestCase):
 
 
 class Words(unittest.TestCase):
-    def test_a_network_failure_is_told_from_others(self) -> None:
+    def test_a_network_failure_differs_from_others(self) -> None:
         output = 'go: x@v1: Get "http://p/x": dial tcp: lookup p: no such host\nexit status 1\n'
         self.assertIn("no such host", console.network_failure(output) or "")
         self.assertIsNone(console.network_failure("main.go:1: syntax error\n"))

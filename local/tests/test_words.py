@@ -18,23 +18,23 @@ class Words(unittest.TestCase):
         text = "Wish\nmend it\nfor\never\nIts Pod\nof its Pod, wishful amendments, for everyone\n"
         self.assertEqual(found("a.md", text), [(1, "Wish"), (2, "mend"), (3, "for ever"), (5, "Its Pod")])
 
-    def test_rust_is_searched_in_comments_and_strings(self) -> None:
+    def test_rust_is_searched_in_comments_strings_and_names_of_functions(self) -> None:
         text = "\n".join(
             [
                 "/// A wish.",
-                "fn wish(fate: &'a str) -> char { '\"' }",
+                "fn it_is_mended(fate: &'a str) -> char { '\"' }",
                 'let a = "the \\" fate"; // mend',
                 'let b = r#"whoever "#;',
                 "/* buried",
                 "   for ever */",
             ]
         )
-        lines = [(1, "wish"), (3, "fate"), (3, "mend"), (4, "whoever"), (5, "buried"), (6, "for ever")]
+        lines = [(1, "wish"), (2, "mended"), (3, "fate"), (3, "mend"), (4, "whoever"), (5, "buried"), (6, "for ever")]
         self.assertEqual(found("a.rs", text), lines)
 
-    def test_python_is_searched_in_comments_and_strings(self) -> None:
-        text = '"""A wish."""\nwish = 1  # mend\nfate = f"fate {0}"\n'
-        self.assertEqual([word for _, word in found("a.py", text)], ["wish", "mend", "fate"])
+    def test_python_is_searched_in_comments_strings_and_names_of_functions(self) -> None:
+        text = '"""A wish."""\nwish = 1  # mend\nfate = f"fate {0}"\ndef test_it_is_for_ever(wish): ...\n'
+        self.assertEqual([word for _, word in found("a.py", text)], ["wish", "mend", "fate", "for ever"])
 
     def test_what_is_allowed_is_not_reported_and_what_is_not_needed_is(self) -> None:
         listing = "# Quotes.\na.md: I wish\na.md: gone\n"

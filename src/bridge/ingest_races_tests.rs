@@ -59,7 +59,7 @@ async fn one_that_vanishes_in_between_is_created() {
 }
 
 #[tokio::test]
-async fn a_refusal_for_good_is_told_from_a_passing_failure() {
+async fn a_permanent_refusal_differs_from_a_passing_failure() {
     let (refused, _) = against(vec![refusal(422, "Invalid")], message("a", 100)).await;
     assert!(matches!(refused, Err(IngestError::Refused { .. })), "{refused:?}");
     let (failed, _) = against(vec![refusal(403, "Forbidden")], message("a", 100)).await;

@@ -21,7 +21,7 @@ fn images(registry: &ImageRegistry) -> Value {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_image_that_can_never_run_fails_before_a_job_is_made_and_evalai_is_told() {
+async fn an_image_that_can_never_run_fails_before_a_job_is_made_and_evalai_gets_the_reason() {
     let world = World::new().await;
     let registry = ImageRegistry::start().await;
     let mut with_volumes = config();

@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_of_the_api_server_is_told_in_its_own_words_once() {
+    fn an_answer_of_the_api_server_is_shown_in_its_own_words_once() {
         let error = refused(403, "leases is forbidden", "Forbidden");
         assert_eq!(kube(&error), "the API server answered 403: leases is forbidden");
         assert_eq!(

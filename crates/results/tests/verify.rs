@@ -226,7 +226,7 @@ fn forged_records_are_told() {
 }
 
 #[test]
-fn a_driving_score_that_is_no_product_is_told() {
+fn a_driving_score_that_is_no_product_is_reported() {
     for format in [V1, V2] {
         let mut file = finished(format, &[drive(50.0, 1.0, &[])]);
         file["_checkpoint"]["records"][0]["scores"]["score_composed"] = 90.into();

@@ -262,7 +262,7 @@ async fn no_transition_is_refused() {
 }
 
 #[tokio::test]
-async fn concurrent_results_double_the_row_and_then_fail_for_ever() {
+async fn concurrent_results_double_the_row_and_then_fail_permanently() {
     let stand = Stand::start().await;
     let pk = stand.submit().await;
     stand.knobs(&json!({"put_delay_ms": 2_000})).await;

@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_surely_wrong_comes_first_and_all_is_told() {
+    fn what_is_surely_wrong_comes_first_and_all_is_shown() {
         let mut reach = Reach::default();
         reach.take(Place::Bucket, "bucket", 1, silent(), at(0));
         reach.take(Place::Table, "table", 1, Finding::Good, at(0));

@@ -178,7 +178,7 @@ async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
 }
 
 #[test]
-fn an_attempt_that_evalai_has_asked_for_is_told_from_one_that_a_person_has_begun() {
+fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
     let mut of = |attempt, record: Option<Value>| {
         submission.spec.attempt = attempt;

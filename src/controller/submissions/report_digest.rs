@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_of_another_object_is_told_apart() {
+    fn a_report_of_another_object_is_recognized() {
         assert_eq!(ReportDigest::read(&report(true), "v").unwrap(), None);
         assert!(
             ReportDigest::read(b"torn", "u")

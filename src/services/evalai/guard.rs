@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_attempt_is_told_once_even_where_the_earlier_one_left_its_words() {
+    fn a_later_attempt_is_published_once_even_where_the_earlier_one_left_its_texts() {
         assert_eq!(
             progress(S::Running, of(2, true), false, Progress::Queued),
             Verdict::Send

@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_deleted_submission_is_told_by_whether_it_had_come_to_its_end() {
+    fn a_deleted_submission_is_recognized_by_whether_it_had_come_to_its_end() {
         for (status, deleted) in [
             ("submitted", Status::Deleted),
             ("running", Status::Deleted),

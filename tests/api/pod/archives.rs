@@ -74,7 +74,7 @@ async fn tight_s3() -> (String, JoinHandle<()>) {
 }
 
 #[tokio::test]
-async fn a_missing_object_is_told_from_a_forbidden_one() {
+async fn a_missing_object_differs_from_a_forbidden_one() {
     let (endpoint, server) = tight_s3().await;
     let client = || async { ministack::aws(&endpoint).await.s3(None, Some(&endpoint)) };
     let ours = Archive::new(client().await, "bucket", "runs/77/");

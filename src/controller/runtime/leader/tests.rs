@@ -374,7 +374,7 @@ async fn of_many_candidates_exactly_one_leads_at_any_time() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_release_that_fails_is_told_and_leaves_the_fence_closed() {
+async fn a_release_that_fails_is_reported_and_leaves_the_fence_closed() {
     let server = FakeServer::default();
     let candidate = Candidate::start(&server, someone());
     candidate.leads().await;

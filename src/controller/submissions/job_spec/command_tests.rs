@@ -279,7 +279,7 @@ fn a_resumed_attempt_says_so() {
 }
 
 #[test]
-fn an_image_without_an_agent_is_told_what_is_missing() {
+fn an_image_without_an_agent_shows_what_is_missing() {
     let image = Image::new("nobody");
     image.program("python3", FAKE_PYTHON);
     let job = Case::new("V2", json!({})).json();
@@ -305,7 +305,7 @@ fn the_evaluators_exit_code_is_the_commands() {
 }
 
 #[test]
-fn the_runner_is_told_the_deadlines() {
+fn the_runner_gets_the_deadlines() {
     let deadlines = json!({"readySeconds": 60, "idleSeconds": 30, "flushSeconds": 50, "cancelSeconds": 40});
     let job = Case::new("V2", json!({"deadlines": deadlines, "agent": {"logSizeLimit": "2Mi"}})).json();
     let (words, mut env) = started(container(&job, "simulator-3"), &[]);

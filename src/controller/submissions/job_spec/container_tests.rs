@@ -207,7 +207,7 @@ fn only_our_own_containers_have_an_identity() {
 }
 
 #[test]
-fn eks_is_told_every_stranger() {
+fn eks_skips_every_container_of_a_stranger() {
     let pod = json!({"spec": {"initContainers": [{"name": "metrics", "image": "m", "restartPolicy": "Always"}]}});
     let job = Case::new("V2", json!({"pairs": 2, "podOverrides": pod})).json();
     assert_eq!(
@@ -340,7 +340,7 @@ fn the_hosts_variables_win_but_not_over_the_plan() {
 }
 
 #[test]
-fn the_pod_is_told_what_to_measure_and_the_next_one_what_was_found() {
+fn the_pod_gets_what_to_measure_and_the_next_one_what_was_found() {
     let asked = |network: Value, found: Option<(&str, i64, &str)>| {
         let mut case = Case::new("V2", json!({ "network": network }));
         case.leaderboard.metadata.generation = Some(3);

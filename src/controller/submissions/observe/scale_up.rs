@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn an_autoscalers_last_word_is_told_from_the_schedulers() {
+    fn an_autoscalers_last_message_differs_from_the_schedulers() {
         let scheduler = || event("FailedScheduling", "default-scheduler", 900, "0/3 nodes are available.");
         let triggered = "pod triggered scale-up: [{gpu-nodes 0->1 (max: 2)}]";
         let full = "pod didn't trigger scale-up: 1 max node group size reached";

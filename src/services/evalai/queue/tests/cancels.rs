@@ -22,7 +22,7 @@ fn a_cancellation_is_found_by_the_next_list() {
 }
 
 #[test]
-fn a_cancellation_that_a_write_under_way_may_undo_is_told_again() {
+fn a_cancellation_that_a_write_under_way_may_undo_is_sent_again() {
     let (mut bench, write) = partial_under_way();
     let list = next_list(&mut bench);
     bench.answer(&list, Reply::Rows(Answer::Done(vec![row(7, Status::Cancelled)])));

@@ -76,7 +76,7 @@ fn throttling_stops_everything_for_as_long_as_asked() {
 }
 
 #[test]
-fn a_refused_end_is_told_tried_again_later_and_at_once_with_other_texts() {
+fn a_refused_end_is_reported_tried_again_later_and_at_once_with_other_texts() {
     let mut bench = Bench::new();
     bench.running(7);
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
@@ -242,7 +242,7 @@ fn what_waits_for_the_first_write_is_woken_once_when_it_may_be_sent() {
 }
 
 #[test]
-fn a_refused_token_is_told_and_asked_again_after_a_minute_or_its_renewal() {
+fn a_refused_token_is_reported_and_tried_again_after_a_minute_or_its_renewal() {
     let mut bench = Bench::new();
     bench.serve();
     let ticket = bench.expect("sweep of submitted");

@@ -218,7 +218,7 @@ fn the_sweep_takes_of_each_phase_what_came_after_its_own_leaderboard() {
 }
 
 #[test]
-fn a_swept_row_that_was_run_before_is_told_from_a_lost_rerun() {
+fn a_swept_row_that_was_run_before_differs_from_a_lost_rerun() {
     let edited = |pk| Row {
         submitted_at: Some(wall(-1000)),
         resumed_at: Some(wall(-200)),
