@@ -25,7 +25,6 @@ pub struct JobStatus {
 #[derive(Deserialize, Clone, Debug)]
 #[serde(rename_all = "camelCase")]
 pub struct SubmissionStatus {
-    state: Option<String>,
     reason: Option<String>,
     message: Option<String>,
     #[serde(default)]
@@ -127,9 +126,8 @@ impl Observed {
             let now = Instant::now();
             moments.uids.entry(name.clone()).or_insert(submission.metadata.uid);
             let Some(status) = status else { return };
-            let state = status.state.unwrap_or_default();
             let reason = status.reason.unwrap_or_default();
-            if state == "Running" {
+            if is_true(&status.conditions, "Running") {
                 moments.running.entry(name.clone()).or_insert(now);
             }
             let known = moments.reasons.get(&name).is_some_and(|(known, _)| *known == reason);
@@ -137,8 +135,8 @@ impl Observed {
                 moments.reasons.insert(name.clone(), (reason.clone(), now));
             }
             if is_true(&status.conditions, "Finished") {
-                if state != "Finished" {
-                    let why = format!("{state} {reason}: {}", status.message.unwrap_or_default());
+                if reason != "Finished" {
+                    let why = format!("{reason}: {}", status.message.unwrap_or_default());
                     moments.failed.insert(name.clone(), why);
                 }
                 moments.finished.entry(name).or_insert(now);

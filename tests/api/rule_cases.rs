@@ -19,10 +19,10 @@ pub struct Case {
 pub enum Step {
     /// `good` is accepted, `bad` on top of it is not.
     Create { good: Value, bad: Value },
-    /// The object `from` is there, perhaps in a state; the change `bad` is refused, then `good` is accepted.
+    /// The object `from` is there, perhaps with an end; the change `bad` is refused, then `good` is accepted.
     Update {
         from: Value,
-        state: Option<&'static str>,
+        end: Option<&'static str>,
         bad: Value,
         good: Value,
     },
@@ -39,7 +39,7 @@ fn create(kind: Kind, message: &'static str, good: &Value, bad: &Value) -> Case 
 fn update(kind: Kind, message: &'static str, from: &Value, bad: &Value, good: &Value) -> Case {
     let step = Step::Update {
         from: json!({ "spec": from }),
-        state: None,
+        end: None,
         bad: json!({ "spec": bad }),
         good: json!({ "spec": good }),
     };

@@ -193,16 +193,23 @@ async fn try_case(api: &Api<kube::core::DynamicObject>, case: &Case, name: &str)
             let object = case.kind.object(name, &[good, bad]);
             refused(case, create(api, object, true).await.map(drop))
         }
-        Step::Update { from, state, bad, good } => {
+        Step::Update {
+            from,
+            end: reason,
+            bad,
+            good,
+        } => {
             let object = case.kind.object(name, &[from]);
             create(api, object, false)
                 .await
                 .map_err(|error| show("the first one is refused", &error))?;
             let params = PatchParams::default();
-            if let Some(state) = state {
-                let status = Patch::Merge(json!({"status": {"state": state}}));
+            if let Some(reason) = reason {
+                let end = json!({"type": "Finished", "status": "True", "reason": reason, "message": "",
+                                 "lastTransitionTime": "2026-01-01T00:00:00Z"});
+                let status = Patch::Merge(json!({"status": {"conditions": [end]}}));
                 let set = api.patch_status(name, &params, &status).await;
-                set.map_err(|error| show("the state is refused", &error))?;
+                set.map_err(|error| show("the end is refused", &error))?;
             }
             refused(case, api.patch(name, &params, &Patch::Merge(bad)).await.map(drop))?;
             let allowed = api.patch(name, &params, &Patch::Merge(good)).await;

@@ -134,7 +134,7 @@ async fn between_tries(scene: &Scene) {
     });
     board(scene, "tries", crashes).await;
     scene.submit_to("tries", "tries", "agent:standard").await;
-    case.shows(scene, "tries", "Replacing", "It is tried again in 10 s")
+    case.shows(scene, "tries", "Replacing", "The submission is tried again in 10 s")
         .await;
     cancelled(&mut case, scene, "tries").await;
     case.close();

@@ -3,7 +3,8 @@
 //! Called by the controller. Pure: the time is handed in.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
-use schemars::{Schema, SchemaGenerator};
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde_json::Value;
 
 /// The submission has a Leaderboard, a track, an image and a place in EvalAI.
 pub const ACCEPTED: &str = "Accepted";
@@ -33,6 +34,9 @@ pub const ISOLATED: &str = "Isolated";
 pub const CHECKED: &str = "Checked";
 /// A Leaderboard that is being deleted waits for its submissions.
 pub const TERMINATING: &str = "Terminating";
+
+/// Characters of a condition's message, which may hold a stranger's text.
+pub const MAX_MESSAGE: usize = 32_768;
 
 /// The truth of a condition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,7 +77,7 @@ pub fn set(
         type_: type_.into(),
         status: truth.as_str().into(),
         reason: reason.into(),
-        message: message.into(),
+        message: fitting(message).into(),
         observed_generation: generation,
         last_transition_time: now.clone(),
     };
@@ -95,6 +99,15 @@ pub fn set(
     changed
 }
 
+/// What of a message the definition allows.
+fn fitting(message: &str) -> &str {
+    let end = message
+        .char_indices()
+        .nth(MAX_MESSAGE)
+        .map_or(message.len(), |(at, _)| at);
+    &message[..end]
+}
+
 /// Removes one condition.
 pub fn remove(conditions: &mut Vec<Condition>, type_: &str) {
     conditions.retain(|c| c.type_ != type_);
@@ -110,12 +123,18 @@ pub fn is_true(conditions: &[Condition], type_: &str) -> bool {
     get(conditions, type_).is_some_and(|c| c.status == "True")
 }
 
-/// A list of conditions, one of each type.
+/// A list of conditions, one of each type. Kubernetes bounds none of its texts, and a rule may walk only what is bounded.
 pub(super) fn schema(generator: &mut SchemaGenerator) -> Schema {
-    let item = generator.subschema_for::<Condition>();
+    let mut item = Condition::json_schema(generator);
+    for (field, longest) in [("message", MAX_MESSAGE), ("reason", 64), ("status", 7), ("type", 64)] {
+        if let Some(Value::Object(text)) = item.pointer_mut(&format!("/properties/{field}")) {
+            text.insert("maxLength".to_owned(), longest.into());
+        }
+    }
     schemars::json_schema!({
         "type": "array",
         "items": item,
+        "maxItems": 16,
         "x-kubernetes-list-type": "map",
         "x-kubernetes-list-map-keys": ["type"]
     })
@@ -127,6 +146,15 @@ mod tests {
 
     fn at(second: i64) -> Time {
         Time(jiff::Timestamp::from_second(second).unwrap())
+    }
+
+    #[test]
+    fn a_message_is_cut_to_what_the_definition_allows() {
+        let mut list = Vec::new();
+        let long = "é".repeat(MAX_MESSAGE + 1);
+        set(&mut list, READY, Truth::False, "A", &long, None, &at(1));
+        assert_eq!(list[0].message.chars().count(), MAX_MESSAGE);
+        assert!(!set(&mut list, READY, Truth::False, "A", &long, None, &at(2)));
     }
 
     #[test]

@@ -13,7 +13,7 @@ use crate::kubernetes::Store;
 use crate::observability::Observability;
 use crate::observability::metrics::{BoardState, Standing};
 use crate::services::evalai::Hub;
-use leaderboard_api::{FailureClass, Leaderboard, State, Submission, conditions, reasons};
+use leaderboard_api::{FailureClass, Leaderboard, State, Submission, SubmissionStatus, conditions, reasons};
 
 /// How often what is not an event is counted: more often than anybody scrapes.
 const EVERY: Duration = Duration::from_secs(5);
@@ -161,7 +161,7 @@ fn count_standings(submissions: &[Arc<Submission>]) -> BTreeMap<Standing, usize>
     let mut written: BTreeMap<(&'static str, &str, &'static str), usize> = BTreeMap::new();
     for submission in submissions {
         let status = submission.status.as_ref();
-        let state = status.and_then(|status| status.state).unwrap_or(State::Pending);
+        let state = state(submission);
         let failure = status.and_then(|status| status.failure.as_ref());
         let class = failure.filter(|_| state == State::Failed).map(|failure| failure.class);
         let reason = status.and_then(|status| status.reason.as_deref());
@@ -183,20 +183,19 @@ fn count_standings(submissions: &[Arc<Submission>]) -> BTreeMap<Standing, usize>
 fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {
     let mut counts: BTreeMap<_, _> = STATES.iter().map(|state| (state.as_str(), 0)).collect();
     for submission in submissions {
-        let state = submission
-            .status
-            .as_ref()
-            .and_then(|s| s.state)
-            .unwrap_or(State::Pending);
-        *counts.entry(state.as_str()).or_default() += 1;
+        *counts.entry(state(submission).as_str()).or_default() += 1;
     }
     counts
+}
+
+fn state(submission: &Submission) -> State {
+    let status = submission.status.as_ref();
+    status.map_or(State::Pending, SubmissionStatus::state_of_conditions)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use leaderboard_api::{SubmissionSpec, SubmissionStatus};
     use serde_json::json;
 
     const NOW: &str = "2026-01-01T01:00:00Z";
@@ -285,27 +284,24 @@ mod tests {
 
     #[test]
     fn submissions_are_counted_by_the_reason_and_the_class_of_their_failure() {
-        let with = |state, reason: Option<&str>, class: Option<&str>| {
-            let mut one = submission("a", &[]);
+        let with = |condition, reason: &str, class: Option<&str>| {
+            let mut one = submission("a", &[(condition, "True", reason, 1)]);
             let failure = class.map(|class| json!({"class": class, "charged": false, "reason": "R", "message": "M"}));
-            Arc::make_mut(&mut one).status = Some(SubmissionStatus {
-                state: Some(state),
-                reason: reason.map(str::to_owned),
-                failure: serde_json::from_value(json!(failure)).unwrap(),
-                ..SubmissionStatus::default()
-            });
+            let status = Arc::make_mut(&mut one).status.as_mut().unwrap();
+            status.reason = Some(reason.to_owned());
+            status.failure = serde_json::from_value(json!(failure)).unwrap();
             one
         };
         let mut unseen = submission("a", &[]);
         Arc::make_mut(&mut unseen).status = None;
         let all = [
             unseen,
-            with(State::Failed, Some("AgentCrashed"), Some("Participant")),
-            with(State::Failed, Some("AgentCrashed"), Some("Participant")),
-            with(State::Failed, Some("AgentCrashed"), Some("Infrastructure")),
+            with("Finished", "AgentCrashed", Some("Participant")),
+            with("Finished", "AgentCrashed", Some("Participant")),
+            with("Finished", "AgentCrashed", Some("Infrastructure")),
             // What failed once is no failure of the attempt that runs now.
-            with(State::Running, Some("Running"), Some("Infrastructure")),
-            with(State::Cancelled, Some("of a version to come"), None),
+            with("Running", "Running", Some("Infrastructure")),
+            with("Finished", "of a version to come", None),
         ];
         let expected = [
             ("Cancelled", "Other", "", 1),
@@ -323,27 +319,15 @@ mod tests {
 
     #[test]
     fn every_state_is_counted_also_with_nobody_in_it() {
-        let spec: SubmissionSpec =
-            serde_json::from_value(serde_json::json!({"leaderboardName": "one", "track": "map", "image": "agent:1"}))
-                .unwrap();
-        let submission = |state| {
-            let status = SubmissionStatus {
-                state,
-                ..SubmissionStatus::default()
-            };
-            let mut object = Submission::new("one", spec.clone());
-            object.status = Some(status);
-            Arc::new(object)
-        };
-        let found = states(&[
-            submission(None),
-            submission(Some(State::Failed)),
-            submission(Some(State::Failed)),
-        ]);
+        let mut edited = submission("a", &[]);
+        // No program reads the state that is shown.
+        Arc::make_mut(&mut edited).status.as_mut().unwrap().state = Some(State::Failed);
+        let finished = || submission("a", &[("Finished", "True", "Finished", 1)]);
+        let found = states(&[edited, finished(), finished()]);
         let expected = [
             ("Cancelled", 0),
-            ("Failed", 2),
-            ("Finished", 0),
+            ("Failed", 0),
+            ("Finished", 2),
             ("Pending", 1),
             ("Resumed", 0),
             ("Running", 0),

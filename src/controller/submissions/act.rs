@@ -173,7 +173,11 @@ impl Actor<'_> {
             Action::ForgetEvalai => uses.external.hub.forget(&key_of(submission)),
             Action::Forget => {
                 uses.external.gone(&key_of(submission));
-                uses.archive.forget(&uid_of(submission));
+                let uid = uid_of(submission);
+                uses.archive.forget(&uid);
+                uses.images.forget(&uid);
+                uses.foreign_runs.forget(&uid);
+                uses.addresses.forget(&uid);
             }
             Action::Record { end } => uses.external.record(self.view, status, end),
         }

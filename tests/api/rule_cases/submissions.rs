@@ -93,8 +93,8 @@ fn requeues() -> Vec<Case> {
         &number(2),
         &json!({"priority": 5}),
     );
-    if let Step::Update { state, .. } = &mut finished.step {
-        *state = Some("Finished");
+    if let Step::Update { end, .. } = &mut finished.step {
+        *end = Some("Finished");
     }
     vec![
         update(
@@ -117,10 +117,10 @@ fn requeues() -> Vec<Case> {
 
 fn attempts() -> Vec<Case> {
     let second = json!({"attempt": 2, "cancel": false});
-    let ended = |state, message, bad: &Value, good: &Value| {
+    let ended = |reason, message, bad: &Value, good: &Value| {
         let mut case = update(Submission, message, &json!({}), bad, good);
-        if let Step::Update { state: slot, .. } = &mut case.step {
-            *slot = Some(state);
+        if let Step::Update { end, .. } = &mut case.step {
+            *end = Some(reason);
         }
         case
     };
@@ -149,7 +149,7 @@ fn attempts() -> Vec<Case> {
         ),
         ended("Finished", again, &json!({"attempt": 2}), &json!({"priority": 5})),
         ended(
-            "Failed",
+            "AgentCrashed",
             "to resume, set cancel to false",
             &json!({"attempt": 2, "cancel": true}),
             &second,

@@ -267,7 +267,7 @@ fn waits_for_phase(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bo
         PHASE_SECONDS / 60
     );
     let message = draft.stall(reasons::PHASE_DIFFERS, &message);
-    let since = draft.stalled_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
+    let since = draft.blocked_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
     let until = after(since, PHASE_SECONDS);
     if draft.now() >= until {
         end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, &what));

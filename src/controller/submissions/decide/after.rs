@@ -72,8 +72,8 @@ fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
         refused.attempt,
         seconds(refused.at)
     );
-    let is_new = draft.stalled_since(reason).is_none();
-    draft.condition(conditions::STALLED, Truth::True, reason, &message);
+    let is_new = draft.blocked_since(reason).is_none();
+    draft.stall_with(reason, &message);
     if is_new {
         draft.event(true, reason, message);
     }

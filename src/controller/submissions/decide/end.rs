@@ -55,9 +55,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     if draft.is_cancelled() {
         let reason = cancel_reason(draft);
         let message = if reason == reasons::ENDED_IN_EVALAI {
-            "EvalAI has ended it; what it had reached is kept."
+            "EvalAI ended the submission; what it had reached is kept."
         } else {
-            "It was cancelled; what it had reached is kept."
+            "The submission was cancelled; what it had reached is kept."
         };
         return cancelled(draft, reason, message);
     }
@@ -105,11 +105,11 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
         READ_SECONDS
     };
     let message = format!(
-        "Its results cannot be read: {} It goes on when they can.",
+        "The results cannot be read: {} The submission goes on when they can.",
         sentence(why)
     );
     let message = draft.stall(reasons::NOT_STORED, &message);
-    let since = draft.stalled_since(reasons::NOT_STORED).unwrap_or(draft.now());
+    let since = draft.blocked_since(reasons::NOT_STORED).unwrap_or(draft.now());
     let until = after(since, limit);
     if draft.now() >= until {
         return false;
@@ -205,7 +205,10 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
         (0, next.to_owned())
     } else {
         let delay = RETRY_SECONDS << failures.clamp(0, MAX_DOUBLINGS);
-        (delay, format!("It is tried again in {delay} s; this costs no attempt."))
+        (
+            delay,
+            format!("The submission is tried again in {delay} s; this costs no attempt."),
+        )
     };
     let at = after(draft.now(), delay);
     count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));

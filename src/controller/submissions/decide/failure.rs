@@ -77,12 +77,12 @@ pub(super) fn job_expired() -> Failure {
 pub(super) fn before_restore() -> Failure {
     infrastructure(
         reasons::IMPORTED_FAILURE,
-        "It had failed before its object was restored without a status; finished routes are kept.",
+        "The submission had failed before its object was restored without a status; finished routes are kept.",
     )
 }
 
 pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure {
-    let node = node.map_or_else(|| "Its node".to_owned(), |node| format!("Node {node}"));
+    let node = node.map_or_else(|| "The node of the Pod".to_owned(), |node| format!("Node {node}"));
     let what = if node_state == ObservedNode::Reports {
         "did not end its Pod within its grace"
     } else {

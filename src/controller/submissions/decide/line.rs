@@ -42,7 +42,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> Step {
         ),
     };
     draft.status.waiting = Some(Waiting::new(position, eta));
-    draft.moves();
+    draft.waits(reason);
     draft.show(reason, message);
     // Its priority may have been edited since.
     join(draft);

@@ -75,9 +75,9 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
             return;
         }
         let what = if reason == reasons::ENDED_IN_EVALAI {
-            "EvalAI has ended it"
+            "EvalAI ended the submission"
         } else {
-            "It was cancelled"
+            "The submission was cancelled"
         };
         let when = if draft.status.retry > 0 {
             "between two tries; what it had reached is kept"
@@ -119,7 +119,7 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     }
     if draft.status.reason.as_deref() != Some(reasons::REPLACING) {
-        let message = "It is tried again after a failure that is not the participant's.";
+        let message = "The submission is tried again after a failure that is not the participant's.";
         draft.show(reasons::REPLACING, message);
     }
     draft.requeue_at(at);
@@ -133,7 +133,7 @@ fn start_job(draft: &mut PlanBuilder<'_>) {
     draft.status.job_name = Some(name);
     note_gpus(draft);
     draft.act(Action::CreateJob(draft.status.job_number()));
-    draft.condition(conditions::STALLED, Truth::False, reasons::PREPARING, "");
+    draft.waits(reasons::PREPARING);
     if draft.is_running() {
         let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
         start::replacing(draft, message);

@@ -275,9 +275,6 @@ impl<'a> PlanBuilder<'a> {
     }
 
     pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: &str, message: &str) {
-        if type_ == conditions::STALLED {
-            self.note_blocked(truth, reason);
-        }
         let now = self.time();
         let generation = self.status.observed_generation;
         conditions::set(
@@ -291,17 +288,18 @@ impl<'a> PlanBuilder<'a> {
         );
     }
 
-    /// Remembers since when it has been stalled for one reason: the condition's own time moves with its status alone.
-    fn note_blocked(&mut self, truth: Truth, reason: &str) {
-        if truth != Truth::True {
-            self.status.blocked_since = None;
-        } else if self.stalled_since(reason).is_none_or(|since| since > self.now()) {
-            // Also after a clock was set back: what is counted from this time would not end.
+    /// Remembers since when it has been blocked for one reason, and returns it: the condition's own time moves with its status alone.
+    pub(super) fn blocked(&mut self, reason: &str) -> Timestamp {
+        let now = self.now();
+        // A later time is that of a clock that was set back since: what is counted from it would not end.
+        let known = self.blocked_since(reason).filter(|since| *since <= now);
+        known.unwrap_or_else(|| {
             self.status.blocked_since = Some(BlockedSince {
                 reason: reason.to_owned(),
                 time: self.time(),
             });
-        }
+            now
+        })
     }
 
     /// Shows why the submission is in its state.
@@ -320,22 +318,44 @@ impl<'a> PlanBuilder<'a> {
             .filter(|c| c.status == "True" && c.reason == reason)
             .map(|c| c.message.clone());
         let message = known.unwrap_or_else(|| message.to_owned());
-        self.condition(conditions::STALLED, Truth::True, reason, &message);
+        self.stall_with(reason, &message);
         message
     }
 
     /// The same with the words of this moment: for a cause that changes while the reason stays.
     pub(super) fn stall_with(&mut self, reason: &str, message: &str) {
-        self.stall(reason, message);
+        self.blocked(reason);
         self.condition(conditions::STALLED, Truth::True, reason, message);
     }
 
     pub(super) fn moves(&mut self) {
-        self.condition(conditions::STALLED, Truth::False, reasons::NOT_STALLED, "");
+        self.waits(reasons::NOT_STALLED);
     }
 
-    /// Since when it is stalled for this reason.
-    pub(super) fn stalled_since(&self, reason: &str) -> Option<Timestamp> {
+    /// Shows that it waits for what comes without a person: it is not stalled.
+    pub(super) fn waits(&mut self, reason: &str) {
+        self.status.blocked_since = None;
+        self.condition(conditions::STALLED, Truth::False, reason, "");
+    }
+
+    /// Shows a wait that is a stall once it has lasted for so long.
+    pub(super) fn stalls_after(&mut self, seconds: i64, reason: &str, message: &str) {
+        let until = after(self.blocked(reason), seconds);
+        if self.now() >= until {
+            return self.stall_with(reason, message);
+        }
+        self.requeue_at(until);
+        self.waits_since(reason, message);
+    }
+
+    /// Shows a wait, and remembers since when it has lasted.
+    pub(super) fn waits_since(&mut self, reason: &str, message: &str) {
+        self.blocked(reason);
+        self.condition(conditions::STALLED, Truth::False, reason, message);
+    }
+
+    /// Since when it is blocked for this reason.
+    pub(super) fn blocked_since(&self, reason: &str) -> Option<Timestamp> {
         let blocked = self.status.blocked_since.as_ref();
         blocked
             .filter(|blocked| blocked.reason == reason)

@@ -73,8 +73,7 @@ fn show_end(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, state: ImportedState,
         },
         table: String::new(),
     };
-    let what =
-        "It had ended before its object was restored without a status; nothing was run, published or recorded again.";
+    let what = "The submission had ended before its object was restored without a status; nothing was run, published or recorded again.";
     let generation = draft.submission().metadata.generation.unwrap_or_default();
     let team = draft.status.team.take();
     let now = draft.time();

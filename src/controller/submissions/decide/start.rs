@@ -28,6 +28,8 @@ const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
 const SETTLE_SECONDS: i64 = 5;
 /// How long something may keep a check from starting that seldom resolves itself. A host waits for it.
 const CHECK_SECONDS: i64 = 60;
+/// How long no node may accept a Pod, without an autoscaler that adds one, before a person has to look: `Stalled` is True then.
+const NODE_SECONDS: i64 = 15 * 60;
 /// How long a Job may take to make its Pod before that is shown.
 const POD_SECONDS: i64 = 45;
 
@@ -52,7 +54,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let found = trouble::of_pod(pod);
     let stalled = found
         .as_ref()
-        .map(|found| draft.stalled_since(found.reason).unwrap_or(draft.now()));
+        .map(|found| draft.blocked_since(found.reason).unwrap_or(draft.now()));
     // Until the scheduler has spoken there is no node that could be late.
     let limit = pulls::limit(pod, &draft.deadlines(), stalled);
     let over = limit.filter(|limit| draft.now() >= limit.at);
@@ -85,7 +87,7 @@ fn lasts_in_check(draft: &mut PlanBuilder<'_>, reason: &str) -> bool {
     if !draft.spec().check {
         return false;
     }
-    let since = draft.stalled_since(reason).unwrap_or(draft.now());
+    let since = draft.blocked_since(reason).unwrap_or(draft.now());
     let until = after(since, CHECK_SECONDS);
     draft.requeue_at(until);
     draft.now() >= until
@@ -136,7 +138,7 @@ fn show_wait(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
 }
 
 fn show_trouble(draft: &mut PlanBuilder<'_>, found: &Trouble, has_started: bool) {
-    draft.condition(conditions::STALLED, Truth::True, found.reason, &found.message);
+    draft.stall_with(found.reason, &found.message);
     if has_started {
         draft.show(found.reason, found.message.clone());
     } else {
@@ -193,13 +195,16 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
             (reasons::POD_REFUSED, "The API server refuses the Pod")
         };
         let message = sentence(&format!("{what}: {words}"));
-        wait_for_node(draft, job, reason, &message);
+        if !is_late(draft, job, reason, &message) {
+            draft.stall_with(reason, &message);
+            show_wait(draft, reason, &message);
+        }
     } else if had_pod {
         replacing(draft, LOST);
     } else if job.created.is_some_and(|at| draft.now() >= after(at, POD_SECONDS)) {
         let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
                        cluster's controller manager runs.";
-        draft.condition(conditions::STALLED, Truth::True, reasons::PREPARING, message);
+        draft.stall_with(reasons::PREPARING, message);
         show_wait(draft, reasons::PREPARING, message);
     }
     draft.requeue_in(Duration::from_secs(15));
@@ -215,14 +220,23 @@ fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_
         Some(ScaleUp::Refused(words)) => format!(" The autoscaler adds no node: {}", sentence(words)),
         None => String::new(),
     };
-    wait_for_node(draft, job, reasons::UNSCHEDULABLE, &(sentence(words) + &of_nodes));
+    let (reason, message) = (reasons::UNSCHEDULABLE, sentence(words) + &of_nodes);
+    if is_late(draft, job, reason, &message) {
+        return;
+    }
+    if matches!(scale_up, Some(ScaleUp::Coming(_))) {
+        draft.waits_since(reason, &message);
+    } else {
+        draft.stalls_after(NODE_SECONDS, reason, &message);
+    }
+    show_wait(draft, reason, &message);
 }
 
-/// No node has the Pod: waits as long as `scheduleSeconds` says, and says why.
-fn wait_for_node(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) {
+/// Whether no node has had the Pod for as long as `scheduleSeconds` allows: then the attempt fails.
+fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) -> bool {
     let had_pod = draft.status.times.scheduled.is_some();
     let since = if had_pod {
-        draft.stalled_since(reason)
+        draft.blocked_since(reason)
     } else {
         job.created
     };
@@ -237,12 +251,12 @@ fn wait_for_node(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, messa
         let deadline = after(since.unwrap_or(draft.now()), limit);
         if draft.now() >= deadline {
             let what = format!("No node accepted the Pod within {limit} s: {message}");
-            return draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
+            draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
+            return true;
         }
         draft.requeue_at(deadline);
     }
-    draft.condition(conditions::STALLED, Truth::True, reason, message);
-    show_wait(draft, reason, message);
+    false
 }
 
 fn too_late(found: &Trouble, seconds: i64) -> Failure {

@@ -68,7 +68,7 @@ pub(super) fn note(draft: &PlanBuilder<'_>) -> Option<String> {
     let report = traces(draft)?.report.as_ref()?;
     let place = effective::results_url(&plan.storage, &plan.run_id);
     Some(format!(
-        "It was run before and had lost its status; it goes on from {place}, where {} of {} routes are done.",
+        "The submission was run before and its object had lost its status; it goes on from {place}, where {} of {} routes are done.",
         report.digest.done, report.digest.total
     ))
 }

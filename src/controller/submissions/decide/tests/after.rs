@@ -142,7 +142,7 @@ fn an_end_whose_result_cannot_be_read_says_why_it_waits() {
 }
 
 #[test]
-fn a_cancel_that_our_own_write_may_have_undone_is_told_again() {
+fn a_cancel_that_our_own_write_may_have_undone_is_sent_again() {
     let mut world = World::evalai().running();
     (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
     world.pass();
@@ -198,7 +198,7 @@ fn evalais_end_wins_until_ours_is_answered_and_not_after() {
 }
 
 #[test]
-fn a_cancelled_one_that_evalai_ended_too_is_told_once() {
+fn a_cancelled_one_that_evalai_ended_too_is_sent_once() {
     let mut world = World::evalai();
     world.submission().spec.cancel = true;
     assert_eq!(

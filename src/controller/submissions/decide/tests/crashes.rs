@@ -218,7 +218,9 @@ fn simulators_that_fail_in_each_job_are_counted_by_team() {
         assert_eq!(plan.status.retry, retry);
         let message = plan.status.message.unwrap();
         assert!(
-            message.ends_with(&format!("It is tried again in {pause} s; this costs no attempt.")),
+            message.ends_with(&format!(
+                "The submission is tried again in {pause} s; this costs no attempt."
+            )),
             "{message}"
         );
         world.job_gone();

@@ -165,7 +165,7 @@ fn each_end_without_that_has_its_class_and_reason() {
 }
 
 #[test]
-fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_is_told_what_is_wrong_with_it() {
+fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_gets_what_is_wrong_with_it() {
     let refused = Report {
         is_final: true,
         why: Some("the records are not a list.".into()),

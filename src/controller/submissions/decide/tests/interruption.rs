@@ -174,7 +174,10 @@ fn interruptions_use_up_no_retry_and_put_no_other_off() {
     world.complete();
     let plan = world.pass_to(Pending, reasons::REPLACING);
     assert!(
-        plan.status.message.unwrap().contains("It is tried again in 10 s"),
+        plan.status
+            .message
+            .unwrap()
+            .contains("The submission is tried again in 10 s"),
         "the first of its kind"
     );
     assert_eq!(plan.status.retry, 2);

@@ -39,7 +39,7 @@ fn end_without_pod(world: &mut World) -> Plan {
 }
 
 #[test]
-fn an_agents_failure_is_told_by_its_own_log_from_s3() {
+fn an_agents_failure_is_explained_by_its_own_log_from_s3() {
     for (word, reason) in [
         ("exited", reasons::AGENT_CRASHED),
         ("idle", reasons::IDLE),
@@ -63,7 +63,7 @@ fn an_agents_failure_is_told_by_its_own_log_from_s3() {
 }
 
 #[test]
-fn a_failure_of_the_whole_run_is_told_by_a_pair_that_was_not_done() {
+fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     let mut world = World::local().running();
     world.report(report(2));
     world.pass();
@@ -130,7 +130,7 @@ fn a_simulators_log_is_kept_while_its_pod_lives() {
 }
 
 #[test]
-fn a_preparation_that_fails_is_told_by_its_container_before_the_job_is_deleted() {
+fn a_preparation_that_fails_is_explained_by_its_container_before_the_job_is_deleted() {
     for name in ["contents", "workspace", "logcopy"] {
         let mut world = World::local().with_pod();
         world.see(ended(name, 5, "", 3, 1700));

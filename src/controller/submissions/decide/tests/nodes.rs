@@ -48,7 +48,7 @@ fn going(node: ObservedNode) -> World {
 }
 
 #[test]
-fn a_node_that_is_away_is_told_before_kubernetes_gives_its_pod_up() {
+fn a_node_that_is_away_is_reported_before_kubernetes_gives_its_pod_up() {
     let silent = ObservedNode::Silent { since: at(40) };
     for (node, words) in [
         (ObservedNode::Gone, "Node node-a is gone, and the Pod with it."),

@@ -187,7 +187,7 @@ fn pod_view() -> impl Strategy<Value = PodView> {
     })
 }
 
-fn report_sight() -> impl Strategy<Value = ObservedReport> {
+fn observed_report() -> impl Strategy<Value = ObservedReport> {
     let status = select(vec!["Finished", "Rejected", "Crashed", "Invalid"]);
     let flags = (any::<bool>(), any::<bool>(), any::<bool>(), 0u32..6);
     let ours = (0u32..=4, flags, status).prop_map(|(done, (is_final, eligible, is_refused, crashes), status)| {
@@ -310,7 +310,7 @@ fn change() -> impl Strategy<Value = Change> {
         8 => job().prop_map(Change::Job),
         6 => prop::option::weighted(0.9, pod_view().prop_map(Box::new)).prop_map(Change::Pod),
         3 => (select(nodes), select(vec![None, None, Some("karpenter.sh/disrupted")])).prop_map(|(node, leaving)| Change::Node(node, leaving)),
-        5 => report_sight().prop_map(Change::Report),
+        5 => observed_report().prop_map(Change::Report),
         4 => answers(),
         3 => evalai_view().prop_map(Box::new).prop_map(Change::Evalai),
         1 => any::<bool>().prop_map(Change::Recorded),

@@ -67,7 +67,7 @@ fn a_request_is_carried_out_once_and_costs_no_retry() {
     let plan = world.pass_to(Pending, reasons::REPLACING);
     let message = plan.status.message.unwrap();
     assert!(
-        message.contains("It is tried again in 10 s"),
+        message.contains("The submission is tried again in 10 s"),
         "the first of its kind: {message}"
     );
     assert_eq!(plan.status.retry, 2);

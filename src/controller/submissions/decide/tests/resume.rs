@@ -84,7 +84,7 @@ fn an_attempt_that_begins_on_its_own_old_job_does_not_end_by_it() {
 }
 
 #[test]
-fn finished_is_for_ever() {
+fn finished_is_final() {
     let mut world = World::local().running();
     world.complete();
     world.report(final_report());

@@ -11,7 +11,7 @@ use leaderboard_api::conditions::{self, LOGGED, PLAUSIBLE, RUNNING, STALLED};
 use leaderboard_api::reasons;
 
 #[test]
-fn progress_is_no_transition_and_is_told_once() {
+fn progress_is_no_transition_and_is_sent_once() {
     let mut world = World::evalai().running();
     world.report(report(1));
     let plan = world.pass_to(Running, reasons::RUNNING);
@@ -225,7 +225,7 @@ fn a_lost_pod_is_replaced_and_the_state_stays() {
     let plan = world.pass_to(Running, reasons::REPLACING);
     assert_eq!(
         condition(&plan, STALLED),
-        ("True".into(), reasons::UNSCHEDULABLE.into())
+        ("False".into(), reasons::UNSCHEDULABLE.into())
     );
     world.pod().unschedulable = None;
     world.pod().scheduled = Some(at(300));

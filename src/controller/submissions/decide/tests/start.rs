@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::view::{ContainerView, ScaleUp};
+use crate::controller::submissions::view::{ContainerView, ScaleUp, Turn};
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Pending, Running};
@@ -39,7 +39,7 @@ fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
 }
 
 #[test]
-fn a_silent_node_is_told_in_steps() {
+fn a_silent_node_is_reported_in_steps() {
     let mut world = World::local().with_pod();
     let said = |world: &mut World, second| {
         world.go_to(second);
@@ -142,7 +142,7 @@ fn pulling_and_backing_off_are_one_message() {
 }
 
 #[test]
-fn a_cause_that_is_mended_is_forgotten() {
+fn a_cause_that_is_fixed_is_forgotten() {
     let mut world = World::local().with_pod();
     world.see(waiting(
         "agent-1",
@@ -269,7 +269,7 @@ fn a_pull_that_fails_late_is_shown_at_once_and_has_the_time_of_a_start() {
 }
 
 #[test]
-fn without_a_node_it_waits_for_ever_saying_why() {
+fn without_a_node_it_waits_without_a_limit_and_shows_why() {
     let words = "0/1 nodes are available: 1 Insufficient nvidia.com/gpu.";
     let mut world = World::local().with_pod();
     let pod = world.pod();
@@ -302,6 +302,51 @@ fn without_a_node_it_waits_for_ever_saying_why() {
     assert!(failure.message.contains(words));
 }
 
+/// Tools that follow kstatus take `Stalled=True` for a failure, which a wait for an autoscaled node is not.
+#[test]
+fn a_wait_for_a_node_is_a_stall_after_15_minutes_without_a_scale_up() {
+    let coming = || Some(ScaleUp::Coming("pod triggered scale-up".into()));
+    let refused = || Some(ScaleUp::Refused("pod didn't trigger scale-up".into()));
+    let mut world = World::local().with_pod();
+    let pod = world.pod();
+    (pod.scheduled, pod.node) = (None, None);
+    pod.unschedulable = Some("0/1 nodes are available".into());
+    for (second, scale_up, expected) in [
+        (10, None, "False"),
+        (100, refused(), "False"),
+        (909, None, "False"),
+        (910, None, "True"),
+        (911, coming(), "False"),
+        (90_000, coming(), "False"),
+        (90_001, refused(), "True"),
+    ] {
+        world.pod().scale_up = scale_up;
+        world.go_to(second);
+        let plan = world.pass_to(Pending, reasons::UNSCHEDULABLE);
+        let stalled = condition(&plan, STALLED);
+        assert_eq!(
+            stalled,
+            (expected.into(), reasons::UNSCHEDULABLE.into()),
+            "after {second} s"
+        );
+        assert_eq!(plan.status.blocked_since.unwrap().time.0, at(10));
+    }
+}
+
+#[test]
+fn a_wait_for_a_slot_is_no_stall_and_names_its_reason() {
+    for (turn, reason) in [
+        (Turn::Wait { position: 3, eta: None }, reasons::WAITING_FOR_SLOT),
+        (Turn::Paused { position: 3 }, reasons::PAUSED),
+    ] {
+        let mut world = World::local();
+        world.view.turn = turn;
+        let plan = world.pass_to(Pending, reason);
+        assert_eq!(condition(&plan, STALLED), ("False".into(), reason.into()));
+        assert_eq!(plan.status.blocked_since, None);
+    }
+}
+
 #[test]
 fn a_wait_for_a_node_says_whether_one_is_on_its_way() {
     let coming = ScaleUp::Coming("pod triggered scale-up: [{gpu 0->1 (max: 2)}]".into());
@@ -328,7 +373,7 @@ fn a_wait_for_a_node_says_whether_one_is_on_its_way() {
 }
 
 #[test]
-fn a_quota_or_a_refusal_is_said_and_goes_on_when_mended() {
+fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
     let cases = [
         (
             "pods \"x\" is forbidden: exceeded quota: q, requested: cpu=2",

@@ -44,7 +44,7 @@ fn before_its_pod_or_agents_the_job_is_deleted_at_once() {
 }
 
 #[test]
-fn a_running_one_is_told_and_keeps_what_it_has() {
+fn a_running_one_is_asked_to_stop_and_keeps_what_it_has() {
     for (request, reason) in REQUESTS {
         let mut world = World::evalai().running();
         world.report(report(2));
@@ -346,7 +346,7 @@ fn a_deleted_one_is_released_when_all_know_its_end() {
 }
 
 #[test]
-fn deletion_does_not_wait_for_ever() {
+fn deletion_does_not_wait_without_end() {
     let mut world = World::evalai().running();
     world.go_to(100);
     world.delete();
