@@ -26,7 +26,7 @@ PRINTS: dict[str, tuple[str, int]] = {
     PLUGIN: ("stand-in", 99),
 }
 # Behind these words, and behind `file://`, is the name of a file.
-FILES = ("--values", "--config-file", "--template-file", "--file")
+FILES = ("--values", "--config-file", "--template-file", "--file", "--decisions")
 # What `leaderboard-operator import` prints, in the folder: docs/import.md shows it.
 IMPORTED = "challenge.yaml"
 # Added behind the words of kubectl, where the last of two flags counts.
