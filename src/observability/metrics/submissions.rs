@@ -62,7 +62,7 @@ impl Submissions {
             team_gpu: zero(
                 r,
                 "team_gpu_seconds",
-                "The same by team, as `status.gpuUse` names it; the first 50 teams of a Leaderboard, all others as `other`",
+                "GPUs times seconds as in `leaderboard_gpu_seconds_total`, by Leaderboard and team, as `status.gpuUse` names it: the first 50 teams of a Leaderboard, all others as `other`",
             ),
             teams: Mutex::default(),
         }
