@@ -330,7 +330,7 @@ fn resources(cpu: &str, memory: &str, disk: &str) -> Value {
 
 /// Comments: why a field is as it is, and which fields a person has decided.
 fn notes(board: &BoardEntry, options: &Options, decisions: &Decisions) -> Vec<(String, String)> {
-    let reasons = reasons(board, options).into_iter();
+    let reasons = reasons(board).into_iter().chain(reasons_of_the_command(board, options));
     let left = reasons.filter(|(_, field, _)| !decisions.set(board.board, field));
     let mut notes: Vec<_> = left.map(|(key, _, text)| (key.to_owned(), text)).collect();
     let decided = decisions.keys(board.board).into_iter();
@@ -339,8 +339,8 @@ fn notes(board: &BoardEntry, options: &Options, decisions: &Decisions) -> Vec<(S
 }
 
 /// The key before which a comment stands, the field that it explains, and its text.
-fn reasons(board: &BoardEntry, options: &Options) -> Vec<(&'static str, &'static str, String)> {
-    let mut notes = vec![
+fn reasons(board: &BoardEntry) -> [(&'static str, &'static str, String); 6] {
+    [
         (
             "pairs",
             "pairs",
@@ -371,7 +371,12 @@ fn reasons(board: &BoardEntry, options: &Options) -> Vec<(&'static str, &'static
             "agent.resources",
             "The original requested no CPU, memory or disk; these let four pairs fit on a g5.12xlarge.".to_owned(),
         ),
-    ];
+    ]
+}
+
+/// The same for what neither the entry nor the command's options name.
+fn reasons_of_the_command(board: &BoardEntry, options: &Options) -> Vec<(&'static str, &'static str, String)> {
+    let mut notes = Vec::new();
     if options.queue.is_none() {
         notes.push((
             "leaderboardVersion",
