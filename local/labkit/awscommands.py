@@ -77,6 +77,7 @@ def of_operation(service: str, operation: str, options: dict[str, list[str]]) ->
         return [f"{service} has no operation {operation}"]
     shape = model.operation_model(names[operation]).input_shape
     members: dict[str, Any] = {xform_name(name, "-"): of for name, of in shape.members.items()} if shape else {}
+    members |= {f"no-{name}": of for name, of in members.items() if of.type_name == "boolean"}
     needed = {xform_name(name, "-") for name in shape.required_members} if shape else set()
     found = [f"no option --{name}" for name in sorted(options.keys() - members.keys())]
     found += [f"--{name} is missing" for name in sorted(needed - options.keys())]

@@ -19,6 +19,7 @@ PRINTS: dict[str, tuple[str, int]] = {
     "aws sqs get-queue-url": ("https://sqs.us-east-1.amazonaws.com/123456789012/queue", 99),
     "aws sqs receive-message --queue-url https://sqs.us-east-1.amazonaws.com/123456789012/queue --query": (MESSAGE, 2),
     "aws sqs receive-message": (f'{{"Messages": [{MESSAGE}]}}', 99),
+    "aws sts get-caller-identity": ("123456789012", 99),
     "aws ecr describe-repositories": ("challenge-participant-team-7", 99),
     "aws": ("stand-in", 99),
     "make --silent install-yaml": ("apiVersion: v1\nkind: ConfigMap\nmetadata: {name: installed}", 99),
@@ -26,7 +27,7 @@ PRINTS: dict[str, tuple[str, int]] = {
     PLUGIN: ("stand-in", 99),
 }
 # Behind these words, and behind `file://`, is the name of a file.
-FILES = ("--values", "--config-file", "--template-file", "--file")
+FILES = ("--values", "--config-file", "--template-file", "--file", "--decisions")
 # What `leaderboard-operator import` prints, in the folder: docs/import.md shows it.
 IMPORTED = "challenge.yaml"
 # Added behind the words of kubectl, where the last of two flags counts.

@@ -184,6 +184,60 @@ async fn entries_that_cannot_be_used_are_refused_and_nothing_is_printed() {
     assert!(only.status.success(), "the other entry is not read");
 }
 
+/// The file of decisions that a page has its reader write, with addresses in place of the shell's.
+fn decisions_of(page: &str) -> String {
+    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(page);
+    let page = std::fs::read_to_string(page).unwrap();
+    let (_, rest) = page.split_once("> decisions.yaml <<END\n").unwrap();
+    let (file, _) = rest.split_once("\nEND\n").unwrap();
+    let file = file.replace("$egress", "    - {cidr: 192.168.255.5/32, ports: [443]}");
+    let lines = file.lines().map(|line| match line.split_once("$(aws sqs") {
+        Some((field, _)) => format!("{field}https://sqs.us-west-2.amazonaws.com/123456789012/dead"),
+        None => line
+            .replace("$s3", "https://bucket.example")
+            .replace("$account", "123456789012"),
+    });
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+#[tokio::test]
+async fn the_decisions_of_the_documents_leave_no_question_and_the_api_server_accepts_what_comes_of_them() {
+    let namespace = server().await.namespace("decisions").await;
+    let folder = tempfile::tempdir().unwrap();
+    for (name, entry) in entries() {
+        std::fs::write(folder.path().join(format!("{name}.json")), entry.to_string()).unwrap();
+    }
+    let (path, file) = (folder.path().to_str().unwrap(), folder.path().join("decisions.yaml"));
+    let file = file.to_str().unwrap();
+    // Nobody answers there, who would list other readers of the queue.
+    let always = [
+        "--from-files",
+        path,
+        "--region",
+        REGION,
+        "--endpoint",
+        "http://127.0.0.1:9",
+        "--decisions",
+        file,
+    ];
+    let queue = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
+    let more = ["--namespace", &namespace, "--queue", queue];
+    for page in ["import.md", "migrate.md"] {
+        std::fs::write(file, decisions_of(page)).unwrap();
+        let (manifests, notes) = texts(&import(&[always.as_slice(), more.as_slice()].concat()).await);
+        assert!(!notes.contains("to decide:"), "{page}: {notes}");
+        let (accepted, shown) = dry_run(&manifests).await;
+        assert!(accepted && !shown.contains("Warning"), "{page}: {shown}\n{manifests}");
+        assert_eq!(shown.lines().count(), 4, "{page}: {shown}");
+    }
+    std::fs::write(file, "all: {concurency: {total: 1}}").unwrap();
+    let refused = import(&[always.as_slice(), more.as_slice()].concat()).await;
+    let (out, err) = texts(&refused);
+    assert_eq!((refused.status.code(), out.as_str()), (Some(2), ""));
+    let why = "leaderboard-operator import: decisions.yaml: all.concurency is no field of a Leaderboard; there are ";
+    assert!(err.starts_with(why), "{err}");
+}
+
 /// A table with rows of both pipelines, and what becomes of them.
 struct Table {
     world: World,

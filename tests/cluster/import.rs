@@ -16,7 +16,7 @@ use super::expected::{assert_finished, assert_row};
 use crate::aws::{BUCKET, REGION};
 use crate::evalai::{Evalai, HOST_TOKEN};
 use crate::operator::{bridge, controller};
-use crate::scene::{Scene, USER_AGENT, lay_over, scenario, state};
+use crate::scene::{Scene, USER_AGENT, scenario, state};
 
 /// Of the entries alone: the lab has its own in [`REGION`].
 const ENTRIES: &str = "us-west-2";
@@ -58,33 +58,47 @@ async fn store_entries(scene: &Scene, evalai: &Evalai) {
     }
 }
 
-/// What the command prints.
+/// What a host of this cluster decides: it has no GPUs and one small node, AWS and EvalAI are stand-ins, and nothing enforces policies.
+fn decisions(scene: &Scene) -> Value {
+    let resources = json!({
+        "requests": {"cpu": null, "memory": null, "ephemeral-storage": "16Mi"},
+        "limits": {"ephemeral-storage": "4Gi"},
+    });
+    let (region, endpoint) = (REGION, &scene.cloud.endpoint);
+    let track = |name: &str| json!({"tracks": [{"name": name, "nodeSelector": null, "tolerations": []}]});
+    json!({
+        "all": {
+            "evalai": {"challenge": 1, "token": {"secretsManager": {"id": "evalai"}}},
+            "gpu": {"mode": "None", "resourceName": null},
+            "simulator": {"resources": resources, "securityContext": null, "display": "Offscreen"},
+            "agent": {"resources": resources, "images": [], "env": [{"name": "ROUTE_MS", "value": "100"}]},
+            "storage": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix},
+            "table": {"region": region, "endpoint": scene.gate.url},
+            "queue": {"region": region, "endpoint": scene.gate.url},
+            "podIdentity": {"secretName": "aws"},
+            "network": {"dns": "None", "enforcement": "Off"},
+            "concurrency": {"total": 2, "perTeam": 2},
+            "deadlines": {"runSeconds": 0},
+            "syncPeriodSeconds": 2,
+        },
+        "leaderboard-10": track("map"),
+        "leaderboard-20": track("sensors"),
+    })
+}
+
+/// What the command prints, with the cluster's decisions in a file.
 async fn import(scene: &Scene) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("decisions.yaml");
+    std::fs::write(&file, serde_saphyr::to_string(&decisions(scene)).unwrap()).unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_leaderboard-operator"));
     command
-        .args([
-            "import",
-            "--challenge",
-            "1",
-            "--region",
-            ENTRIES,
-            "--endpoint",
-            &scene.cloud.endpoint,
-        ])
-        .args([
-            "--queue",
-            &scene.cloud.queue_url,
-            "--queue-region",
-            REGION,
-            "--dead-letter",
-            &scene.cloud.dead_url,
-        ])
-        .args([
-            "--namespace",
-            &scene.namespace,
-            "--egress",
-            &format!("{}/32", scene.lab.host),
-        ]);
+        .args(["import", "--region", ENTRIES, "--endpoint", &scene.cloud.endpoint])
+        .args(["--queue", &scene.cloud.queue_url, "--queue-region", REGION])
+        .args(["--dead-letter", &scene.cloud.dead_url, "--namespace", &scene.namespace])
+        .args(["--egress", &format!("{}/32", scene.lab.host)])
+        .arg("--decisions")
+        .arg(&file);
     let output = command.output().await.unwrap();
     let (out, err) = (
         String::from_utf8(output.stdout).unwrap(),
@@ -92,6 +106,7 @@ async fn import(scene: &Scene) -> String {
     );
     assert!(output.status.success(), "{err}");
     assert!(!out.contains(HOST_TOKEN) && !err.contains(HOST_TOKEN));
+    assert!(!err.contains("to decide:"), "the file leaves no question: {err}");
     // The lab's stand-in has neither of the two services, which must not keep anybody from the manifests.
     for unread in [
         "EventBridge Pipes could not be listed",
@@ -102,51 +117,22 @@ async fn import(scene: &Scene) -> String {
     out
 }
 
-/// What this cluster needs otherwise: it has no GPUs and one small node, AWS and EvalAI are stand-ins, and nothing enforces policies.
-fn fit(scene: &Scene, object: &mut Value) {
-    let disk = json!({"requests": {"ephemeral-storage": "16Mi"}, "limits": {"ephemeral-storage": "4Gi"}});
-    let small = |resources: &Value| json!({"resources": resources});
-    let (region, endpoint) = (REGION, &scene.cloud.endpoint);
-    let change = json!({
-        "gpu": {"mode": "None", "resourceName": null},
-        "simulator": {"resources": null, "securityContext": null, "display": "Offscreen"},
-        "agent": {"resources": null, "images": [], "env": [{"name": "ROUTE_MS", "value": "100"}]},
-        "storage": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix},
-        "table": {"region": region, "endpoint": scene.gate.url},
-        "queue": {"endpoint": scene.gate.url},
-        "podIdentity": {"secretName": "aws"},
-        "network": {"dns": "None", "enforcement": "Off"},
-        "syncPeriodSeconds": 2,
-    });
-    lay_over(&mut object["spec"], change);
-    lay_over(
-        &mut object["spec"],
-        json!({"simulator": small(&disk), "agent": small(&disk)}),
-    );
-    for track in object["spec"]["tracks"].as_array_mut().unwrap() {
-        track.as_object_mut().unwrap().remove("nodeSelector");
-    }
-}
-
-/// Applies what was printed, object by object.
+/// Applies what was printed, object by object, as `kubectl apply --server-side` does.
 async fn apply(scene: &Scene, manifests: &str) {
     let objects: Vec<Value> = serde_saphyr::from_multiple(manifests).unwrap();
     let kinds: Vec<_> = objects.iter().map(|object| object["kind"].as_str().unwrap()).collect();
     assert_eq!(kinds, ["Namespace", "ServiceAccount", "Leaderboard", "Leaderboard"]);
-    for mut object in objects {
-        if object["kind"] == "Leaderboard" {
-            fit(scene, &mut object);
-        }
+    for object in objects {
         let types: TypeMeta = serde_json::from_value(object.clone()).unwrap();
         let kind = ApiResource::from_gvk(&GroupVersionKind::try_from(&types).unwrap());
-        let name = object["metadata"]["name"].as_str().unwrap().to_owned();
+        let name = object["metadata"]["name"].as_str().unwrap();
         let api: Api<DynamicObject> = if object["kind"] == "Namespace" {
             Api::all_with(scene.client.clone(), &kind)
         } else {
             Api::namespaced_with(scene.client.clone(), &scene.namespace, &kind)
         };
         let params = PatchParams::apply(USER_AGENT).force();
-        let applied = api.patch(&name, &params, &Patch::Apply(&object)).await;
+        let applied = api.patch(name, &params, &Patch::Apply(&object)).await;
         applied.unwrap_or_else(|error| panic!("{name}: {error}"));
     }
 }

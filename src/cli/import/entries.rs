@@ -17,7 +17,7 @@ pub(super) const EVALAI: &str = "evalai";
 pub(super) const TRACKS: &str = "evalai-tracks";
 
 /// A Leaderboard of the original, by the name of its entry.
-#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Board {
     #[value(name = "leaderboard-10")]
     Ten,

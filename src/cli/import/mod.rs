@@ -1,11 +1,14 @@
 //! `leaderboard-operator import`: the entries of the original pipeline become manifests, and the rows of its table Submissions.
 //!
-//! `entries` parses, `plan` makes the objects, `print` writes them: all pure. This file reads and writes. Standard output is YAML
-//! alone; what a person has to know is a comment of it and on standard error.
+//! `entries` parses, `plan` makes the objects and lays a person's `decisions` over them, `questions` has what is still open, `print`
+//! writes: all pure. This file reads and writes. Standard output is YAML alone; what a person has to know is a comment of it and on
+//! standard error.
 
+mod decisions;
 mod entries;
 mod plan;
 mod print;
+mod questions;
 mod rows;
 #[cfg(test)]
 mod samples;
@@ -19,7 +22,9 @@ use std::process::ExitCode;
 use clap::Args;
 use jiff::Timestamp;
 
+use self::decisions::{DecisionError, Decisions};
 use self::entries::{Board, EVALAI, EntryError, TRACKS, Texts};
+use self::plan::PlanError;
 use self::taint::Taint;
 use crate::services::aws::Aws;
 use crate::services::event_sources::{self, NotAQueue, QueueArn, Readers};
@@ -43,8 +48,12 @@ pub(super) struct Import {
     /// Manager.
     #[arg(long, value_name = "DIR", conflicts_with = "from_table")]
     from_files: Option<PathBuf>,
-    /// Id of the challenge in EvalAI, as in the address of its page. No entry holds it.
-    #[arg(long, value_parser = clap::value_parser!(i64).range(1..), required_unless_present = "from_table")]
+    /// A YAML file of what you have decided, laid over what is printed: parts of a Leaderboard's spec under `all`, `leaderboard-10` and
+    /// `leaderboard-20`. Objects are laid over deep, lists as a whole, tracks by name, and null removes.
+    #[arg(long, value_name = "FILE", conflicts_with = "from_table")]
+    decisions: Option<PathBuf>,
+    /// Id of the challenge in EvalAI, as in the address of its page. No entry holds it; --decisions may.
+    #[arg(long, value_parser = clap::value_parser!(i64).range(1..), required_unless_present_any = ["from_table", "decisions"])]
     challenge: Option<i64>,
     /// Namespace of the objects.
     #[arg(long, default_value = "leaderboards")]
@@ -89,16 +98,16 @@ pub(super) struct Import {
 enum Failure {
     #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
     Entries(Vec<EntryError>),
+    #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+    Decisions(Vec<DecisionError>),
     #[error("--queue: {0}")]
     Queue(#[from] NotAQueue),
     #[error("no AWS region is configured; give --region, that of the entries")]
     NoRegion,
-    #[error(
-        "--challenge is missing: no entry holds the id of the challenge; it is in the address of its page in EvalAI"
-    )]
-    NoChallenge,
     #[error("{0}")]
-    Object(#[from] plan::NotALeaderboard),
+    Plan(#[from] PlanError),
+    #[error("--decisions: {path}: {error}")]
+    DecisionsFile { path: String, error: std::io::Error },
     #[error(
         "{path}: {error}; --from-files needs {EVALAI}.json, {TRACKS}.json and one file for each Leaderboard (--only takes one)"
     )]
@@ -119,7 +128,11 @@ enum Failure {
 impl Failure {
     fn exit_code(&self) -> ExitCode {
         match self {
-            Self::Entries(_) | Self::Queue(_) | Self::NoRegion | Self::NoChallenge => ExitCode::from(2),
+            Self::Entries(_)
+            | Self::Decisions(_)
+            | Self::Queue(_)
+            | Self::NoRegion
+            | Self::Plan(PlanError::Decisions(_) | PlanError::NoChallenge) => ExitCode::from(2),
             _ => ExitCode::FAILURE,
         }
     }
@@ -158,15 +171,15 @@ impl Import {
         let boards = self.only.map_or(Board::ALL.to_vec(), |board| vec![board]);
         let texts = self.texts(aws, &region, &boards).await?;
         let entries = entries::parse(&texts, &boards).map_err(Failure::Entries)?;
+        let decisions = self.decisions()?;
         let options = self.options(region)?;
-        let import = plan::plan(&entries, &options, Timestamp::now())?;
-        let readers = match &options.queue {
-            Some(queue) => {
-                let found = event_sources::readers(aws, &queue.arn, self.endpoint.as_deref()).await;
-                reader_lines(&queue.arn, &found)
-            }
-            None => Vec::new(),
-        };
+        let import = plan::plan(&entries, &options, &decisions, Timestamp::now())?;
+        let mut readers = Vec::new();
+        for (url, region) in &import.queues {
+            let queue = QueueArn::of_url(url, region.as_deref().or(Some(options.region.as_str())))?;
+            let found = event_sources::readers(aws, &queue, self.endpoint.as_deref()).await;
+            readers.extend(reader_lines(&queue, &found));
+        }
         let text = print::yaml(&import, &self.heading(&options), &readers)?;
         // What a person has to know goes before the manifests, and is not lost in a pipe.
         for (title, lines) in [
@@ -195,12 +208,24 @@ impl Import {
             role_arn: self.role_arn.clone(),
             region,
             endpoint: self.endpoint.clone(),
-            challenge: self.challenge.ok_or(Failure::NoChallenge)?,
+            challenge: self.challenge,
             dead_letter: self.dead_letter.clone(),
             egress: self.egress.clone(),
             taints: self.taint.clone(),
             two_operators: self.two_operators,
         })
+    }
+
+    fn decisions(&self) -> Result<Decisions, Failure> {
+        let Some(path) = &self.decisions else {
+            return Ok(Decisions::default());
+        };
+        let text = std::fs::read_to_string(path).map_err(|error| Failure::DecisionsFile {
+            path: path.display().to_string(),
+            error,
+        })?;
+        let name = path.file_name().unwrap_or(path.as_os_str());
+        Decisions::parse(&name.to_string_lossy(), &text).map_err(Failure::Decisions)
     }
 
     fn heading(&self, options: &plan::Options) -> String {
@@ -211,7 +236,11 @@ impl Import {
                 options.region
             ),
         };
-        format!("Made by `leaderboard-operator import` from {from}.")
+        let decided = match self.decisions.as_ref().and_then(|path| path.file_name()) {
+            Some(file) => format!(", with the decisions of {}", file.to_string_lossy()),
+            None => String::new(),
+        };
+        format!("Made by `leaderboard-operator import` from {from}{decided}.")
     }
 
     /// The texts of the entries that are needed.

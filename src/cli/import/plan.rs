@@ -1,13 +1,16 @@
 //! What the original's entries become: objects of Kubernetes, what is dropped, and what a person still has to decide. Pure.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use jiff::Timestamp;
-use leaderboard_api::{GROUP, Leaderboard, LeaderboardVersion, VERSION};
+use leaderboard_api::{GROUP, LeaderboardSpec, LeaderboardVersion, VERSION};
 use serde_json::{Map, Value, json};
 
-use super::entries::{BoardEntry, EVALAI, Entries, TrackEntry};
+use super::decisions::{DecisionError, Decisions};
+use super::entries::{Board, BoardEntry, EVALAI, Entries, TrackEntry};
+use super::questions;
 use super::taint::Taint;
 use crate::services::event_sources::QueueArn;
-use crate::services::token::WARN_BEFORE;
 
 /// Requests a minute of one operator of two, which share EvalAI's 60.
 const SHARED_BUDGET: i32 = 27;
@@ -17,12 +20,6 @@ const INSTANCE_TYPE: &str = "g5.12xlarge";
 const GPU: &str = "nvidia.com/gpu";
 /// The key of the token in its entry.
 const TOKEN_KEY: &str = "auth_token";
-const NO_ROLE: &str = "podIdentity: the role that may write to bucket and log group (--role-arn); without it the Pods have no \
-                       credentials of their own";
-const NO_EGRESS: &str = "network.egress: the addresses of the VPC's interface endpoints of S3, STS and CloudWatch Logs (--egress, each as \
-                         address/32); where policies are enforced, nothing is stored without them";
-const NO_TAINTS: &str = "tracks[].tolerations: do the GPU nodes have a taint (--taint)? The original's had none; with one that is not \
-                         tolerated submissions stay Unschedulable";
 
 /// What the entries do not hold.
 #[derive(Clone, Debug)]
@@ -34,7 +31,8 @@ pub(super) struct Options {
     pub(super) region: String,
     /// In place of Secrets Manager's own.
     pub(super) endpoint: Option<String>,
-    pub(super) challenge: i64,
+    /// A decision may name it instead.
+    pub(super) challenge: Option<i64>,
     pub(super) queue: Option<Queue>,
     pub(super) dead_letter: Option<String>,
     pub(super) egress: Vec<String>,
@@ -61,6 +59,8 @@ pub(super) struct Import {
     pub(super) decide: Vec<String>,
     /// Values of the chart that let the operator serve these objects.
     pub(super) values: Value,
+    /// The queues that are read, by URL and region.
+    pub(super) queues: BTreeSet<(String, Option<String>)>,
 }
 
 /// One object, with comments before fields of its spec.
@@ -68,42 +68,94 @@ pub(super) struct Import {
 pub(super) struct Document {
     pub(super) comment: Option<String>,
     pub(super) object: Value,
-    pub(super) notes: Vec<(&'static str, String)>,
+    pub(super) notes: Vec<(String, String)>,
 }
 
-/// Why an object cannot be printed: a mistake of this program, or a value that the API would refuse.
+/// Why there is nothing to print.
 #[derive(thiserror::Error, Debug)]
-#[error(
-    "the Leaderboard {name} would not be one: {source}; report this with the keys of the entry, without their texts"
-)]
-pub(super) struct NotALeaderboard {
-    name: &'static str,
-    source: serde_json::Error,
+pub(super) enum PlanError {
+    #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+    Decisions(Vec<DecisionError>),
+    #[error(
+        "--challenge is missing: no entry holds the id of the challenge; it is in the address of its page in EvalAI, or may be \
+         evalai.challenge of --decisions"
+    )]
+    NoChallenge,
+    /// A mistake of this program, or a field that a decision has removed.
+    #[error("the Leaderboard {name} would not be one: {source}; {next}")]
+    NotALeaderboard {
+        name: &'static str,
+        source: serde_json::Error,
+        next: String,
+    },
 }
 
 /// Makes the objects.
-pub(super) fn plan(entries: &Entries, options: &Options, now: Timestamp) -> Result<Import, NotALeaderboard> {
+pub(super) fn plan(
+    entries: &Entries,
+    options: &Options,
+    decisions: &Decisions,
+    now: Timestamp,
+) -> Result<Import, PlanError> {
+    let tracks = entries.boards.iter().map(|board| (board.board, track_names(board)));
+    let unknown = decisions.unknown_tracks(&tracks.collect::<BTreeMap<Board, BTreeSet<String>>>());
+    if !unknown.is_empty() {
+        return Err(PlanError::Decisions(unknown));
+    }
     let mut documents = vec![namespace(options), service_account(options)];
+    let mut specs = Vec::new();
     for board in &entries.boards {
-        documents.push(leaderboard(entries, board, options)?);
+        let mut spec = spec(entries, board, options);
+        decisions.lay_over(board.board, &mut spec);
+        specs.push(read(board, &spec, decisions)?);
+        documents.push(leaderboard(board, spec, options, decisions));
     }
     let dropped = entries.dropped.iter();
     Ok(Import {
         documents,
         dropped: dropped.map(|d| format!("{}: {} ({})", d.entry, d.key, d.why)).collect(),
-        decide: decide(entries, options, now),
-        values: values(options),
+        decide: questions::open(entries, options, decisions, now),
+        values: values(options, &specs),
+        queues: specs.iter().filter_map(queue_of).collect(),
     })
 }
 
+/// A spec as the operator reads it.
+fn read(board: &BoardEntry, spec: &Value, decisions: &Decisions) -> Result<LeaderboardSpec, PlanError> {
+    if spec["evalai"].is_object() && spec["evalai"]["challenge"].is_null() {
+        return Err(PlanError::NoChallenge);
+    }
+    let next = match decisions.file() {
+        "" => "report this with the keys of the entry, without their texts".to_owned(),
+        file => format!("look at what {file} removes"),
+    };
+    let name = board.board.entry();
+    serde_json::from_value(spec.clone()).map_err(|source| PlanError::NotALeaderboard { name, source, next })
+}
+
 /// Leaderboards may name only what the chart's values allow.
-fn values(options: &Options) -> Value {
-    let queues = options.queue.iter().map(|queue| &queue.url).chain(&options.dead_letter);
-    json!({"leaderboards": [{
-        "namespace": options.namespace,
-        "secretsManager": [EVALAI],
-        "queues": queues.collect::<Vec<_>>(),
-    }]})
+fn values(options: &Options, specs: &[LeaderboardSpec]) -> Value {
+    let queues = specs.iter().filter_map(|spec| spec.queue.as_ref());
+    let queues: BTreeSet<_> = queues
+        .flat_map(|queue| std::iter::once(&queue.url).chain(&queue.dead_letter_url))
+        .collect();
+    let tokens = || specs.iter().filter_map(|spec| Some(&spec.evalai.as_ref()?.token));
+    let entries: BTreeSet<_> = tokens()
+        .filter_map(|token| Some(&token.secrets_manager.as_ref()?.id))
+        .collect();
+    let secrets: BTreeSet<_> = tokens()
+        .filter_map(|token| Some(&token.secret_key_ref.as_ref()?.name))
+        .collect();
+    let mut values = json!({"namespace": options.namespace, "secretsManager": entries, "queues": queues});
+    if !secrets.is_empty() {
+        values["secrets"] = json!(secrets);
+    }
+    json!({"leaderboards": [values]})
+}
+
+fn queue_of(spec: &LeaderboardSpec) -> Option<(String, Option<String>)> {
+    let queue = spec.queue.as_ref()?;
+    Some((queue.url.clone(), queue.region.clone()))
 }
 
 fn plain(comment: &str, object: Value) -> Document {
@@ -137,21 +189,18 @@ fn service_account(options: &Options) -> Document {
     )
 }
 
-fn leaderboard(entries: &Entries, board: &BoardEntry, options: &Options) -> Result<Document, NotALeaderboard> {
+fn leaderboard(board: &BoardEntry, spec: Value, options: &Options, decisions: &Decisions) -> Document {
     let name = board.board.entry();
-    let object = json!({
+    let mut object = json!({
         "apiVersion": format!("{GROUP}/{VERSION}"), "kind": "Leaderboard",
         "metadata": {"name": name, "namespace": options.namespace},
-        "spec": spec(entries, board, options),
     });
-    // Read back as the operator reads it.
-    let read: Result<Leaderboard, _> = serde_json::from_value(object.clone());
-    read.map_err(|source| NotALeaderboard { name, source })?;
-    Ok(Document {
+    object["spec"] = spec;
+    Document {
         comment: Some(format!("From the entry {name}.")),
         object,
-        notes: notes(board, options),
-    })
+        notes: notes(board, options, decisions),
+    }
 }
 
 fn spec(entries: &Entries, board: &BoardEntry, options: &Options) -> Value {
@@ -196,9 +245,11 @@ fn evalai(entries: &Entries, options: &Options) -> Value {
     }
     let mut evalai = json!({
         "apiServer": entries.api_server,
-        "challenge": options.challenge,
         "token": {"secretsManager": token},
     });
+    if let Some(challenge) = options.challenge {
+        evalai["challenge"] = json!(challenge);
+    }
     if options.two_operators {
         evalai["requestsPerMinute"] = json!(SHARED_BUDGET);
     }
@@ -219,7 +270,8 @@ fn queue(queue: &Queue, options: &Options) -> Value {
     Value::Object(fields)
 }
 
-fn track(board: &BoardEntry, track: &TrackEntry, taints: &[Taint]) -> Value {
+/// The name that a phase's track gets.
+pub(super) fn track_name(board: &BoardEntry, track: &TrackEntry) -> String {
     let short = track.codename.to_ascii_lowercase().replace(['_', '.'], "-");
     let short = short.trim_matches('-');
     let same = board
@@ -228,7 +280,7 @@ fn track(board: &BoardEntry, track: &TrackEntry, taints: &[Taint]) -> Value {
         .filter(|other| other.codename == track.codename)
         .count();
     // Names are unique, and two phases may have the same track.
-    let name = match (same, short) {
+    match (same, short) {
         (_, "") => format!("phase-{}", track.phase),
         (1, short) => short.to_owned(),
         (_, short) => format!(
@@ -236,9 +288,16 @@ fn track(board: &BoardEntry, track: &TrackEntry, taints: &[Taint]) -> Value {
             short.get(..12).unwrap_or(short).trim_end_matches('-'),
             track.phase
         ),
-    };
+    }
+}
+
+fn track_names(board: &BoardEntry) -> BTreeSet<String> {
+    board.tracks.iter().map(|track| track_name(board, track)).collect()
+}
+
+fn track(board: &BoardEntry, track: &TrackEntry, taints: &[Taint]) -> Value {
     let mut fields = json!({
-        "name": name, "codename": track.codename, "phase": track.phase,
+        "name": track_name(board, track), "codename": track.codename, "phase": track.phase,
         "routesFile": "/workspace/leaderboard/data/routes_testing.xml",
         "nodeSelector": {"node.kubernetes.io/instance-type": INSTANCE_TYPE},
     });
@@ -269,37 +328,59 @@ fn resources(cpu: &str, memory: &str, disk: &str) -> Value {
     })
 }
 
-fn notes(board: &BoardEntry, options: &Options) -> Vec<(&'static str, String)> {
-    let mut notes = vec![
+/// Comments: why a field is as it is, and which fields a person has decided.
+fn notes(board: &BoardEntry, options: &Options, decisions: &Decisions) -> Vec<(String, String)> {
+    let reasons = reasons(board).into_iter().chain(reasons_of_the_command(board, options));
+    let left = reasons.filter(|(_, field, _)| !decisions.set(board.board, field));
+    let mut notes: Vec<_> = left.map(|(key, _, text)| (key.to_owned(), text)).collect();
+    let decided = decisions.keys(board.board).into_iter();
+    notes.extend(decided.map(|key| (key.to_owned(), format!("Decided in {}.", decisions.file()))));
+    notes
+}
+
+/// The key before which a comment stands, the field that it explains, and its text.
+fn reasons(board: &BoardEntry) -> [(&'static str, &'static str, String); 6] {
+    [
         (
+            "pairs",
             "pairs",
             "As in the original: 20 routes over 4 pairs (0-4, 5-9, 10-14, 15-19).".to_owned(),
         ),
         (
             "gpu",
+            "gpu",
             "As in the original: pair n has GPU n-1 of its node. That needs a default runtime nvidia and the device plugin's strategy \
              envvar. Later: mode PerContainer works with every plugin."
                 .to_owned(),
         ),
-        ("simulator", simulator_note(board)),
+        ("simulator", "simulator.securityContext", simulator_note(board)),
         (
             "deadlines",
+            "deadlines.runSeconds",
             "As in the original, a run has no time limit, so an agent that does not end keeps its node until it is cancelled. \
              Pulls of its images may take 90 minutes (pullSeconds), and the rest of its start 30 (startSeconds)."
                 .to_owned(),
         ),
         (
             "concurrency",
+            "concurrency",
             "The most nodes that the original's node group had for this Leaderboard; one submission takes one node.".to_owned(),
         ),
         (
             "agent",
+            "agent.resources",
             "The original requested no CPU, memory or disk; these let four pairs fit on a g5.12xlarge.".to_owned(),
         ),
-    ];
+    ]
+}
+
+/// The same for what neither the entry nor the command's options name.
+fn reasons_of_the_command(board: &BoardEntry, options: &Options) -> Vec<(&'static str, &'static str, String)> {
+    let mut notes = Vec::new();
     if options.queue.is_none() {
         notes.push((
             "leaderboardVersion",
+            "queue",
             "TODO: queue: {url: …, region: …}, the SQS queue of the challenge. Without it submissions come from EvalAI's lists alone, \
              one minute and more after they were made."
                 .to_owned(),
@@ -307,6 +388,7 @@ fn notes(board: &BoardEntry, options: &Options) -> Vec<(&'static str, String)> {
     } else if options.two_operators {
         notes.push((
             "queue",
+            "queue.foreign",
             "Two operators read this queue: each leaves the other's messages, and takes half of EvalAI's requests."
                 .to_owned(),
         ));
@@ -314,6 +396,7 @@ fn notes(board: &BoardEntry, options: &Options) -> Vec<(&'static str, String)> {
     if board.log_group.is_none() {
         notes.push((
             "storage",
+            "logGroup",
             "TODO: logGroup: {name: …, region: …}; the entry has no cloudwatch_log_group.".to_owned(),
         ));
     }
@@ -331,65 +414,6 @@ fn simulator_note(board: &BoardEntry) -> String {
         "As in the original: privileged. Remove that once the simulator runs without it, since a hostile agent that takes over a \
          privileged simulator has the node.{display}"
     )
-}
-
-const FLUENTD: &str = "logGroup: does the original's FluentD run on these nodes? Then each line is stored twice: leave logGroup out, or take \
-                       the namespace out of FluentD's source (docs/migrate.md, Logs twice)";
-
-fn decide(entries: &Entries, options: &Options, now: Timestamp) -> Vec<String> {
-    let queue = match &options.queue {
-        None => "queue: the URL of the SQS queue that EvalAI writes to (--queue), and its region".to_owned(),
-        Some(queue) => format!(
-            "queue: is {} the region of the queue? The original's was in us-west-2, its participants' images in us-east-1",
-            queue.arn.region()
-        ),
-    };
-    let challenge = format!(
-        "evalai.challenge: is {} the challenge of these phases? No entry holds it",
-        options.challenge
-    );
-    let open = |is_open: bool, question: &str| is_open.then(|| question.to_owned());
-    let questions = [
-        Some(token(entries, now)),
-        Some(queue),
-        open(
-            options.queue.is_some() && options.dead_letter.is_none(),
-            "queue.deadLetterURL: a queue for messages that cannot be used (--dead-letter); the original had none, and without \
-             one they stay in the queue until it drops them",
-        ),
-        Some(challenge),
-        open(options.role_arn.is_none(), NO_ROLE),
-        open(options.egress.is_empty(), NO_EGRESS),
-        Some("tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?".to_owned()),
-        Some("concurrency: how many submissions may run at once, in all and of one team".to_owned()),
-        Some(
-            "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else"
-                .to_owned(),
-        ),
-        Some("deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original".to_owned()),
-        open(entries.boards.iter().any(|board| board.log_group.is_some()), FLUENTD),
-        open(options.taints.is_empty(), NO_TAINTS),
-        open(
-            options.two_operators,
-            "which cluster gets which Leaderboard: apply only one of the two in each (--only prints one)",
-        ),
-    ];
-    questions.into_iter().flatten().collect()
-}
-
-fn token(entries: &Entries, now: Timestamp) -> String {
-    match &entries.token {
-        Err(why) => format!("the entry {EVALAI}: {why}"),
-        Ok(Some(end)) if end.duration_since(now) <= WARN_BEFORE => {
-            format!(
-                "the entry {EVALAI}: the token ends on {}; renew it on EvalAI's profile page",
-                end.strftime("%Y-%m-%d")
-            )
-        }
-        Ok(_) => format!(
-            "the entry {EVALAI}: may the operator's AWS identity read it (secretsmanager:GetSecretValue)? The token stays there"
-        ),
-    }
 }
 
 #[cfg(test)]

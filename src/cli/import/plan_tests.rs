@@ -16,7 +16,7 @@ fn options() -> Options {
         role_arn: Some("arn:aws:iam::123456789012:role/leaderboard-submission-worker".into()),
         region: "us-west-2".into(),
         endpoint: None,
-        challenge: 2098,
+        challenge: Some(2098),
         queue: Some(Queue {
             url: url.into(),
             arn: QueueArn::of_url(url, None).unwrap(),
@@ -29,7 +29,7 @@ fn options() -> Options {
 }
 
 fn planned(entries: &Entries, options: &Options) -> Import {
-    plan(entries, options, Timestamp::UNIX_EPOCH).unwrap()
+    plan(entries, options, &Decisions::default(), Timestamp::UNIX_EPOCH).unwrap()
 }
 
 fn specs(import: &Import) -> Vec<LeaderboardSpec> {

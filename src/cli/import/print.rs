@@ -75,7 +75,7 @@ pub(super) fn document(document: &Document) -> Result<String, serde_saphyr::ser:
         in_spec |= line == "spec:";
         let key = line.strip_prefix("  ").and_then(|line| line.split_once(':'));
         if let (true, Some((key, _))) = (in_spec, key) {
-            let notes = document.notes.iter().filter(|(of, _)| *of == key);
+            let notes = document.notes.iter().filter(|(of, _)| of == key);
             text.extend(notes.map(|(_, note)| comment(note, "  ")));
         }
         text += line;
@@ -150,7 +150,7 @@ mod tests {
 
     fn printed(comment: &str, team: &str) -> String {
         let object = json!({"kind": "Submission", "spec": {"team": {"name": team}, "track": "sensors"}});
-        let notes = vec![("team", format!("note {comment}"))];
+        let notes = vec![("team".to_owned(), format!("note {comment}"))];
         document(&Document {
             comment: Some(comment.to_owned()),
             object,

@@ -257,7 +257,8 @@ impl Actor<'_> {
         let more = u64::try_from(seconds(new).saturating_sub(seconds(old))).unwrap_or(0);
         if more > 0 {
             let track = new.track.clone().unwrap_or_default();
-            self.uses.metrics.gpus_used(self.leaderboard(), track, more);
+            let team = self.view.submission.team();
+            self.uses.metrics.gpus_used(self.leaderboard(), track, team, more);
         }
     }
 

@@ -109,8 +109,12 @@ async fn gpu_seconds_are_counted_when_they_are_stored_and_once() {
             ..old.clone()
         };
         let text = metrics_after(&around, &mut view, status).await;
-        let line = format!("leaderboard_gpu_seconds_total{{leaderboard=\"one/board\",track=\"sensors\"}} {sum}");
-        assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+        for line in [
+            format!("leaderboard_gpu_seconds_total{{leaderboard=\"one/board\",track=\"sensors\"}} {sum}"),
+            format!("leaderboard_team_gpu_seconds_total{{leaderboard=\"one/board\",team=\"t1\"}} {sum}"),
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+        }
     }
 }
 

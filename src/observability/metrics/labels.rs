@@ -1,5 +1,5 @@
 //! The label sets of the families. Values are kinds, outcomes and other fixed words; names are those of
-//! Leaderboards and queues alone.
+//! Leaderboards and queues, and of a bounded number of teams.
 
 use prometheus_client::encoding::EncodeLabelSet;
 
@@ -60,6 +60,12 @@ pub struct Standing {
 pub(super) struct OfTrack {
     pub leaderboard: String,
     pub track: String,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(super) struct OfTeam {
+    pub leaderboard: String,
+    pub team: String,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]

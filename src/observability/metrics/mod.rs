@@ -1,7 +1,7 @@
 //! Every metric of the operator, as one typed struct: what is counted, with which labels.
 //!
-//! Parts call the methods; the health server asks for the text. Labels hold kinds, outcomes and other fixed values, and the names of
-//! Leaderboards and queues, which are few: never those of a Submission, a team or an image.
+//! Parts call the methods; the health server asks for the text. Labels hold kinds, outcomes and other fixed values, the names of
+//! Leaderboards and queues, which are few, and those of the first teams of each Leaderboard: never those of a Submission or an image.
 
 mod boards;
 mod labels;

@@ -1,12 +1,21 @@
 //! Submissions: how many stand where, what they used, how they failed. The leader alone counts them.
 
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Mutex, PoisonError};
+
+use leaderboard_api::text::{LONGEST_NAME, one_line};
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
-use super::labels::{OfFailure, OfTrack, Reason, Standing, State};
+use super::labels::{OfFailure, OfTeam, OfTrack, Reason, Standing, State};
 use super::{Metrics, whole, zero};
+
+/// Teams of a Leaderboard that have a sample of their own: a series for each of thousands would burden Prometheus.
+const MAX_TEAMS: usize = 50;
+/// The team of all others.
+const OTHER_TEAMS: &str = "other";
 
 #[derive(Debug)]
 pub(super) struct Submissions {
@@ -16,6 +25,9 @@ pub(super) struct Submissions {
     repeating_teams: Gauge,
     failures: Family<OfFailure, Counter>,
     gpu: Family<OfTrack, Counter>,
+    team_gpu: Family<OfTeam, Counter>,
+    /// Those with a sample of their own, by Leaderboard.
+    teams: Mutex<BTreeMap<String, BTreeSet<String>>>,
 }
 
 impl Submissions {
@@ -47,6 +59,25 @@ impl Submissions {
                 "gpu_seconds",
                 "GPUs times seconds of the Jobs that have ended while this process led, by Leaderboard and track",
             ),
+            team_gpu: zero(
+                r,
+                "team_gpu_seconds",
+                "GPUs times seconds as in `leaderboard_gpu_seconds_total`, by Leaderboard and team, as `status.gpuUse` names it: the first 50 teams of a Leaderboard, all others as `other`",
+            ),
+            teams: Mutex::default(),
+        }
+    }
+
+    /// How a team is called in a label.
+    fn label_of(&self, leaderboard: &str, team: &str) -> String {
+        let team = one_line(team, LONGEST_NAME);
+        let mut teams = self.teams.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = teams.entry(leaderboard.to_owned()).or_default();
+        if known.contains(&team) || known.len() < MAX_TEAMS {
+            known.insert(team.clone());
+            team
+        } else {
+            OTHER_TEAMS.to_owned()
         }
     }
 
@@ -98,8 +129,16 @@ impl Metrics {
         self.submissions.repeating_teams.set(whole(count));
     }
 
-    /// A Job that has ended had so many GPUs for so long. `leaderboard` has its namespace before it.
-    pub fn gpus_used(&self, leaderboard: String, track: String, seconds: u64) {
+    /// A Job that has ended had so many GPUs for so long. `leaderboard` has its namespace before it; a local submission may have no team.
+    pub fn gpus_used(&self, leaderboard: String, track: String, team: Option<&str>, seconds: u64) {
+        if let Some(team) = team {
+            let team = self.submissions.label_of(&leaderboard, team);
+            let of = OfTeam {
+                leaderboard: leaderboard.clone(),
+                team,
+            };
+            self.submissions.team_gpu.get_or_create(&of).inc_by(seconds);
+        }
         let of = OfTrack { leaderboard, track };
         self.submissions.gpu.get_or_create(&of).inc_by(seconds);
     }

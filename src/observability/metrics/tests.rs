@@ -22,7 +22,7 @@ fn all(program: Program) -> Metrics {
     metrics.set_observed("SameEnd", 1);
     metrics.set_oldest_message("https://q/1", Some(1_800_000_000_500));
     metrics.set_repeating_teams(1);
-    metrics.gpus_used("ns/board".into(), "sensors".into(), 400);
+    metrics.gpus_used("ns/board".into(), "sensors".into(), Some("7"), 400);
     metrics.attempt_failed(FailedAttempt {
         leaderboard: "ns/board".into(),
         class: "Participant",
@@ -83,6 +83,7 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_queue_oldest_message_timestamp_seconds{queue=\"https://q/1\"} 1800000000.5",
         "leaderboard_teams_with_repeated_infrastructure_failures 1",
         "leaderboard_gpu_seconds_total{leaderboard=\"ns/board\",track=\"sensors\"} 400",
+        "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"7\"} 400",
         "leaderboard_submission_failures_total{leaderboard=\"ns/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"} 1",
         "leaderboard_ready{leaderboard=\"ns/board\"} 1",
         "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9.0",
@@ -107,6 +108,35 @@ fn every_metric_has_its_name_and_its_labels() {
         assert!(text.lines().any(|l| l == line), "{line} is missing in\n{text}");
     }
     assert!(text.ends_with("# EOF\n"));
+}
+
+#[test]
+fn fifty_teams_of_a_leaderboard_have_a_sample_each_and_the_others_one() {
+    let metrics = Metrics::new(Program::Controller);
+    let used = |board: &str, team: Option<&str>| metrics.gpus_used(board.into(), "map".into(), team, 2);
+    let teams: Vec<String> = (1..=200).map(|number| format!("Team {number}")).collect();
+    for team in teams.iter().chain(&teams) {
+        used("ns/board", Some(team));
+    }
+    used("ns/other", Some("Team 200"));
+    used("ns/other", Some("two\nlines\u{1b}[2J\u{202e}"));
+    used("ns/other", None);
+    let text = metrics.text().unwrap();
+    let samples: Vec<&str> = text
+        .lines()
+        .filter(|line| line.starts_with("leaderboard_team_gpu_seconds_total{"))
+        .collect();
+    assert_eq!(samples.len(), 50 + 1 + 2, "{samples:#?}");
+    for line in [
+        "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"Team 1\"} 4",
+        "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"Team 50\"} 4",
+        "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"other\"} 600",
+        "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/other\",team=\"Team 200\"} 2",
+        "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/other\",team=\"two lines\u{fffd}[2J\u{fffd}\"} 2",
+        "leaderboard_gpu_seconds_total{leaderboard=\"ns/other\",track=\"map\"} 6",
+    ] {
+        assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+    }
 }
 
 #[test]

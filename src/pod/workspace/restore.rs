@@ -2,6 +2,9 @@
 //!
 //! Called by `workspace`. What is stored came from strangers' containers: keys are checked like paths, sizes against the
 //! run's limit. Status files speak of containers that are gone; they are dropped on both sides.
+//!
+//! The newest pipeline before this operator (carla-simulator/leaderboard-cloud, one Job for each worker) has the checkpoints of its
+//! workers at other keys. They are restored to where a pair's is.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -11,7 +14,7 @@ use futures::{StreamExt, TryStreamExt};
 use super::WorkspaceError;
 use crate::pod::blocking;
 use crate::pod::daily::Daily;
-use crate::pod::keys::{EVALAI, MERGED, REFUSED};
+use crate::pod::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
 use crate::pod::report::{OWNER_KEY, REPORT_KEY};
 use crate::pod::run::{Run, STATUS_FOLDER};
 use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
@@ -52,12 +55,21 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
         &Quota::new(limit, run.plan.slices.len()),
         run.plan.slices.len(),
     );
-    let others = chosen.others.iter();
+    let others = chosen.others.iter().chain(&chosen.of_workers);
     let others: Vec<(String, Stored)> = others
         .map(|other| (other.key.clone(), Stored::unknown(other.size)))
         .collect();
+    let of_workers = chosen.of_workers.len();
+    for object in chosen.of_workers {
+        let path = of_worker(&object.key).map(checkpoint_path).unwrap_or_default();
+        // Not known as stored: it gets a pair's key with the first upload.
+        download(archive, tree, object, &path).await?;
+    }
     let stored: Vec<Option<(String, Stored)>> = futures::stream::iter(chosen.objects)
-        .map(|object| download(archive, tree, object))
+        .map(|object| async move {
+            let key = object.key.clone();
+            download(archive, tree, object, &key).await
+        })
         .buffer_unordered(AT_ONCE)
         .try_collect()
         .await?;
@@ -66,7 +78,7 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
         sent: Daily::default(),
     };
     let restored = Restored {
-        files: memory.stored.len(),
+        files: memory.stored.len().saturating_add(of_workers),
         bytes: memory.bytes(),
         left_out: chosen.left_out,
     };
@@ -85,6 +97,8 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
 #[derive(Debug, PartialEq, Eq)]
 struct Chosen {
     objects: Vec<Listed>,
+    /// The checkpoints of another pipeline's workers, each for the pair of its number.
+    of_workers: Vec<Listed>,
     /// What stays in the bucket only.
     others: Vec<Listed>,
     /// How many of them are not left there on purpose.
@@ -94,6 +108,7 @@ struct Chosen {
 /// What is restored: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
 fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
     let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
+    let (of_workers, objects) = checkpoints_of_workers(objects, quota, pairs);
     let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
         .into_iter()
         .filter(|object| !not_counted.contains(&object.key.as_str()))
@@ -116,8 +131,47 @@ fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
     Chosen {
         left_out: all.saturating_sub(objects.len()),
         objects,
+        of_workers,
         others,
     }
+}
+
+/// Takes out the checkpoints of the newest pipeline's workers that belong to pairs without one of their own. As many workers as pairs
+/// share the routes out as the pairs do; with another number each has other routes, and the run begins anew. Each worker has logs.
+fn checkpoints_of_workers(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> (Vec<Listed>, Vec<Listed>) {
+    let workers = objects
+        .iter()
+        .filter_map(|object| of_worker(&object.key).or_else(|| log_of_worker(&object.key)));
+    if workers.max() != Some(pairs) {
+        return (Vec::new(), objects);
+    }
+    let own: BTreeSet<String> = objects.iter().map(|object| object.key.clone()).collect();
+    let mut left = quota.bytes;
+    objects.into_iter().partition(|object| {
+        let is_free = of_worker(&object.key).is_some_and(|worker| !own.contains(&checkpoint_path(worker)));
+        let after = left.checked_sub(object.size).filter(|_| is_free);
+        left = after.unwrap_or(left);
+        after.is_some()
+    })
+}
+
+/// The number of the worker whose checkpoint a key is.
+fn of_worker(key: &str) -> Option<usize> {
+    number(key.strip_prefix("agent/partial_agent_results")?.strip_suffix(".json")?)
+}
+
+/// The number of the worker one of whose containers has this log.
+fn log_of_worker(key: &str) -> Option<usize> {
+    let (container, worker) = key.strip_prefix("logs/")?.strip_suffix(".log")?.split_once('-')?;
+    ["agent", "simulator", "uploader"]
+        .contains(&container)
+        .then(|| number(worker))?
+}
+
+/// A number from 1 on, as a shell writes it.
+fn number(text: &str) -> Option<usize> {
+    let number = text.parse().ok().filter(|number| *number > 0)?;
+    (usize::to_string(&number) == text).then_some(number)
 }
 
 /// Whether a key is one that the run goes on with.
@@ -149,9 +203,10 @@ async fn download(
     archive: &Archive,
     tree: &Arc<Tree>,
     object: Listed,
+    path: &str,
 ) -> Result<Option<(String, Stored)>, WorkspaceError> {
-    let local = |error: TreeError| volume(&object.key, error);
-    let (creating, key) = (Arc::clone(tree), object.key.clone());
+    let local = |error: TreeError| volume(path, error);
+    let (creating, key) = (Arc::clone(tree), path.to_owned());
     let created = blocking(move || creating.create(&key)).await;
     let created = created.map_err(TreeError::from).flatten().map_err(local)?;
     let mut file = tokio::fs::File::from_std(created);
@@ -161,7 +216,7 @@ async fn download(
         return Ok(None);
     };
     drop(file);
-    let (reading, key) = (Arc::clone(tree), object.key.clone());
+    let (reading, key) = (Arc::clone(tree), path.to_owned());
     let read = blocking(move || fingerprint_of(&reading, &key)).await;
     let Some((fingerprint, stamp)) = read.map_err(TreeError::from).flatten().map_err(local)? else {
         return Ok(None);
@@ -235,6 +290,41 @@ mod tests {
             "logcopy/logcopy.log",
         ];
         assert_eq!((keys(&chosen), chosen.left_out), (expected.to_vec(), 0));
+    }
+
+    #[test]
+    fn the_checkpoints_of_as_many_workers_as_pairs_are_those_of_the_pairs() {
+        let partial = |worker: &str| format!("agent/partial_agent_results{worker}.json");
+        for (keys, taken) in [
+            (vec![partial("1"), partial("2")], vec![partial("1"), partial("2")]),
+            // The second worker has begun, and has no route yet.
+            (vec![partial("1"), "logs/uploader-2.log".into()], vec![partial("1")]),
+            // Of two pairs and one worker, or three workers, each has other routes.
+            (vec![partial("1")], vec![]),
+            (vec![partial("1"), partial("2"), partial("3")], vec![]),
+            (vec![partial("1"), partial("2"), "logs/agent-3.log".into()], vec![]),
+            // The pair has gone on since.
+            (
+                vec![partial("1"), partial("2"), "agent/agent1/agent_results.json".into()],
+                vec![partial("2")],
+            ),
+            (
+                vec![partial("01"), partial("2"), partial(""), partial("0"), partial("-1")],
+                vec![partial("2")],
+            ),
+        ] {
+            let objects = keys.iter().map(|key| listed(key, 10)).collect();
+            let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+            let found: Vec<_> = chosen.of_workers.iter().map(|object| object.key.clone()).collect();
+            assert_eq!(found, taken, "{keys:?}");
+            assert!(
+                chosen.objects.iter().all(|object| !taken.contains(&object.key)),
+                "{keys:?}"
+            );
+        }
+        let large = vec![listed(&partial("1"), 2 * MIB), listed(&partial("2"), 10)];
+        let chosen = choose(large, &Quota::new(MIB, 2), 2);
+        assert_eq!(chosen.of_workers.len(), 1, "within the limit of the run");
     }
 
     #[test]

@@ -159,6 +159,38 @@ async fn a_resume_takes_up_what_has_no_report() {
     assert_eq!(fs::read(pod.path("agent/agent2/agent_results.json")).unwrap(), b"{}");
 }
 
+/// As carla-simulator/leaderboard-cloud stores it since it has one Job for each worker.
+#[tokio::test]
+async fn a_resume_takes_up_the_checkpoints_of_the_newest_pipelines_workers() {
+    let mut pod = Pod::new().await;
+    pod.setting.run.plan.resume = true;
+    for (key, text) in [
+        (
+            "agent/partial_agent_results1.json",
+            "{\"_checkpoint\": {\"progress\": [1, 2]}}",
+        ),
+        ("agent/partial_agent_results2.json", "{}"),
+        ("agent/agent2/agent_results.json", "{\"newer\": true}"),
+        ("agent_results.json", "{}"),
+        ("containers-status/agent-1.crash0", ""),
+        ("logs/agent-1.log", "one"),
+    ] {
+        pod.archive.put(key, text.as_bytes().to_vec()).await.unwrap();
+    }
+    pod.prepare().await.unwrap();
+    let first = fs::read(pod.path("agent/agent1/agent_results.json")).unwrap();
+    assert_eq!(first, b"{\"_checkpoint\": {\"progress\": [1, 2]}}");
+    let second = fs::read(pod.path("agent/agent2/agent_results.json")).unwrap();
+    assert_eq!(second, b"{\"newer\": true}", "a pair's own goes before it");
+    assert!(!pod.path("agent/partial_agent_results1.json").exists());
+    assert!(
+        pod.keys()
+            .await
+            .contains(&"agent/partial_agent_results1.json".to_owned()),
+        "it stays in the bucket"
+    );
+}
+
 #[tokio::test]
 async fn a_failure_is_said_in_the_termination_log() {
     let mut pod = Pod::new().await;
