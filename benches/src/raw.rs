@@ -59,10 +59,9 @@ impl Bodies {
     /// Those of [`SAMPLE`], whose UID is this, among the entries of an audit log; none as long as one of them is missing.
     pub fn of_sample(entries: &[audit::Entry], uid: &str) -> Option<Self> {
         let found = |resource: &str, holds: &dyn Fn(&Value) -> bool| {
-            // The operator also asks whether the Leaderboard's Job would be accepted.
             let mut all = entries
                 .iter()
-                .filter(|entry| entry.is_write() && entry.resource() == resource && !entry.uri.contains("dryRun"));
+                .filter(|entry| entry.is_write() && entry.resource() == resource && !entry.is_trial());
             all.find(|entry| entry.body.as_ref().is_some_and(holds))
                 .and_then(Body::of)
         };

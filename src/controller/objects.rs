@@ -1,13 +1,14 @@
 //! What is read off any object: its key, its owner, and what marks it as ours. Pure.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 use tracing::Span;
 
-use crate::observability::about;
+use crate::observability::about::{self, LogSpan};
 use crate::services::ObjectKey;
 use leaderboard_api::{Leaderboard, Submission, names};
 
@@ -15,8 +16,13 @@ use leaderboard_api::{Leaderboard, Submission, names};
 pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;
 
 /// The key of an object in every map of the controller: its UID, which a name does not replace.
+pub fn uid(object: &impl Resource) -> &str {
+    object.meta().uid.as_deref().unwrap_or_default()
+}
+
+/// The same, to be kept.
 pub fn uid_of(object: &impl Resource) -> String {
-    object.meta().uid.clone().unwrap_or_default()
+    uid(object).to_owned()
 }
 
 /// The key of an object towards the services.
@@ -30,14 +36,30 @@ pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
 
 /// What all log lines about a submission are written in.
 pub fn span_of(submission: &Submission) -> Span {
+    let spec = &submission.spec;
+    about::submission(
+        full_name(submission),
+        &spec.leaderboard_name,
+        spec.attempt,
+        uid(submission),
+    )
+}
+
+/// The same, for a task that works for it later.
+pub fn log_span_of(submission: &Submission) -> LogSpan {
+    let spec = &submission.spec;
+    LogSpan::of(
+        full_name(submission),
+        &spec.leaderboard_name,
+        spec.attempt,
+        uid(submission),
+    )
+}
+
+fn full_name(submission: &Submission) -> impl fmt::Display {
     let meta = &submission.metadata;
     let (namespace, name) = (meta.namespace.as_deref(), meta.name.as_deref());
-    about::submission(
-        format_args!("{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()),
-        &submission.spec.leaderboard_name,
-        submission.spec.attempt,
-        meta.uid.as_deref().unwrap_or_default(),
-    )
+    fmt::from_fn(move |f| write!(f, "{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()))
 }
 
 /// The reference by which a child goes with its owner.

@@ -1,11 +1,13 @@
 //! The writes that Submissions and Leaderboards share: the finalizer and the status. Both are safe to repeat.
 
+use std::borrow::Cow;
+
 use kube::api::{Patch, PatchParams};
 use kube::{Client, Resource, ResourceExt};
 use serde::Serialize;
 use serde_json::json;
 
-use super::objects::uid_of;
+use super::objects::uid;
 use crate::kubernetes::{CallError, Watchable, Writes, call};
 use leaderboard_api::names;
 
@@ -36,18 +38,37 @@ where
     }
 }
 
+/// A status as it is applied. Written as text at once: a tree of values would be most of what a write allocates.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Applied<'a, S> {
+    api_version: Cow<'a, str>,
+    kind: Cow<'a, str>,
+    metadata: Identity<'a>,
+    status: &'a S,
+}
+
+#[derive(Serialize)]
+struct Identity<'a> {
+    name: &'a str,
+    uid: &'a str,
+}
+
 /// Applies a status. Returns the version of the object that has it.
 pub async fn apply_status<K>(client: &Client, object: &K, status: &impl Serialize) -> Result<Box<str>, CallError>
 where
     K: Watchable + Resource<DynamicType = ()>,
 {
     let (api, name) = (api(client, object), object.name_any());
-    let patch = Patch::Apply(json!({
-        "apiVersion": <K as Resource>::api_version(&()),
-        "kind": <K as Resource>::kind(&()),
-        "metadata": { "name": name, "uid": uid_of(object) },
-        "status": status,
-    }));
+    let patch = Patch::Apply(Applied {
+        api_version: <K as Resource>::api_version(&()),
+        kind: <K as Resource>::kind(&()),
+        metadata: Identity {
+            name: &name,
+            uid: uid(object),
+        },
+        status,
+    });
     let params = PatchParams::apply(names::MANAGER_STATUS).force();
     let applied = api.patch_status(&name, &params, &patch);
     let written = call("the status", &described(object), applied).await?;

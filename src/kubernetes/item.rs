@@ -33,6 +33,11 @@ pub trait Watchable: Lookup<DynamicType = ()> + Clone + fmt::Debug + Send + Sync
 
     /// Stores texts once that many objects have.
     fn share(&mut self, _texts: &mut Texts) {}
+
+    /// Whether nothing has changed since `before` that anybody reads.
+    fn is_same(&self, _before: &Self) -> bool {
+        false
+    }
 }
 
 /// An object that this program can't read.
@@ -115,7 +120,16 @@ impl Parts for Submission {
     type Status = Option<SubmissionStatus>;
 
     fn of(metadata: ObjectMeta, spec: Self::Spec, status: Self::Status) -> Self {
-        Self { metadata, spec, status }
+        let mut submission = Self { metadata, spec, status };
+        if let Some(status) = &mut submission.status {
+            // A list that was read has room for twice as many.
+            status.conditions.shrink_to_fit();
+            status.pairs.shrink_to_fit();
+            if let Some(plan) = &mut status.plan {
+                plan.slices.shrink_to_fit();
+            }
+        }
+        submission
     }
 }
 

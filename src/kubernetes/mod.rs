@@ -26,7 +26,7 @@ pub use feed::{WatchEvent, WatchEvents};
 pub use item::{Item, Malformed, Watchable};
 pub use namespaces::Namespaces;
 pub use store::{Index, Store};
-pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
+pub use watch::{PAGE, Shape, Synced, Unreadable, Watch, spawn_watch};
 pub use write::{Writes, Written};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.

@@ -2,6 +2,7 @@
 
 mod lists;
 mod namespaces;
+mod unread;
 
 use std::time::Duration;
 

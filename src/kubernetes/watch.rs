@@ -25,7 +25,7 @@ use crate::observability::shutdown::Stop;
 use leaderboard_api::client_errors;
 
 /// Objects of one page of a list, each of up to 50 KB: a page is in memory as a whole while it is decoded.
-const PAGE: u32 = 100;
+pub const PAGE: u32 = 100;
 
 /// A running watch. Clones are the same one.
 pub struct Watch<K: Watchable> {
@@ -231,9 +231,12 @@ impl<K: Watchable> Task<K> {
         };
         self.unreadable.keys().remove(&key_of(&object));
         let (after, before) = self.writer.put(object);
-        // The end of an object that was replaced by another one of its name between two reads.
-        if let Some(before) = before.filter(|before| before.uid() != after.uid()) {
-            self.tell(&before, true);
+        match before {
+            // The end of an object that was replaced by another one of its name between two reads.
+            Some(before) if before.uid() != after.uid() => self.tell(&before, true),
+            // Of a Pod most of what its kubelet and the Job controller write is read by nobody here.
+            Some(before) if after.is_same(&before) => return,
+            _ => {}
         }
         self.tell(&after, false);
     }

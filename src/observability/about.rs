@@ -4,6 +4,7 @@
 //! have the same fields.
 
 use std::fmt;
+use std::sync::Arc;
 
 use tracing::Span;
 use tracing::field::Empty;
@@ -37,26 +38,41 @@ pub fn identify(attempt: i64, uid: &str) {
     }
 }
 
-/// The span in which work was asked for, for the task that does it. Two pieces of work that differ in it alone are the same.
-#[derive(Clone)]
-pub struct LogSpan(Span);
+/// The span of a submission, for the task that does what was asked for it. Two pieces of work that differ in it alone are the same.
+///
+/// Work may wait for hours, so this is what the span is made of: a span takes several times as much as long as it lives.
+#[derive(Clone, Default)]
+pub struct LogSpan(Option<Arc<Fields>>);
+
+struct Fields {
+    submission: Box<str>,
+    leaderboard: Box<str>,
+    attempt: i64,
+    uid: Box<str>,
+}
 
 impl LogSpan {
-    /// The one that is current where this is called.
-    pub fn current() -> Self {
-        Self(Span::current())
+    /// That of [`submission`].
+    pub fn of(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Self {
+        Self(Some(Arc::new(Fields {
+            submission: submission.to_string().into(),
+            leaderboard: leaderboard.into(),
+            attempt,
+            uid: uid.into(),
+        })))
     }
 
     /// To be entered for the work's lines.
-    pub fn span(&self) -> &Span {
-        &self.0
-    }
-}
-
-impl Default for LogSpan {
-    /// Nothing that is known.
-    fn default() -> Self {
-        Self(Span::none())
+    pub fn span(&self) -> Span {
+        self.0.as_deref().map_or_else(Span::none, |fields| {
+            let Fields {
+                submission: name,
+                leaderboard,
+                attempt,
+                uid,
+            } = fields;
+            submission(name, leaderboard, *attempt, uid)
+        })
     }
 }
 
@@ -83,7 +99,7 @@ mod tests {
     fn work_of_another_task_logs_with_the_fields_of_who_asked_for_it() {
         let lines = Lines::default();
         let _guard = lines.collect();
-        let log = submission("ns/one", "carla", 2, "uid").in_scope(LogSpan::current);
+        let log = LogSpan::of("ns/one", "carla", 2, "uid");
         tracing::warn!("nothing is known");
         log.span().in_scope(|| tracing::warn!(why = "slow", "late"));
         let found = lines.take_json();

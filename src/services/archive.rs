@@ -145,7 +145,8 @@ impl Archive {
             }
             Err(error) => return Err(self.failed(OP, key, &error)),
         };
-        let mut bytes = Vec::new();
+        let announced = output.content_length.and_then(|length| u64::try_from(length).ok());
+        let mut bytes = Vec::with_capacity(usize::try_from(announced.unwrap_or(0).min(limit)).unwrap_or(0));
         while let Some(chunk) = output.body.try_next().await.map_err(|e| self.broken(OP, key, &e))? {
             if (bytes.len() + chunk.len()) as u64 > limit {
                 return Err(self.error(OP, key, Cause::TooLarge(limit)));

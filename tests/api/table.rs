@@ -9,6 +9,7 @@ use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
 use leaderboard_api as api;
+use leaderboard_operator::observability::about::LogSpan;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
 use leaderboard_operator::services::ObjectKey;
@@ -388,8 +389,14 @@ async fn the_recorder_writes_in_the_background_only_while_it_may() {
         name: name.into(),
         uid: "u".into(),
     };
-    recorder.record(&spec, &key("a"), row(1, "FINISHED"), true);
-    recorder.record(&named(&stand_in, "nowhere"), &key("b"), row(1, "FINISHED"), true);
+    recorder.record(&spec, &key("a"), row(1, "FINISHED"), true, LogSpan::default());
+    recorder.record(
+        &named(&stand_in, "nowhere"),
+        &key("b"),
+        row(1, "FINISHED"),
+        true,
+        LogSpan::default(),
+    );
     let mut all = Vec::new();
     for _ in 0..2 {
         all.push(tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap());
@@ -421,7 +428,7 @@ async fn a_row_that_dynamodb_throttles_is_written_at_last_and_an_older_state_is_
     };
     // The SDK sends each call three times: so the first call fails, and part of the second.
     throttle.refuse(5);
-    recorder.record(&spec, &key, row(1, "RUNNING"), false);
+    recorder.record(&spec, &key, row(1, "RUNNING"), false, LogSpan::default());
     tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap();
     let view = recorder.view(&key).unwrap();
     let why = view.error.unwrap();
@@ -429,7 +436,7 @@ async fn a_row_that_dynamodb_throttles_is_written_at_last_and_an_older_state_is_
         why.contains("ProvisionedThroughputExceededException") && why.contains("it is retried"),
         "{why}"
     );
-    recorder.record(&spec, &key, row(1, "FINISHED"), true);
+    recorder.record(&spec, &key, row(1, "FINISHED"), true, LogSpan::default());
     while !recorder.view(&key).unwrap().end_written {
         tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap();
     }

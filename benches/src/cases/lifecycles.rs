@@ -42,10 +42,10 @@ pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
     Ok(figures)
 }
 
-/// What the operator has written, by the audit log.
-fn writes(world: &World) -> Outcome<usize> {
-    let all = audit::read(&world.servers.audit_log())?;
-    Ok(audit::writes(&all).values().sum())
+/// What the operator has written about the measured submissions, by the audit log.
+async fn writes(world: &World) -> Outcome<usize> {
+    let all = audit::read_settled(&world.servers.audit_log()).await?;
+    Ok(audit::writes(&all).measured.values().sum())
 }
 
 async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize, is_operator: bool) -> Outcome<()> {
@@ -86,11 +86,8 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
     if is_operator {
         let requests = world.storage.requests() - s3;
         figures.add("S3 requests a lifecycle", requests as f64 / count as f64);
-        let writes = writes(&world)?;
-        figures.add(
-            "operator writes a lifecycle, all at once",
-            writes as f64 / (count + 1) as f64,
-        );
+        let writes = writes(&world).await?;
+        figures.add("operator writes a lifecycle, all at once", writes as f64 / count as f64);
         let failed = world.observed.get().failed.values().next().cloned();
         if let Some(why) = failed {
             figures.note(format!("a submission has not finished: {why}"));

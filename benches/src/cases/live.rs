@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use futures::future::try_join_all;
+use leaderboard_operator::kubernetes::PAGE;
 use serde::Deserialize;
 
 use crate::api;
@@ -22,8 +23,6 @@ const BLOCK_CAP: Duration = Duration::from_mins(3);
 const SETTLE: Duration = Duration::from_secs(15);
 const REST: Duration = Duration::from_secs(30);
 const ALL_CAP: Duration = Duration::from_mins(3);
-/// Objects in a page of a list, as the operator asks for them.
-const PAGE: usize = 500;
 
 pub async fn measure(bench: &Bench) -> Outcome<Figures> {
     let mut figures = Figures::default();

@@ -1,6 +1,6 @@
 //! One Leaderboard: who has a slot, who waits, and what has run. Knows no lock, no client and no clock.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::mem::discriminant;
 
 use super::member::{Kind, Member, Stand};
@@ -18,10 +18,11 @@ const STEPS: i32 = 10;
 pub(super) struct Line {
     /// None while the watch shows no such Leaderboard.
     limits: Option<Limits>,
-    members: HashMap<String, Member>,
-    /// Names of Jobs, by the UID of their owner.
-    jobs: HashMap<String, HashSet<String>>,
-    running: HashMap<String, Running>,
+    members: HashMap<Box<str>, Box<Member>>,
+    /// The UID of the owner of each Job, by the Job's name.
+    jobs: HashMap<Box<str>, Box<str>>,
+    /// The attempt of everybody in a slot, as the watch shows it.
+    running: HashMap<Box<str>, i64>,
     reserved: HashMap<String, Reserved>,
     waiting: HashMap<String, Waiting>,
     past: Past,
@@ -33,13 +34,6 @@ pub(super) struct Line {
     pub(super) last_check: Option<CheckEnd>,
     /// Something has changed since slots were allocated last.
     pub(super) is_dirty: bool,
-}
-
-/// Somebody in a slot, as the watch shows it.
-#[derive(PartialEq, Eq)]
-struct Running {
-    team: String,
-    attempt: i64,
 }
 
 /// A slot whose Job the watch does not show yet.
@@ -68,13 +62,12 @@ impl Line {
     }
 
     pub(super) fn job(&mut self, owner: &str, name: &str, is_gone: bool) {
-        if is_gone {
-            if let Some(jobs) = self.jobs.get_mut(owner) {
-                jobs.remove(name);
-            }
-            self.jobs.retain(|_, jobs| !jobs.is_empty());
-        } else {
-            self.jobs.entry(owner.to_owned()).or_default().insert(name.to_owned());
+        let known = self.jobs.get(name).map(AsRef::as_ref);
+        if is_gone && known == Some(owner) {
+            self.jobs.remove(name);
+        } else if !is_gone && known != Some(owner) {
+            // One of an older object of this name is gone.
+            self.jobs.insert(name.into(), owner.into());
         }
         self.place(owner);
     }
@@ -117,12 +110,17 @@ impl Line {
             self.is_past_stale = true;
         }
         self.is_dirty |= !is_same && new.began.is_some();
-        self.members.insert(uid.to_owned(), new)
+        self.is_dirty |= old.is_some_and(|old| old.team != new.team);
+        let Some(known) = self.members.get_mut(uid) else {
+            self.members.insert(uid.into(), Box::new(new));
+            return None;
+        };
+        Some(std::mem::replace(known.as_mut(), new))
     }
 
     fn gone(&mut self, uid: &str) -> Option<Member> {
         self.leaves(uid);
-        let old = self.members.remove(uid);
+        let old = self.members.remove(uid).map(|member| *member);
         let has_run = old.as_ref().is_some_and(|old| old.began.is_some());
         self.is_past_stale |= has_run;
         self.is_dirty |= has_run;
@@ -137,7 +135,7 @@ impl Line {
         let holds = |reserved: &Reserved| {
             reserved.waiting.attempt == attempt && (reserved.is_started || reserved.limits == limits)
         };
-        let is_held = limits.paused && !self.members.get(uid).is_some_and(Member::is_check);
+        let is_held = limits.paused && !self.members.get(uid).is_some_and(|member| member.is_check());
         if self.reserved.get(uid).is_some_and(holds) || (!is_held && self.has_slot(uid, attempt)) {
             return Turn::Go;
         }
@@ -147,7 +145,7 @@ impl Line {
 
     pub(super) fn join(&mut self, attempt: i64, place: InLine) {
         // One that is gone has left nothing behind; one that the watch has not shown yet joins when it does.
-        let is_known = self.members.contains_key(&place.uid);
+        let is_known = self.members.contains_key(place.uid.as_str());
         if !is_known
             || self
                 .reserved
@@ -222,7 +220,7 @@ impl Line {
             return woken;
         }
         self.recount_past();
-        let running = self.running.values().map(|running| &running.team);
+        let running = self.running.keys().filter_map(|uid| Some(&self.members.get(uid)?.team));
         let reserved = self.reserved.values().map(|reserved| &reserved.waiting.place.team);
         self.past.occupied = running.chain(reserved).cloned().collect();
         let line = self.waiting.values().map(|waiting| &waiting.place);
@@ -267,13 +265,13 @@ impl Line {
             return Vec::new();
         }
         let running = &self.running;
-        let holds = |uid: &String, waiting: &Waiting| running.get(uid).is_some_and(|r| r.attempt == waiting.attempt);
+        let holds = |uid: &String, waiting: &Waiting| running.get(uid.as_str()) == Some(&waiting.attempt);
         let through = self.waiting.extract_if(|uid, waiting| holds(uid, waiting));
         through.map(|(_, waiting)| waiting.place.name).collect()
     }
 
     fn has_slot(&self, uid: &str, attempt: i64) -> bool {
-        self.running.get(uid).is_some_and(|running| running.attempt == attempt)
+        self.running.get(uid) == Some(&attempt)
     }
 
     /// Works out whether a Submission has a slot, and what of its place and reservation is over.
@@ -282,20 +280,18 @@ impl Line {
             self.is_dirty |= self.running.remove(uid).is_some();
             return;
         };
-        let has_job = self.jobs.get(uid).is_some_and(|jobs| jobs.contains(&member.job));
+        let has_job = || {
+            self.jobs
+                .get(member.job().as_str())
+                .is_some_and(|owner| **owner == *uid)
+        };
         let runs = match member.stand {
             Stand::Over => false,
             Stand::HasSlot => true,
-            Stand::Idle => has_job,
+            Stand::Idle => has_job(),
         };
-        let running = runs.then(|| Running {
-            team: member.team.clone(),
-            attempt: member.attempt,
-        });
-        if self.running.get(uid) != running.as_ref() {
-            self.is_dirty = true;
-        }
-        let is_of_it = |attempt: i64| member.attempt >= attempt;
+        let attempt = member.number.attempt;
+        let is_of_it = |of: i64| attempt >= of;
         let is_void = |reserved: &Reserved| {
             let is_left = member.is_leaving && !reserved.is_started;
             is_of_it(reserved.waiting.attempt) && (runs || member.stand == Stand::Over || is_left)
@@ -309,10 +305,12 @@ impl Line {
             self.waiting.remove(uid);
             self.is_dirty = true;
         }
-        match running {
-            Some(running) => _ = self.running.insert(uid.to_owned(), running),
-            None => _ = self.running.remove(uid),
-        }
+        let has_moved = match self.running.get_mut(uid) {
+            Some(known) if runs => std::mem::replace(known, attempt) != attempt,
+            None if runs => self.running.insert(uid.into(), attempt).is_none(),
+            _ => self.running.remove(uid).is_some(),
+        };
+        self.is_dirty |= has_moved;
     }
 
     fn count(&mut self, member: &Member, by: i32) {

@@ -8,10 +8,8 @@ pub(super) struct Member {
     pub(super) name: String,
     pub(super) team: String,
     pub(super) track: String,
-    /// The attempt that runs or is to run next.
-    pub(super) attempt: i64,
-    /// The Job of that attempt, as it is or will be called.
-    pub(super) job: String,
+    /// The Job that runs or is to run next.
+    pub(super) number: JobNumber,
     pub(super) stand: Stand,
     /// It starts nothing any more.
     pub(super) is_leaving: bool,
@@ -76,8 +74,7 @@ impl Member {
         Self {
             team: own.unwrap_or_else(|| submission.team().unwrap_or_default().to_owned()),
             track: status.track.clone().or(spec.track.clone()).unwrap_or_default(),
-            attempt: number.attempt,
-            job: names::job(&name, number),
+            number,
             name,
             stand: match status {
                 _ if is_over => Stand::Over,
@@ -97,6 +94,11 @@ impl Member {
                 Kind::OfTeam
             },
         }
+    }
+
+    /// Name of the Job that runs or is to run next.
+    pub(super) fn job(&self) -> String {
+        names::job(&self.name, self.number)
     }
 
     pub(super) fn is_check(&self) -> bool {

@@ -21,7 +21,7 @@ use kube::runtime::reflector::ObjectRef;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use crate::controller::objects::uid_of;
+use crate::controller::objects::uid;
 use crate::controller::slots::turns::{InLine, Limits, Turn};
 use crate::kubernetes::objects::Job;
 use crate::lock::lock;
@@ -79,11 +79,10 @@ impl SlotAllocator {
             return;
         };
         let key = (meta.namespace().to_owned(), board.to_string());
-        self.change(&key, |line| {
-            for owner in &meta.owner_references {
-                line.job(&owner.uid, &meta.name, is_gone);
-            }
-        });
+        // Ours is the first; somebody may have added another.
+        if let Some(owner) = meta.owner_references.first() {
+            self.change(&key, |line| line.job(&owner.uid, &meta.name, is_gone));
+        }
     }
 
     /// The watch shows a Submission. Returns whether the counts or the last check of its Leaderboard have changed.
@@ -116,17 +115,17 @@ impl SlotAllocator {
 
     /// The Job is about to be created, or exists.
     pub fn starts(&self, submission: &Submission) {
-        self.change(&board_of(submission), |line| line.starts(&uid_of(submission)));
+        self.change(&board_of(submission), |line| line.starts(uid(submission)));
     }
 
     /// It was to start, and that failed: a pause or a lower limit may take the slot back again.
     pub fn did_not_start(&self, submission: &Submission) {
-        self.change(&board_of(submission), |line| line.did_not_start(&uid_of(submission)));
+        self.change(&board_of(submission), |line| line.did_not_start(uid(submission)));
     }
 
     /// It waits for something else, or has come to its end: its place and its reservation are free.
     pub fn leaves(&self, submission: &Submission) {
-        self.change(&board_of(submission), |line| line.leaves(&uid_of(submission)));
+        self.change(&board_of(submission), |line| line.leaves(uid(submission)));
     }
 
     /// The Leaderboard has changed: wakes those that may have waited for that.

@@ -77,7 +77,7 @@ impl World {
     fn joins(&self, submission: &Submission) {
         let created = submission.metadata.creation_timestamp.as_ref().unwrap();
         let place = InLine {
-            uid: uid_of(submission),
+            uid: uid(submission).to_owned(),
             name: submission.name_any(),
             team: submission.spec.team.as_ref().unwrap().id.clone().unwrap(),
             track: "sensors".into(),

@@ -25,7 +25,7 @@ use super::phases::{self, Ended, Phase};
 use super::significance::{Change, change, patience};
 use super::spans;
 use super::view::{LogPlace, ObservedTexts, View};
-use crate::controller::objects::{key_of, uid_of};
+use crate::controller::objects::{key_of, uid};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
@@ -98,7 +98,8 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for event in &plan.events {
         actor.publish(event).await;
     }
-    uses.archive.demand(&view.submission, &plan.status, plan.report);
+    uses.archive
+        .demand(&view.submission, &plan.status, view.ended_at(), plan.report);
     for action in plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
@@ -173,11 +174,11 @@ impl Actor<'_> {
             Action::ForgetEvalai => uses.external.hub.forget(&key_of(submission)),
             Action::Forget => {
                 uses.external.gone(&key_of(submission));
-                let uid = uid_of(submission);
-                uses.archive.forget(&uid);
-                uses.images.forget(&uid);
-                uses.foreign_runs.forget(&uid);
-                uses.addresses.forget(&uid);
+                let uid = uid(submission);
+                uses.archive.forget(uid);
+                uses.images.forget(uid);
+                uses.foreign_runs.forget(uid);
+                uses.addresses.forget(uid);
             }
             Action::Record { end } => uses.external.record(self.view, status, end),
         }
@@ -190,8 +191,9 @@ impl Actor<'_> {
     }
 
     async fn write_status(&self, status: &SubmissionStatus) -> Result<Option<Duration>, ActError> {
-        let old = self.submission().status.clone().unwrap_or_default();
-        match change(&old, status) {
+        let nothing = SubmissionStatus::default();
+        let old = self.submission().status.as_ref().unwrap_or(&nothing);
+        match change(old, status) {
             Change::Nothing => return Ok(None),
             Change::Place => {
                 let position = status.waiting.as_ref().map_or(0, |w| w.position);
@@ -211,10 +213,17 @@ impl Actor<'_> {
             Change::Real => {}
         }
         let version = apply_status(self.uses.client, self.submission(), status).await?;
-        self.uses.memory.wrote(self.submission(), status, &version);
+        let shown = self
+            .uses
+            .stores
+            .submissions
+            .get(&ObjectRef::from_obj(self.submission()));
+        self.uses
+            .memory
+            .wrote(self.submission(), status, &version, shown.as_deref());
         self.log_transition(status);
-        self.count_use(&old, status);
-        self.count_failure(&old, status);
+        self.count_use(old, status);
+        self.count_failure(old, status);
         self.note_phases(status);
         Ok(None)
     }

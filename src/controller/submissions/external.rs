@@ -13,9 +13,8 @@ use super::memory::Memory;
 use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
-use crate::controller::objects::{key_of, uid_of};
+use crate::controller::objects::{key_of, log_span_of, uid, uid_of};
 use crate::lock::lock;
-use crate::observability::about::LogSpan;
 use crate::services::ObjectKey;
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Publisher, Run, Status, Subject, SubmissionState, Target,
@@ -46,12 +45,12 @@ impl ExternalSystems {
 
     /// Nothing more of a Leaderboard goes to EvalAI.
     pub fn retire(&self, leaderboard: &Leaderboard) {
-        lock(&self.targets).remove(&uid_of(leaderboard));
+        lock(&self.targets).remove(uid(leaderboard));
         self.hub.retire(&key_of(leaderboard));
     }
 
     fn target(&self, leaderboard: &Leaderboard) -> Option<Arc<Target>> {
-        lock(&self.targets).get(&uid_of(leaderboard)).cloned()
+        lock(&self.targets).get(uid(leaderboard)).cloned()
     }
 
     /// What EvalAI is known to say of a submission.
@@ -157,12 +156,24 @@ impl ExternalSystems {
             // Before its end there is nothing to learn.
             if end {
                 let row = result_texts::trial(status);
-                self.recorder.record(table, &key_of(view.submission.as_ref()), row, end);
+                self.recorder.record(
+                    table,
+                    &key_of(view.submission.as_ref()),
+                    row,
+                    end,
+                    log_span_of(&view.submission),
+                );
             }
             return;
         }
         if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
-            self.recorder.record(table, &key_of(view.submission.as_ref()), row, end);
+            self.recorder.record(
+                table,
+                &key_of(view.submission.as_ref()),
+                row,
+                end,
+                log_span_of(&view.submission),
+            );
         }
     }
 
@@ -194,7 +205,7 @@ fn run_of(submission: &Submission) -> Run {
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
         has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
         ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
-        log: LogSpan::current(),
+        log: log_span_of(submission),
     }
 }
 

@@ -260,6 +260,7 @@ mod tests {
 
     use super::super::questions::Shared;
     use super::*;
+    use crate::observability::about::LogSpan;
 
     fn ask(attempt: i64) -> Question {
         Question {
@@ -285,20 +286,20 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn it_is_looked_once_for_an_attempt_and_again_only_for_one_that_still_waits() {
         let shared = Shared::default();
-        shared.want("u".into(), by("s"), ask(1));
+        shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(shared.next(), Some(("u".into(), ask(1), "one".into())));
-        shared.want("u".into(), by("s"), ask(1));
+        shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(shared.next(), None, "it is under way");
         tokio::time::advance(Duration::from_secs(3)).await;
         assert_eq!(shared.observe("u", 1), ObservedTraces::Asked(Duration::from_secs(3)));
         assert_eq!(shared.done("u", &ask(1), nothing()), Some(by("s")));
         let answered = ObservedTraces::Answered(Arc::new(nothing()));
         assert_eq!(shared.observe("u", 1), answered);
-        shared.want("u".into(), by("s"), ask(1));
+        shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(shared.next(), None, "the answer is young");
         tokio::time::advance(AGAIN).await;
         assert_eq!(shared.next(), None, "nobody asks");
-        shared.want("u".into(), by("s"), ask(1));
+        shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(
             shared.observe("u", 1),
             answered,
@@ -306,7 +307,7 @@ mod tests {
         );
         assert_eq!(shared.next(), Some(("u".into(), ask(1), "one".into())));
         assert_eq!(shared.observe("u", 2), ObservedTraces::NotAsked);
-        shared.want("u".into(), by("s"), ask(2));
+        shared.want("u".into(), by("s"), ask(2), LogSpan::default());
         assert_eq!(
             shared.done("u", &ask(1), nothing()),
             None,

@@ -85,6 +85,7 @@ mod tests {
 
     use super::super::questions::{KEPT, Shared};
     use super::*;
+    use crate::observability::about::LogSpan;
 
     fn question(attempt: i64, reference: &str) -> Question {
         Question {
@@ -107,9 +108,9 @@ mod tests {
     async fn a_question_is_asked_once_and_its_answer_stays_for_its_attempt() {
         let shared = Shared::default();
         let first = question(1, "one");
-        shared.want("u".into(), by("s"), first.clone());
+        shared.want("u".into(), by("s"), first.clone(), LogSpan::default());
         assert_eq!(shared.next(), Some(("u".into(), first.clone(), "one".into())));
-        shared.want("u".into(), by("s"), first.clone());
+        shared.want("u".into(), by("s"), first.clone(), LogSpan::default());
         assert_eq!(shared.next(), None, "it is under way");
         tokio::time::advance(Duration::from_secs(3)).await;
         assert_eq!(shared.observe("u", 1), ObservedImage::Asked(Duration::from_secs(3)));
@@ -119,7 +120,7 @@ mod tests {
             ObservedImage::Answered(Arc::new(Err(Fault::NotFound)))
         );
         assert_eq!(shared.observe("u", 2), ObservedImage::NotAsked);
-        shared.want("u".into(), by("s"), question(2, "one"));
+        shared.want("u".into(), by("s"), question(2, "one"), LogSpan::default());
         assert_eq!(shared.next().unwrap().1.attempt, 2, "it may have been pushed since");
     }
 
@@ -127,9 +128,9 @@ mod tests {
     async fn the_answer_to_an_older_question_is_nobodys() {
         let shared = Shared::default();
         let (old, new) = (question(1, "one"), question(1, "other"));
-        shared.want("u".into(), by("s"), old.clone());
+        shared.want("u".into(), by("s"), old.clone(), LogSpan::default());
         shared.next();
-        shared.want("u".into(), by("s"), new.clone());
+        shared.want("u".into(), by("s"), new.clone(), LogSpan::default());
         assert_eq!(shared.done("u", &old, Err(Fault::NotFound)), None);
         assert_eq!(shared.observe("u", 1), ObservedImage::Asked(Duration::ZERO));
         assert_eq!(shared.next().unwrap().1, new);
@@ -139,14 +140,14 @@ mod tests {
     async fn who_asked_first_is_served_first_and_old_answers_go() {
         let shared = Shared::default();
         for uid in ["a", "b"] {
-            shared.want(uid.into(), by(uid), question(1, uid));
+            shared.want(uid.into(), by(uid), question(1, uid), LogSpan::default());
             tokio::time::advance(Duration::from_secs(1)).await;
         }
         let (uid, question, _) = shared.next().unwrap();
         assert_eq!(uid, "a");
         shared.done(&uid, &question, Err(Fault::Denied));
         tokio::time::advance(KEPT).await;
-        shared.want("c".into(), by("c"), super::tests::question(1, "c"));
+        shared.want("c".into(), by("c"), super::tests::question(1, "c"), LogSpan::default());
         assert_eq!(shared.observe("a", 1), ObservedImage::NotAsked);
         assert!(
             matches!(shared.observe("b", 1), ObservedImage::Asked(_)),

@@ -9,7 +9,7 @@ use std::time::Duration;
 use kube::ResourceExt;
 use tokio::time::Instant;
 
-use crate::controller::objects::uid_of;
+use crate::controller::objects::uid;
 use crate::lock::lock;
 use leaderboard_api::{Submission, SubmissionStatus};
 
@@ -21,7 +21,7 @@ const PLACE_PACE: Duration = Duration::from_secs(1);
 /// One entry for each Submission, by UID.
 #[derive(Default)]
 pub struct Memory {
-    entries: Mutex<HashMap<String, Entry>>,
+    entries: Mutex<HashMap<Box<str>, Box<Entry>>>,
     /// When the next place of those far behind may be written.
     next_place: Mutex<Option<Instant>>,
 }
@@ -54,7 +54,7 @@ impl Memory {
         self.is_shown(&submission);
         let entries = lock(&self.entries);
         let written = entries
-            .get(&uid_of(submission.as_ref()))
+            .get(uid(submission.as_ref()))
             .and_then(|e| e.written.as_ref()?.status.as_deref());
         match written {
             Some(status) => {
@@ -66,20 +66,23 @@ impl Memory {
         }
     }
 
-    /// Remembers a status that we wrote, and the version that the API server has made of it.
-    pub fn wrote(&self, submission: &Submission, status: &SubmissionStatus, version: &str) {
+    /// Remembers a status that we wrote, and the version that the API server has made of it. The watch may be faster than the
+    /// answer: what the cache has `shown` by now is not kept.
+    pub fn wrote(&self, submission: &Submission, status: &SubmissionStatus, version: &str, shown: Option<&Submission>) {
+        let made = version.parse().unwrap_or(0);
+        let is_shown = shown.is_some_and(|shown| uid(shown) == uid(submission) && self::version(shown) >= made);
         let written = Written {
-            version: version.parse().unwrap_or(0),
+            version: made,
             at: Instant::now(),
-            status: Some(Box::new(status.clone())),
+            status: (!is_shown).then(|| Box::new(status.clone())),
         };
-        lock(&self.entries).entry(uid_of(submission)).or_default().written = Some(written);
+        lock(&self.entries).entry(uid(submission).into()).or_default().written = Some(written);
     }
 
     /// The cache shows an object: our own status goes once that is as new.
     pub fn is_shown(&self, submission: &Submission) {
         let mut entries = lock(&self.entries);
-        let entry = entries.get_mut(&uid_of(submission));
+        let entry = entries.get_mut(uid(submission));
         if let Some(written) = entry.and_then(|e| e.written.as_mut())
             && version(submission) >= written.version
         {
@@ -91,7 +94,7 @@ impl Memory {
     pub fn since_write(&self, submission: &Submission) -> Option<Duration> {
         let entries = lock(&self.entries);
         entries
-            .get(&uid_of(submission))
+            .get(uid(submission))
             .and_then(|e| e.written.as_ref())
             .map(|w| w.at.elapsed())
     }
@@ -100,7 +103,7 @@ impl Memory {
     /// each has a moment of its own, so that a step of a thousand is not a thousand writes.
     pub fn place_waits(&self, submission: &Submission, position: i32, now: Instant) -> Option<Duration> {
         let mut entries = lock(&self.entries);
-        let entry = entries.entry(uid_of(submission)).or_default();
+        let entry = entries.entry(uid(submission).into()).or_default();
         if position <= FIRST_PLACES {
             entry.place_at = None;
             return None;
@@ -120,23 +123,23 @@ impl Memory {
 
     /// Routes of the last partial result of the present attempt.
     pub fn partial_sent(&self, submission: &Submission) -> Option<u32> {
-        let (attempt, done) = lock(&self.entries).get(&uid_of(submission))?.partial?;
+        let (attempt, done) = lock(&self.entries).get(uid(submission))?.partial?;
         (Some(attempt) == submission.status.as_ref()?.attempt).then_some(done)
     }
 
     /// Remembers a partial result.
     pub fn sent_partial(&self, submission: &Submission, attempt: i64, done: u32) {
-        lock(&self.entries).entry(uid_of(submission)).or_default().partial = Some((attempt, done));
+        lock(&self.entries).entry(uid(submission).into()).or_default().partial = Some((attempt, done));
     }
 
     /// Remembers a Job that was created.
     pub fn created_job(&self, submission: &Submission, name: String) {
-        lock(&self.entries).entry(uid_of(submission)).or_default().job = Some((name, Instant::now()));
+        lock(&self.entries).entry(uid(submission).into()).or_default().job = Some((name, Instant::now()));
     }
 
     /// Forgets the Job that was created: the cache shows it, or it is being deleted.
     pub fn forget_job(&self, submission: &Submission) {
-        if let Some(entry) = lock(&self.entries).get_mut(&uid_of(submission)) {
+        if let Some(entry) = lock(&self.entries).get_mut(uid(submission)) {
             entry.job = None;
         }
     }
@@ -144,7 +147,7 @@ impl Memory {
     /// Whether the cache may not show yet that the Job of this name was created.
     pub fn awaits_job(&self, submission: &Submission, name: &str) -> bool {
         let entries = lock(&self.entries);
-        let job = entries.get(&uid_of(submission)).and_then(|entry| entry.job.as_ref());
+        let job = entries.get(uid(submission)).and_then(|entry| entry.job.as_ref());
         job.is_some_and(|(known, at)| known == name && at.elapsed() < JOB_SHOWS)
     }
 
@@ -152,7 +155,7 @@ impl Memory {
     pub fn asks_evalai(&self, submission: &Submission) {
         let attempt = submission.spec.attempt;
         let mut entries = lock(&self.entries);
-        let entry = entries.entry(uid_of(submission)).or_default();
+        let entry = entries.entry(uid(submission).into()).or_default();
         if entry.asked.is_none_or(|(of, _)| of != attempt) {
             entry.asked = Some((attempt, Instant::now()));
         }
@@ -161,7 +164,7 @@ impl Memory {
     /// How long EvalAI has been asked about the present attempt.
     pub fn evalai_waited(&self, submission: &Submission) -> Duration {
         let entries = lock(&self.entries);
-        let asked = entries.get(&uid_of(submission)).and_then(|entry| entry.asked);
+        let asked = entries.get(uid(submission)).and_then(|entry| entry.asked);
         let asked = asked.filter(|(of, _)| *of == submission.spec.attempt);
         asked.map_or(Duration::ZERO, |(_, at)| at.elapsed())
     }
@@ -251,7 +254,7 @@ mod tests {
     fn an_older_cache_does_not_hide_our_own_write() {
         let memory = Memory::default();
         let (old, new) = (object("9", "old"), object("", "new").status.unwrap());
-        memory.wrote(&old, &new, "12");
+        memory.wrote(&old, &new, "12", Some(&old));
         let reason = |shown: &Submission| {
             let shown = memory.with_own_status(Arc::new(shown.clone()));
             shown.status.as_ref().unwrap().reason.clone().unwrap()
@@ -266,10 +269,17 @@ mod tests {
     fn our_own_status_is_kept_no_longer_than_the_cache_lags() {
         let memory = Memory::default();
         let old = object("9", "old");
-        memory.wrote(&old, old.status.as_ref().unwrap(), "12");
+        memory.wrote(&old, old.status.as_ref().unwrap(), "12", None);
         let keeps = || lock(&memory.entries)["u"].written.as_ref().unwrap().status.is_some();
         assert!(keeps());
         memory.is_shown(&object("12", "new"));
         assert!(!keeps() && memory.since_write(&old).is_some());
+        let write = |version: &str, shown: &Submission| {
+            memory.wrote(&old, old.status.as_ref().unwrap(), version, Some(shown));
+        };
+        write("14", &object("13", "between"));
+        assert!(keeps());
+        write("15", &object("15", "new"));
+        assert!(!keeps(), "the watch was faster than the answer");
     }
 }

@@ -12,7 +12,7 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 use tracing::Instrument;
 
-use crate::controller::objects::{Wake, uid_of};
+use crate::controller::objects::{Wake, log_span_of, uid, uid_of};
 use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
@@ -82,14 +82,14 @@ impl<Q: Question> Questions<Q> {
 
     /// Asks, unless there is a good answer or the question is under way.
     pub fn want(&self, submission: &Submission, question: Q) {
-        self.0
-            .want(uid_of(submission), ObjectRef::from_obj(submission), question);
+        let (uid, by) = (uid_of(submission), ObjectRef::from_obj(submission));
+        self.0.want(uid, by, question, log_span_of(submission));
     }
 
     /// What is known for the submission's present attempt.
     pub fn observe(&self, submission: &Submission) -> Observed<Q::Answer> {
         let attempt = submission.status.as_ref().and_then(|status| status.attempt);
-        self.0.observe(&uid_of(submission), attempt.unwrap_or(1))
+        self.0.observe(uid(submission), attempt.unwrap_or(1))
     }
 
     /// Drops what is known for an object that is gone.
@@ -108,7 +108,7 @@ impl<Q: Question> Default for Shared<Q> {
 }
 
 impl<Q: Question> Shared<Q> {
-    pub(super) fn want(&self, uid: String, by: ObjectRef<Submission>, question: Q) {
+    pub(super) fn want(&self, uid: String, by: ObjectRef<Submission>, question: Q, log: LogSpan) {
         let now = Instant::now();
         let age = |entry: &Entry<Q>| now.saturating_duration_since(entry.asked);
         let mut entries = lock(&self.entries);
@@ -123,7 +123,7 @@ impl<Q: Question> Shared<Q> {
             let entry = Entry {
                 question,
                 by,
-                log: LogSpan::current(),
+                log,
                 asked: now,
                 is_due: true,
                 is_under_way: false,
@@ -184,7 +184,7 @@ where
         while under_way.len() < Q::AT_ONCE
             && let Some((uid, question, namespace)) = shared.next()
         {
-            let answer = ask(question.clone(), namespace).instrument(shared.log_of(&uid).span().clone());
+            let answer = ask(question.clone(), namespace).instrument(shared.log_of(&uid).span());
             under_way.push(answer.map(move |answer| (uid, question, answer)));
         }
         tokio::select! {

@@ -37,12 +37,14 @@ pub fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
 }
 
 fn is_place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> bool {
-    let waits = old.waiting.is_some() && new.waiting.is_some();
+    if old.waiting.is_none() || new.waiting.is_none() {
+        return false;
+    }
     let moved = SubmissionStatus {
         waiting: new.waiting.clone(),
         ..old.clone()
     };
-    waits && moved == *new
+    moved == *new
 }
 
 /// How long progress may wait since the last write.

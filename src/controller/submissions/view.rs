@@ -23,7 +23,7 @@ pub struct View {
     pub now: Timestamp,
     pub submission: Arc<Submission>,
     pub leaderboard: Option<Arc<Leaderboard>>,
-    /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place.
+    /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place; only meaningful while it has no Job.
     pub is_policy_in_place: bool,
     /// What its registry has told of its image.
     pub image: ObservedImage,

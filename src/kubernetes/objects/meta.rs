@@ -59,6 +59,26 @@ impl Meta {
         self.owner_references.iter().any(|owner| *owner.uid == *uid)
     }
 
+    /// Whether nothing but its version separates them.
+    pub(super) fn is_same(&self, other: &Self) -> bool {
+        let Self {
+            name,
+            namespace,
+            uid,
+            resource_version: _,
+            creation_timestamp,
+            deletion_timestamp,
+            deletion_grace_period_seconds,
+            owner_references,
+            labels,
+            annotations,
+        } = self;
+        (name, namespace, uid) == (&other.name, &other.namespace, &other.uid)
+            && (creation_timestamp, deletion_timestamp) == (&other.creation_timestamp, &other.deletion_timestamp)
+            && *deletion_grace_period_seconds == other.deletion_grace_period_seconds
+            && (owner_references, labels, annotations) == (&other.owner_references, &other.labels, &other.annotations)
+    }
+
     pub(super) fn share_texts(&mut self, texts: &mut Texts) {
         let shared = [
             &mut self.namespace,

@@ -70,6 +70,10 @@ macro_rules! watchable {
             fn share(&mut self, texts: &mut $crate::kubernetes::objects::Texts) {
                 self.share_texts(texts);
             }
+
+            fn is_same(&self, other: &Self) -> bool {
+                self.is_same_as(other)
+            }
         }
     };
 }

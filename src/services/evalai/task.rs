@@ -200,7 +200,7 @@ fn take(shared: &Arc<Shared>, outlets: &Outlets, ticket: &Ticket, reply: Option<
 fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
     let request = ticket.request.name();
     let subject = ticket.request.submission();
-    let _lines = subject.map(|subject| subject.log.span().enter());
+    let _lines = subject.map(|subject| subject.log.span().entered());
     let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);
     match answer {
         Answer::Done(()) if ticket.request.is_write() => {

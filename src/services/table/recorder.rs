@@ -84,12 +84,12 @@ impl Recorder {
 
     /// Hands in the newest row of an object; `end`: it is the last of its attempt. Cheap, and safe to call
     /// in each reconcile: what is written or waiting already is not written again.
-    pub fn record(&self, table: &api::Table, key: &ObjectKey, row: Row, end: bool) {
+    pub fn record(&self, table: &api::Table, key: &ObjectKey, row: Row, end: bool, log: LogSpan) {
         let id = TableId::from(table);
         let update = RowUpdate {
             row: row.into(),
             end,
-            log: LogSpan::current(),
+            log,
         };
         if !self.shared.ledger().record(id.clone(), key, update, Instant::now()) {
             return;

@@ -97,10 +97,16 @@ impl Bench {
 async fn a_table_is_written_at_most_every_two_seconds_and_the_newest_row_wins() {
     let mut bench = bench(vec![]);
     for step in 1..=50 {
+        bench.recorder.record(
+            &table("t"),
+            &key("a"),
+            row(&format!("{step}/50")),
+            step == 50,
+            LogSpan::default(),
+        );
         bench
             .recorder
-            .record(&table("t"), &key("a"), row(&format!("{step}/50")), step == 50);
-        bench.recorder.record(&table("u"), &key("b"), row("1/1"), true);
+            .record(&table("u"), &key("b"), row("1/1"), true, LogSpan::default());
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
     let mut woken = vec![bench.wake.recv().await.unwrap(), bench.wake.recv().await.unwrap()];
@@ -124,7 +130,9 @@ async fn a_table_is_written_at_most_every_two_seconds_and_the_newest_row_wins() 
 async fn nothing_is_written_while_the_fence_is_down() {
     let mut bench = bench(vec![]);
     bench.fence.store(false, Ordering::SeqCst);
-    bench.recorder.record(&table("t"), &key("a"), row("1/1"), true);
+    bench
+        .recorder
+        .record(&table("t"), &key("a"), row("1/1"), true, LogSpan::default());
     tokio::time::sleep(Duration::from_mins(1)).await;
     assert_eq!(bench.written(), []);
     bench.fence.store(true, Ordering::SeqCst);
@@ -135,7 +143,9 @@ async fn nothing_is_written_while_the_fence_is_down() {
 #[tokio::test(start_paused = true)]
 async fn a_sick_table_is_tried_ever_more_slowly_until_it_is_well() {
     let mut bench = bench((0..6).map(|_| throttled()).collect());
-    bench.recorder.record(&table("t"), &key("a"), row("1/1"), true);
+    bench
+        .recorder
+        .record(&table("t"), &key("a"), row("1/1"), true, LogSpan::default());
     assert_eq!(bench.wake.recv().await, Some(key("a")));
     let error = bench.recorder.view(&key("a")).unwrap().error.unwrap();
     assert_eq!(error, "table t: UpdateItem failed: slow down; it is retried");
@@ -162,7 +172,7 @@ async fn a_worker_that_panics_is_a_failed_task_of_the_process() {
     let (_stop, signal) = Stop::new();
     let tasks = Tasks::new(signal);
     let recorder = Recorder::with_store(Box::new(Broken), || true, mpsc::unbounded_channel().0, tasks.clone());
-    recorder.record(&table("t"), &key("a"), row("1"), false);
+    recorder.record(&table("t"), &key("a"), row("1"), false, LogSpan::default());
     let failed = tokio::time::timeout(Duration::from_mins(1), tasks.failed())
         .await
         .unwrap();
@@ -178,7 +188,9 @@ async fn a_running_submission_costs_a_write_for_each_step_of_its_progress_and_no
     // A reconcile of a live run each 10 s: three new routes in ten minutes.
     for step in 0..60 {
         let progress = format!("{}/20", step / 20);
-        bench.recorder.record(&table("t"), &key("a"), row(&progress), false);
+        bench
+            .recorder
+            .record(&table("t"), &key("a"), row(&progress), false, LogSpan::default());
         tokio::time::sleep(Duration::from_secs(10)).await;
     }
     assert_eq!(bench.written().len(), 3);
@@ -189,7 +201,9 @@ async fn nothing_is_remembered_of_a_thousand_rows_that_are_written_and_forgotten
     let mut bench = bench(vec![]);
     let keys: Vec<ObjectKey> = (0..1000).map(|number| key(&format!("submission-{number}"))).collect();
     for key in &keys {
-        bench.recorder.record(&table("t"), key, row("20/20"), true);
+        bench
+            .recorder
+            .record(&table("t"), key, row("20/20"), true, LogSpan::default());
     }
     for _ in &keys {
         let key = bench.wake.recv().await.unwrap();

@@ -10,12 +10,12 @@ mod state;
 mod text_budget;
 mod work;
 
-use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::stream::FuturesUnordered;
 use futures::{FutureExt, StreamExt};
+use jiff::Timestamp;
 use kube::runtime::reflector::ObjectRef;
 use kube::{Client, ResourceExt};
 use tokio::sync::Notify;
@@ -25,13 +25,12 @@ use tracing::Instrument;
 use super::failure_log::{LogDemand, Tail};
 use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
-use crate::controller::objects::{Wake, uid_of};
+use crate::controller::objects::{Wake, log_span_of, uid, uid_of};
 use crate::lock::lock;
-use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use leaderboard_api::{JobNumber, Storage, Submission, SubmissionStatus, effective};
+use leaderboard_api::{JobNumber, RunPlan, Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
 use text_budget::TextBudget;
@@ -49,19 +48,26 @@ struct Shared {
     tasks: Tasks,
     texts: TextBudget,
     /// A worker ends under this lock, and is asked for more under it.
-    buckets: Mutex<HashMap<String, Arc<Bucket>>>,
+    buckets: Mutex<Vec<Arc<Bucket>>>,
 }
 
 /// What one worker shares with those that ask it.
-#[derive(Default)]
 struct Bucket {
+    storage: Storage,
     state: Mutex<State>,
     notify: Notify,
 }
 
-/// The key of a bucket.
-fn bucket_id(storage: &Storage) -> String {
-    format!("{:?}/{:?}/{}", storage.region, storage.endpoint, storage.bucket)
+impl Bucket {
+    fn is_of(&self, storage: &Storage) -> bool {
+        let Storage {
+            bucket,
+            region,
+            endpoint,
+            ..
+        } = &self.storage;
+        (bucket, region, endpoint) == (&storage.bucket, &storage.region, &storage.endpoint)
+    }
 }
 
 /// What a run's worker knows of it.
@@ -91,22 +97,28 @@ impl ArchiveWorkers {
         let status = submission.status.as_ref();
         let job = status.map_or(JobNumber::first(1), SubmissionStatus::job_number);
         let found = status.and_then(|status| self.known_bucket(status));
-        let uid = uid_of(submission);
+        let uid = uid(submission);
         let nothing = State::default();
         let guard = found.as_ref().map(|bucket| lock(&bucket.state));
         let state = guard.as_deref().unwrap_or(&nothing);
         Observed {
-            report: state.report(&uid, job, pod, now),
-            texts: state.texts(&uid),
-            fence: state.fence(&uid, job, now),
-            log: state.log(&uid, job, is_over, now),
+            report: state.report(uid, job, pod, now),
+            texts: state.texts(uid),
+            fence: state.fence(uid, job, now),
+            log: state.log(uid, job, is_over, now),
         }
     }
 
-    /// Notes which report is needed; None: none any more.
-    pub fn demand(&self, submission: &Submission, status: &SubmissionStatus, demand: Option<ReportDemand>) {
+    /// Notes which report is needed of a run that `ended` then; None: none any more.
+    pub fn demand(
+        &self,
+        submission: &Submission,
+        status: &SubmissionStatus,
+        ended: Option<Timestamp>,
+        demand: Option<ReportDemand>,
+    ) {
         if demand.is_some() || self.known_bucket(status).is_some() {
-            self.ask(submission, status, |state, uid, target, now| {
+            self.ask(submission, status, ended, |state, uid, target, now| {
                 state.demand(uid, target, demand, now);
             });
         }
@@ -114,7 +126,8 @@ impl ArchiveWorkers {
 
     /// Asks for the texts of a report.
     pub fn want_texts(&self, submission: &Submission, status: &SubmissionStatus, of: ReportId) {
-        self.ask(submission, status, |state, uid, target, now| {
+        let ended = status.times.finished.as_ref().map(|at| at.0);
+        self.ask(submission, status, ended, |state, uid, target, now| {
             state.want_texts(uid, target, of, now);
         });
     }
@@ -122,7 +135,7 @@ impl ArchiveWorkers {
     /// Drops the texts of a report: they are with EvalAI's side, or nobody wants them.
     pub fn drop_texts(&self, submission: &Submission, status: &SubmissionStatus) {
         if let Some(bucket) = self.known_bucket(status) {
-            lock(&bucket.state).drop_texts(&uid_of(submission));
+            lock(&bucket.state).drop_texts(uid(submission));
             bucket.notify.notify_one();
         }
     }
@@ -131,14 +144,14 @@ impl ArchiveWorkers {
     pub fn want_fence(&self, submission: &Submission, status: &SubmissionStatus) {
         let since = status.times.stopping.as_ref().map_or(0, |t| t.0.as_second());
         let mark = format!("controller-{since}");
-        self.ask(submission, status, |state, uid, target, now| {
+        self.ask(submission, status, None, |state, uid, target, now| {
             state.want_fence(uid, target, status.job_number(), mark, now);
         });
     }
 
     /// Asks for the log that explains a failure.
     pub fn want_log(&self, submission: &Submission, status: &SubmissionStatus, demand: LogDemand) {
-        self.ask(submission, status, |state, uid, target, now| {
+        self.ask(submission, status, None, |state, uid, target, now| {
             state.want_log(uid, target, demand, now);
         });
     }
@@ -147,12 +160,12 @@ impl ArchiveWorkers {
     pub fn tail(&self, submission: &Submission, status: &SubmissionStatus) -> Option<Tail> {
         let bucket = self.known_bucket(status)?;
         let state = lock(&bucket.state);
-        state.tail(&uid_of(submission), status.job_number())
+        state.tail(uid(submission), status.job_number())
     }
 
     /// Drops all that is known of an object.
     pub fn forget(&self, uid: &str) {
-        for bucket in lock(&self.0.buckets).values() {
+        for bucket in lock(&self.0.buckets).iter() {
             lock(&bucket.state).forget(uid);
             bucket.notify.notify_one();
         }
@@ -160,7 +173,8 @@ impl ArchiveWorkers {
 
     fn known_bucket(&self, status: &SubmissionStatus) -> Option<Arc<Bucket>> {
         let plan = status.plan.as_ref()?;
-        lock(&self.0.buckets).get(&bucket_id(&plan.storage)).cloned()
+        let buckets = lock(&self.0.buckets);
+        buckets.iter().find(|bucket| bucket.is_of(&plan.storage)).cloned()
     }
 
     /// Changes what the worker of a run's bucket has to do. Nothing, without a plan.
@@ -168,30 +182,49 @@ impl ArchiveWorkers {
         &self,
         submission: &Submission,
         status: &SubmissionStatus,
+        ended: Option<Timestamp>,
         change: impl FnOnce(&mut State, &Uid, &Arc<Target>, Instant),
     ) {
         let Some(plan) = &status.plan else { return };
-        let target = Target {
-            namespace: submission.namespace().unwrap_or_default(),
-            name: submission.name_any(),
-            prefix: effective::key_prefix(&plan.storage, &plan.run_id),
-            submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
-            log: LogSpan::current(),
-        };
-        let id = bucket_id(&plan.storage);
         let mut buckets = lock(&self.0.buckets);
-        let bucket = buckets
-            .entry(id.clone())
-            .or_insert_with(|| ArchiveWorker::start(&self.0, id, &plan.storage));
-        let uid = uid_of(submission).into();
-        change(&mut lock(&bucket.state), &uid, &Arc::new(target), Instant::now());
+        let known = buckets.iter().find(|bucket| bucket.is_of(&plan.storage)).cloned();
+        let bucket = known.unwrap_or_else(|| {
+            let bucket = ArchiveWorker::start(&self.0, &plan.storage);
+            buckets.push(Arc::clone(&bucket));
+            bucket
+        });
+        let now = Instant::now();
+        let mut state = lock(&bucket.state);
+        let is_same =
+            |target: &Target| target.attempt == submission.spec.attempt && target.ended.is_some() == ended.is_some();
+        let (uid, target) = state
+            .known(uid(submission))
+            .filter(|(_, target)| is_same(target))
+            .unwrap_or_else(|| {
+                let target = target(submission, plan, ended, now);
+                (uid(submission).into(), Arc::new(target))
+            });
+        change(&mut state, &uid, &target, now);
         bucket.notify.notify_one();
+    }
+}
+
+fn target(submission: &Submission, plan: &RunPlan, ended: Option<Timestamp>, now: Instant) -> Target {
+    let age = ended.map(|at| Timestamp::now().duration_since(at));
+    let age = age.map(|age| Duration::try_from(age).unwrap_or_default());
+    Target {
+        namespace: submission.namespace().unwrap_or_default(),
+        name: submission.name_any(),
+        prefix: effective::key_prefix(&plan.storage, &plan.run_id),
+        submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
+        attempt: submission.spec.attempt,
+        ended: age.map(|age| now.checked_sub(age).unwrap_or(now)),
+        log: log_span_of(submission),
     }
 }
 
 /// Does the work of one bucket until the stop, or until nobody uses the bucket.
 struct ArchiveWorker {
-    id: String,
     shared: Arc<Shared>,
     bucket: Arc<Bucket>,
     archive: Archive,
@@ -199,10 +232,13 @@ struct ArchiveWorker {
 }
 
 impl ArchiveWorker {
-    fn start(shared: &Arc<Shared>, id: String, storage: &Storage) -> Arc<Bucket> {
-        let bucket = Arc::new(Bucket::default());
+    fn start(shared: &Arc<Shared>, storage: &Storage) -> Arc<Bucket> {
+        let bucket = Arc::new(Bucket {
+            storage: storage.clone(),
+            state: Mutex::default(),
+            notify: Notify::default(),
+        });
         let worker = Self {
-            id,
             archive: Archive::of_storage(&shared.aws, storage),
             texts: shared.texts.of_another(),
             shared: Arc::clone(shared),
@@ -251,7 +287,7 @@ impl ArchiveWorker {
     async fn done(&self, work: Work) -> (Work, Done) {
         let archive = self.archive.at_prefix(work.target.prefix.as_str());
         let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work);
-        let done = done.instrument(work.target.log.span().clone()).await;
+        let done = done.instrument(work.target.log.span()).await;
         (work, done)
     }
 
@@ -260,7 +296,7 @@ impl ArchiveWorker {
         let mut buckets = lock(&self.shared.buckets);
         let is_idle = lock(&self.bucket.state).is_idle();
         if is_idle {
-            buckets.remove(&self.id);
+            buckets.retain(|bucket| !Arc::ptr_eq(bucket, &self.bucket));
         }
         is_idle
     }

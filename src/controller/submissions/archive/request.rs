@@ -3,6 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::time::Instant;
+
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
@@ -34,8 +36,18 @@ pub struct Target {
     pub prefix: String,
     /// UID that its reports name.
     pub submission_uid: String,
+    pub attempt: i64,
+    /// When its run ended: of several that have, the oldest end is read first. None: it goes on.
+    pub ended: Option<Instant>,
     /// For the log.
     pub log: LogSpan,
+}
+
+impl Target {
+    /// Since when a read that is to be made at once has been due.
+    pub(super) fn due(&self, now: Instant) -> Instant {
+        self.ended.map_or(now, |ended| ended.min(now))
+    }
 }
 
 /// Something to do now.

@@ -14,9 +14,10 @@ pub(super) struct Run {
     pub target: Arc<Target>,
     pub due: [Option<Instant>; KINDS.len()],
     pub report: Option<ReportRun>,
-    pub texts: Option<TextsRun>,
-    pub fence: Option<FenceRun>,
-    pub log: Option<LogRun>,
+    /// Boxed, as most runs have none of these most of the time.
+    pub texts: Option<Box<TextsRun>>,
+    pub fence: Option<Box<FenceRun>>,
+    pub log: Option<Box<LogRun>>,
 }
 
 pub(super) struct ReportRun {

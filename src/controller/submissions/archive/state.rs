@@ -35,7 +35,7 @@ const LOG_TRIES: u32 = 3;
 /// All runs of one bucket.
 #[derive(Default)]
 pub(super) struct State {
-    runs: HashMap<Uid, Run>,
+    runs: HashMap<Uid, Box<Run>>,
     due: [BTreeSet<(Instant, Uid)>; KINDS.len()],
     under_way: [usize; KINDS.len()],
     next_read: Option<Instant>,
@@ -87,6 +87,12 @@ impl State {
         }
     }
 
+    /// What a run was last asked for with.
+    pub fn known(&self, uid: &str) -> Option<(Uid, Arc<Target>)> {
+        let (uid, run) = self.runs.get_key_value(uid)?;
+        Some((Arc::clone(uid), Arc::clone(&run.target)))
+    }
+
     /// What is known of a report, seen from a run that is at this Job with this Pod.
     pub fn report(&self, uid: &str, job: JobNumber, pod: Option<&str>, now: Instant) -> SeenReport {
         let known = self.runs.get(uid).and_then(|run| run.report.as_ref());
@@ -120,11 +126,13 @@ impl State {
     /// Asks for the texts of a report.
     pub fn want_texts(&mut self, uid: &Uid, target: &Arc<Target>, id: ReportId, now: Instant) {
         let run = self.run(uid, target);
-        let known = run.texts.get_or_insert(TextsRun {
-            wanted: id,
-            is_under_way: false,
-            tried: None,
-            got: ObservedTexts::NotRead,
+        let known = run.texts.get_or_insert_with(|| {
+            Box::new(TextsRun {
+                wanted: id,
+                is_under_way: false,
+                tried: None,
+                got: ObservedTexts::NotRead,
+            })
         });
         let is_new = known.wanted != id;
         known.wanted = id;
@@ -135,7 +143,7 @@ impl State {
         let again = known
             .tried
             .filter(|_| !is_new)
-            .map_or(now, |tried| now.max(tried + TRY_AGAIN));
+            .map_or_else(|| target.due(now), |tried| now.max(tried + TRY_AGAIN));
         self.plan(uid, Kind::Texts, Some(again));
     }
 
@@ -165,13 +173,13 @@ impl State {
         if run.fence.as_ref().is_some_and(|fence| fence.job == job) {
             return;
         }
-        run.fence = Some(FenceRun {
+        run.fence = Some(Box::new(FenceRun {
             job,
             mark,
             since: now,
             is_held: false,
             has_failed: false,
-        });
+        }));
         self.plan(uid, Kind::Fence, Some(now));
     }
 
@@ -190,23 +198,26 @@ impl State {
         let run = self.run(uid, target);
         let known = run.log.take();
         let is_under_way = known.as_ref().is_some_and(|log| log.is_under_way);
-        let fresh = |demand, tail| LogRun {
-            demand,
-            since: now,
-            tries: 0,
-            is_under_way,
-            tail,
-            end: None,
+        let fresh = |demand, tail| {
+            Box::new(LogRun {
+                demand,
+                since: now,
+                tries: 0,
+                is_under_way,
+                tail,
+                end: None,
+            })
         };
         let known = known.filter(|log| log.demand.job == demand.job);
         run.log = Some(match known {
             Some(log) if log.demand == demand || (log.demand.is_over && !demand.is_over) => log,
             // Found already, and nothing more is to be done with it.
             Some(log) if log.demand.is_over == demand.is_over && log.tail.is_some() => log,
-            Some(log) if log.demand.is_over == demand.is_over => LogRun {
-                since: log.since,
-                ..fresh(demand, None)
-            },
+            Some(log) if log.demand.is_over == demand.is_over => {
+                let mut again = fresh(demand, None);
+                again.since = log.since;
+                again
+            }
             Some(log) => fresh(demand, log.tail),
             None => fresh(demand, None),
         });
@@ -233,7 +244,7 @@ impl State {
     }
 
     fn log_of(&self, uid: &str, job: JobNumber) -> Option<&LogRun> {
-        let log = self.runs.get(uid)?.log.as_ref()?;
+        let log = self.runs.get(uid)?.log.as_deref()?;
         (log.demand.job == job).then_some(log)
     }
 
@@ -423,7 +434,7 @@ impl State {
         let is_answered = report.of.as_ref().is_some_and(|of| answers(of, &report.wanted));
         let known = run.due[kind as usize];
         let at = match (is_answered, &report.error) {
-            (false, _) => Some(now),
+            (false, _) => Some(run.target.due(now)),
             // Already planned.
             (true, _) if known.is_some() => known,
             (true, _) if is_live => {
@@ -451,13 +462,15 @@ impl State {
     }
 
     fn run(&mut self, uid: &Uid, target: &Arc<Target>) -> &mut Run {
-        let run = self.runs.entry(uid.clone()).or_insert_with(|| Run {
-            target: Arc::clone(target),
-            due: [None; KINDS.len()],
-            report: None,
-            texts: None,
-            fence: None,
-            log: None,
+        let run = self.runs.entry(uid.clone()).or_insert_with(|| {
+            Box::new(Run {
+                target: Arc::clone(target),
+                due: [None; KINDS.len()],
+                report: None,
+                texts: None,
+                fence: None,
+                log: None,
+            })
         });
         // The log names the attempt that asked last.
         run.target = Arc::clone(target);
@@ -480,3 +493,7 @@ impl State {
 #[cfg(test)]
 #[path = "state_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "order_tests.rs"]
+mod order_tests;

@@ -52,6 +52,8 @@ impl Bench {
                 name: "sub".into(),
                 prefix: "7/".into(),
                 submission_uid: "u".into(),
+                attempt: 1,
+                ended: None,
                 log: LogSpan::default(),
             }),
         }

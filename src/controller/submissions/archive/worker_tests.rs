@@ -82,7 +82,8 @@ impl Bench {
             stage,
             period: std::time::Duration::from_secs(10),
         };
-        self.workers().demand(&self.submission, &self.status(), Some(demand));
+        self.workers()
+            .demand(&self.submission, &self.status(), None, Some(demand));
     }
 
     /// Waits until the submission is woken; hands back what is known then.

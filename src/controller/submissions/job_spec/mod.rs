@@ -33,7 +33,7 @@ use k8s_openapi::api::batch::v1::{Job, JobSpec};
 use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
 use kube::api::{DynamicObject, TypeMeta};
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
@@ -120,7 +120,8 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     DynamicObject {
         types: Some(TypeMeta::resource::<Job>()),
         metadata: metadata(input),
-        data: json!({ "spec": spec }),
+        // A value as it is: `json!` would copy all of it.
+        data: Value::Object([("spec".to_owned(), spec)].into_iter().collect()),
     }
 }
 

@@ -71,7 +71,8 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let others = || uses.stores.submissions_of(&namespace);
     View {
         now,
-        is_policy_in_place: leaderboard.as_deref().is_some_and(is_policy_in_place),
+        // Comparing it takes longer than reading the rest.
+        is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         image: uses.images.observe(&submission),
         traces: uses.foreign_runs.observe(&submission),
         other_routes: uses.other_results.observe(&submission),
@@ -99,6 +100,11 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         job,
         pod,
     }
+}
+
+/// Whether a Job may be made now.
+fn may_create(job: &ObservedJob) -> bool {
+    matches!(job, ObservedJob::Absent | ObservedJob::Foreign)
 }
 
 /// The Job that the present attempt should have, and its newest Pod.

@@ -1,0 +1,45 @@
+//! In which order ends are read.
+
+use super::*;
+use crate::observability::about::LogSpan;
+
+fn ended(before: Duration, now: Instant) -> Arc<Target> {
+    Arc::new(Target {
+        namespace: "one".into(),
+        name: "sub".into(),
+        prefix: "7/".into(),
+        submission_uid: "u".into(),
+        attempt: 1,
+        ended: now.checked_sub(before),
+        log: LogSpan::default(),
+    })
+}
+
+/// Whose work comes next, until nothing is due.
+fn order(mut state: State, mut now: Instant) -> Vec<String> {
+    let mut found = Vec::new();
+    while let Some(work) = state.next(now) {
+        found.push(work.uid.to_string());
+        now += SPACING;
+    }
+    found
+}
+
+#[test]
+fn of_ends_that_wait_the_oldest_is_read_first() {
+    let now = Instant::now();
+    let demand = ReportDemand {
+        job: JobNumber::first(1),
+        pod: None,
+        stage: Stage::JobEnded,
+        period: Duration::from_secs(10),
+    };
+    let (mut reports, mut texts) = (State::default(), State::default());
+    for (name, seconds) in [("new", 1), ("oldest", 30), ("old", 20)] {
+        let (uid, target) = (Uid::from(name), ended(Duration::from_secs(seconds), now));
+        reports.demand(&uid, &target, Some(demand.clone()), now);
+        texts.want_texts(&uid, &target, ReportId::default(), now);
+    }
+    assert_eq!(order(reports, now), ["oldest", "old", "new"]);
+    assert_eq!(order(texts, now), ["oldest", "old", "new"]);
+}
