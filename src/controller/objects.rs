@@ -35,7 +35,7 @@ pub fn span_of(submission: &Submission) -> Span {
     about::submission(
         format_args!("{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()),
         &submission.spec.leaderboard_name,
-        submission.spec.attempt,
+        submission.present_attempt(),
         meta.uid.as_deref().unwrap_or_default(),
     )
 }

@@ -234,6 +234,21 @@ fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
 }
 
 #[test]
+fn an_attempt_that_is_asked_for_early_takes_no_second_slot() {
+    let early = |status: Value| {
+        let mut object = submission("a", "x", 1, status);
+        object.spec.attempt = 2;
+        object
+    };
+    let (a, b) = (early(json!({"attempt": 1})), submission("b", "y", 2, json!({})));
+    let world = World::new(leaderboard(&json!({"total": 2}), false), &[&a, &b]);
+    assert_eq!(world.asks(&a), Turn::Go);
+    world.slots.starts(&a);
+    world.shows(&early(json!({"attempt": 1, "jobName": "a-1"})));
+    assert_eq!(world.asks(&b), Turn::Go);
+}
+
+#[test]
 fn no_slot_is_granted_before_the_caches_are_there() {
     let slots = Arc::new(SlotAllocator::default());
     let world = World {

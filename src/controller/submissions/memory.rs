@@ -150,7 +150,7 @@ impl Memory {
 
     /// Remembers since when EvalAI has been asked about an attempt.
     pub fn asks_evalai(&self, submission: &Submission) {
-        let attempt = submission.spec.attempt;
+        let attempt = submission.present_attempt();
         let mut entries = lock(&self.entries);
         let entry = entries.entry(uid_of(submission)).or_default();
         if entry.asked.is_none_or(|(of, _)| of != attempt) {
@@ -162,7 +162,7 @@ impl Memory {
     pub fn evalai_waited(&self, submission: &Submission) -> Duration {
         let entries = lock(&self.entries);
         let asked = entries.get(&uid_of(submission)).and_then(|entry| entry.asked);
-        let asked = asked.filter(|(of, _)| *of == submission.spec.attempt);
+        let asked = asked.filter(|(of, _)| *of == submission.present_attempt());
         asked.map_or(Duration::ZERO, |(_, at)| at.elapsed())
     }
 
