@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, crashes, failure, interruption, reading, requeue};
+use super::{allowance, clock, crashes, failure, interruption, reading, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -208,7 +207,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
         (delay, format!("It is tried again in {delay} s; this costs no attempt."))
     };
     let at = after(draft.now(), delay);
-    count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
+    clock::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
     if interruption::is_one(found) {
         interruption::note(draft);
     } else if requeue::is_one(found) {
@@ -223,7 +222,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.status.failure = None;
     draft.status.recreated = 0;
     draft.status.next_retry_time = Some(Time(at));
-    draft.status.times.scheduled = None;
+    clock::restart(draft);
     draft.status.times.stopping = None;
     for pair in &mut draft.status.pairs {
         pair.crashes = 0;
@@ -269,7 +268,7 @@ fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
     if !draft.is_finished() {
-        count_use(draft, ended);
+        clock::count_use(draft, ended);
     }
     draft.status.times.finished = Some(Time(ended));
     let started = draft.status.times.started.as_ref();
@@ -293,16 +292,6 @@ fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     }
     draft.show(reason, message);
-}
-
-/// Counts what the present Job has used, from its Pod's scheduling until its end.
-pub(super) fn count_use(draft: &mut PlanBuilder<'_>, until: Timestamp) {
-    let Some(scheduled) = draft.status.times.scheduled.as_ref().map(|time| time.0) else {
-        return;
-    };
-    if let Some(usage) = &mut draft.status.usage {
-        usage.add(until.duration_since(scheduled).as_secs());
-    }
 }
 
 /// A time span in its two largest units.
