@@ -266,6 +266,26 @@ fn a_result_without_a_metric_is_sent_once_its_leaderboard_wants_it_no_more() {
 }
 
 #[test]
+fn a_write_to_a_row_that_only_a_read_finds_waits_and_lets_others_through() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("finished 7");
+    bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Missing, 404))));
+    assert_eq!(bench.view(7).last_error.as_deref(), Some("EvalAI answered 404"));
+    bench.wait(4.0);
+    bench.expect_nothing();
+    bench.update(8, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
+    bench.read_and_write(8, "failed");
+    bench.expect_nothing();
+    bench.wait(2.5);
+    bench.get(7, Row::missing(7));
+    bench.expect_nothing();
+    assert_eq!(bench.view(7).end, Some(Ended::Otherwise(Status::Missing)));
+}
+
+#[test]
 fn a_broken_server_is_left_alone_longer_each_time() {
     let mut bench = Bench::new();
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
