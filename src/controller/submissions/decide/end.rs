@@ -47,8 +47,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
         ObservedReport::Unreadable(why) if wait_for_bucket(draft, why) => return,
         _ => None,
     };
-    let complete = report.filter(|r| r.is_complete());
-    if let Some(report) = complete.filter(|r| r.eligible) {
+    if let Some(report) = report.filter(|r| r.is_complete() && r.eligible) {
         return finished(draft, report);
     }
     if draft.is_cancelled() {
@@ -67,7 +66,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     }
     let recorded = draft.status.failure.clone();
     let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
-    let found = recorded.unwrap_or_else(|| cause(draft, report, complete, job_end));
+    let found = recorded.unwrap_or_else(|| cause(draft, report, job_end));
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
     }
@@ -138,17 +137,13 @@ pub(super) fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
     }
 }
 
-fn cause(
-    draft: &PlanBuilder<'_>,
-    report: Option<&ReportDigest>,
-    complete: Option<&ReportDigest>,
-    job_end: Option<&JobEnd>,
-) -> Failure {
+fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option<&JobEnd>) -> Failure {
     // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
-    if let Some(why) = report.filter(|r| r.is_final).and_then(|r| r.why.as_deref()) {
+    let verdict = report.filter(|r| r.is_verdict());
+    if let Some(why) = verdict.and_then(|r| r.why.as_deref()) {
         return failure::invalid_results(why);
     }
-    if let Some(report) = complete {
+    if let Some(report) = verdict {
         return failure::not_eligible(&report.entry_status);
     }
     match job_end {
