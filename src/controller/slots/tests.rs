@@ -420,6 +420,17 @@ fn a_change_of_the_leaderboard_wakes_those_without_a_job() {
 }
 
 #[test]
+fn a_finished_one_waits_for_nothing_although_another_attempt_was_asked_for_while_it_ran() {
+    let mut end = condition("Finished", "True");
+    end["reason"] = json!("Finished");
+    let mut a = submission("a", "x", 1, json!({"attempt": 1, "conditions": [end]}));
+    a.spec.attempt = 2;
+    let world = World::new(one(), &[&a]);
+    world.slots.wake_pending(&ObjectRef::from_obj(&world.leaderboard));
+    assert_eq!(world.woken(), [""; 0]);
+}
+
+#[test]
 fn counts_follow_each_change_of_the_conditions_and_not_the_stored_state() {
     let mut a = submission("a", "x", 1, json!({"state": "Finished"}));
     let world = World::new(
