@@ -40,7 +40,7 @@ pub fn span_of(submission: &Submission) -> Span {
     about::submission(
         full_name(submission),
         &spec.leaderboard_name,
-        spec.attempt,
+        submission.present_attempt(),
         uid(submission),
     )
 }
@@ -51,7 +51,7 @@ pub fn log_span_of(submission: &Submission) -> LogSpan {
     LogSpan::of(
         full_name(submission),
         &spec.leaderboard_name,
-        spec.attempt,
+        submission.present_attempt(),
         uid(submission),
     )
 }

@@ -40,6 +40,10 @@ const ENDS: [&str; 3] = ["FINISHED", "FAILED", "CANCELLED"];
 /// A row is written only over an older attempt, or over the same one before its end.
 const CONDITION: &str = "attribute_not_exists(#attempt) OR #attempt < :attempt \
      OR (#attempt = :attempt AND NOT (#status IN (:end0, :end1, :end2)))";
+/// What a cancelled submission's row says.
+const CANCELLED: &str = ENDS[2];
+/// A cancel that EvalAI shows after it has refused a result is written over the end that the row had. Nothing leads back from it.
+const OR_CANCELLED: &str = " OR (#attempt = :attempt AND #status IN (:end0, :end1))";
 /// Column with the Submission of a re-run, which comes after the end.
 const RERUN: &str = "rerun_as";
 /// A row that names a re-run is also written over the end that it had before.
@@ -116,7 +120,9 @@ impl Row {
 /// What must hold of the row that is there.
 fn condition(row: &Row) -> String {
     let or_rerun = if row.rerun_as.is_empty() { "" } else { OR_RERUN };
-    format!("{CONDITION}{or_rerun}")
+    let is_cancelled = row.submission_status == CANCELLED;
+    let or_cancelled = if is_cancelled { OR_CANCELLED } else { "" };
+    format!("{CONDITION}{or_rerun}{or_cancelled}")
 }
 
 /// Columns and their values; those without one are removed.

@@ -182,6 +182,7 @@ async fn an_older_row_never_wins() {
         (row(1, "FAILED"), Written::Stale),
         (row(2, "CANCELLED"), Written::Stored),
         (row(2, "RUNNING"), Written::Stale),
+        (row(2, "FINISHED"), Written::Stale),
         (row(10, "PENDING"), Written::Stored),
         (row(9, "FINISHED"), Written::Stale),
     ];
@@ -250,6 +251,41 @@ async fn metrics_of_an_earlier_row_are_removed() {
         table.write(&with(row(1, "FAILED"), Some("10.5"))).await,
         Ok(Written::Stale),
         "it is not the same"
+    );
+}
+
+/// EvalAI refused a result, whose row is written all the same; a host cancels the submission there later.
+#[tokio::test]
+async fn a_cancel_is_written_over_another_end_and_takes_its_metrics_away() {
+    let stand_in = StandIn::start().await;
+    let (spec, table) = usual(&stand_in).await;
+    let with = |row: Row, score: Option<&str>| Row {
+        metrics: vec![("driving_score".into(), score.map(str::to_owned))],
+        ..row
+    };
+    for (attempt, end, score) in [(1, "FINISHED", Some("43.1")), (2, "FAILED", None)] {
+        let ended = with(row(attempt, end), score);
+        let cancelled = with(row(attempt, "CANCELLED"), None);
+        assert_eq!(table.write(&ended).await, Ok(Written::Stored));
+        for _ in 0..2 {
+            assert_eq!(table.write(&cancelled).await, Ok(Written::Stored), "over {end}");
+            let stored = rows(&stand_in, &spec.name).await.remove(0);
+            assert_eq!(
+                (stored["submission_status"].as_str(), stored.get("driving_score")),
+                ("CANCELLED", None)
+            );
+        }
+        assert_eq!(
+            table.write(&ended).await,
+            Ok(Written::Stale),
+            "{end} does not come back"
+        );
+    }
+    let older = with(row(1, "CANCELLED"), None);
+    assert_eq!(
+        table.write(&older).await,
+        Ok(Written::Stale),
+        "it is of an older attempt"
     );
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Pure.
 
-use crate::SubmissionStatus;
+use crate::{Submission, SubmissionStatus};
 
 /// Which Job of a submission.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -40,6 +40,14 @@ impl SubmissionStatus {
     }
 }
 
+impl Submission {
+    /// The attempt that all is about which is done now. A higher one in the spec waits until this one has ended.
+    pub fn present_attempt(&self) -> i64 {
+        let present = self.status.as_ref().and_then(|status| status.attempt);
+        present.unwrap_or(self.spec.attempt)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -59,5 +67,19 @@ mod tests {
         (status.attempt, status.retry) = (Some(3), 2);
         let expected = JobNumber { attempt: 3, retry: 2 };
         assert_eq!(status.job_number(), expected);
+    }
+
+    #[test]
+    fn an_attempt_that_is_asked_for_is_present_once_the_status_speaks_of_it() {
+        let spec = serde_json::json!({"leaderboardName": "lb", "image": "i", "track": "sensors", "attempt": 2});
+        let mut submission = Submission::new("a", serde_json::from_value(spec).unwrap());
+        assert_eq!(submission.present_attempt(), 2);
+        for attempt in [1, 2] {
+            submission.status = Some(SubmissionStatus {
+                attempt: Some(attempt),
+                ..SubmissionStatus::default()
+            });
+            assert_eq!(submission.present_attempt(), attempt);
+        }
     }
 }

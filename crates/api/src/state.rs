@@ -35,6 +35,11 @@ impl SubmissionStatus {
         self.end().is_some()
     }
 
+    /// Whether an attempt that is asked for follows the present one: only a higher one, and none follows results that count.
+    pub fn is_followed_by(&self, attempt: i64) -> bool {
+        self.attempt.is_some_and(|present| attempt > present) && self.state_of_conditions() != State::Finished
+    }
+
     /// The state that the conditions show.
     pub fn state_of_conditions(&self) -> State {
         let running = self.condition(RUNNING);

@@ -78,6 +78,10 @@ pub struct SubmissionStatus {
     /// Times the Job of this attempt had to be created again after somebody deleted it.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub recreated: i32,
+    /// Seconds that earlier Pods of the present Job have run. They count against `deadlines.runSeconds`; the wait of a Pod for its node
+    /// does not.
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub ran_seconds: i64,
     /// When the next Job of this attempt is made, after an infrastructure failure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_retry_time: Option<Time>,
@@ -345,8 +349,8 @@ pub struct Failure {
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]
-fn is_none(attempts: &i64) -> bool {
-    *attempts == 0
+fn is_none(number: &i64) -> bool {
+    *number == 0
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]

@@ -55,8 +55,8 @@ impl Member {
         let status = submission.status.as_ref().unwrap_or(&none);
         let name = submission.metadata.name.clone().unwrap_or_default();
         let is_finished = status.has_ended();
-        let known = status.attempt.unwrap_or(spec.attempt);
-        let is_over = is_finished && spec.attempt <= known;
+        let known = submission.present_attempt();
+        let is_over = is_finished && !status.is_followed_by(spec.attempt);
         let number = if is_finished && !is_over {
             JobNumber::first(spec.attempt)
         } else {

@@ -104,12 +104,12 @@ impl SlotAllocator {
         let lines = lock(&self.lines);
         let line = lines.by_board.get(&board_of(submission));
         let uid = submission.metadata.uid.as_deref().unwrap_or_default();
-        line.map_or(Turn::NotInLine, |line| line.turn(uid, submission.spec.attempt))
+        line.map_or(Turn::NotInLine, |line| line.turn(uid, submission.present_attempt()))
     }
 
     /// A submission waits for nothing but a slot. It is woken by the answer, and by each change of it.
     pub fn join(&self, submission: &Submission, place: InLine) {
-        let attempt = submission.spec.attempt;
+        let attempt = submission.present_attempt();
         self.change(&board_of(submission), |line| line.join(attempt, place));
     }
 

@@ -234,6 +234,21 @@ fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
 }
 
 #[test]
+fn an_attempt_that_is_asked_for_early_takes_no_second_slot() {
+    let early = |status: Value| {
+        let mut object = submission("a", "x", 1, status);
+        object.spec.attempt = 2;
+        object
+    };
+    let (a, b) = (early(json!({"attempt": 1})), submission("b", "y", 2, json!({})));
+    let world = World::new(leaderboard(&json!({"total": 2}), false), &[&a, &b]);
+    assert_eq!(world.asks(&a), Turn::Go);
+    world.slots.starts(&a);
+    world.shows(&early(json!({"attempt": 1, "jobName": "a-1"})));
+    assert_eq!(world.asks(&b), Turn::Go);
+}
+
+#[test]
 fn no_slot_is_granted_before_the_caches_are_there() {
     let slots = Arc::new(SlotAllocator::default());
     let world = World {
@@ -401,6 +416,17 @@ fn a_change_of_the_leaderboard_wakes_those_without_a_job() {
     world.slots.wake_pending(&reference);
     assert_eq!(world.woken(), ["a", "d"]);
     world.slots.wake_pending(&ObjectRef::new("other").within("ns"));
+    assert_eq!(world.woken(), [""; 0]);
+}
+
+#[test]
+fn a_finished_one_waits_for_nothing_although_another_attempt_was_asked_for_while_it_ran() {
+    let mut end = condition("Finished", "True");
+    end["reason"] = json!("Finished");
+    let mut a = submission("a", "x", 1, json!({"attempt": 1, "conditions": [end]}));
+    a.spec.attempt = 2;
+    let world = World::new(one(), &[&a]);
+    world.slots.wake_pending(&ObjectRef::from_obj(&world.leaderboard));
     assert_eq!(world.woken(), [""; 0]);
 }
 

@@ -143,7 +143,7 @@ impl ExternalSystems {
         let leaderboard = key_of(view.leaderboard.as_deref()?);
         let is_shown = self.hub.shows_partial(&leaderboard, result_texts::phase(view));
         let payload = result_texts::partial_payload(view, is_shown)?;
-        let attempt = view.submission.spec.attempt;
+        let attempt = view.submission.present_attempt();
         memory.sent_partial(&view.submission, attempt, report.done);
         Some(DesiredUpdate::Partial(Arc::new(payload)))
     }
@@ -197,8 +197,8 @@ impl ExternalSystems {
 
 /// The present attempt, as EvalAI's side has to know it.
 fn run_of(submission: &Submission) -> Run {
-    let attempt = submission.spec.attempt;
-    let status = submission.status.as_ref().filter(|s| s.attempt == Some(attempt));
+    let attempt = submission.present_attempt();
+    let status = submission.status.as_ref();
     Run {
         attempt,
         job: names::job(&submission.name_any(), JobNumber::first(attempt)),
@@ -236,7 +236,7 @@ fn as_observed(seen: SubmissionState, observes: bool) -> SubmissionState {
 }
 
 fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
-    let attempt = submission.spec.attempt;
+    let attempt = submission.present_attempt();
     // An image that was asked for is waited for; why there is none is an answer too.
     let image_known = !wants_image(submission) || seen.image.is_some();
     let present = seen.attempt == attempt;

@@ -182,6 +182,7 @@ fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
     let mut of = |attempt, record: Option<Value>| {
         submission.spec.attempt = attempt;
+        submission.status.as_mut().unwrap().attempt = Some(attempt);
         let annotations = record.map(|record| (names::ANNOTATION_INGESTED.to_owned(), record.to_string()));
         submission.metadata.annotations = annotations.map(|annotation| [annotation].into());
         run_of(&submission).by_hand
@@ -207,7 +208,20 @@ fn a_run_has_a_job_once_that_of_this_attempt_was_asked_for() {
     assert!(run_of(&submission).has_job, "between two tries");
     submission.status.as_mut().unwrap().retry = 0;
     assert!(!run_of(&submission).has_job);
+}
+
+#[test]
+fn an_attempt_that_is_asked_for_early_is_not_the_one_that_runs() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
-    submission.spec.attempt += 1;
-    assert!(!run_of(&submission).has_job, "it was the attempt before");
+    submission.spec.attempt = 2;
+    let run = run_of(&submission);
+    assert_eq!((run.attempt, run.job.as_str(), run.has_job), (1, "sub-1", true));
+    let ended_in_evalai = SubmissionState {
+        attempt: 1,
+        ended: Some(Status::Cancelled),
+        ..SubmissionState::default()
+    };
+    assert!(map_view(&ended_in_evalai, &submission, None).cancelled);
+    submission.status = None;
+    assert_eq!(run_of(&submission).attempt, 2);
 }

@@ -153,7 +153,7 @@ impl Memory {
 
     /// Remembers since when EvalAI has been asked about an attempt.
     pub fn asks_evalai(&self, submission: &Submission) {
-        let attempt = submission.spec.attempt;
+        let attempt = submission.present_attempt();
         let mut entries = lock(&self.entries);
         let entry = entries.entry(uid(submission).into()).or_default();
         if entry.asked.is_none_or(|(of, _)| of != attempt) {
@@ -165,7 +165,7 @@ impl Memory {
     pub fn evalai_waited(&self, submission: &Submission) -> Duration {
         let entries = lock(&self.entries);
         let asked = entries.get(uid(submission)).and_then(|entry| entry.asked);
-        let asked = asked.filter(|(of, _)| *of == submission.spec.attempt);
+        let asked = asked.filter(|(of, _)| *of == submission.present_attempt());
         asked.map_or(Duration::ZERO, |(_, at)| at.elapsed())
     }
 

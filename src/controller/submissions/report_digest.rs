@@ -83,9 +83,12 @@ impl ReportDigest {
         self.is_final && self.done == self.total && self.total > 0
     }
 
-    /// Whether it says how a run came to its own end, whatever becomes of its Job.
+    /// Whether it says how a run came to its own end, whatever becomes of its Job. Of one that was stopped for its node, or by a host,
+    /// only results that count do: it goes on in another Job, which stores no report of its own before its first round.
     pub fn is_verdict(&self) -> bool {
-        self.is_complete() || (self.is_final && self.why.is_some())
+        let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));
+        let is_decided = self.is_complete() || (self.is_final && self.why.is_some());
+        is_decided && (self.eligible || !goes_on)
     }
 
     pub fn progress(&self) -> Progress {

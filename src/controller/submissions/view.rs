@@ -135,6 +135,7 @@ pub struct PodView {
     pub name: String,
     pub uid: String,
     pub node: Option<String>,
+    pub created: Option<Timestamp>,
     pub scheduled: Option<Timestamp>,
     /// The scheduler's words, while no node fits.
     pub unschedulable: Option<String>,

@@ -1,9 +1,10 @@
-//! Checks of what is about to be sent, because the server's own are incomplete: it takes results without metrics, and
-//! results for the leaderboard of a foreign phase.
+//! What is about to be sent: results name the split of their Leaderboard, and are checked, because the server's own checks are
+//! incomplete: it takes results without metrics, and results for the leaderboard of a foreign phase.
 //!
 //! Called by `queue`. Pure.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::Arc;
 
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -15,6 +16,29 @@ use super::types::Payload;
 struct Entry {
     split: String,
     accuracies: Map<String, Value>,
+}
+
+/// The same results for this split. A Pod does not know it: what it stores names the original's, in S3 for good.
+pub fn for_split(payload: Arc<Payload>, split: &str) -> Arc<Payload> {
+    match named(&payload.result, split) {
+        Some(result) if result != payload.result => Arc::new(Payload {
+            result,
+            ..Payload::clone(&payload)
+        }),
+        _ => payload,
+    }
+}
+
+/// A text of results with another split and otherwise the same bytes, since a number that is read and written again may have other
+/// digits. None where no split is named.
+fn named(result: &str, split: &str) -> Option<String> {
+    let (_, after) = result.split_once(r#""split""#)?;
+    let value = after.trim_start().strip_prefix(':')?.trim_start();
+    let mut values = serde_json::Deserializer::from_str(value).into_iter::<String>();
+    values.next()?.ok()?;
+    let before = result.strip_suffix(value)?;
+    let rest = value.get(values.byte_offset()..)?;
+    Some(format!("{before}{}{rest}", Value::from(split)))
 }
 
 /// Why results are not sent: they lack or misname what the leaderboard wants.
@@ -97,6 +121,31 @@ mod tests {
         ] {
             let error = checked(result).unwrap_err();
             assert!(error.contains(part), "{result}: {error}");
+        }
+    }
+
+    #[test]
+    fn results_name_the_split_of_their_leaderboard_and_keep_their_digits() {
+        let of = |result: &str, split| {
+            let payload = Payload {
+                result: result.into(),
+                stdout: "a summary".into(),
+                ..Payload::default()
+            };
+            let sent = for_split(Arc::new(payload), split);
+            assert_eq!(&*sent.stdout, "a summary");
+            sent.result.clone()
+        };
+        let first = r#"[{"split": "leaderboard", "show_to_participant": true, "accuracies": {"Driving score": 0.10}}]"#;
+        let last = r#"[{"accuracies":{"Driving score":1e2},"split":"leaderboard"}]"#;
+        assert_eq!(of(first, "val"), first.replace("leaderboard", "val"));
+        assert_eq!(of(&of(first, "val"), "leaderboard"), first, "also from another one");
+        assert_eq!(of(last, r#"a "b"\"#), last.replace("leaderboard", r#"a \"b\"\\"#));
+        for same in [first, last] {
+            assert_eq!(of(same, "leaderboard"), same);
+        }
+        for broken in ["", "[]", r#"[{"split": 1}]"#, r#"[{"split""#] {
+            assert_eq!(of(broken, "val"), broken, "that it is broken is found next");
         }
     }
 

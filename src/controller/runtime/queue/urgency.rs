@@ -63,7 +63,7 @@ fn of(submission: &Submission, status: Option<&SubmissionStatus>) -> Class {
     let Some(status) = status else {
         return urgent_or(is_deleting || submission.spec.cancel, Class::New);
     };
-    let is_behind = status.attempt.is_some_and(|present| submission.spec.attempt > present);
+    let is_behind = status.is_followed_by(submission.spec.attempt);
     if status.has_ended() {
         return urgent_or(is_deleting, if is_behind { Class::New } else { Class::Refresh });
     }

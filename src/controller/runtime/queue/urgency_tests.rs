@@ -19,8 +19,12 @@ fn submission(change: &Value) -> Submission {
 }
 
 fn finished() -> Value {
+    ended("Finished")
+}
+
+fn ended(reason: &str) -> Value {
     let time = "2026-01-01T00:00:00Z";
-    json!([{"type": "Finished", "status": "True", "reason": "Finished", "message": "", "lastTransitionTime": time}])
+    json!([{"type": "Finished", "status": "True", "reason": reason, "message": "", "lastTransitionTime": time}])
 }
 
 #[test]
@@ -66,8 +70,13 @@ fn a_submission_is_as_urgent_as_what_it_shows() {
         ),
         (
             "ended, with a further attempt",
-            json!({"spec": {"attempt": 2}, "status": {"attempt": 1, "jobName": "j", "conditions": finished()}}),
+            json!({"spec": {"attempt": 2}, "status": {"attempt": 1, "jobName": "j", "conditions": ended("Cancelled")}}),
             [New, Urgent, New],
+        ),
+        (
+            "finished, whatever attempt was asked for before",
+            json!({"spec": {"attempt": 2}, "status": {"attempt": 1, "jobName": "j", "conditions": finished()}}),
+            [Refresh, Urgent, Urgent],
         ),
     ] {
         let object = submission(&change);

@@ -240,7 +240,7 @@ fn image_unread(draft: &PlanBuilder<'_>) -> String {
     let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
     format!(
         "The image is not known: spec.image is empty, and the file in EvalAI that names it could not be read; it is tried \
-         again.{why} If this lasts, check that EvalAI serves the submission's input_file, or set spec.image."
+         again.{why} If this lasts, check that EvalAI serves the submission's input_file."
     )
 }
 

@@ -354,10 +354,11 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     let message = format!("EvalAI says {status}, so the result is not published.");
     draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
     draft.show(reasons::ENDED_IN_EVALAI, message);
-    if !draft.status.is_true(conditions::RECORDED) {
+    // While EvalAI refused the result, its row was written with the outcome that no longer holds; the status may not show it yet.
+    let is_written = draft.view.record.as_ref().is_some_and(|row| row.end_written);
+    if !is_written && !draft.status.is_true(conditions::RECORDED) {
         return Delivery::Done;
     }
-    // While EvalAI refused the result, its row was written with the outcome that no longer holds.
     draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     draft.act(Action::Record { end: true });
     Delivery::Waiting

@@ -117,7 +117,7 @@ pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
     let by_itself = |pair: &PairStatus| matches!(cause(pair), Some(EndReason::Exited | EndReason::Incomplete));
     let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
-    is_of_results && status.pairs.iter().any(by_itself) && report.is_final && report.why.is_some()
+    is_of_results && status.pairs.iter().any(by_itself) && report.is_verdict() && report.why.is_some()
 }
 
 fn cause(pair: &PairStatus) -> Option<EndReason> {

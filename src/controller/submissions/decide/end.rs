@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, crashes, failure, interruption, reading, requeue};
+use super::{allowance, clock, crashes, failure, interruption, reading, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -48,8 +47,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
         ObservedReport::Unreadable(why) if wait_for_bucket(draft, why) => return,
         _ => None,
     };
-    let complete = report.filter(|r| r.is_complete());
-    if let Some(report) = complete.filter(|r| r.eligible) {
+    if let Some(report) = report.filter(|r| r.is_complete() && r.eligible) {
         return finished(draft, report);
     }
     if draft.is_cancelled() {
@@ -68,7 +66,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     }
     let recorded = draft.status.failure.clone();
     let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
-    let found = recorded.unwrap_or_else(|| cause(draft, report, complete, job_end));
+    let found = recorded.unwrap_or_else(|| cause(draft, report, job_end));
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
     }
@@ -139,17 +137,13 @@ pub(super) fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
     }
 }
 
-fn cause(
-    draft: &PlanBuilder<'_>,
-    report: Option<&ReportDigest>,
-    complete: Option<&ReportDigest>,
-    job_end: Option<&JobEnd>,
-) -> Failure {
+fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option<&JobEnd>) -> Failure {
     // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
-    if let Some(why) = report.filter(|r| r.is_final).and_then(|r| r.why.as_deref()) {
+    let verdict = report.filter(|r| r.is_verdict());
+    if let Some(why) = verdict.and_then(|r| r.why.as_deref()) {
         return failure::invalid_results(why);
     }
-    if let Some(report) = complete {
+    if let Some(report) = verdict {
         return failure::not_eligible(&report.entry_status);
     }
     match job_end {
@@ -211,7 +205,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
         )
     };
     let at = after(draft.now(), delay);
-    count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
+    clock::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
     if interruption::is_one(found) {
         interruption::note(draft);
     } else if requeue::is_one(found) {
@@ -226,7 +220,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.status.failure = None;
     draft.status.recreated = 0;
     draft.status.next_retry_time = Some(Time(at));
-    draft.status.times.scheduled = None;
+    clock::restart(draft);
     draft.status.times.stopping = None;
     for pair in &mut draft.status.pairs {
         pair.crashes = 0;
@@ -272,7 +266,7 @@ fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
     if !draft.is_finished() {
-        count_use(draft, ended);
+        clock::count_use(draft, ended);
     }
     draft.status.times.finished = Some(Time(ended));
     let started = draft.status.times.started.as_ref();
@@ -296,16 +290,6 @@ fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     }
     draft.show(reason, message);
-}
-
-/// Counts what the present Job has used, from its Pod's scheduling until its end.
-pub(super) fn count_use(draft: &mut PlanBuilder<'_>, until: Timestamp) {
-    let Some(scheduled) = draft.status.times.scheduled.as_ref().map(|time| time.0) else {
-        return;
-    };
-    if let Some(usage) = &mut draft.status.usage {
-        usage.add(until.duration_since(scheduled).as_secs());
-    }
 }
 
 /// A time span in its two largest units.

@@ -7,7 +7,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, addresses, crashes, end, failure, interruption, isolation, line, reading, reported, requeue, start, stop,
+    accept, addresses, clock, crashes, end, failure, interruption, isolation, line, reading, reported, requeue, start,
+    stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
@@ -189,9 +190,9 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
             draft.fail(failure::job_deleted());
             return end::decide(draft, None);
         }
-        end::count_use(draft, draft.now());
+        clock::count_use(draft, draft.now());
         draft.status.recreated += 1;
-        draft.status.times.scheduled = None;
+        clock::restart(draft);
         draft.event(
             true,
             reasons::JOB_RECREATED,
@@ -287,9 +288,9 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
 fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     let known = draft.status.node_name.take();
     draft.status.node_name = pod.node.clone().or(known);
-    let times = &mut draft.status.times;
-    times.scheduled = times.scheduled.take().or(pod.scheduled.map(Time));
-    times.started = times.started.take().or(pod.agent_started.map(Time));
+    clock::take_node(draft, pod);
+    let started = &mut draft.status.times.started;
+    *started = started.take().or(pod.agent_started.map(Time));
     let now = draft.now();
     crashes::note(&mut draft.status, pod, now);
 }
@@ -301,29 +302,17 @@ fn watch_run(draft: &mut PlanBuilder<'_>) {
         return draft.fail(found);
     }
     // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.
-    let Some(since) = run_since(draft).filter(|_| draft.leaderboard().is_some()) else {
+    let Some(ran) = clock::run_seconds(draft).filter(|_| draft.leaderboard().is_some()) else {
         return;
     };
     let limit = draft.deadlines().run_seconds;
     if limit == 0 {
         return;
     }
-    let deadline = after(since, limit);
-    if draft.now() >= deadline {
+    if ran >= limit {
         draft.fail(failure::time_limit(limit));
-    } else {
-        draft.requeue_at(deadline);
-    }
-}
-
-/// When the clock of the run began: with its first agent. A Job that replaces one which the infrastructure took away has
-/// the whole time again, from its Pod's scheduling: waiting for a node costs the participant nothing.
-fn run_since(draft: &PlanBuilder<'_>) -> Option<jiff::Timestamp> {
-    let times = &draft.status.times;
-    let started = times.started.as_ref()?.0;
-    match &times.scheduled {
-        Some(scheduled) => Some(started.max(scheduled.0)),
-        None => (draft.status.retry == 0 && draft.status.recreated == 0).then_some(started),
+    } else if clock::has_node(draft) {
+        draft.requeue_at(after(draft.now(), limit - ran));
     }
 }
 

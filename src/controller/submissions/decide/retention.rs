@@ -39,9 +39,8 @@ fn until(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let kept = draft.leaderboard()?.retention.finished_seconds;
     let status = &draft.status;
     let end = status.end()?;
-    let is_present = status.attempt == Some(draft.spec().attempt);
     let has_all = status.is_delivered(conditions::PUBLISHED) && status.is_delivered(conditions::RECORDED);
-    let may_go = kept > 0 && !draft.is_deleting() && is_present && has_all && !has_job(draft);
+    let may_go = kept > 0 && !draft.is_deleting() && has_all && !has_job(draft);
     may_go.then(|| after(end.last_transition_time.0, kept))
 }
 

@@ -19,6 +19,7 @@ pub fn view(pod: &Pod) -> PodView {
         name: meta.name.to_string(),
         uid: meta.uid.to_string(),
         node: pod.spec.node_name.as_deref().map(str::to_owned),
+        created: meta.creation_timestamp.as_ref().map(|time| time.0),
         scheduled: scheduled(status),
         unschedulable: unschedulable(status),
         scale_up: None,

@@ -169,7 +169,11 @@ impl Queue {
     fn refused(&mut self, subject: &SubmissionRef, request: &Request, refusal: Refusal, now: &Now) {
         self.change(subject, |sub| match (refusal.about, request) {
             (About::Token, _) => {}
-            (About::Missing, _) => sub.outdated = true,
+            (About::Missing, _) => {
+                // A row that reads go on finding must not take the budget of all others.
+                sub.outdated = true;
+                sub.write_failed(refusal.message, pause(sub.write_failures), now);
+            }
             (About::Request, Request::Final(..)) => sub.refuse_end(refusal.message, now),
             (About::Request | About::Challenge, _) => {
                 drop_partial(sub, request);

@@ -31,7 +31,7 @@ use self::poll::Challenge;
 use self::sub::{Asked, Pending, Sub};
 use super::budget::Budget;
 use super::labels::{Labels, compare};
-use super::payload::{check, digest};
+use super::payload::{check, digest, for_split};
 use super::request::Request;
 use super::status::{Outcome, Progress};
 use super::types::{Changed, DesiredUpdate, Ended, Key, Load, Payload, Subject, SubmissionState, SweepRow, Target};
@@ -170,6 +170,8 @@ impl Queue {
             .entry(target.challenge)
             .or_insert_with(|| Challenge::new(target.period));
         self.arrange(now);
+        let ends = self.subs.values_mut().filter(|sub| sub.challenge == target.challenge);
+        ends.for_each(|sub| sub.fit_end(target, &now));
         if let Some(challenge) = self.challenges.get_mut(&target.challenge) {
             challenge.check.poll.due = now.at;
             challenge.check.restart();
@@ -424,6 +426,7 @@ fn request_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
 }
 
 fn request_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
+    let payload = for_split(payload, &target.split);
     let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == payload);
     if sub.has_end() || pending || sub.partial_sent == Some(digest(&payload)) {
         return false;
@@ -444,14 +447,11 @@ fn request_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Pa
         .end
         .as_ref()
         .is_some_and(|end| !matches!(end, Ended::Refused(_)));
-    let want = (outcome, payload);
+    let want = (outcome, for_split(payload, &target.split));
     if closed || sub.end.as_ref().is_some_and(|end| end.what == want) {
         return false;
     }
-    sub.misfit = match outcome {
-        Outcome::Finished => check(&want.1, &target.split, &target.labels).err(),
-        Outcome::Failed | Outcome::Cancelled => None,
-    };
+    sub.misfit = sub::misfit(&want, target);
     let since = now.at;
     sub.end = Some(Pending { what: want, since });
     sub.run.ended.get_or_insert(now.wall);

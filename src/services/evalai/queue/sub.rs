@@ -10,9 +10,10 @@ use jiff::Timestamp;
 use super::Now;
 use super::poll::pause;
 use crate::services::evalai::guard::{self, Attempt, End, Start, Verdict};
+use crate::services::evalai::payload::{check, for_split};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
-use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, SubmissionState};
+use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, SubmissionState, Target};
 
 /// Wait before an unknown status of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
@@ -316,6 +317,22 @@ impl Sub {
         self.write_failed(why, RETRY_END, now);
     }
 
+    /// Its Leaderboard has changed: an end that waits, or was refused, is to fit what it says now. What that changes may be what it
+    /// was refused for, so it is tried at once.
+    pub fn fit_end(&mut self, target: &Target, now: &Now) {
+        let Some(end) = &mut self.end else { return };
+        let (outcome, payload) = end.what.clone();
+        if !target.phases.contains(&payload.phase) {
+            return;
+        }
+        let what = (outcome, for_split(payload, &target.split));
+        let misfit = misfit(&what, target);
+        if end.what != what || self.misfit != misfit {
+            (end.what, self.misfit) = (what, misfit);
+            self.retry_at = self.retry_at.min(now.at);
+        }
+    }
+
     /// What becomes of the update of progress; none without one, or without a row.
     pub fn progress_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
@@ -401,5 +418,13 @@ impl Sub {
         self.retry_at = now.at + pause;
         self.write_failures = self.write_failures.saturating_add(1);
         self.view.last_error = Some(why);
+    }
+}
+
+/// Why an end's results are not what its Leaderboard sends.
+pub(super) fn misfit((outcome, payload): &(Outcome, Arc<Payload>), target: &Target) -> Option<String> {
+    match outcome {
+        Outcome::Finished => check(payload, &target.split, &target.labels).err(),
+        Outcome::Failed | Outcome::Cancelled => None,
     }
 }

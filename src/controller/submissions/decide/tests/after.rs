@@ -233,30 +233,34 @@ fn a_refused_result_is_said_once_and_does_not_hold_up_the_row() {
 
 #[test]
 fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
-    let mut world = finished();
-    world.in_evalai().end = Some(EvalaiEnd::Refused {
-        message: "it belongs to another phase".into(),
-    });
-    world.pass();
-    world.recorded();
-    world.pass();
-    world.in_evalai().end = Some(EvalaiEnd::Ended {
-        status: "cancelled".into(),
-    });
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
-    assert!(
-        has(&plan, |a| *a == Action::Record { end: true }),
-        "the row said FINISHED"
-    );
-    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
-    assert!(!has(&plan, |a| *a == Action::Forget));
-    // The row that was handed in is not the written one.
-    world.view.record.as_mut().unwrap().end_written = false;
-    assert!(has(&world.pass(), |a| *a == Action::Record { end: true }));
-    world.recorded();
-    let plan = world.pass();
-    assert_eq!(condition(&plan, RECORDED).0, "True");
-    assert!(has(&plan, |a| *a == Action::Forget));
+    for is_shown in [true, false] {
+        let mut world = finished();
+        world.in_evalai().end = Some(EvalaiEnd::Refused {
+            message: "it belongs to another phase".into(),
+        });
+        world.pass();
+        world.recorded();
+        if is_shown {
+            world.pass();
+        }
+        world.in_evalai().end = Some(EvalaiEnd::Ended {
+            status: "cancelled".into(),
+        });
+        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        assert!(
+            has(&plan, |a| *a == Action::Record { end: true }),
+            "the row said FINISHED"
+        );
+        assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
+        assert!(!has(&plan, |a| *a == Action::Forget));
+        // The row that was handed in is not the written one.
+        world.view.record.as_mut().unwrap().end_written = false;
+        assert!(has(&world.pass(), |a| *a == Action::Record { end: true }));
+        world.recorded();
+        let plan = world.pass();
+        assert_eq!(condition(&plan, RECORDED).0, "True");
+        assert!(has(&plan, |a| *a == Action::Forget));
+    }
 }
 
 #[test]

@@ -2,10 +2,11 @@
 
 use super::builders::*;
 use crate::controller::submissions::decide::Action;
-use crate::controller::submissions::view::{ObservedNode, PodView};
+use crate::controller::submissions::view::{JobEnd, ObservedNode, PodView};
+use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::State::{Finished, Pending, Running};
-use leaderboard_api::{Interruptions, JobNumber, reasons};
+use leaderboard_api::{Interruptions, JobNumber, conditions, reasons};
 
 const TAINT: &str = "karpenter.sh/disrupted";
 
@@ -197,4 +198,49 @@ fn a_cancel_and_a_complete_result_come_before_an_interruption() {
     world.report(final_report());
     let status = world.pass_to(Finished, reasons::FINISHED).status;
     assert_eq!((status.retry, status.interruptions), (0, None));
+}
+
+/// A Job that follows this run, which is stopped and has stored a refused checkpoint; its Pod has a node and has stored nothing yet.
+fn followed(mut world: World, stop: Stop) -> World {
+    world.leaderboard().retries.infrastructure = 1;
+    world.pass();
+    world.wait(20);
+    world.complete();
+    world.report(Report {
+        is_final: true,
+        why: Some("nonsense".into()),
+        stopped: Some(stop),
+        ..report(2)
+    });
+    world.pass_to(Pending, reasons::REPLACING);
+    world.view.leaving = None;
+    world.job_gone();
+    assert!(creates(&world.pass()));
+    world.see_job();
+    world.view.pod = Some(PodView {
+        uid: "pod-2".into(),
+        ..pod(200)
+    });
+    world.pass();
+    world
+}
+
+#[test]
+fn what_a_stopped_run_has_stored_is_no_verdict_on_the_job_that_follows() {
+    let mut requeued = World::evalai().running();
+    requeued.requeue(None);
+    for (world, stop) in [(leaving(), Stop::Interruption), (requeued, Stop::Cancel)] {
+        let mut deleted = followed(world, stop);
+        let mut ended = deleted.clone();
+        deleted.job_gone();
+        let plan = deleted.pass();
+        assert!(creates(&plan), "{stop:?}: {:?}", plan.status.failure);
+        assert!(events(&plan).contains(&reasons::JOB_RECREATED), "{stop:?}");
+
+        let now = ended.view.now;
+        ended.job().end = Some(JobEnd::Complete { at: Some(now) });
+        let plan = ended.pass_to(Pending, reasons::REPLACING);
+        let running = conditions::get(&plan.status.conditions, conditions::RUNNING).unwrap();
+        assert_eq!(running.reason, reasons::RESULTS_NOT_STORED, "{stop:?}");
+    }
 }

@@ -7,6 +7,7 @@ mod allowance;
 mod blame;
 mod builders;
 mod check;
+mod clock;
 mod crashes;
 mod end;
 mod failure;

@@ -5,8 +5,8 @@ use std::time::Duration;
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::EvalaiEnd;
-use leaderboard_api::State::{Cancelled, Failed, Finished};
-use leaderboard_api::conditions::{PUBLISHED, RECORDED};
+use leaderboard_api::State::{Failed, Finished};
+use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::reasons;
 
 /// What a host keeps, in seconds.
@@ -84,7 +84,9 @@ fn nothing_else_is_ever_deleted() {
         ("EvalAI does not have its end", |w| w.forget(PUBLISHED)),
         ("the table does not have its end", |w| w.forget(RECORDED)),
         ("another attempt is requested", |w| {
-            w.submission().status.as_mut().unwrap().state = Some(Cancelled);
+            let conditions = &mut w.submission().status.as_mut().unwrap().conditions;
+            let end = conditions.iter_mut().find(|c| c.type_ == FINISHED).unwrap();
+            end.reason = reasons::CANCELLED.into();
             w.submission().spec.attempt = 2;
         }),
     ];
@@ -97,6 +99,14 @@ fn nothing_else_is_ever_deleted() {
         let plan = crate::controller::submissions::decide::decide(&world.view);
         assert!(!deletes(&plan), "{why}: {:?}", plan.actions);
     }
+}
+
+#[test]
+fn a_finished_one_goes_although_another_attempt_was_asked_for_while_it_ran() {
+    let mut world = known_to_all();
+    world.submission().spec.attempt = 2;
+    world.wait(KEPT);
+    assert!(deletes(&world.pass()));
 }
 
 #[test]

@@ -3,6 +3,7 @@
 use serde_json::json;
 
 use super::builders::*;
+use crate::controller::submissions::view::PodView;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
 use leaderboard_api::{Use, reasons};
 
@@ -77,4 +78,33 @@ fn what_never_had_a_node_or_a_gpu_has_used_none() {
     world.complete();
     world.report(final_report());
     assert_eq!(world.pass_to(Finished, reasons::FINISHED).status.usage, None);
+}
+
+#[test]
+fn a_pod_that_waits_for_its_node_uses_none() {
+    let mut world = with_gpus().running();
+    world.go_to(1000);
+    world.view.pod = Some(PodView {
+        uid: "pod-2".into(),
+        created: Some(at(1000)),
+        scheduled: None,
+        unschedulable: Some("0/1 nodes are available.".into()),
+        ..pod(1000)
+    });
+    world.pass_to(Running, reasons::REPLACING);
+    let mut cancelled = world.clone();
+    cancelled.submission().spec.cancel = true;
+    cancelled.go_to(5000);
+    cancelled.complete();
+    let plan = cancelled.pass_to(Cancelled, reasons::CANCELLED);
+    assert_eq!(plan.status.usage, Some(used(2000)));
+
+    (world.pod().unschedulable, world.pod().scheduled) = (None, Some(at(5000)));
+    world.see_agents();
+    world.go_to(6000);
+    world.pass_to(Running, reasons::RUNNING);
+    world.complete();
+    world.report(final_report());
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(plan.status.usage, Some(used(2000 + 2000)));
 }

@@ -175,6 +175,116 @@ fn a_list_that_brings_a_refused_result_does_not_put_off_its_next_try() {
     assert!(tried.is_some_and(|after| (590..=610).contains(&after)), "{tried:?}");
 }
 
+fn with_split(split: &str) -> Target {
+    Target {
+        split: split.into(),
+        ..target()
+    }
+}
+
+/// The results that a request has.
+fn results_of(ticket: &Ticket) -> &str {
+    match &ticket.request {
+        Request::Partial(_, payload) | Request::Final(_, _, payload) => &payload.result,
+        other => panic!("{} has no results", other.name()),
+    }
+}
+
+impl Bench {
+    /// An update of submission 7, whose Leaderboard is this one.
+    fn update_of(&mut self, board: &Target, update: DesiredUpdate) {
+        let now = self.now();
+        let subject = Subject {
+            target: Arc::new(board.clone()),
+            ..of(7, 1)
+        };
+        self.queue.update(&subject, update, now);
+    }
+
+    fn becomes(&mut self, leaderboard: &Key, board: &Target) {
+        let now = self.now();
+        self.queue.serve(leaderboard, board, now);
+    }
+}
+
+#[test]
+fn results_are_sent_for_the_split_of_their_leaderboard() {
+    let (mut bench, val) = (Bench::new(), with_split("val"));
+    bench.running(7);
+    bench.update_of(&val, DesiredUpdate::Partial(results(41.0)));
+    let sent = bench.read_and_write(7, "partial");
+    assert!(results_of(&sent).contains(r#""split":"val""#), "{sent:?}");
+    bench.update_of(&val, DesiredUpdate::Partial(results(41.0)));
+    bench.wait(5.0);
+    bench.expect_nothing();
+    bench.update_of(&val, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    let sent = bench.read_and_write(7, "finished");
+    assert!(results_of(&sent).contains(r#""split":"val""#), "{sent:?}");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+#[test]
+fn a_result_that_was_refused_for_its_split_is_sent_once_its_leaderboard_names_another() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.update_of(
+        &with_split("vall"),
+        DesiredUpdate::Final(Outcome::Finished, results(43.0)),
+    );
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("finished 7");
+    bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Request, 400))));
+    bench.wait(5.0);
+    let other = Target {
+        phases: [2].into(),
+        ..with_split("val")
+    };
+    bench.becomes(&key(90), &other);
+    bench.list("sweep of submitted", vec![]);
+    bench.becomes(&key(100), &with_split("val"));
+    let sent = bench.read_and_write(7, "finished");
+    assert!(results_of(&sent).contains(r#""split":"val""#), "{sent:?}");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+#[test]
+fn a_result_without_a_metric_is_sent_once_its_leaderboard_wants_it_no_more() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    let wants_more = Target {
+        labels: ["Driving score".to_owned(), "Agent blocked".to_owned()].into(),
+        ..target()
+    };
+    bench.update_of(&wants_more, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    bench.get(7, row(7, Status::Running));
+    assert!(matches!(bench.view(7).end, Some(Ended::Refused(why)) if why.contains("lack the metrics Agent blocked")));
+    bench.wait(5.0);
+    bench.expect_nothing();
+    bench.becomes(&key(100), &target());
+    bench.read_and_write(7, "finished");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+#[test]
+fn a_write_to_a_row_that_only_a_read_finds_waits_and_lets_others_through() {
+    let mut bench = Bench::new();
+    bench.running(7);
+    bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    bench.get(7, row(7, Status::Running));
+    let put = bench.expect("finished 7");
+    bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Missing, 404))));
+    assert_eq!(bench.view(7).last_error.as_deref(), Some("EvalAI answered 404"));
+    bench.wait(4.0);
+    bench.expect_nothing();
+    bench.update(8, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
+    bench.read_and_write(8, "failed");
+    bench.expect_nothing();
+    bench.wait(2.5);
+    bench.get(7, Row::missing(7));
+    bench.expect_nothing();
+    assert_eq!(bench.view(7).end, Some(Ended::Otherwise(Status::Missing)));
+}
+
 #[test]
 fn a_broken_server_is_left_alone_longer_each_time() {
     let mut bench = Bench::new();
