@@ -196,7 +196,7 @@ impl ArchiveWorkers {
         let now = Instant::now();
         let mut state = lock(&bucket.state);
         let is_same =
-            |target: &Target| target.attempt == submission.spec.attempt && target.ended.is_some() == ended.is_some();
+            |target: &Target| target.attempt == submission.present_attempt() && target.ended.is_some() == ended.is_some();
         let (uid, target) = state
             .known(uid(submission))
             .filter(|(_, target)| is_same(target))
@@ -217,7 +217,7 @@ fn target(submission: &Submission, plan: &RunPlan, ended: Option<Timestamp>, now
         name: submission.name_any(),
         prefix: effective::key_prefix(&plan.storage, &plan.run_id),
         submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
-        attempt: submission.spec.attempt,
+        attempt: submission.present_attempt(),
         ended: age.map(|age| now.checked_sub(age).unwrap_or(now)),
         log: log_span_of(submission),
     }
