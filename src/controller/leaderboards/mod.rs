@@ -1,14 +1,15 @@
 //! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
-//! Does nothing for a Leaderboard that another installation drives. Applies the policy before it waits for anything else, since no
-//! Job is made without it. Reads the token (every five minutes, or when EvalAI refuses it), checks whether bucket, table and queues
-//! answer, and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
+//! Does nothing for a Leaderboard that another installation drives. Applies the policy before all else, since no Job is made without
+//! it. What its token is, and whether bucket, table and queues answer, is found by `looks`, in a task of its own that wakes this
+//! reconcile; it waits for the API server alone, and gives the way to EvalAI to `external`. `decide`, `probe::due` and `reach` are pure.
 
 mod check;
 pub mod claims;
 pub mod decide;
 mod foreign;
 pub mod isolation;
+pub mod looks;
 pub mod operator;
 mod places;
 mod pod_notes;
@@ -25,6 +26,8 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::Client;
+use tokio::sync::mpsc::UnboundedSender;
+use tokio::time::Instant;
 
 use super::objects::{key_of, uid_of};
 use super::settings::Settings;
@@ -35,13 +38,15 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::{team_history, team_use};
 use crate::kubernetes::CallError;
 use crate::observability::metrics::{LimitsState, Metrics};
-use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
 use leaderboard_api::{Leaderboard, Submission, names};
+use looks::Look;
 use probe::Probe;
-use refusal::Refusal;
-use state::{COUNTS_EVERY, LeaderboardState, Policy, RESYNC, SOONEST};
+use state::{COUNTS_EVERY, LeaderboardState, Looked, Policy, RESYNC, SOONEST};
+
+/// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
+const FIRST_LOOK: Duration = Duration::from_secs(2);
 
 /// What a reconcile of a Leaderboard uses.
 #[derive(Clone, Copy)]
@@ -50,7 +55,7 @@ pub struct Uses<'a> {
     pub settings: &'a Settings,
     pub slots: &'a SlotAllocator,
     pub external: &'a ExternalSystems,
-    pub aws: &'a Aws,
+    pub looks: &'a UnboundedSender<Look>,
     pub metrics: &'a Metrics,
 }
 
@@ -76,7 +81,6 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
-    let uid = uid_of(leaderboard.as_ref());
     let now = Timestamp::now();
     let Policies {
         client, stores, state, ..
@@ -84,26 +88,36 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
     let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
-    let probe = probed(uses, &leaderboard, refusal.as_ref(), now).await;
-    state.keep(&uid, probe.clone());
-    let view = LeaderboardView {
-        refusal,
-        ..observe(uses, &leaderboard, policy, &probe, now)
+    let Looked { known, since } = match refusal {
+        Some(_) => Looked::default(),
+        None => state.looked(&uid_of(leaderboard.as_ref())),
     };
-    show_limits(uses, &view, &probe);
+    let view = LeaderboardView {
+        is_looked_at: refusal.is_some() || known.is_of(&leaderboard),
+        refusal,
+        ..observe(uses, &leaderboard, policy, &known, now)
+    };
     let plan = decide(&view);
+    show_limits(uses, &view, &known);
+    serve(uses, &view, &plan, &known);
+    let since = since.or_else(|| look(uses, &view, &known));
     if let Some(wanted) = plan.finalizer {
         set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
     }
     if plan.finalizer == Some(false) {
-        uses.external.retire(&leaderboard);
         return Ok(RESYNC);
     }
-    let again = write_status(client, state, &leaderboard, &plan, now).await?;
-    let probed = probe.next(now).map(|at| at.duration_since(now).unsigned_abs());
+    let left = since.filter(|_| !view.is_looked_at);
+    let left = left.map(|since| FIRST_LOOK.saturating_sub(since.elapsed()));
+    let again = match left.filter(|left| !left.is_zero()) {
+        Some(left) => left,
+        None => write_status(client, state, &leaderboard, &plan, now).await?,
+    };
+    // The end of a look wakes it.
+    let due = known.next(&leaderboard, now).filter(|_| since.is_none());
+    let due = due.map_or(RESYNC, |at| at.duration_since(now).unsigned_abs());
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
-    let next = probed.map_or(policy, |probed| probed.min(policy));
-    Ok(next.max(SOONEST).min(again))
+    Ok(policy.min(due).max(SOONEST).min(again))
 }
 
 /// Shows what it has left, in metrics.
@@ -118,18 +132,31 @@ fn show_limits(uses: Uses<'_>, view: &LeaderboardView, probe: &Probe) {
     uses.metrics.set_limits(&name, state);
 }
 
-/// What was tried of it. Where it names what it may not, nothing is asked, and EvalAI is no longer spoken to.
-async fn probed(uses: Uses<'_>, leaderboard: &Arc<Leaderboard>, refusal: Option<&Refusal>, now: Timestamp) -> Probe {
-    if refusal.is_some() {
+/// Hands the way to EvalAI to `external`. Of a Leaderboard that goes, or names what it may not, nothing more is sent there.
+fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, known: &Probe) {
+    let leaderboard = &view.leaderboard;
+    if view.refusal.is_some() || plan.finalizer == Some(false) {
         uses.external.retire(leaderboard);
-        return Probe::default();
+    } else if let Some(target) = known.target(leaderboard) {
+        uses.external.serve(leaderboard, target);
     }
-    let known = uses.policies.state.probe(&uid_of(leaderboard.as_ref()));
-    let probe = known.refresh(uses, leaderboard, now).await;
-    if let Some(target) = probe.target() {
-        uses.external.set_target(leaderboard, target);
+}
+
+/// Begins a look if something is due; returns when it began. Where a Leaderboard names what it may not, nothing is asked.
+fn look(uses: Uses<'_>, view: &LeaderboardView, known: &Probe) -> Option<Instant> {
+    let leaderboard = &view.leaderboard;
+    let key = key_of(leaderboard.as_ref());
+    let is_token_refused = uses.external.hub.token_refused(&key).is_some();
+    let due = known.due(leaderboard, is_token_refused, view.now);
+    if view.refusal.is_some() || due.is_nothing() {
+        return None;
     }
-    probe
+    let now = Instant::now();
+    uses.policies.state.begin_look(&key.uid, now);
+    // An error means that the task is gone, which ends the process.
+    let leaderboard = Arc::clone(leaderboard);
+    let _ = uses.looks.send(Look { leaderboard, due });
+    Some(now)
 }
 
 fn observe(
@@ -156,6 +183,7 @@ fn observe(
         policy,
         measured: isolation::measured(stores, uses.policies.state, leaderboard),
         refusal: None,
+        is_looked_at: true,
         invalid_pod: probe.invalid_pod(),
         pod_notes: probe.pod_notes(),
         claims: probe.claims(),

@@ -5,6 +5,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use tokio::time::Instant;
 
 use super::foreign::Foreign;
 use super::probe::Probe;
@@ -52,13 +53,21 @@ impl Applied {
 /// What was measured last, of which generation.
 pub(super) type Measured = (Option<i64>, WorkspaceVerdict);
 
+/// What the looks at a Leaderboard have found.
+#[derive(Clone, Default)]
+pub(super) struct Looked {
+    pub(super) known: Probe,
+    /// Since when a look is under way.
+    pub(super) since: Option<Instant>,
+}
+
 /// One entry for each Leaderboard.
 #[derive(Default)]
 pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 
 #[derive(Default)]
 struct Entry {
-    probe: Probe,
+    looked: Looked,
     /// When its status was written.
     written: Option<Timestamp>,
     applied: Option<Applied>,
@@ -73,15 +82,23 @@ impl LeaderboardState {
         lock(&self.0).remove(uid);
     }
 
-    pub(super) fn probe(&self, uid: &str) -> Probe {
-        lock(&self.0)
-            .get(uid)
-            .map(|entry| entry.probe.clone())
-            .unwrap_or_default()
+    pub(super) fn looked(&self, uid: &str) -> Looked {
+        let entries = lock(&self.0);
+        entries.get(uid).map(|entry| entry.looked.clone()).unwrap_or_default()
     }
 
-    pub(super) fn keep(&self, uid: &str, probe: Probe) {
-        self.change(uid, |entry| entry.probe = probe);
+    /// A look begins.
+    pub(super) fn begin_look(&self, uid: &str, now: Instant) {
+        self.change(uid, |entry| entry.looked.since = Some(now));
+    }
+
+    /// A look has ended. False: the Leaderboard is gone.
+    pub(super) fn end_look(&self, uid: &str, known: Probe) -> bool {
+        let mut entries = lock(&self.0);
+        let entry = entries.get_mut(uid);
+        entry
+            .map(|entry| entry.looked = Looked { known, since: None })
+            .is_some()
     }
 
     pub(super) fn wrote(&self, uid: &str, now: Timestamp) {
