@@ -19,7 +19,9 @@ mod queue_readers;
 mod reach;
 mod refusal;
 pub mod shared_queue;
+pub mod standing;
 pub mod state;
+mod tried_pods;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -190,7 +192,7 @@ fn observe(
         unreachable: probe.unreachable(now),
         place_notes: probe.place_notes(now),
         shared_queue: probe.shared_queue(),
-        evalai: probe.evalai_standing(hub, leaderboard, &key, now),
+        evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),
     }

@@ -2,37 +2,32 @@
 //!
 //! `looks` calls the look; a reconcile asks only what is known and what is due.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::core::v1::Secret;
-use kube::api::{ApiResource, DynamicObject, PostParams};
 use kube::{Api, Client, ResourceExt};
 use leaderboard_results::metrics;
 
 use super::claims::{self, Claims};
 use super::places::{self, Readings};
-use super::pod_notes::{TrackPods, notes};
-use super::priority::{self, Asked};
+use super::priority;
 use super::queue_readers;
-use super::reach::{Place, Reach, Unreachable, capitalized};
+use super::reach::{Place, Reach, Unreachable};
 use super::shared_queue::SharedQueue;
+use super::tried_pods::{TriedPods, try_pods};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::controller::stores::Stores;
-use crate::controller::submissions::job_spec::{self, JobInput};
-use crate::controller::submissions::pod_overlay;
 use crate::kubernetes::call;
 use crate::observability::metrics::LimitsState;
 use crate::pod::run::results_format;
-use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Hub, InboxTrouble, Labels, Target};
+use crate::services::evalai::Target;
 use crate::services::queue::Reading;
 use crate::services::token::{Token, TokenSource};
-use leaderboard_api::{Evalai, EvalaiMode, JobNumber, Leaderboard, Submission, Token as TokenPlace, Track, effective};
+use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
@@ -83,35 +78,6 @@ pub struct Due {
     claims: bool,
     token: bool,
     places: Vec<(Place, String)>,
-}
-
-/// What was found of a Leaderboard's Pods.
-#[derive(Clone, Default)]
-struct TriedPods {
-    /// Why they would be refused.
-    refused: Option<String>,
-    /// What their host should know all the same.
-    notes: Vec<String>,
-    /// Their PriorityClasses.
-    classes: BTreeMap<String, Asked>,
-}
-
-/// How a Leaderboard stands with EvalAI.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum EvalaiStanding {
-    NotRequired,
-    NoToken(String),
-    TokenRefused(String),
-    /// Its queue in EvalAI is not read.
-    QueueUnread(InboxTrouble),
-    /// Its phases or labels do not fit the challenge.
-    Misfit(String),
-    /// Not checked yet, or EvalAI does not answer.
-    Unchecked(Option<String>),
-    Fits {
-        /// Something to be said although it works, such as a token that ends soon.
-        note: Option<String>,
-    },
 }
 
 impl Due {
@@ -234,8 +200,29 @@ impl Probe {
     /// The way to EvalAI, once there is a token.
     pub(super) fn target(&self, leaderboard: &Leaderboard) -> Option<Target> {
         let evalai = leaderboard.spec.evalai.as_ref()?;
-        let token = self.token_of(leaderboard)?.token.as_ref().ok()?;
-        Some(target(leaderboard, evalai, token))
+        let token = self.token(leaderboard)?.as_ref().ok()?;
+        let spec = &leaderboard.spec;
+        let format = results_format(spec.leaderboard_version);
+        let created = leaderboard.metadata.creation_timestamp.as_ref();
+        Some(Target {
+            api_server: evalai.server(),
+            challenge: evalai.challenge,
+            split: evalai.split.clone(),
+            token: Arc::clone(token),
+            requests_per_minute: evalai.requests_per_minute.unsigned_abs(),
+            sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
+            period: Duration::from_secs(spec.sync_period_seconds.unsigned_abs()),
+            phases: spec.tracks.iter().filter_map(|t| t.phase).collect(),
+            labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
+            inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
+            is_observed: evalai.mode == EvalaiMode::Observe,
+            since: created.map(|time| time.0).unwrap_or_default(),
+        })
+    }
+
+    /// Its token, or why there is none, once it was looked for.
+    pub(super) fn token(&self, leaderboard: &Leaderboard) -> Option<&Result<Arc<Token>, String>> {
+        self.token_of(leaderboard).map(|found| &found.token)
     }
 
     /// What was found where the Leaderboard says that its token is.
@@ -278,63 +265,6 @@ impl Probe {
             .flatten()
             .min()
     }
-
-    pub(super) fn evalai_standing(
-        &self,
-        hub: &Hub,
-        leaderboard: &Leaderboard,
-        key: &ObjectKey,
-        now: Timestamp,
-    ) -> EvalaiStanding {
-        if leaderboard.spec.evalai.is_none() {
-            return EvalaiStanding::NotRequired;
-        }
-        let token = match self.token_of(leaderboard).map(|found| &found.token) {
-            None => return EvalaiStanding::Unchecked(None),
-            Some(Err(why)) => return EvalaiStanding::NoToken(why.clone()),
-            Some(Ok(token)) => token,
-        };
-        if let Some(why) = hub.token_refused(key) {
-            return EvalaiStanding::TokenRefused(why);
-        }
-        match hub.inbox_trouble(key) {
-            Some(trouble) if trouble.is_refused => return EvalaiStanding::QueueUnread(trouble),
-            Some(trouble) if hub.labels(key).0.is_none_or(|labels| labels.ok()) => {
-                return EvalaiStanding::QueueUnread(trouble);
-            }
-            _ => {}
-        }
-        match hub.labels(key) {
-            (None, why) => EvalaiStanding::Unchecked(why),
-            (Some(labels), _) if !labels.ok() => {
-                let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
-                EvalaiStanding::Misfit(problems.join("; "))
-            }
-            (Some(labels), _) => EvalaiStanding::Fits {
-                note: note(&labels, ends_soon(token, now)),
-            },
-        }
-    }
-}
-
-/// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
-fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
-    let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
-    let notes: Vec<String> = of_labels.chain(of_token).collect();
-    (!notes.is_empty()).then(|| notes.join(" "))
-}
-
-fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
-    token.ends_soon(now).then(|| {
-        let when = token
-            .expires()
-            .map(|t| t.strftime("%Y-%m-%d").to_string())
-            .unwrap_or_default();
-        if token.expires().is_some_and(|end| end <= now) {
-            return format!("EvalAI's token has ended on {when}; put a new one where evalai.token says.");
-        }
-        format!("EvalAI's token ends on {when}; put a new one where evalai.token says before.")
-    })
 }
 
 fn generation_of(leaderboard: &Leaderboard) -> i64 {
@@ -389,107 +319,9 @@ async fn read_token(
     source.read(aws).await.map(Arc::new).map_err(|e| e.to_string())
 }
 
-fn target(leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) -> Target {
-    let format = results_format(leaderboard.spec.leaderboard_version);
-    Target {
-        api_server: evalai.server(),
-        challenge: evalai.challenge,
-        split: evalai.split.clone(),
-        token: Arc::clone(token),
-        requests_per_minute: evalai.requests_per_minute.unsigned_abs(),
-        sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
-        period: Duration::from_secs(leaderboard.spec.sync_period_seconds.unsigned_abs()),
-        phases: leaderboard.spec.tracks.iter().filter_map(|t| t.phase).collect(),
-        labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
-        inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
-        is_observed: evalai.mode == EvalaiMode::Observe,
-        since: leaderboard
-            .metadata
-            .creation_timestamp
-            .as_ref()
-            .map(|t| t.0)
-            .unwrap_or_default(),
-    }
-}
-
-/// Whether Pods of this Leaderboard would be refused, by our own rules or by the API server's dry run; and what is to be noted.
-async fn try_pods(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
-    if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
-        return TriedPods {
-            refused: Some(error.to_string()),
-            ..TriedPods::default()
-        };
-    }
-    let tracks = leaderboard.spec.tracks.iter();
-    let jobs: Vec<(&Track, DynamicObject)> = tracks
-        .filter_map(|track| Some((track, sample_job(settings, leaderboard, track)?)))
-        .collect();
-    let template = |job: &DynamicObject| job.data.pointer("/spec/template").cloned().unwrap_or_default();
-    let pods = jobs.iter().map(|(track, job)| TrackPods {
-        track: track.name.clone(),
-        template: template(job),
-    });
-    let pods: Vec<TrackPods> = pods.collect();
-    let mut templates = jobs.iter().map(|(_, job)| template(job));
-    let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
-    TriedPods {
-        notes: notes(&pods),
-        classes: priority::asked(&leaderboard.spec.tracks, &pods),
-        refused: match (unclear, jobs.first()) {
-            (Some(unclear), _) => Some(unclear),
-            (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
-            (None, None) => None,
-        },
-    }
-}
-
-async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicObject) -> Option<String> {
-    let namespace = leaderboard.namespace().unwrap_or_default();
-    let resource = ApiResource::erase::<k8s_openapi::api::batch::v1::Job>(&());
-    let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), &namespace, &resource);
-    let params = PostParams {
-        dry_run: true,
-        ..PostParams::default()
-    };
-    let error = call(
-        "a dry run of the Job",
-        &leaderboard.name_any(),
-        api.create(&params, job),
-    )
-    .await
-    .err()?;
-    let status = error.status().filter(|status| [400, 422].contains(&status.code))?;
-    Some(status.message.clone())
-}
-
-fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> Option<DynamicObject> {
-    let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
-    let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
-    sample.metadata.namespace = leaderboard.namespace();
-    sample.metadata.uid = leaderboard.uid();
-    let plan = effective::plan(
-        &leaderboard.spec,
-        track,
-        sample.run_id(),
-        "example/agent:1".into(),
-        false,
-    );
-    Some(job_spec::build_object(&JobInput {
-        submission: &sample,
-        leaderboard,
-        plan: &plan,
-        number: JobNumber::first(1),
-        settings,
-        without_gpu: &[],
-        addresses: None,
-        now: Timestamp::now(),
-    }))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::services::evalai::Misfit;
 
     #[test]
     fn a_token_counts_only_for_the_place_where_it_was_found() {
@@ -520,27 +352,5 @@ mod tests {
         let later = now.checked_add(SOON).unwrap();
         assert!(probe.due(&old, true, later).token);
         assert!(probe.target(&new).is_none() && probe.due(&new, false, now).token);
-    }
-
-    #[test]
-    fn columns_that_stay_empty_and_a_token_that_ends_soon_are_said() {
-        let labels = |problems| Labels {
-            at: Timestamp::UNIX_EPOCH,
-            problems,
-            partial: vec![],
-        };
-        let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
-        assert_eq!(note(&labels(vec![]), None), None);
-        assert_eq!(note(&labels(vec![]), ends()), ends());
-        let unsent = Misfit::Unsent {
-            phase: 2,
-            labels: vec!["Speed".into(), "Comfort".into()],
-        };
-        let said = note(&labels(vec![unsent]), ends()).unwrap();
-        assert_eq!(
-            said,
-            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \
-             on 2027-01-01."
-        );
     }
 }
