@@ -40,7 +40,7 @@ pub async fn carry_out(mut looks: mpsc::UnboundedReceiver<Look>, uses: Uses<'_>)
 /// What was found of a Leaderboard that is gone is nobody's, and what was found of a spec that has changed leaves the new one due.
 async fn look(uses: Uses<'_>, Look { leaderboard, due }: Look) {
     let (uid, now) = (uid_of(leaderboard.as_ref()), Timestamp::now());
-    let known = uses.state.looked(&uid).known;
+    let known = uses.state.read(&uid, |entry| entry.looked.known.clone());
     let found = known.look(uses.places, &leaderboard, due, now).await;
     if uses.state.end_look(&uid, found) {
         (uses.wake)(ObjectRef::from_obj(leaderboard.as_ref()));

@@ -7,7 +7,7 @@ use tokio::time::Instant;
 
 use super::*;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
-use crate::controller::leaderboards::state::RESYNC;
+use crate::controller::leaderboards::state::{Entry, RESYNC};
 use crate::controller::leaderboards::{FIRST_LOOK, Reconciled, reconcile};
 use crate::controller::network_policy::network_policy;
 use leaderboard_api::{names, reasons};
@@ -144,7 +144,8 @@ async fn what_was_found_of_a_leaderboard_that_is_gone_is_dropped() {
     around.context.leaderboards.forget(&uid_of(&board));
     look(around.context.for_looks(), wanted).await;
     assert!(around.woken.try_recv().is_err());
-    assert!(!around.context.leaderboards.looked(&uid_of(&board)).known.is_of(&board));
+    let is_known = |entry: &Entry| entry.looked.known.is_of(&board);
+    assert!(!around.context.leaderboards.read(&uid_of(&board), is_known));
 }
 
 #[tokio::test(start_paused = true)]

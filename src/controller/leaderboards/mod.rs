@@ -83,7 +83,7 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
-    let now = Timestamp::now();
+    let (uid, now) = (uid_of(leaderboard.as_ref()), Timestamp::now());
     let Policies {
         client, stores, state, ..
     } = uses.policies;
@@ -92,7 +92,7 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
     let Looked { known, since } = match refusal {
         Some(_) => Looked::default(),
-        None => state.looked(&uid_of(leaderboard.as_ref())),
+        None => state.read(&uid, |entry| entry.looked.clone()),
     };
     let view = LeaderboardView {
         is_looked_at: refusal.is_some() || known.is_of(&leaderboard),
@@ -100,6 +100,9 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         ..observe(uses, &leaderboard, policy, &known, now)
     };
     let plan = decide(&view);
+    if let Some(found) = &view.measured {
+        isolation::remember(state, &leaderboard, found);
+    }
     show_limits(uses, &view, &known);
     serve(uses, &view, &plan, &known);
     let since = since.or_else(|| look(uses, &view, &known));
@@ -154,7 +157,9 @@ fn look(uses: Uses<'_>, view: &LeaderboardView, known: &Probe) -> Option<Instant
         return None;
     }
     let now = Instant::now();
-    uses.policies.state.begin_look(&key.uid, now);
+    uses.policies
+        .state
+        .change(&key.uid, |entry| entry.looked.since = Some(now));
     // An error means that the task is gone, which ends the process.
     let leaderboard = Arc::clone(leaderboard);
     let _ = uses.looks.send(Look { leaderboard, due });
@@ -188,9 +193,9 @@ fn observe(
         is_looked_at: true,
         invalid_pod: probe.invalid_pod(),
         pod_notes: probe.pod_notes(),
-        claims: probe.claims(),
-        unreachable: probe.unreachable(now),
-        place_notes: probe.place_notes(now),
+        claims: probe.claims.clone(),
+        unreachable: probe.reach.unreachable(now),
+        place_notes: probe.reach.notes(now),
         shared_queue: probe.shared_queue(),
         evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
@@ -232,6 +237,6 @@ async fn write_status(
         return Ok(RESYNC);
     }
     apply_status(client, leaderboard, &plan.status).await?;
-    state.wrote(&uid, now);
+    state.change(&uid, |entry| entry.written = Some(now));
     Ok(RESYNC)
 }

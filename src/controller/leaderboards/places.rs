@@ -49,10 +49,10 @@ pub(super) fn due(
 pub(super) async fn look(
     aws: &Aws,
     leaderboard: &Leaderboard,
-    mut reach: Reach,
+    reach: &mut Reach,
     due: Vec<(Place, String)>,
     now: Timestamp,
-) -> (Reach, Readings) {
+) -> Readings {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
     let places: Vec<Place> = named(leaderboard).iter().map(|(place, _)| *place).collect();
     reach.retain(&places);
@@ -77,7 +77,7 @@ pub(super) async fn look(
         }
         reach.take(place, &address, generation, found, now);
     }
-    (reach, readings)
+    readings
 }
 
 /// What a Leaderboard names, each with its address in words.

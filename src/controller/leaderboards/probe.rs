@@ -14,7 +14,7 @@ use super::claims::{self, Claims};
 use super::places::{self, Readings};
 use super::priority;
 use super::queue_readers;
-use super::reach::{Place, Reach, Unreachable};
+use super::reach::{Place, Reach};
 use super::shared_queue::SharedQueue;
 use super::tried_pods::{TriedPods, try_pods};
 use crate::controller::objects::key_of;
@@ -49,7 +49,7 @@ pub(super) struct Probe {
     /// Of which spec; of another one everything is due.
     generation: Option<i64>,
     token: Option<FoundToken>,
-    reach: Reach,
+    pub(super) reach: Reach,
     /// Whether somebody else reads its queue.
     queue: Option<SharedQueue>,
     /// Messages of the queue, visible and in flight, and of its dead-letter queue.
@@ -58,7 +58,7 @@ pub(super) struct Probe {
     pods: TriedPods,
     priority: priority::Problems,
     priority_at: Option<Timestamp>,
-    claims: Claims,
+    pub(super) claims: Claims,
     claims_at: Option<Timestamp>,
 }
 
@@ -70,10 +70,9 @@ struct FoundToken {
     token: Result<Arc<Token>, String>,
 }
 
-/// What a look has to ask.
+/// What a look has to ask; of an edited Leaderboard its Pods are tried too.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Due {
-    pods: bool,
     priority: bool,
     claims: bool,
     token: bool,
@@ -101,7 +100,6 @@ impl Probe {
         let has_token = token.is_some_and(|found| found.token.is_ok()) && !is_token_refused;
         let is_queue_due = self.queue.as_ref().is_some_and(|queue| queue.is_due(now));
         Due {
-            pods: is_edited,
             priority: is_edited || has_classes && due(self.priority_at, self.priority.refused.is_none(), now),
             claims: is_edited || has_claims && due(self.claims_at, self.claims == Claims::InPlace, now),
             token: leaderboard.spec.evalai.is_some() && due(token.map(|found| found.at), has_token, now),
@@ -113,7 +111,7 @@ impl Probe {
     pub(super) async fn look(mut self, uses: Uses<'_>, leaderboard: &Leaderboard, due: Due, now: Timestamp) -> Self {
         let (client, aws) = (uses.client, uses.aws);
         let is_edited = !self.is_of(leaderboard);
-        if due.pods {
+        if is_edited {
             self.pods = try_pods(client, uses.settings, leaderboard).await;
         }
         if due.priority {
@@ -135,13 +133,10 @@ impl Probe {
         if let Some(queue) = self.queue.as_mut().filter(|_| is_queue_due) {
             queue.asked(now);
         }
-        let reach = std::mem::take(&mut self.reach);
         // A bucket that hangs must not keep EvalAI waiting.
-        let places = places::look(aws, leaderboard, reach, due.places, now);
+        let places = places::look(aws, leaderboard, &mut self.reach, due.places, now);
         let token = find_token(client, aws, leaderboard, due.token.then_some(now));
-        let (found, read) = tokio::join!(places, token);
-        let readings;
-        (self.reach, readings) = found;
+        let (readings, read) = tokio::join!(places, token);
         self.token = read.or(self.token);
         self.note_messages(leaderboard, &readings);
         self.note_queue(uses, leaderboard, readings.queue, now).await;
@@ -237,18 +232,6 @@ impl Probe {
 
     pub(super) fn pod_notes(&self) -> Vec<String> {
         self.pods.notes.iter().chain(&self.priority.notes).cloned().collect()
-    }
-
-    pub(super) fn claims(&self) -> Claims {
-        self.claims.clone()
-    }
-
-    pub(super) fn place_notes(&self, now: Timestamp) -> Vec<String> {
-        self.reach.notes(now)
-    }
-
-    pub(super) fn unreachable(&self, now: Timestamp) -> Option<Unreachable> {
-        self.reach.unreachable(now)
     }
 
     /// When something has to be tried again.

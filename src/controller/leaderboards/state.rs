@@ -50,9 +50,6 @@ impl Applied {
     }
 }
 
-/// What was measured last, of which generation.
-pub(super) type Measured = (Option<i64>, WorkspaceVerdict);
-
 /// What the looks at a Leaderboard have found.
 #[derive(Clone, Default)]
 pub(super) struct Looked {
@@ -66,14 +63,15 @@ pub(super) struct Looked {
 pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 
 #[derive(Default)]
-struct Entry {
-    looked: Looked,
+pub(super) struct Entry {
+    pub(super) looked: Looked,
     /// When its status was written.
-    written: Option<Timestamp>,
-    applied: Option<Applied>,
-    measured: Option<Measured>,
+    pub(super) written: Option<Timestamp>,
+    pub(super) applied: Option<Applied>,
+    /// What was measured last, of which generation.
+    pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
     /// The Lease of the installation that drives it, where that is another one.
-    foreign: Option<Foreign>,
+    pub(super) foreign: Option<Foreign>,
 }
 
 impl LeaderboardState {
@@ -82,14 +80,12 @@ impl LeaderboardState {
         lock(&self.0).remove(uid);
     }
 
-    pub(super) fn looked(&self, uid: &str) -> Looked {
-        let entries = lock(&self.0);
-        entries.get(uid).map(|entry| entry.looked.clone()).unwrap_or_default()
+    pub(super) fn read<T>(&self, uid: &str, read: impl FnOnce(&Entry) -> T) -> T {
+        read(lock(&self.0).get(uid).unwrap_or(&Entry::default()))
     }
 
-    /// A look begins.
-    pub(super) fn begin_look(&self, uid: &str, now: Instant) {
-        self.change(uid, |entry| entry.looked.since = Some(now));
+    pub(super) fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
+        change(lock(&self.0).entry(uid.to_owned()).or_default());
     }
 
     /// A look has ended. False: the Leaderboard is gone.
@@ -101,18 +97,6 @@ impl LeaderboardState {
             .is_some()
     }
 
-    pub(super) fn wrote(&self, uid: &str, now: Timestamp) {
-        self.change(uid, |entry| entry.written = Some(now));
-    }
-
-    pub(super) fn applied(&self, uid: &str) -> Option<Applied> {
-        lock(&self.0).get(uid)?.applied.clone()
-    }
-
-    pub(super) fn note_applied(&self, uid: &str, applied: Applied) {
-        self.change(uid, |entry| entry.applied = Some(applied));
-    }
-
     /// The cache shows the policy as it should be.
     pub(super) fn note_seen(&self, uid: &str) {
         self.change(uid, |entry| {
@@ -122,30 +106,10 @@ impl LeaderboardState {
         });
     }
 
-    pub(super) fn measured(&self, uid: &str) -> Option<Measured> {
-        lock(&self.0).get(uid)?.measured.clone()
-    }
-
-    pub(super) fn note_measured(&self, uid: &str, found: Measured) {
-        self.change(uid, |entry| entry.measured = Some(found));
-    }
-
-    pub(super) fn foreign(&self, uid: &str) -> Option<Foreign> {
-        lock(&self.0).get(uid)?.foreign.clone()
-    }
-
-    pub(super) fn note_foreign(&self, uid: &str, found: Foreign) {
-        self.change(uid, |entry| entry.foreign = Some(found));
-    }
-
     /// Whether its status was not written for so long.
     pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
-        let written = lock(&self.0).get(uid).and_then(|entry| entry.written);
-        written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
-    }
-
-    fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
-        change(lock(&self.0).entry(uid.to_owned()).or_default());
+        self.read(uid, |entry| entry.written)
+            .is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
     }
 }
 
@@ -161,7 +125,7 @@ mod tests {
         let written = (0..60).filter(|second| {
             let may = state.is_older("u", at(*second), COUNTS_EVERY);
             if may {
-                state.wrote("u", at(*second));
+                state.change("u", |entry| entry.written = Some(at(*second)));
             }
             may
         });

@@ -1,4 +1,4 @@
-//! Whether a Leaderboard's Pods would be taken: a dry run of a Job of each track's kind, before anybody submits. Called by `probe`.
+//! Whether a Leaderboard's Pods would be taken, by our own rules and by a dry run of its first track's Job, before anybody submits. Called by `probe`.
 
 use std::collections::BTreeMap;
 

@@ -45,13 +45,13 @@ pub(super) async fn keep(
         let load = hub.load();
         telemetry.metrics.set_evalai_load(load.used, load.limit, load.waiting);
         let all = submissions.state();
-        for (state, count) in states(&all) {
-            telemetry.metrics.set_submissions(state, count);
-        }
         for count in standings.values_mut() {
             *count = 0;
         }
         standings.extend(count_standings(&all));
+        for (state, count) in states(&standings) {
+            telemetry.metrics.set_submissions(state, count);
+        }
         for (standing, count) in &standings {
             telemetry.metrics.set_standing(*standing, *count);
         }
@@ -180,17 +180,11 @@ fn count_standings(submissions: &[Arc<Submission>]) -> BTreeMap<Standing, usize>
     counts
 }
 
-fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {
-    let mut counts: BTreeMap<_, _> = STATES.iter().map(|state| (state.as_str(), 0)).collect();
-    for submission in submissions {
-        let state = submission
-            .status
-            .as_ref()
-            .and_then(|s| s.state)
-            .unwrap_or(State::Pending);
-        *counts.entry(state.as_str()).or_default() += 1;
-    }
-    counts
+fn states(standings: &BTreeMap<Standing, usize>) -> [(&'static str, usize); 6] {
+    STATES.map(State::as_str).map(|state| {
+        let of_state = standings.iter().filter(|(standing, _)| standing.state == state);
+        (state, of_state.map(|(_, count)| count).sum())
+    })
 }
 
 #[cfg(test)]
@@ -335,19 +329,19 @@ mod tests {
             object.status = Some(status);
             Arc::new(object)
         };
-        let found = states(&[
+        let all = [
             submission(None),
             submission(Some(State::Failed)),
             submission(Some(State::Failed)),
-        ]);
-        let expected = [
-            ("Cancelled", 0),
-            ("Failed", 2),
-            ("Finished", 0),
-            ("Pending", 1),
-            ("Resumed", 0),
-            ("Running", 0),
         ];
-        assert_eq!(found, expected.into());
+        let expected = [
+            ("Pending", 1),
+            ("Running", 0),
+            ("Resumed", 0),
+            ("Finished", 0),
+            ("Failed", 2),
+            ("Cancelled", 0),
+        ];
+        assert_eq!(states(&count_standings(&all)), expected);
     }
 }
