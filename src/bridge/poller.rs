@@ -359,7 +359,9 @@ impl Poller {
     async fn fresh<'a>(&self, readers: &'a Readers) -> Option<&'a Leaderboards> {
         let ask = || async {
             let read = Leaderboards::read(&self.shared.client, &self.shared.scope);
-            let read = tokio::time::timeout(PULSE_LIMIT, read).await.ok()?.ok()?;
+            let read = call_within(PULSE_LIMIT, "the Leaderboards", &self.url, read)
+                .await
+                .ok()?;
             Some(Leaderboards {
                 all: route::readers(&self.url, &read.all),
                 ..read

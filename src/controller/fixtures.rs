@@ -20,6 +20,7 @@ use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
 use crate::allowed::Allowed;
+use crate::controller::leaderboards::looks::Look;
 use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
@@ -67,6 +68,7 @@ pub struct Arrived {
     pub at: Instant,
     pub method: Method,
     pub path: String,
+    pub body: Value,
 }
 
 /// What is to be kept while a context is used.
@@ -78,6 +80,8 @@ pub struct Surroundings {
     pub woken: mpsc::UnboundedReceiver<String>,
     /// The Submissions that were woken with an answer of their own.
     pub answered: mpsc::UnboundedReceiver<String>,
+    /// The Leaderboards that are to be looked at.
+    pub wanted: mpsc::UnboundedReceiver<Look>,
     _stop: watch::Sender<bool>,
 }
 
@@ -105,6 +109,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let tasks = Tasks::new(stopped);
     let (answering, answered) = mpsc::unbounded_channel();
     let (waking, woken) = mpsc::unbounded_channel();
+    let (looks, wanted) = mpsc::unbounded_channel();
     let context = Context {
         settings: settings(),
         stores: stores(cluster),
@@ -118,6 +123,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),
+        looks,
         external: external(&aws, &tasks),
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
         metrics: Arc::default(),
@@ -132,6 +138,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         requests,
         woken,
         answered,
+        wanted,
         _stop: stop,
     }
 }
@@ -187,10 +194,10 @@ async fn serve(
     while let Some((request, answer)) = handle.next_request().await {
         let (method, path) = (request.method().clone(), request.uri().path().to_owned());
         let body = request.into_body().collect_bytes().await.unwrap();
-        let body = serde_json::from_slice(&body).unwrap_or_default();
-        let reply = reply(&method, &path, body, &known);
+        let body: Value = serde_json::from_slice(&body).unwrap_or_default();
+        let reply = reply(&method, &path, body.clone(), &known);
         let at = Instant::now();
-        let _ = arrived.send(Arrived { at, method, path });
+        let _ = arrived.send(Arrived { at, method, path, body });
         answer.send_response(Response::new(Body::from(reply.to_string().into_bytes())));
     }
 }

@@ -33,14 +33,11 @@ pub fn name(leaderboard: &Leaderboard) -> String {
 
 /// The policy for all Pods of a Leaderboard, owned by it.
 pub fn network_policy(leaderboard: &Leaderboard) -> NetworkPolicy {
-    let name = leaderboard.metadata.name.clone().unwrap_or_default();
+    let name = leaderboard.metadata.name.as_deref().unwrap_or_default();
     NetworkPolicy {
         metadata: child_of(leaderboard, self::name(leaderboard)),
         spec: Some(NetworkPolicySpec {
-            pod_selector: Some(LabelSelector {
-                match_labels: Some(BTreeMap::from([(names::LABEL_LEADERBOARD.into(), name)])),
-                match_expressions: None,
-            }),
+            pod_selector: Some(labelled((names::LABEL_LEADERBOARD, name))),
             policy_types: Some(vec!["Ingress".into(), "Egress".into()]),
             // Empty, not absent: an apply leaves a field alone that it does not name, and with it a rule that somebody added.
             ingress: Some(Vec::new()),
@@ -57,10 +54,8 @@ pub fn is_in_place(found: &NetworkPolicy, leaderboard: &Leaderboard) -> bool {
         labels.is_some_and(|labels| labels.get(key) == Some(value))
     });
     // One of an older Leaderboard of this name is going away with its owner.
-    let owners = found.metadata.owner_references.iter().flatten();
-    let is_owned = owners
-        .into_iter()
-        .any(|owner| Some(&owner.uid) == leaderboard.metadata.uid.as_ref());
+    let mut owners = found.metadata.owner_references.iter().flatten();
+    let is_owned = owners.any(|owner| Some(&owner.uid) == leaderboard.metadata.uid.as_ref());
     let is_going = found.metadata.deletion_timestamp.is_some();
     has_labels && is_owned && !is_going && found.spec.clone().map(plain) == wanted.spec.map(plain)
 }
@@ -76,10 +71,7 @@ fn plain(spec: NetworkPolicySpec) -> NetworkPolicySpec {
 
 fn egress(leaderboard: &Leaderboard) -> Vec<NetworkPolicyEgressRule> {
     let network = &leaderboard.spec.network;
-    let names = match network.dns {
-        Dns::Cluster => Some(dns(&network.dns_servers)),
-        Dns::Pinned | Dns::None => None,
-    };
+    let names = (network.dns == Dns::Cluster).then(|| dns(&network.dns_servers));
     names
         .into_iter()
         .chain(network.egress.iter().filter_map(rule))

@@ -7,7 +7,7 @@ use kube::core::Status;
 use leaderboard_api::client_errors;
 
 /// Time any one call may take.
-pub const CALL_TIMEOUT: Duration = Duration::from_secs(20);
+const CALL_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Why a call failed.
 #[derive(thiserror::Error, Debug)]

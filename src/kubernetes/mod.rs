@@ -21,7 +21,7 @@ use std::time::Duration;
 use kube::core::NamespaceResourceScope;
 use kube::{Api, Client};
 
-pub use call::{CALL_TIMEOUT, CallError, call, call_within};
+pub use call::{CallError, call, call_within};
 pub use feed::{WatchEvent, WatchEvents};
 pub use item::{Item, Malformed, Watchable};
 pub use namespaces::Namespaces;

@@ -405,17 +405,13 @@ async fn what_a_backup_brings_back_without_a_status_is_neither_run_nor_published
     restore::<Leaderboard>(world, boards).await;
     let is_evalais = |object: &Value| !object["spec"]["evalai"].is_null();
     restore::<Submission>(world, submissions.into_iter().filter(is_evalais).collect()).await;
-    shell(
-        world,
-        &format!("sed '/^    resourceVersion: /d' {file} | kubectl create --filename -"),
-    )
-    .await;
     let names = format!("{LOCAL_FINISHED} {LOCAL_RUNNING}");
-    shell(
-        world,
-        &format!("kubectl --namespace $NS annotate submissions {names} leaderboard.carla.org/adopt=true"),
-    )
-    .await;
+    for command in [
+        format!("sed '/^    resourceVersion: /d' {file} | kubectl create --filename -"),
+        format!("kubectl --namespace $NS annotate submissions {names} leaderboard.carla.org/adopt=true"),
+    ] {
+        shell(world, &command).await;
+    }
     let _controller = world.controller();
     ends_are_shown(&season).await;
     runs_are_resumed(&season).await;

@@ -122,54 +122,59 @@ async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
     .await;
 }
 
+/// A name, what of the Leaderboard is broken, the agent of its check, and what the check says.
+fn broken_parts(missing: &str) -> [(&'static str, Value, &'static str, &'static [&'static str]); 4] {
+    let root = json!([{"name": "LEADERBOARD_ROOT", "value": "/nothing"}]);
+    [
+        (
+            "image",
+            json!({"simulator": {"image": missing}}),
+            "agent:standard",
+            &[
+                "✘ Images         ImagePull: The image of simulator-1 cannot be pulled",
+                "→ Fix what this names, then run the check again.",
+            ],
+        ),
+        (
+            "bucket",
+            json!({"storage": {"bucket": "leaderboard-tests-none"}}),
+            "agent:standard",
+            &[
+                "✘ Bucket         ",
+                "– Leaderboard    not Ready: see Bucket",
+                "– Route          not reached",
+            ],
+        ),
+        (
+            "contents",
+            json!({"contents": {"env": root}}),
+            "agent:standard",
+            &[
+                "✘ Contents       ",
+                "✔ Node           leaderboard-local",
+                "– Agent          not reached",
+            ],
+        ),
+        (
+            "agent",
+            json!({}),
+            "agent:print-routes",
+            &[
+                "✘ Agent          AgentCrashed",
+                "✔ Simulator      started",
+                "→ Correct the image of the check, or name another one with --image.",
+            ],
+        ),
+    ]
+}
+
 /// What is broken, the part that the check marks, and the step that it names.
 #[tokio::test]
 async fn each_broken_part_is_marked_with_its_next_step() {
     scenario("check-broken", async |scene: &Scene| {
         let _controller = controller(scene);
         let missing = scene.lab.challenge("simulator:does-not-exist");
-        let root = json!([{"name": "LEADERBOARD_ROOT", "value": "/nothing"}]);
-        let cases: [(&str, Value, &str, &[&str]); 4] = [
-            (
-                "image",
-                json!({"simulator": {"image": missing}}),
-                "agent:standard",
-                &[
-                    "✘ Images         ImagePull: The image of simulator-1 cannot be pulled",
-                    "→ Fix what this names, then run the check again.",
-                ],
-            ),
-            (
-                "bucket",
-                json!({"storage": {"bucket": "leaderboard-tests-none"}}),
-                "agent:standard",
-                &[
-                    "✘ Bucket         ",
-                    "– Leaderboard    not Ready: see Bucket",
-                    "– Route          not reached",
-                ],
-            ),
-            (
-                "contents",
-                json!({"contents": {"env": root}}),
-                "agent:standard",
-                &[
-                    "✘ Contents       ",
-                    "✔ Node           leaderboard-local",
-                    "– Agent          not reached",
-                ],
-            ),
-            (
-                "agent",
-                json!({}),
-                "agent:print-routes",
-                &[
-                    "✘ Agent          AgentCrashed",
-                    "✔ Simulator      started",
-                    "→ Correct the image of the check, or name another one with --image.",
-                ],
-            ),
-        ];
+        let cases = broken_parts(&missing);
         let runs = cases.into_iter().map(async |(name, change, agent, expected)| {
             scene.leaderboard(name, change).await;
             let (code, text) = check(scene, name, agent).await;

@@ -1,16 +1,17 @@
 //! Single ends that need their own arrangement.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 use leaderboard_api::LeaderboardVersion;
+use leaderboard_operator::pod::places::Pace;
 use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 use nix::sys::signal::Signal;
 
 use super::kubelet::{Kubelet, Name, members};
 use super::results::{report, results};
-use super::submission::Submission;
-use crate::ministack::server;
+use super::submission::{FASTER, Submission};
+use crate::ministack::{Proxy, server};
 
 const LIMIT: Duration = Duration::from_mins(1);
 
@@ -20,7 +21,8 @@ const LIMIT: Duration = Duration::from_mins(1);
 async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything_is_final() {
     let mut random = Rng::new();
     let bucket = server().await.bucket().await;
-    let mut submission = Submission::new(&bucket, LeaderboardVersion::V2, &mut random).await;
+    let proxy = server().await.proxy().await;
+    let mut submission = Submission::on(&proxy.endpoint(), &bucket, LeaderboardVersion::V2, &mut random).await;
     // The fifth route of a server is its pair's last; the next server has one route left.
     submission.simulator_knobs = "crash@5".to_owned();
     submission.route_ms = 200;
@@ -29,11 +31,13 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
     kubelet.make_pod();
     let in_time = tokio::time::timeout(LIMIT, all_crash(&mut kubelet)).await;
     assert!(in_time.is_ok(), "they do not all crash\n{}", kubelet.story());
-    // A route in which the simulation crashed is not done. As long as it waits for results that are complete, and as much again.
+    // A route in which the simulation crashed is not done.
     let agent = "agent/agent1/agent_results.json";
     let in_time = tokio::time::timeout(LIMIT, until_reported(&submission, 16)).await;
     assert!(in_time.is_ok(), "no report of it\n{}", kubelet.story());
-    tokio::time::sleep(Duration::from_secs(3)).await;
+    let settled = Instant::now() + 2 * Pace::default().faster(FASTER).settle;
+    let in_time = tokio::time::timeout(LIMIT, rounds_past(&proxy, settled)).await;
+    assert!(in_time.is_ok(), "logcopy makes no more rounds\n{}", kubelet.story());
     let waiting = report(&submission.archive).await.unwrap();
     assert!(!waiting.is_final && !kubelet.has(StatusFile::Stored), "{waiting:?}");
     assert!(
@@ -94,6 +98,15 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
         let (name, status) = kubelet.ended().await;
         assert_eq!(status.code(), Some(1), "{name}: both sides count the crash");
         kubelet.handle(name, status);
+    }
+}
+
+/// Awaits logcopy's rounds, each of which asks the bucket whose the prefix is, until one has come so late that complete results would
+/// have been final in it.
+async fn rounds_past(proxy: &Proxy, settled: Instant) {
+    while Instant::now() < settled {
+        let known = proxy.requests();
+        until(|| proxy.requests() > known).await;
     }
 }
 

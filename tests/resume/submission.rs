@@ -18,7 +18,7 @@ use crate::ministack::{self, server};
 pub const PAIRS: u16 = 4;
 pub const ROUTES_OF_PAIR: u16 = 5;
 /// logcopy looks every 50 ms and gives up waiting after a twentieth of its times.
-const FASTER: u32 = 20;
+pub const FASTER: u32 = 20;
 /// Below what the kernel gives away by itself, so that a simulator that comes back finds its port free.
 const PORTS: std::ops::Range<u16> = 12_000..28_000;
 

@@ -232,6 +232,7 @@ fn a_pod_refuses_with_a_reason() {
 #[test]
 fn a_pod_refuses_files_of_the_wrong_shape() {
     let plan = pod(V2, 1, &[(0, 2)]);
+    let no_pair = "is not a pair of whole numbers";
     for (place, value, words) in [
         (
             "/sensors",
@@ -248,26 +249,10 @@ fn a_pod_refuses_files_of_the_wrong_shape() {
             json!([3, 4]),
             "is for 4 route runs, but this pair has 3",
         ),
-        (
-            "/_checkpoint/progress",
-            json!([3, 3.0]),
-            "is not a pair of whole numbers",
-        ),
-        (
-            "/_checkpoint/progress",
-            json!([3, -3]),
-            "is not a pair of whole numbers",
-        ),
-        (
-            "/_checkpoint/progress",
-            json!(["3", 3]),
-            "is not a pair of whole numbers",
-        ),
-        (
-            "/_checkpoint/progress",
-            json!([3, 3, 3]),
-            "is not a pair of whole numbers",
-        ),
+        ("/_checkpoint/progress", json!([3, 3.0]), no_pair),
+        ("/_checkpoint/progress", json!([3, -3]), no_pair),
+        ("/_checkpoint/progress", json!(["3", 3]), no_pair),
+        ("/_checkpoint/progress", json!([3, 3, 3]), no_pair),
         (
             "/_checkpoint/records",
             json!({}),

@@ -9,9 +9,9 @@ use kube::ResourceExt;
 use super::check;
 use super::claims::Claims;
 use super::isolation;
-use super::probe::EvalaiStanding;
 use super::reach::Unreachable;
 use super::refusal::Refusal;
+use super::standing::EvalaiStanding;
 use super::state::Policy;
 use crate::controller::submissions::decide::previous_controller;
 use crate::pod::workspace::WorkspaceVerdict;
@@ -25,6 +25,7 @@ use leaderboard_api::{
 
 const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
                                  Update the cluster, or choose another gpu.mode.";
+const FIRST_LOOK: &str = "The bucket and whatever else the Leaderboard names are being asked for the first time, and not all have answered yet.";
 /// What the host of a Leaderboard that only observes is to know.
 const OBSERVES: &str = "evalai.mode is Observe: nothing is written to EvalAI; the condition Compared of each submission shows whether \
                         the ends agree.";
@@ -53,6 +54,8 @@ pub struct LeaderboardView {
     pub measured: Option<WorkspaceVerdict>,
     /// What it names and may not; nothing of it is asked or read then.
     pub refusal: Option<Refusal>,
+    /// Whether all that follows was looked at as the present spec has it. Until then it is no ground for anything.
+    pub is_looked_at: bool,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
     /// What its host should know of its Pods all the same.
@@ -85,38 +88,33 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let leaderboard = &view.leaderboard;
     let mut status = leaderboard.status.clone().unwrap_or_default();
     let generation = leaderboard.metadata.generation;
-    status.observed_generation = generation;
+    if view.is_looked_at {
+        status.observed_generation = generation;
+    }
     status.counts = Some(view.counts);
     status.infrastructure_failures.clone_from(&view.teams);
     status.gpu_use.clone_from(&view.gpu_use);
-    status.evalai = view.usage.map(evalai_use);
+    status.evalai = view.usage.filter(|_| view.refusal.is_none()).map(evalai_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
+    let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, &str, String)| {
+        conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
+    };
+    if let Some(ready) = ready(view) {
+        set(&mut status, conditions::READY, with_notes(view, ready));
+    }
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
-    let ready = with_notes(view, ready(view));
-    let fault = Some(ready.1).filter(|_| ready.0 != Truth::True);
+    set(&mut status, conditions::ISOLATED, isolated);
+    let fault = conditions::get(&status.conditions, conditions::READY).filter(|ready| ready.status != "True");
+    let fault = fault.map(|ready| ready.reason.as_str());
     status.last_check = check::last(status.last_check.take(), view.check.as_ref(), fault, generation);
     let checked = check::condition(leaderboard, status.last_check.as_ref());
-    for (type_, (truth, reason, message)) in [
-        (conditions::READY, ready),
-        (conditions::ISOLATED, isolated),
-        (conditions::CHECKED, checked),
-    ] {
-        conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
-    }
+    set(&mut status, conditions::CHECKED, checked);
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
     let is_in_use = view.in_use > 0 || view.pods > 0;
     if deleting && is_in_use {
-        let message = in_use(view);
-        conditions::set(
-            &mut status.conditions,
-            conditions::TERMINATING,
-            Truth::True,
-            reasons::IN_USE,
-            &message,
-            generation,
-            &now,
-        );
+        let in_use = (Truth::True, reasons::IN_USE, in_use(view));
+        set(&mut status, conditions::TERMINATING, in_use);
     }
     let held = leaderboard
         .finalizers()
@@ -154,13 +152,23 @@ fn in_use(view: &LeaderboardView) -> String {
     }
 }
 
-/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong.
-fn ready(view: &LeaderboardView) -> (Truth, &'static str, String) {
+/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong. None: what was said of an earlier
+/// spec, or by the controller before, stays until the first look has ended.
+fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
+    if let Some(wrong) = of_spec(view) {
+        return Some(wrong);
+    }
+    if view.is_looked_at {
+        return Some(found(view));
+    }
+    let is_new = view.leaderboard.condition(conditions::READY).is_none();
+    is_new.then(|| (Truth::Unknown, reasons::CHECKING, FIRST_LOOK.to_owned()))
+}
+
+/// What the looks at its queue, its places and EvalAI say.
+fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
     let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
     let (evalai_truth, reason, message) = evalai(&view.evalai);
-    if let Some(wrong) = of_spec(view) {
-        return wrong;
-    }
     // Before all that the sweep goes on with: the sweep reads it here.
     if let Some(message) = &view.shared_queue {
         return (Truth::False, reasons::QUEUE_SHARED, message.clone());

@@ -54,6 +54,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         policy: Policy::InPlace,
         measured: None,
         refusal: None,
+        is_looked_at: true,
         invalid_pod: None,
         pod_notes: Vec::new(),
         claims: Claims::NotRequired,
@@ -371,4 +372,42 @@ fn what_it_may_not_name_comes_before_what_else_is_wrong() {
     });
     seen.invalid_pod = Some("no Pod".into());
     assert_eq!(reason(&decide(&seen)), ("False".into(), reasons::NOT_ALLOWED.into()));
+}
+
+#[test]
+fn before_the_first_look_only_what_is_surely_wrong_is_said() {
+    let mut one = leaderboard("one", 1, 7, "https://e", "a/").as_ref().clone();
+    one.metadata.generation = Some(2);
+    let unseen = |one: &Leaderboard| LeaderboardView {
+        is_looked_at: false,
+        evalai: EvalaiStanding::Unchecked(None),
+        ..view(&Arc::new(one.clone()), &[])
+    };
+    let plan = decide(&unseen(&one));
+    assert_eq!(reason(&plan), ("Unknown".into(), reasons::CHECKING.into()));
+    assert_eq!(plan.status.observed_generation, None);
+
+    let conditions = &mut one.status.get_or_insert_default().conditions;
+    let now = Time(Timestamp::UNIX_EPOCH);
+    conditions::set(
+        conditions,
+        conditions::READY,
+        Truth::True,
+        reasons::READY,
+        "As before.",
+        Some(1),
+        &now,
+    );
+    let before = conditions::get(conditions, conditions::READY).cloned();
+    let mut seen = unseen(&one);
+    seen.shared_queue = Some("Not looked at either.".into());
+    let plan = decide(&seen);
+    assert_eq!(
+        conditions::get(&plan.status.conditions, conditions::READY).cloned(),
+        before
+    );
+    seen.policy = Policy::NotApplied("No.".into());
+    assert_eq!(reason(&decide(&seen)), ("False".into(), reasons::NOT_ISOLATED.into()));
+    seen.is_looked_at = true;
+    assert_eq!(decide(&seen).status.observed_generation, Some(2));
 }

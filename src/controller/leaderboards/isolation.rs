@@ -13,7 +13,7 @@ use kube::api::{Patch, PatchParams};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client, ResourceExt};
 
-use super::state::{Applied, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
+use super::state::{Applied, Entry, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
 use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::objects::{Wake, key_of, uid_of};
 use crate::controller::slots::SlotAllocator;
@@ -41,8 +41,9 @@ pub struct Policies<'a> {
 impl Policies<'_> {
     /// Whether Jobs may be made: the watch shows the policy of the present spec, and the last apply did not fail.
     pub fn is_in_place(&self, leaderboard: &Leaderboard) -> bool {
-        let last = self.state.applied(&uid_of(leaderboard));
-        self.stores.shows_policy(leaderboard) && !last.is_some_and(|last| last.has_failed())
+        let uid = uid_of(leaderboard);
+        let has_failed = |entry: &Entry| entry.applied.as_ref().is_some_and(Applied::has_failed);
+        self.stores.shows_policy(leaderboard) && !self.state.read(&uid, has_failed)
     }
 }
 
@@ -70,7 +71,7 @@ pub(super) async fn keep(policies: Policies<'_>, leaderboard: &Leaderboard, now:
     if is_shown {
         policies.state.note_seen(&uid);
     }
-    let last = policies.state.applied(&uid);
+    let last = policies.state.read(&uid, |entry| entry.applied.clone());
     if let Some(last) = last.as_ref().filter(|last| last.generation == generation)
         && now.duration_since(last.at).unsigned_abs() < again(&last.policy, is_shown)
     {
@@ -90,7 +91,7 @@ pub(super) async fn keep(policies: Policies<'_>, leaderboard: &Leaderboard, now:
         unseen,
     };
     log(leaderboard, last.as_ref(), &applied);
-    policies.state.note_applied(&uid, applied);
+    policies.state.change(&uid, |entry| entry.applied = Some(applied));
     if policy == Policy::InPlace && last.is_some_and(|last| last.has_failed()) {
         // An apply that changes nothing is no event.
         let reference = ObjectRef::from_obj(leaderboard);
@@ -213,14 +214,18 @@ pub(super) fn measured(
     }
     let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation);
     let remembered = || {
-        let (of, verdict) = state.measured(&uid)?;
+        let (of, verdict) = state.read(&uid, |entry| entry.measured.clone())?;
         (of == generation).then_some(verdict)
     };
-    let found = by_pods(stores, leaderboard)
+    by_pods(stores, leaderboard)
         .or_else(|| known(leaderboard))
-        .or_else(remembered)?;
-    state.note_measured(&uid, (generation, found.clone()));
-    Some(found)
+        .or_else(remembered)
+}
+
+/// Notes what was measured, for the time when no Pod and no condition shows it.
+pub(super) fn remember(state: &LeaderboardState, leaderboard: &Leaderboard, found: &WorkspaceVerdict) {
+    let found = (leaderboard.metadata.generation, found.clone());
+    state.change(&uid_of(leaderboard), |entry| entry.measured = Some(found));
 }
 
 /// What the Pod that ended its `workspace` last has found, of those that this generation's Jobs made.

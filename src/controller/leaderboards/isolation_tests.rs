@@ -98,7 +98,11 @@ fn only_what_was_measured_is_called_enforced() {
 async fn what_a_pod_found_outlives_it_until_the_spec_changes() {
     let around = surroundings(Cluster::default(), "http://127.0.0.1:1").await;
     let said = |leaderboard: &Leaderboard| {
-        let found = measured(&around.context.stores, &around.context.leaderboards, leaderboard);
+        let (stores, state) = (&around.context.stores, &around.context.leaderboards);
+        let found = measured(stores, state, leaderboard);
+        if let Some(found) = &found {
+            remember(state, leaderboard, found);
+        }
         condition(leaderboard, &Policy::InPlace, found.as_ref())
     };
     for (reason, of) in [
@@ -212,7 +216,7 @@ fn note(state: &LeaderboardState, board: &Leaderboard, policy: Policy, at: Times
         policy,
         unseen: None,
     };
-    state.note_applied(&uid_of(board), applied);
+    state.change(&uid_of(board), |entry| entry.applied = Some(applied));
 }
 
 #[tokio::test]

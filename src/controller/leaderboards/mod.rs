@@ -1,14 +1,15 @@
 //! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
-//! Does nothing for a Leaderboard that another installation drives. Applies the policy before it waits for anything else, since no
-//! Job is made without it. Reads the token (every five minutes, or when EvalAI refuses it), checks whether bucket, table and queues
-//! answer, and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
+//! Does nothing for a Leaderboard that another installation drives. Applies the policy before all else, since no Job is made without
+//! it. What its token is, and whether bucket, table and queues answer, is found by `looks`, in a task of its own that wakes this
+//! reconcile; it waits for the API server alone, and gives the way to EvalAI to `external`. `decide`, `probe::due` and `reach` are pure.
 
 mod check;
 pub mod claims;
 pub mod decide;
 mod foreign;
 pub mod isolation;
+pub mod looks;
 pub mod operator;
 mod places;
 mod pod_notes;
@@ -18,13 +19,17 @@ mod queue_readers;
 mod reach;
 mod refusal;
 pub mod shared_queue;
+pub mod standing;
 pub mod state;
+mod tried_pods;
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::Client;
+use tokio::sync::mpsc::UnboundedSender;
+use tokio::time::Instant;
 
 use super::objects::{key_of, uid_of};
 use super::settings::Settings;
@@ -35,13 +40,15 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::{team_history, team_use};
 use crate::kubernetes::CallError;
 use crate::observability::metrics::{LimitsState, Metrics};
-use crate::services::aws::Aws;
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
 use leaderboard_api::{Leaderboard, Submission, names};
+use looks::Look;
 use probe::Probe;
-use refusal::Refusal;
-use state::{COUNTS_EVERY, LeaderboardState, Policy, RESYNC, SOONEST};
+use state::{COUNTS_EVERY, LeaderboardState, Looked, Policy, RESYNC, SOONEST};
+
+/// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
+const FIRST_LOOK: Duration = Duration::from_secs(2);
 
 /// What a reconcile of a Leaderboard uses.
 #[derive(Clone, Copy)]
@@ -50,7 +57,7 @@ pub struct Uses<'a> {
     pub settings: &'a Settings,
     pub slots: &'a SlotAllocator,
     pub external: &'a ExternalSystems,
-    pub aws: &'a Aws,
+    pub looks: &'a UnboundedSender<Look>,
     pub metrics: &'a Metrics,
 }
 
@@ -76,34 +83,46 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
-    let uid = uid_of(leaderboard.as_ref());
-    let now = Timestamp::now();
+    let (uid, now) = (uid_of(leaderboard.as_ref()), Timestamp::now());
     let Policies {
         client, stores, state, ..
     } = uses.policies;
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
     let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
-    let probe = probed(uses, &leaderboard, refusal.as_ref(), now).await;
-    state.keep(&uid, probe.clone());
-    let view = LeaderboardView {
-        refusal,
-        ..observe(uses, &leaderboard, policy, &probe, now)
+    let Looked { known, since } = match refusal {
+        Some(_) => Looked::default(),
+        None => state.read(&uid, |entry| entry.looked.clone()),
     };
-    show_limits(uses, &view, &probe);
+    let view = LeaderboardView {
+        is_looked_at: refusal.is_some() || known.is_of(&leaderboard),
+        refusal,
+        ..observe(uses, &leaderboard, policy, &known, now)
+    };
     let plan = decide(&view);
+    if let Some(found) = &view.measured {
+        isolation::remember(state, &leaderboard, found);
+    }
+    show_limits(uses, &view, &known);
+    serve(uses, &view, &plan, &known);
+    let since = since.or_else(|| look(uses, &view, &known));
     if let Some(wanted) = plan.finalizer {
         set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
     }
     if plan.finalizer == Some(false) {
-        uses.external.retire(&leaderboard);
         return Ok(RESYNC);
     }
-    let again = write_status(client, state, &leaderboard, &plan, now).await?;
-    let probed = probe.next(now).map(|at| at.duration_since(now).unsigned_abs());
+    let left = since.filter(|_| !view.is_looked_at);
+    let left = left.map(|since| FIRST_LOOK.saturating_sub(since.elapsed()));
+    let again = match left.filter(|left| !left.is_zero()) {
+        Some(left) => left,
+        None => write_status(client, state, &leaderboard, &plan, now).await?,
+    };
+    // The end of a look wakes it.
+    let due = known.next(&leaderboard, now).filter(|_| since.is_none());
+    let due = due.map_or(RESYNC, |at| at.duration_since(now).unsigned_abs());
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
-    let next = probed.map_or(policy, |probed| probed.min(policy));
-    Ok(next.max(SOONEST).min(again))
+    Ok(policy.min(due).max(SOONEST).min(again))
 }
 
 /// Shows what it has left, in metrics.
@@ -118,18 +137,33 @@ fn show_limits(uses: Uses<'_>, view: &LeaderboardView, probe: &Probe) {
     uses.metrics.set_limits(&name, state);
 }
 
-/// What was tried of it. Where it names what it may not, nothing is asked, and EvalAI is no longer spoken to.
-async fn probed(uses: Uses<'_>, leaderboard: &Arc<Leaderboard>, refusal: Option<&Refusal>, now: Timestamp) -> Probe {
-    if refusal.is_some() {
+/// Hands the way to EvalAI to `external`. Of a Leaderboard that goes, or names what it may not, nothing more is sent there.
+fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, known: &Probe) {
+    let leaderboard = &view.leaderboard;
+    if view.refusal.is_some() || plan.finalizer == Some(false) {
         uses.external.retire(leaderboard);
-        return Probe::default();
+    } else if let Some(target) = known.target(leaderboard) {
+        uses.external.serve(leaderboard, target);
     }
-    let known = uses.policies.state.probe(&uid_of(leaderboard.as_ref()));
-    let probe = known.refresh(uses, leaderboard, now).await;
-    if let Some(target) = probe.target() {
-        uses.external.set_target(leaderboard, target);
+}
+
+/// Begins a look if something is due; returns when it began. Where a Leaderboard names what it may not, nothing is asked.
+fn look(uses: Uses<'_>, view: &LeaderboardView, known: &Probe) -> Option<Instant> {
+    let leaderboard = &view.leaderboard;
+    let key = key_of(leaderboard.as_ref());
+    let is_token_refused = uses.external.hub.token_refused(&key).is_some();
+    let due = known.due(leaderboard, is_token_refused, view.now);
+    if view.refusal.is_some() || due.is_nothing() {
+        return None;
     }
-    probe
+    let now = Instant::now();
+    uses.policies
+        .state
+        .change(&key.uid, |entry| entry.looked.since = Some(now));
+    // An error means that the task is gone, which ends the process.
+    let leaderboard = Arc::clone(leaderboard);
+    let _ = uses.looks.send(Look { leaderboard, due });
+    Some(now)
 }
 
 fn observe(
@@ -156,13 +190,14 @@ fn observe(
         policy,
         measured: isolation::measured(stores, uses.policies.state, leaderboard),
         refusal: None,
+        is_looked_at: true,
         invalid_pod: probe.invalid_pod(),
         pod_notes: probe.pod_notes(),
-        claims: probe.claims(),
-        unreachable: probe.unreachable(now),
-        place_notes: probe.place_notes(now),
+        claims: probe.claims.clone(),
+        unreachable: probe.reach.unreachable(now),
+        place_notes: probe.reach.notes(now),
         shared_queue: probe.shared_queue(),
-        evalai: probe.evalai_standing(hub, leaderboard, &key, now),
+        evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),
     }
@@ -202,6 +237,6 @@ async fn write_status(
         return Ok(RESYNC);
     }
     apply_status(client, leaderboard, &plan.status).await?;
-    state.wrote(&uid, now);
+    state.change(&uid, |entry| entry.written = Some(now));
     Ok(RESYNC)
 }

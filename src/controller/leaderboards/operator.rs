@@ -93,7 +93,7 @@ async fn is_driven(client: &Client, state: &LeaderboardState, leaderboard: &Lead
     let uid = uid_of(leaderboard);
     let (namespace, name) = other.split_once('/').unwrap_or_default();
     let api: Api<Lease> = Api::namespaced(client.clone(), namespace);
-    let known = state.foreign(&uid);
+    let known = state.read(&uid, |entry| entry.foreign.clone());
     let is_new = known.as_ref().is_none_or(|known| known.operator != other);
     let lease = match call("the Lease", other, api.get_opt(name)).await {
         Ok(Some(lease)) => lease,
@@ -107,7 +107,7 @@ async fn is_driven(client: &Client, state: &LeaderboardState, leaderboard: &Lead
     let now = Instant::now();
     let found = Foreign::of(other, &lease, now).after(known.as_ref());
     let is_given_up = found.is_given_up(now);
-    state.note_foreign(&uid, found);
+    state.change(&uid, |entry| entry.foreign = Some(found));
     if is_new {
         let leaderboard = key_of(leaderboard).to_string();
         tracing::warn!(

@@ -30,23 +30,33 @@ pub(super) struct Readings {
     pub(super) dead_letters: Option<Reading>,
 }
 
-/// Asks what is due; the queue also if it is in question.
+/// What has to be asked now, each with its address in words; the queue also if it is in question.
+pub(super) fn due(
+    leaderboard: &Leaderboard,
+    reach: &Reach,
+    is_queue_due: bool,
+    now: Timestamp,
+) -> Vec<(Place, String)> {
+    let generation = leaderboard.metadata.generation.unwrap_or_default();
+    let is_due = |(place, address): &(Place, String)| {
+        let is_in_question = *place == Place::Queue && is_queue_due;
+        is_in_question || reach.is_due(*place, address, generation, now)
+    };
+    named(leaderboard).into_iter().filter(is_due).collect()
+}
+
+/// Asks what is due.
 pub(super) async fn look(
     aws: &Aws,
     leaderboard: &Leaderboard,
-    mut reach: Reach,
-    is_queue_due: bool,
+    reach: &mut Reach,
+    due: Vec<(Place, String)>,
     now: Timestamp,
-) -> (Reach, Readings) {
+) -> Readings {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
-    let named = named(leaderboard);
-    let places: Vec<Place> = named.iter().map(|(place, _)| *place).collect();
+    let places: Vec<Place> = named(leaderboard).iter().map(|(place, _)| *place).collect();
     reach.retain(&places);
-    let due = named.into_iter().filter(|(place, address)| {
-        let is_in_question = *place == Place::Queue && is_queue_due;
-        is_in_question || reach.is_due(*place, address, generation, now)
-    });
-    let asked = due.map(|(place, address)| {
+    let asked = due.into_iter().map(|(place, address)| {
         let question = ask(aws, leaderboard, place);
         async move {
             let answer = tokio::time::timeout(LIMIT, question).await;
@@ -67,7 +77,7 @@ pub(super) async fn look(
         }
         reach.take(place, &address, generation, found, now);
     }
-    (reach, readings)
+    readings
 }
 
 /// What a Leaderboard names, each with its address in words.

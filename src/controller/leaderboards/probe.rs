@@ -1,112 +1,146 @@
-//! What is tried for a Leaderboard from time to time: its token, its places in AWS, its Pod.
+//! What is known of a Leaderboard's token, its places in AWS and its Pods, when each of them has to be looked at, and the look itself.
+//!
+//! `looks` calls the look; a reconcile asks only what is known and what is due.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::core::v1::Secret;
-use kube::api::{ApiResource, DynamicObject, PostParams};
 use kube::{Api, Client, ResourceExt};
 use leaderboard_results::metrics;
 
-use super::Uses;
 use super::claims::{self, Claims};
 use super::places::{self, Readings};
-use super::pod_notes::{TrackPods, notes};
-use super::priority::{self, Asked};
+use super::priority;
 use super::queue_readers;
-use super::reach::{Reach, Unreachable, capitalized};
+use super::reach::{Place, Reach};
 use super::shared_queue::SharedQueue;
+use super::tried_pods::{TriedPods, try_pods};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
-use crate::controller::submissions::job_spec::{self, JobInput};
-use crate::controller::submissions::pod_overlay;
+use crate::controller::stores::Stores;
 use crate::kubernetes::call;
 use crate::observability::metrics::LimitsState;
 use crate::pod::run::results_format;
-use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Hub, InboxTrouble, Labels, Target};
+use crate::services::evalai::Target;
 use crate::services::queue::Reading;
 use crate::services::token::{Token, TokenSource};
-use leaderboard_api::{Evalai, EvalaiMode, JobNumber, Leaderboard, Submission, Token as TokenPlace, Track, effective};
+use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
 /// A failed look is repeated sooner.
 const SOON: SignedDuration = SignedDuration::from_secs(15);
 
+/// What a look uses.
+#[derive(Clone, Copy)]
+pub struct Uses<'a> {
+    pub client: &'a Client,
+    pub aws: &'a Aws,
+    pub stores: &'a Stores,
+    pub settings: &'a Settings,
+}
+
 /// What was last found.
 #[derive(Clone, Default)]
 pub(super) struct Probe {
-    token: Option<Result<Arc<Token>, String>>,
-    token_at: Option<Timestamp>,
-    reach: Reach,
+    /// Of which spec; of another one everything is due.
+    generation: Option<i64>,
+    token: Option<FoundToken>,
+    pub(super) reach: Reach,
     /// Whether somebody else reads its queue.
     queue: Option<SharedQueue>,
     /// Messages of the queue, visible and in flight, and of its dead-letter queue.
     messages: Option<(u64, u64)>,
     dead_letters: Option<u64>,
-    /// The way to EvalAI that follows.
-    target: Option<Arc<Target>>,
-    /// Generation whose Pods were tried, and what was found.
-    pod: Option<(i64, TriedPods)>,
+    pods: TriedPods,
     priority: priority::Problems,
     priority_at: Option<Timestamp>,
-    /// Generation whose claims were looked after, when, and how they stand.
-    claims: Option<(i64, Timestamp, Claims)>,
+    pub(super) claims: Claims,
+    claims_at: Option<Timestamp>,
 }
 
-/// What was found of a Leaderboard's Pods.
-#[derive(Clone, Default)]
-struct TriedPods {
-    /// Why they would be refused.
-    refused: Option<String>,
-    /// What their host should know all the same.
-    notes: Vec<String>,
-    /// Their PriorityClasses.
-    classes: BTreeMap<String, Asked>,
+/// What a place had when it was last looked at.
+#[derive(Clone)]
+struct FoundToken {
+    place: TokenPlace,
+    at: Timestamp,
+    token: Result<Arc<Token>, String>,
 }
 
-/// How a Leaderboard stands with EvalAI.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum EvalaiStanding {
-    NotRequired,
-    NoToken(String),
-    TokenRefused(String),
-    /// Its queue in EvalAI is not read.
-    QueueUnread(InboxTrouble),
-    /// Its phases or labels do not fit the challenge.
-    Misfit(String),
-    /// Not checked yet, or EvalAI does not answer.
-    Unchecked(Option<String>),
-    Fits {
-        /// Something to be said although it works, such as a token that ends soon.
-        note: Option<String>,
-    },
+/// What a look has to ask; of an edited Leaderboard its Pods are tried too.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Due {
+    priority: bool,
+    claims: bool,
+    token: bool,
+    places: Vec<(Place, String)>,
+}
+
+impl Due {
+    pub(super) fn is_nothing(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 impl Probe {
-    /// Tries what is due.
-    pub(super) async fn refresh(mut self, uses: Uses<'_>, leaderboard: &Leaderboard, now: Timestamp) -> Self {
-        let client = uses.policies.client;
-        let generation = leaderboard.metadata.generation.unwrap_or_default();
-        if self.pod.as_ref().is_none_or(|(tried, _)| *tried != generation) {
-            let tried = try_pods(client, uses.settings, leaderboard).await;
-            self.pod = Some((generation, tried));
-            self.priority_at = None;
-        }
-        self.refresh_priority(client, now).await;
-        self.refresh_claims(client, leaderboard, generation, now).await;
-        let reach = std::mem::take(&mut self.reach);
-        // A bucket that hangs must not keep EvalAI waiting.
+    /// Whether all of the Leaderboard as it is was looked at.
+    pub(super) fn is_of(&self, leaderboard: &Leaderboard) -> bool {
+        self.generation == Some(generation_of(leaderboard))
+    }
+
+    /// What has to be looked at now.
+    pub(super) fn due(&self, leaderboard: &Leaderboard, is_token_refused: bool, now: Timestamp) -> Due {
+        let is_edited = !self.is_of(leaderboard);
+        let has_classes = !self.pods.classes.is_empty();
+        let has_claims = self.claims != Claims::NotRequired;
+        let token = self.token_of(leaderboard);
+        let has_token = token.is_some_and(|found| found.token.is_ok()) && !is_token_refused;
         let is_queue_due = self.queue.as_ref().is_some_and(|queue| queue.is_due(now));
-        let places = places::look(uses.aws, leaderboard, reach, is_queue_due, now);
-        let readings;
-        ((self.reach, readings), ()) = tokio::join!(places, self.refresh_token(uses, leaderboard, now));
+        Due {
+            priority: is_edited || has_classes && due(self.priority_at, self.priority.refused.is_none(), now),
+            claims: is_edited || has_claims && due(self.claims_at, self.claims == Claims::InPlace, now),
+            token: leaderboard.spec.evalai.is_some() && due(token.map(|found| found.at), has_token, now),
+            places: places::due(leaderboard, &self.reach, is_queue_due, now),
+        }
+    }
+
+    /// Looks at what is due.
+    pub(super) async fn look(mut self, uses: Uses<'_>, leaderboard: &Leaderboard, due: Due, now: Timestamp) -> Self {
+        let (client, aws) = (uses.client, uses.aws);
+        let is_edited = !self.is_of(leaderboard);
+        if is_edited {
+            self.pods = try_pods(client, uses.settings, leaderboard).await;
+        }
+        if due.priority {
+            self.priority = priority::look(client, &self.pods.classes).await;
+            self.priority_at = Some(now);
+        }
+        if due.claims {
+            self.claims = claims::keep(client, leaderboard).await;
+            self.claims_at = Some(now);
+            // Right after an edit a Job of the spec before may be on its way.
+            if !is_edited
+                && self.claims == Claims::InPlace
+                && let Err(error) = claims::remove_others(client, leaderboard).await
+            {
+                tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
+            }
+        }
+        let is_queue_due = due.places.iter().any(|(place, _)| *place == Place::Queue);
+        if let Some(queue) = self.queue.as_mut().filter(|_| is_queue_due) {
+            queue.asked(now);
+        }
+        // A bucket that hangs must not keep EvalAI waiting.
+        let places = places::look(aws, leaderboard, &mut self.reach, due.places, now);
+        let token = find_token(client, aws, leaderboard, due.token.then_some(now));
+        let (readings, read) = tokio::join!(places, token);
+        self.token = read.or(self.token);
         self.note_messages(leaderboard, &readings);
-        self.refresh_queue(uses, leaderboard, readings.queue, now).await;
+        self.note_queue(uses, leaderboard, readings.queue, now).await;
+        self.generation = Some(generation_of(leaderboard));
         self
     }
 
@@ -123,7 +157,7 @@ impl Probe {
 
     /// For metrics.
     pub(super) fn limits(&self) -> LimitsState {
-        let token = self.token.as_ref().and_then(|token| token.as_ref().ok());
+        let token = self.token.as_ref().and_then(|found| found.token.as_ref().ok());
         LimitsState {
             token_ends: token.and_then(|token| token.expires()),
             queue: self.messages,
@@ -132,40 +166,7 @@ impl Probe {
         }
     }
 
-    async fn refresh_priority(&mut self, client: &Client, now: Timestamp) {
-        let classes = self.pod.as_ref().map(|(_, tried)| &tried.classes);
-        let Some(classes) = classes.filter(|classes| !classes.is_empty()) else {
-            self.priority = priority::Problems::default();
-            return;
-        };
-        if due(self.priority_at, self.priority.refused.is_none(), now) {
-            self.priority = priority::look(client, classes).await;
-            self.priority_at = Some(now);
-        }
-    }
-
-    async fn refresh_claims(&mut self, client: &Client, leaderboard: &Leaderboard, generation: i64, now: Timestamp) {
-        let of_spec = self.claims.as_ref().filter(|(of, _, _)| *of == generation);
-        let is_due = match of_spec {
-            None => true,
-            Some((_, _, Claims::NotRequired)) => false,
-            Some((_, at, found)) => due(Some(*at), *found == Claims::InPlace, now),
-        };
-        if !is_due {
-            return;
-        }
-        let is_known = of_spec.is_some();
-        let found = claims::keep(client, leaderboard).await;
-        if is_known
-            && found == Claims::InPlace
-            && let Err(error) = claims::remove_others(client, leaderboard).await
-        {
-            tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
-        }
-        self.claims = Some((generation, now, found));
-    }
-
-    async fn refresh_queue(
+    async fn note_queue(
         &mut self,
         uses: Uses<'_>,
         leaderboard: &Leaderboard,
@@ -174,7 +175,7 @@ impl Probe {
     ) {
         let before = self.queue.take();
         let Some(queue) = &leaderboard.spec.queue else { return };
-        let (client, stores) = (uses.policies.client, uses.policies.stores);
+        let (client, stores) = (uses.client, uses.stores);
         let known = before.unwrap_or_else(|| SharedQueue::of_status(leaderboard));
         let mut known = known.of_queue(&queue.url);
         if queue_readers::is_on_purpose(stores, queue) {
@@ -191,57 +192,55 @@ impl Probe {
         self.queue.as_ref()?.message()
     }
 
-    async fn refresh_token(&mut self, uses: Uses<'_>, leaderboard: &Leaderboard, now: Timestamp) {
-        let Some(evalai) = &leaderboard.spec.evalai else { return };
-        let refused = uses.external.hub.token_refused(&key_of(leaderboard)).is_some();
-        let good = self.token.as_ref().is_some_and(Result::is_ok) && !refused;
-        if due(self.token_at, good, now) {
-            self.token = Some(read_token(uses.policies.client, uses.aws, leaderboard, &evalai.token).await);
-            self.token_at = Some(now);
-        }
-        if let Some(Ok(token)) = &self.token {
-            self.target = Some(serve(&uses.external.hub, leaderboard, evalai, token));
-        }
+    /// The way to EvalAI, once there is a token.
+    pub(super) fn target(&self, leaderboard: &Leaderboard) -> Option<Target> {
+        let evalai = leaderboard.spec.evalai.as_ref()?;
+        let token = self.token(leaderboard)?.as_ref().ok()?;
+        let spec = &leaderboard.spec;
+        let format = results_format(spec.leaderboard_version);
+        let created = leaderboard.metadata.creation_timestamp.as_ref();
+        Some(Target {
+            api_server: evalai.server(),
+            challenge: evalai.challenge,
+            split: evalai.split.clone(),
+            token: Arc::clone(token),
+            requests_per_minute: evalai.requests_per_minute.unsigned_abs(),
+            sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
+            period: Duration::from_secs(spec.sync_period_seconds.unsigned_abs()),
+            phases: spec.tracks.iter().filter_map(|t| t.phase).collect(),
+            labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
+            inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
+            is_observed: evalai.mode == EvalaiMode::Observe,
+            since: created.map(|time| time.0).unwrap_or_default(),
+        })
     }
 
-    /// How EvalAI is reached, once there is a token.
-    pub(super) fn target(&self) -> Option<Arc<Target>> {
-        self.target.clone()
+    /// Its token, or why there is none, once it was looked for.
+    pub(super) fn token(&self, leaderboard: &Leaderboard) -> Option<&Result<Arc<Token>, String>> {
+        self.token_of(leaderboard).map(|found| &found.token)
+    }
+
+    /// What was found where the Leaderboard says that its token is.
+    fn token_of(&self, leaderboard: &Leaderboard) -> Option<&FoundToken> {
+        let place = &leaderboard.spec.evalai.as_ref()?.token;
+        self.token.as_ref().filter(|found| found.place == *place)
     }
 
     pub(super) fn invalid_pod(&self) -> Option<String> {
-        let of_pod = self.pod.as_ref().and_then(|(_, tried)| tried.refused.clone());
-        of_pod.or_else(|| self.priority.refused.clone())
+        self.pods.refused.clone().or_else(|| self.priority.refused.clone())
     }
 
     pub(super) fn pod_notes(&self) -> Vec<String> {
-        let tried = self.pod.as_ref();
-        let of_pods = tried.map(|(_, tried)| tried.notes.clone()).unwrap_or_default();
-        of_pods.into_iter().chain(self.priority.notes.clone()).collect()
-    }
-
-    pub(super) fn claims(&self) -> Claims {
-        let found = self.claims.as_ref();
-        found.map(|(_, _, found)| found.clone()).unwrap_or_default()
-    }
-
-    pub(super) fn place_notes(&self, now: Timestamp) -> Vec<String> {
-        self.reach.notes(now)
-    }
-
-    pub(super) fn unreachable(&self, now: Timestamp) -> Option<Unreachable> {
-        self.reach.unreachable(now)
+        self.pods.notes.iter().chain(&self.priority.notes).cloned().collect()
     }
 
     /// When something has to be tried again.
-    pub(super) fn next(&self, now: Timestamp) -> Option<Timestamp> {
-        let waits = self.token.as_ref().is_some_and(Result::is_err);
-        let token = self.token_at.filter(|_| waits);
-        let has_bad_class = self.priority.refused.is_some();
-        let priority = self.priority_at.filter(|_| has_bad_class);
-        let is_wrong = |claims: &Claims| matches!(claims, Claims::NotServed | Claims::Missing(_));
-        let claims = self.claims.as_ref().filter(|(_, _, found)| is_wrong(found));
-        let claims = claims.map(|(_, at, _)| *at);
+    pub(super) fn next(&self, leaderboard: &Leaderboard, now: Timestamp) -> Option<Timestamp> {
+        let token = self.token_of(leaderboard).filter(|found| found.token.is_err());
+        let token = token.map(|found| found.at);
+        let priority = self.priority_at.filter(|_| self.priority.refused.is_some());
+        let is_missing = matches!(self.claims, Claims::NotServed | Claims::Missing(_));
+        let claims = self.claims_at.filter(|_| is_missing);
         let [token, priority, claims] = [token, priority, claims].map(|at| at?.checked_add(SOON).ok());
         let queue = self.queue.as_ref().and_then(SharedQueue::next);
         [self.reach.next(now), token, claims, priority, queue]
@@ -249,69 +248,28 @@ impl Probe {
             .flatten()
             .min()
     }
-
-    pub(super) fn evalai_standing(
-        &self,
-        hub: &Hub,
-        leaderboard: &Leaderboard,
-        key: &ObjectKey,
-        now: Timestamp,
-    ) -> EvalaiStanding {
-        if leaderboard.spec.evalai.is_none() {
-            return EvalaiStanding::NotRequired;
-        }
-        let token = match &self.token {
-            None => return EvalaiStanding::Unchecked(None),
-            Some(Err(why)) => return EvalaiStanding::NoToken(why.clone()),
-            Some(Ok(token)) => token,
-        };
-        if let Some(why) = hub.token_refused(key) {
-            return EvalaiStanding::TokenRefused(why);
-        }
-        match hub.inbox_trouble(key) {
-            Some(trouble) if trouble.is_refused => return EvalaiStanding::QueueUnread(trouble),
-            Some(trouble) if hub.labels(key).0.is_none_or(|labels| labels.ok()) => {
-                return EvalaiStanding::QueueUnread(trouble);
-            }
-            _ => {}
-        }
-        match hub.labels(key) {
-            (None, why) => EvalaiStanding::Unchecked(why),
-            (Some(labels), _) if !labels.ok() => {
-                let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
-                EvalaiStanding::Misfit(problems.join("; "))
-            }
-            (Some(labels), _) => EvalaiStanding::Fits {
-                note: note(&labels, ends_soon(token, now)),
-            },
-        }
-    }
 }
 
-/// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
-fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
-    let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
-    let notes: Vec<String> = of_labels.chain(of_token).collect();
-    (!notes.is_empty()).then(|| notes.join(" "))
-}
-
-fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
-    token.ends_soon(now).then(|| {
-        let when = token
-            .expires()
-            .map(|t| t.strftime("%Y-%m-%d").to_string())
-            .unwrap_or_default();
-        if token.expires().is_some_and(|end| end <= now) {
-            return format!("EvalAI's token has ended on {when}; put a new one where evalai.token says.");
-        }
-        format!("EvalAI's token ends on {when}; put a new one where evalai.token says before.")
-    })
+fn generation_of(leaderboard: &Leaderboard) -> i64 {
+    leaderboard.metadata.generation.unwrap_or_default()
 }
 
 fn due(at: Option<Timestamp>, good: bool, now: Timestamp) -> bool {
     let wait = if good { AGAIN } else { SOON };
     // A clock that was set back makes it due as well.
     at.is_none_or(|at| now.duration_since(at) >= wait || now < at)
+}
+
+async fn find_token(
+    client: &Client,
+    aws: &Aws,
+    leaderboard: &Leaderboard,
+    due: Option<Timestamp>,
+) -> Option<FoundToken> {
+    let (at, evalai) = due.zip(leaderboard.spec.evalai.as_ref())?;
+    let place = evalai.token.clone();
+    let token = read_token(client, aws, leaderboard, &place).await;
+    Some(FoundToken { place, at, token })
 }
 
 async fn read_token(
@@ -344,131 +302,38 @@ async fn read_token(
     source.read(aws).await.map(Arc::new).map_err(|e| e.to_string())
 }
 
-fn serve(hub: &Hub, leaderboard: &Leaderboard, evalai: &Evalai, token: &Arc<Token>) -> Arc<Target> {
-    let format = results_format(leaderboard.spec.leaderboard_version);
-    let target = Target {
-        api_server: evalai.server(),
-        challenge: evalai.challenge,
-        split: evalai.split.clone(),
-        token: Arc::clone(token),
-        requests_per_minute: evalai.requests_per_minute.unsigned_abs(),
-        sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
-        period: Duration::from_secs(leaderboard.spec.sync_period_seconds.unsigned_abs()),
-        phases: leaderboard.spec.tracks.iter().filter_map(|t| t.phase).collect(),
-        labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
-        inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
-        is_observed: evalai.mode == EvalaiMode::Observe,
-        since: leaderboard
-            .metadata
-            .creation_timestamp
-            .as_ref()
-            .map(|t| t.0)
-            .unwrap_or_default(),
-    };
-    if let Err(error) = hub.serve(&key_of(leaderboard), &target) {
-        tracing::error!(leaderboard = %leaderboard.name_any(), %error, "cannot create EvalAI client");
-    }
-    Arc::new(target)
-}
-
-/// Whether Pods of this Leaderboard would be refused, by our own rules or by the API server's dry run; and what is to be noted.
-async fn try_pods(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
-    if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
-        return TriedPods {
-            refused: Some(error.to_string()),
-            ..TriedPods::default()
-        };
-    }
-    let tracks = leaderboard.spec.tracks.iter();
-    let jobs: Vec<(&Track, DynamicObject)> = tracks
-        .filter_map(|track| Some((track, sample_job(settings, leaderboard, track)?)))
-        .collect();
-    let template = |job: &DynamicObject| job.data.pointer("/spec/template").cloned().unwrap_or_default();
-    let pods = jobs.iter().map(|(track, job)| TrackPods {
-        track: track.name.clone(),
-        template: template(job),
-    });
-    let pods: Vec<TrackPods> = pods.collect();
-    let mut templates = jobs.iter().map(|(_, job)| template(job));
-    let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
-    TriedPods {
-        notes: notes(&pods),
-        classes: priority::asked(&leaderboard.spec.tracks, &pods),
-        refused: match (unclear, jobs.first()) {
-            (Some(unclear), _) => Some(unclear),
-            (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
-            (None, None) => None,
-        },
-    }
-}
-
-async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicObject) -> Option<String> {
-    let namespace = leaderboard.namespace().unwrap_or_default();
-    let resource = ApiResource::erase::<k8s_openapi::api::batch::v1::Job>(&());
-    let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), &namespace, &resource);
-    let params = PostParams {
-        dry_run: true,
-        ..PostParams::default()
-    };
-    let error = call(
-        "a dry run of the Job",
-        &leaderboard.name_any(),
-        api.create(&params, job),
-    )
-    .await
-    .err()?;
-    let status = error.status().filter(|status| [400, 422].contains(&status.code))?;
-    Some(status.message.clone())
-}
-
-fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> Option<DynamicObject> {
-    let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
-    let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
-    sample.metadata.namespace = leaderboard.namespace();
-    sample.metadata.uid = leaderboard.uid();
-    let plan = effective::plan(
-        &leaderboard.spec,
-        track,
-        sample.run_id(),
-        "example/agent:1".into(),
-        false,
-    );
-    Some(job_spec::build_object(&JobInput {
-        submission: &sample,
-        leaderboard,
-        plan: &plan,
-        number: JobNumber::first(1),
-        settings,
-        without_gpu: &[],
-        addresses: None,
-        now: Timestamp::now(),
-    }))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::services::evalai::Misfit;
 
     #[test]
-    fn columns_that_stay_empty_and_a_token_that_ends_soon_are_said() {
-        let labels = |problems| Labels {
-            at: Timestamp::UNIX_EPOCH,
-            problems,
-            partial: vec![],
+    fn a_token_counts_only_for_the_place_where_it_was_found() {
+        let board = |secret: &str| {
+            let spec = serde_json::json!({
+                "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": secret, "key": "k"}}},
+                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}], "leaderboardVersion": "V2",
+                "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+            });
+            Leaderboard::new("one", serde_json::from_value(spec).unwrap())
         };
-        let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
-        assert_eq!(note(&labels(vec![]), None), None);
-        assert_eq!(note(&labels(vec![]), ends()), ends());
-        let unsent = Misfit::Unsent {
-            phase: 2,
-            labels: vec!["Speed".into(), "Comfort".into()],
+        let (old, new) = (board("old"), board("new"));
+        let now = Timestamp::UNIX_EPOCH;
+        let probe = Probe {
+            generation: Some(generation_of(&old)),
+            token: Some(FoundToken {
+                place: old.spec.evalai.clone().unwrap().token,
+                at: now,
+                token: Ok(Arc::new(Token::parse("abc").unwrap())),
+            }),
+            ..Probe::default()
         };
-        let said = note(&labels(vec![unsent]), ends()).unwrap();
-        assert_eq!(
-            said,
-            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \
-             on 2027-01-01."
+        assert!(probe.target(&old).is_some() && !probe.due(&old, false, now).token);
+        assert!(
+            !probe.due(&old, true, now).token,
+            "a refused one is not read again at once"
         );
+        let later = now.checked_add(SOON).unwrap();
+        assert!(probe.due(&old, true, later).token);
+        assert!(probe.target(&new).is_none() && probe.due(&new, false, now).token);
     }
 }

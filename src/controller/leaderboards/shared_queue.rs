@@ -40,7 +40,8 @@ pub(super) enum Sign {
 pub(super) struct SharedQueue {
     /// The queue; of another one nothing is known.
     url: String,
-    read_at: Option<Timestamp>,
+    /// When it was asked last, with a reading or without.
+    asked_at: Option<Timestamp>,
     /// Readings running that show another reader, and the first of them.
     foreign: u32,
     since: Option<Timestamp>,
@@ -72,9 +73,14 @@ impl SharedQueue {
         }
     }
 
+    /// It was asked; a reading need not have come of it.
+    pub(super) fn asked(&mut self, now: Timestamp) {
+        self.asked_at = Some(now);
+    }
+
     /// Takes a reading in.
     pub(super) fn take(&mut self, reading: &Reading, sign: Sign, now: Timestamp) {
-        self.read_at = Some(now);
+        self.asked(now);
         self.arn.clone_from(&reading.arn);
         match sign {
             Sign::Foreign => {
@@ -109,7 +115,7 @@ impl SharedQueue {
     /// When it is to be read before its usual time.
     pub(super) fn next(&self) -> Option<Timestamp> {
         let in_question = self.is_shared || self.foreign > 0;
-        self.read_at.filter(|_| in_question)?.checked_add(AGAIN).ok()
+        self.asked_at.filter(|_| in_question)?.checked_add(AGAIN).ok()
     }
 
     /// The note about it. The same text as long as it lasts.
@@ -250,6 +256,12 @@ mod tests {
         let shared = after(&[(0, F), (60, F), (120, F), (180, Q)]);
         assert_eq!(shared.next(), Some(at(240)));
         assert!(!shared.is_due(at(239)) && shared.is_due(at(240)));
+        let mut silent = shared;
+        silent.asked(at(240));
+        assert!(
+            !silent.is_due(at(299)) && silent.is_due(at(300)),
+            "no answer is waited for as long as a reading"
+        );
     }
 
     #[test]

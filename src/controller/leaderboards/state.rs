@@ -5,6 +5,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use tokio::time::Instant;
 
 use super::foreign::Foreign;
 use super::probe::Probe;
@@ -49,22 +50,28 @@ impl Applied {
     }
 }
 
-/// What was measured last, of which generation.
-pub(super) type Measured = (Option<i64>, WorkspaceVerdict);
+/// What the looks at a Leaderboard have found.
+#[derive(Clone, Default)]
+pub(super) struct Looked {
+    pub(super) known: Probe,
+    /// Since when a look is under way.
+    pub(super) since: Option<Instant>,
+}
 
 /// One entry for each Leaderboard.
 #[derive(Default)]
 pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 
 #[derive(Default)]
-struct Entry {
-    probe: Probe,
+pub(super) struct Entry {
+    pub(super) looked: Looked,
     /// When its status was written.
-    written: Option<Timestamp>,
-    applied: Option<Applied>,
-    measured: Option<Measured>,
+    pub(super) written: Option<Timestamp>,
+    pub(super) applied: Option<Applied>,
+    /// What was measured last, of which generation.
+    pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
     /// The Lease of the installation that drives it, where that is another one.
-    foreign: Option<Foreign>,
+    pub(super) foreign: Option<Foreign>,
 }
 
 impl LeaderboardState {
@@ -73,27 +80,21 @@ impl LeaderboardState {
         lock(&self.0).remove(uid);
     }
 
-    pub(super) fn probe(&self, uid: &str) -> Probe {
-        lock(&self.0)
-            .get(uid)
-            .map(|entry| entry.probe.clone())
-            .unwrap_or_default()
+    pub(super) fn read<T>(&self, uid: &str, read: impl FnOnce(&Entry) -> T) -> T {
+        read(lock(&self.0).get(uid).unwrap_or(&Entry::default()))
     }
 
-    pub(super) fn keep(&self, uid: &str, probe: Probe) {
-        self.change(uid, |entry| entry.probe = probe);
+    pub(super) fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
+        change(lock(&self.0).entry(uid.to_owned()).or_default());
     }
 
-    pub(super) fn wrote(&self, uid: &str, now: Timestamp) {
-        self.change(uid, |entry| entry.written = Some(now));
-    }
-
-    pub(super) fn applied(&self, uid: &str) -> Option<Applied> {
-        lock(&self.0).get(uid)?.applied.clone()
-    }
-
-    pub(super) fn note_applied(&self, uid: &str, applied: Applied) {
-        self.change(uid, |entry| entry.applied = Some(applied));
+    /// A look has ended. False: the Leaderboard is gone.
+    pub(super) fn end_look(&self, uid: &str, known: Probe) -> bool {
+        let mut entries = lock(&self.0);
+        let entry = entries.get_mut(uid);
+        entry
+            .map(|entry| entry.looked = Looked { known, since: None })
+            .is_some()
     }
 
     /// The cache shows the policy as it should be.
@@ -105,30 +106,10 @@ impl LeaderboardState {
         });
     }
 
-    pub(super) fn measured(&self, uid: &str) -> Option<Measured> {
-        lock(&self.0).get(uid)?.measured.clone()
-    }
-
-    pub(super) fn note_measured(&self, uid: &str, found: Measured) {
-        self.change(uid, |entry| entry.measured = Some(found));
-    }
-
-    pub(super) fn foreign(&self, uid: &str) -> Option<Foreign> {
-        lock(&self.0).get(uid)?.foreign.clone()
-    }
-
-    pub(super) fn note_foreign(&self, uid: &str, found: Foreign) {
-        self.change(uid, |entry| entry.foreign = Some(found));
-    }
-
     /// Whether its status was not written for so long.
     pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
-        let written = lock(&self.0).get(uid).and_then(|entry| entry.written);
-        written.is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
-    }
-
-    fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
-        change(lock(&self.0).entry(uid.to_owned()).or_default());
+        self.read(uid, |entry| entry.written)
+            .is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
     }
 }
 
@@ -144,7 +125,7 @@ mod tests {
         let written = (0..60).filter(|second| {
             let may = state.is_older("u", at(*second), COUNTS_EVERY);
             if may {
-                state.wrote("u", at(*second));
+                state.change("u", |entry| entry.written = Some(at(*second)));
             }
             may
         });

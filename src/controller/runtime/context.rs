@@ -4,10 +4,12 @@ use std::sync::Arc;
 
 use kube::Client;
 use kube::runtime::events::Recorder;
+use tokio::sync::mpsc::UnboundedSender;
 
-use crate::controller::leaderboards;
 use crate::controller::leaderboards::isolation::Policies;
+use crate::controller::leaderboards::looks::{self, Look};
 use crate::controller::leaderboards::state::LeaderboardState;
+use crate::controller::leaderboards::{self, probe};
 use crate::controller::objects::Wake;
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
@@ -43,6 +45,7 @@ pub struct Context {
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
+    pub looks: UnboundedSender<Look>,
     pub external: ExternalSystems,
     pub aws: Aws,
     pub recorder: Recorder,
@@ -93,8 +96,21 @@ impl Context {
             settings: &self.settings,
             slots: &self.slots,
             external: &self.external,
-            aws: &self.aws,
+            looks: &self.looks,
             metrics: &self.metrics,
+        }
+    }
+
+    pub fn for_looks(&self) -> looks::Uses<'_> {
+        looks::Uses {
+            places: probe::Uses {
+                client: &self.client,
+                aws: &self.aws,
+                stores: &self.stores,
+                settings: &self.settings,
+            },
+            state: &self.leaderboards,
+            wake: &self.wake,
         }
     }
 

@@ -45,13 +45,13 @@ pub(super) async fn keep(
         let load = hub.load();
         telemetry.metrics.set_evalai_load(load.used, load.limit, load.waiting);
         let all = submissions.state();
-        for (state, count) in states(&all) {
-            telemetry.metrics.set_submissions(state, count);
-        }
         for count in standings.values_mut() {
             *count = 0;
         }
         standings.extend(count_standings(&all));
+        for (state, count) in states(&standings) {
+            telemetry.metrics.set_submissions(state, count);
+        }
         for (standing, count) in &standings {
             telemetry.metrics.set_standing(*standing, *count);
         }
@@ -180,12 +180,11 @@ fn count_standings(submissions: &[Arc<Submission>]) -> BTreeMap<Standing, usize>
     counts
 }
 
-fn states(submissions: &[Arc<Submission>]) -> BTreeMap<&'static str, usize> {
-    let mut counts: BTreeMap<_, _> = STATES.iter().map(|state| (state.as_str(), 0)).collect();
-    for submission in submissions {
-        *counts.entry(state(submission).as_str()).or_default() += 1;
-    }
-    counts
+fn states(standings: &BTreeMap<Standing, usize>) -> [(&'static str, usize); 6] {
+    STATES.map(State::as_str).map(|state| {
+        let of_state = standings.iter().filter(|(standing, _)| standing.state == state);
+        (state, of_state.map(|(_, count)| count).sum())
+    })
 }
 
 fn state(submission: &Submission) -> State {
@@ -323,15 +322,15 @@ mod tests {
         // No program reads the state that is shown.
         Arc::make_mut(&mut edited).status.as_mut().unwrap().state = Some(State::Failed);
         let finished = || submission("a", &[("Finished", "True", "Finished", 1)]);
-        let found = states(&[edited, finished(), finished()]);
+        let all = [edited, finished(), finished()];
         let expected = [
-            ("Cancelled", 0),
-            ("Failed", 0),
-            ("Finished", 2),
             ("Pending", 1),
-            ("Resumed", 0),
             ("Running", 0),
+            ("Resumed", 0),
+            ("Finished", 2),
+            ("Failed", 0),
+            ("Cancelled", 0),
         ];
-        assert_eq!(found, expected.into());
+        assert_eq!(states(&count_standings(&all)), expected);
     }
 }

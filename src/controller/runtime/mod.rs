@@ -26,6 +26,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
+use super::leaderboards::looks::{self, Look};
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::objects::children_selector;
@@ -263,13 +264,17 @@ impl Parts {
         let (evalai, changed) = mpsc::unbounded_channel();
         let external = self.external(&leader.fence(), evalai, rows);
         let hub = external.hub.clone();
+        let (looks, wanted) = mpsc::unbounded_channel();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(external, &queues)),
+            context: Arc::new(self.context(external, looks, &queues)),
             queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
         self.keep_policies(&shared.context);
+        let context = Arc::clone(&shared.context);
+        let look = async move { looks::carry_out(wanted, context.for_looks()).await };
+        self.telemetry.tasks.until_stop("looks", look);
         let reports = events::Reports {
             rows: changed_rows,
             evalai: changed,
@@ -328,7 +333,7 @@ impl Parts {
     }
 
     /// What all reconciles share.
-    fn context(&self, external: ExternalSystems, queues: &Queues) -> Context {
+    fn context(&self, external: ExternalSystems, looks: mpsc::UnboundedSender<Look>, queues: &Queues) -> Context {
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
         let answered = || events::waking(&queues.submissions, &self.watches.submissions.store);
         let boards = Arc::clone(&queues.leaderboards);
@@ -346,6 +351,7 @@ impl Parts {
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),
+            looks,
             external,
             aws: aws.clone(),
             recorder: events(client),

@@ -14,12 +14,13 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 19] = [
+const TASKS: [&str; 20] = [
     "foreign runs",
     "gauges",
     "images",
     "inbox",
     "lease",
+    "looks",
     "lookups",
     "names",
     "nodes",

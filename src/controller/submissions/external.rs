@@ -39,8 +39,12 @@ impl ExternalSystems {
     }
 
     /// A Leaderboard's way to EvalAI, renewed whenever its spec or token changes.
-    pub fn set_target(&self, leaderboard: &Leaderboard, target: Arc<Target>) {
-        lock(&self.targets).insert(uid_of(leaderboard), target);
+    pub fn serve(&self, leaderboard: &Leaderboard, target: Target) {
+        let key = key_of(leaderboard);
+        if let Err(error) = self.hub.serve(&key, &target) {
+            tracing::error!(leaderboard = %key, %error, "cannot create EvalAI client");
+        }
+        lock(&self.targets).insert(key.uid, Arc::new(target));
     }
 
     /// Nothing more of a Leaderboard goes to EvalAI.

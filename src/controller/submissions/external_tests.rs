@@ -6,7 +6,7 @@ use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
@@ -18,7 +18,7 @@ use crate::controller::submissions::view::{
     ObservedRoutes, ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::State;
-use leaderboard_api::conditions;
+use leaderboard_api::conditions::{self, Truth};
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -87,14 +87,8 @@ async fn bench(state: State) -> Bench {
     let status = submission.status.as_mut().unwrap();
     let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
     status.failure = (state == State::Failed).then(|| serde_json::from_value(failure).unwrap());
-    status.conditions = vec![Condition {
-        type_: conditions::FINISHED.into(),
-        status: "True".into(),
-        reason: state.as_str().into(),
-        message: String::new(),
-        last_transition_time: Time(now),
-        observed_generation: None,
-    }];
+    let (type_, reason) = (conditions::FINISHED, state.as_str());
+    conditions::set(&mut status.conditions, type_, Truth::True, reason, "", None, &Time(now));
     let status = status.clone();
     let view = View {
         now,

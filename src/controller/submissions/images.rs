@@ -8,7 +8,7 @@ use kube::{Api, Client};
 
 use super::questions::{self, Observed, Questions};
 use crate::controller::objects::Wake;
-use crate::kubernetes::CALL_TIMEOUT;
+use crate::kubernetes::call;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::registry::{Credentials, Facts, Fault, Image, Registries};
@@ -62,13 +62,12 @@ impl Images {
 async fn credentials(client: &Client, namespace: &str, question: &Question) -> Option<Credentials> {
     let api: Api<Secret> = Api::namespaced(client.clone(), namespace);
     for name in &question.secrets {
-        let secret = match tokio::time::timeout(CALL_TIMEOUT, api.get(name)).await {
-            Ok(Ok(secret)) => secret,
-            Ok(Err(error)) => {
-                tracing::warn!(namespace, secret = name, "the pull secret cannot be read: {error}");
+        let secret = match call("reading the pull secret", name, api.get(name)).await {
+            Ok(secret) => secret,
+            Err(error) => {
+                tracing::warn!(namespace, "{error}");
                 continue;
             }
-            Err(_) => continue,
         };
         let data = secret.data.as_ref().and_then(|data| data.get(".dockerconfigjson"));
         let found = data.and_then(|data| Credentials::of_secret(&data.0, &question.image.registry));

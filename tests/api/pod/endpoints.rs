@@ -62,9 +62,13 @@ async fn objects_and_lines_go_where_the_leaderboard_says() {
     assert_eq!(lines, ["a line"]);
     assert_eq!(elsewhere.asked(), Vec::<String>::new());
 
-    // One line says which program of which version this was.
-    let first = said("logcopy").lines().next().unwrap_or_default().to_owned();
-    let first: serde_json::Value = serde_json::from_str(&first).unwrap();
+    begins_with_its_program(&said("logcopy"));
+}
+
+/// The first line of a log says which program of which version this was.
+fn begins_with_its_program(log: &str) {
+    let first = log.lines().next().unwrap_or_default();
+    let first: serde_json::Value = serde_json::from_str(first).unwrap();
     assert_eq!(
         (&first["message"], &first["program"], &first["version"]),
         (&"starting".into(), &"logcopy".into(), &env!("CARGO_PKG_VERSION").into())

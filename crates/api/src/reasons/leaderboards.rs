@@ -14,6 +14,9 @@ reasons! {
              expires soon, until when nothing is written to EvalAI after a change of operators, Secrets that participants can read, \
              or rights by which their code can leave its Pod.",
             "Nothing, or what the note asks for.";
+        CHECKING = "Checking",
+            "The operator asks bucket, table, queues and the place of EvalAI's token for the first time, and not all have answered yet.",
+            "Wait: what does not answer is named after ten seconds, an entry of Secrets Manager after a minute.";
         OTHER_OPERATOR = "OtherOperator",
             "Only in the log and the metrics of an operator: another installation drives this Leaderboard, which `status.operator` \
              names by its Lease. This one leaves the Leaderboard and its submissions alone, and takes over when that Lease is gone \

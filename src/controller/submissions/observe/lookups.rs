@@ -18,7 +18,7 @@ use tokio::time::Instant;
 use super::{node, scale_up};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::view::{NodeView, ScaleUp};
-use crate::kubernetes::CALL_TIMEOUT;
+use crate::kubernetes::call;
 use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
@@ -208,8 +208,8 @@ async fn answer(client: &Client, question: &Question) -> Answer {
 async fn events(client: &Client, namespace: &str, selector: &str) -> Option<Vec<Event>> {
     let events: Api<Event> = Api::namespaced(client.clone(), namespace);
     let params = ListParams::default().fields(selector).limit(50);
-    let found = tokio::time::timeout(CALL_TIMEOUT, events.list(&params)).await;
-    Some(found.ok()?.ok()?.items)
+    let found = call("the events", selector, events.list(&params)).await;
+    Some(found.ok()?.items)
 }
 
 async fn refusal(client: &Client, namespace: &str, job: &str) -> Option<String> {

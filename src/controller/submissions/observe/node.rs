@@ -12,8 +12,8 @@ use crate::controller::objects::Wake;
 use crate::controller::stores::Stores;
 use crate::controller::submissions::view::{NodeView, ObservedNode};
 use crate::kubernetes::objects::{Node, Pod};
-use crate::kubernetes::{CALL_TIMEOUT, Item, Store, WatchEvents};
-use leaderboard_api::{Submission, client_errors};
+use crate::kubernetes::{Item, Store, WatchEvents, call};
+use leaderboard_api::Submission;
 
 /// Taints with which a cluster announces that a node is about to go: Karpenter, cluster-autoscaler, and a person or a controller
 /// that knows a node to be off.
@@ -57,15 +57,13 @@ pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Sub
 /// Reads a node. Without the right to (an operator of one namespace has none) it stays unknown.
 pub(super) async fn read(client: &Client, name: &str) -> NodeView {
     let nodes: Api<Item<Node>> = Api::all(client.clone());
-    match tokio::time::timeout(CALL_TIMEOUT, nodes.get_opt(name)).await {
-        Ok(Ok(Some(node))) => node.object.map_or_else(|_| NodeView::default(), |node| of(&node)),
-        Ok(Ok(None)) => gone(),
-        Ok(Err(error)) => {
-            let error = client_errors::kube(&error);
-            tracing::debug!(node = %name, error, "a node cannot be read");
+    match call("reading the node", name, nodes.get_opt(name)).await {
+        Ok(Some(node)) => node.object.map_or_else(|_| NodeView::default(), |node| of(&node)),
+        Ok(None) => gone(),
+        Err(error) => {
+            tracing::debug!("{error}");
             NodeView::default()
         }
-        Err(_) => NodeView::default(),
     }
 }
 

@@ -1,0 +1,161 @@
+//! Reconciles and the looks that they ask for, under a paused clock.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tokio::time::Instant;
+
+use super::*;
+use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
+use crate::controller::leaderboards::state::{Entry, RESYNC};
+use crate::controller::leaderboards::{FIRST_LOOK, Reconciled, reconcile};
+use crate::controller::network_policy::network_policy;
+use leaderboard_api::{names, reasons};
+
+/// Where nobody listens: each request is refused.
+const NOBODY: &str = "http://127.0.0.1:1";
+
+fn leaderboard(endpoint: &str) -> Leaderboard {
+    let mut board = fixtures::leaderboard("carla", endpoint);
+    board.metadata.generation = Some(1);
+    board.metadata.finalizers = Some(vec![names::FINALIZER_LEADERBOARD.into()]);
+    board
+}
+
+/// A cluster whose cache shows the policy.
+async fn around(board: &Leaderboard, endpoint: &str) -> Surroundings {
+    let cluster = Cluster {
+        policies: vec![network_policy(board)],
+        ..Cluster::default()
+    };
+    surroundings(cluster, endpoint).await
+}
+
+/// One reconcile. Returns when the next one is due, and what was written: kinds, and the status.
+async fn reconciled(around: &mut Surroundings, board: &Leaderboard) -> (Duration, Vec<String>, Value) {
+    let board = Arc::new(board.clone());
+    let Reconciled::Done(wait) = reconcile(board, around.context.for_leaderboards()).await.unwrap() else {
+        panic!("it is ours");
+    };
+    let (mut kinds, mut status) = (Vec::new(), Value::Null);
+    while let Ok(request) = around.requests.try_recv() {
+        let is_status = request.path.ends_with("/leaderboards/carla/status");
+        kinds.push(if is_status { "status".into() } else { request.path });
+        status = if is_status {
+            request.body["status"].clone()
+        } else {
+            status
+        };
+    }
+    (wait, kinds, status)
+}
+
+/// Looks until a reconcile is woken.
+async fn woken(around: &mut Surroundings) {
+    let wanted = around.wanted.recv().await.unwrap();
+    look(around.context.for_looks(), wanted).await;
+    assert_eq!(around.woken.recv().await.unwrap(), "carla");
+    while around.requests.try_recv().is_ok() {}
+}
+
+fn ready(status: &Value) -> (&str, &str, Option<i64>) {
+    let all = status["conditions"].as_array().unwrap();
+    let ready = all.iter().find(|condition| condition["type"] == "Ready").unwrap();
+    let text = |field: &str| ready[field].as_str().unwrap();
+    (text("status"), text("reason"), ready["observedGeneration"].as_i64())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_bucket_that_never_answers_holds_up_no_reconcile_and_its_silence_wakes_the_next() {
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("http://{}", silent.local_addr().unwrap());
+    let board = leaderboard(&endpoint);
+    let mut around = around(&board, &endpoint).await;
+    let began = Instant::now();
+
+    let (wait, written, _) = reconciled(&mut around, &board).await;
+    assert!(
+        written.len() == 1 && written[0].contains("/networkpolicies/"),
+        "{written:?}"
+    );
+    assert_eq!(
+        (wait, began.elapsed()),
+        (FIRST_LOOK, Duration::ZERO),
+        "most looks take less, and cost no write more"
+    );
+    tokio::time::advance(FIRST_LOOK).await;
+    let (wait, written, status) = reconciled(&mut around, &board).await;
+    assert_eq!((wait, written), (RESYNC, vec!["status".to_owned()]));
+    assert_eq!(ready(&status), ("Unknown", reasons::CHECKING, Some(1)));
+    assert_eq!(status["observedGeneration"], Value::Null);
+    assert_eq!(began.elapsed(), FIRST_LOOK);
+
+    woken(&mut around).await;
+    assert!(around.wanted.try_recv().is_err(), "one look at a time");
+    let (_, written, status) = reconciled(&mut around, &board).await;
+    assert_eq!(written, ["status"]);
+    assert_eq!(ready(&status), ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)));
+    assert_eq!(status["observedGeneration"], 1);
+    assert!(around.wanted.try_recv().is_err(), "nothing is due so soon");
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_edit_changes_nothing_that_is_shown_before_it_was_looked_at() {
+    let mut board = leaderboard(NOBODY);
+    let mut around = around(&board, NOBODY).await;
+    reconciled(&mut around, &board).await;
+    woken(&mut around).await;
+    let (_, _, first) = reconciled(&mut around, &board).await;
+    assert_eq!(ready(&first), ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)));
+    board.status = serde_json::from_value(first).unwrap();
+    board.status.as_mut().unwrap().operator = fixtures::leaderboard("any", NOBODY).status.unwrap().operator;
+
+    // The first look at generation 2 is under way when the edit to generation 3 comes.
+    board.metadata.generation = Some(2);
+    let (wait, written, _) = reconciled(&mut around, &board).await;
+    assert_eq!(wait, FIRST_LOOK);
+    assert!(
+        written.iter().all(|kind| kind.contains("/networkpolicies/")),
+        "{written:?}"
+    );
+    board.metadata.generation = Some(3);
+    tokio::time::advance(FIRST_LOOK).await;
+    let (_, _, status) = reconciled(&mut around, &board).await;
+    assert_eq!(
+        ready(&status),
+        ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)),
+        "as it was"
+    );
+    assert_eq!(status["observedGeneration"], 1);
+    woken(&mut around).await;
+    let (wait, written, _) = reconciled(&mut around, &board).await;
+    assert_eq!((wait, written), (FIRST_LOOK, vec![]), "that was another spec");
+    woken(&mut around).await;
+    let (_, _, status) = reconciled(&mut around, &board).await;
+    assert_eq!((ready(&status).2, &status["observedGeneration"]), (Some(3), &json!(3)));
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_found_of_a_leaderboard_that_is_gone_is_dropped() {
+    let board = leaderboard(NOBODY);
+    let mut around = around(&board, NOBODY).await;
+    reconciled(&mut around, &board).await;
+    let wanted = around.wanted.recv().await.unwrap();
+    around.context.leaderboards.forget(&uid_of(&board));
+    look(around.context.for_looks(), wanted).await;
+    assert!(around.woken.try_recv().is_err());
+    let is_known = |entry: &Entry| entry.looked.known.is_of(&board);
+    assert!(!around.context.leaderboards.read(&uid_of(&board), is_known));
+}
+
+#[tokio::test(start_paused = true)]
+async fn nothing_is_asked_of_a_leaderboard_that_names_what_it_may_not() {
+    let mut board = leaderboard(NOBODY);
+    let evalai = json!({"apiServer": "http://evalai.example.com", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}});
+    board.spec.evalai = serde_json::from_value(evalai).unwrap();
+    let mut around = around(&board, NOBODY).await;
+    let (_, written, status) = reconciled(&mut around, &board).await;
+    assert_eq!(written.len(), 2, "the policy, and at once the status: {written:?}");
+    assert_eq!(ready(&status), ("False", reasons::INSECURE_SERVER, Some(1)));
+    assert!(around.wanted.try_recv().is_err());
+}

@@ -1,0 +1,113 @@
+//! How a Leaderboard stands with EvalAI: what its token is, and what EvalAI's client knows of its challenge. Reads memory alone.
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+
+use super::reach::capitalized;
+use crate::controller::objects::key_of;
+use crate::services::evalai::{Hub, InboxTrouble, Labels};
+use crate::services::token::Token;
+use leaderboard_api::Leaderboard;
+
+/// How a Leaderboard stands with EvalAI.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum EvalaiStanding {
+    NotRequired,
+    NoToken(String),
+    TokenRefused(String),
+    /// Its queue in EvalAI is not read.
+    QueueUnread(InboxTrouble),
+    /// Its phases or labels do not fit the challenge.
+    Misfit(String),
+    /// Not checked yet, or EvalAI does not answer.
+    Unchecked(Option<String>),
+    Fits {
+        /// Something to be said although it works, such as a token that ends soon.
+        note: Option<String>,
+    },
+}
+
+/// How it stands, with what was found where the Leaderboard says that its token is.
+pub(super) fn standing(
+    hub: &Hub,
+    leaderboard: &Leaderboard,
+    token: Option<&Result<Arc<Token>, String>>,
+    now: Timestamp,
+) -> EvalaiStanding {
+    if leaderboard.spec.evalai.is_none() {
+        return EvalaiStanding::NotRequired;
+    }
+    let token = match token {
+        None => return EvalaiStanding::Unchecked(None),
+        Some(Err(why)) => return EvalaiStanding::NoToken(why.clone()),
+        Some(Ok(token)) => token,
+    };
+    let key = &key_of(leaderboard);
+    let (labels, why) = hub.labels(key);
+    if let Some(why) = hub.token_refused(key) {
+        return EvalaiStanding::TokenRefused(why);
+    }
+    match hub.inbox_trouble(key) {
+        Some(trouble) if trouble.is_refused => return EvalaiStanding::QueueUnread(trouble),
+        Some(trouble) if labels.as_ref().is_none_or(Labels::ok) => {
+            return EvalaiStanding::QueueUnread(trouble);
+        }
+        _ => {}
+    }
+    match labels {
+        None => EvalaiStanding::Unchecked(why),
+        Some(labels) if !labels.ok() => {
+            let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
+            EvalaiStanding::Misfit(problems.join("; "))
+        }
+        Some(labels) => EvalaiStanding::Fits {
+            note: note(&labels, ends_soon(token, now)),
+        },
+    }
+}
+
+/// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
+fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
+    let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
+    let notes: Vec<String> = of_labels.chain(of_token).collect();
+    (!notes.is_empty()).then(|| notes.join(" "))
+}
+
+fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
+    let end = token.expires().filter(|_| token.ends_soon(now))?;
+    let when = end.strftime("%Y-%m-%d");
+    Some(if end <= now {
+        format!("EvalAI's token has ended on {when}; put a new one where evalai.token says.")
+    } else {
+        format!("EvalAI's token ends on {when}; put a new one where evalai.token says before.")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::services::evalai::Misfit;
+
+    #[test]
+    fn columns_that_stay_empty_and_a_token_that_ends_soon_are_said() {
+        let labels = |problems| Labels {
+            at: Timestamp::UNIX_EPOCH,
+            problems,
+            partial: vec![],
+        };
+        let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
+        assert_eq!(note(&labels(vec![]), None), None);
+        assert_eq!(note(&labels(vec![]), ends()), ends());
+        let unsent = Misfit::Unsent {
+            phase: 2,
+            labels: vec!["Speed".into(), "Comfort".into()],
+        };
+        let said = note(&labels(vec![unsent]), ends()).unwrap();
+        assert_eq!(
+            said,
+            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \
+             on 2027-01-01."
+        );
+    }
+}
