@@ -1,6 +1,6 @@
 """Owns jobs that run at the same time: each in a process of its own, whose output is printed whole when it ends. Knows no layer of tests.
 
-So what a job prints can be read as if it had run alone. Until then its output is in a file, whose last line is told every minute.
+So what a job prints can be read as if it had run alone. Until then its output is in a file, whose last line is shown every minute.
 """
 
 import multiprocessing

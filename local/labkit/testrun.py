@@ -110,6 +110,7 @@ def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -
         results.append(run_layer(plan, layer, results))
     if at_once:
         results += side_by_side(plan, at_once, results)
+    results.sort(key=lambda result: NAMES.index(result.name))
     print("\n".join([table(results, time.monotonic() - started), *plan.summary.lines()]), flush=True)
     return not any(result.failure for result in results)
 
@@ -123,7 +124,7 @@ def in_lanes(chosen: Sequence[Layer]) -> tuple[list[Layer], list[list[Layer]]]:
 
 
 def side_by_side(plan: Plan, at_once: Sequence[Sequence[Layer]], before: Sequence[Result]) -> list[Result]:
-    """Runs each lane next to the others; the results in the order of the layers."""
+    """Runs each lane next to the others; the results as the layers end."""
     names = " next to ".join(", ".join(layer.name for layer in lane) for lane in at_once)
     say(f"{names}: each prints its output when it ends; until then it is in {plan.settings.logs}/test-*.log")
     results = []
@@ -135,7 +136,7 @@ def side_by_side(plan: Plan, at_once: Sequence[Sequence[Layer]], before: Sequenc
         results.append(result)
         plan.summary.take(summary)
         say(f"{result.name} took {seconds(result.seconds)}: {result.failure or result.lacks or 'passed'}")
-    return sorted(results, key=lambda result: NAMES.index(result.name))
+    return results
 
 
 def job(plan: Plan, layer: Layer, before: Sequence[Result]) -> lanes.Job:
@@ -440,7 +441,7 @@ def require_target(settings: Settings, name: str) -> None:
 # The cluster waits most of its time: for the kubelet, for runs, for what dies. The others compute.
 WAITS, COMPUTES = LANES = ("waits", "computes")
 LAYERS = (
-    Layer("lab", "local/ itself, in Python", lab),
+    Layer("lab", "local/ itself, in Python", lab, lane=COMPUTES),
     Layer("tools", "etcd, the API server and all others, kept from run to run", make_tools, needs_root=True),
     Layer("build", "all tests, and the programs they run", compile_all),
     Layer("unit", "pure logic, mock clients, and processes on this machine", unit, lane=COMPUTES),
