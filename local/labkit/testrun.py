@@ -43,7 +43,7 @@ from .toolsets import ENVTEST_TOOLS
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
 # Tests that run at once, as they wait most of their time: of the API server for controllers, of the cluster for the kubelet.
-AT_ONCE = 4
+AT_ONCE = 8
 AT_ONCE_IN_CLUSTER = 6
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
