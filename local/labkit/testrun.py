@@ -43,8 +43,7 @@ from .toolsets import ENVTEST_TOOLS
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
 # Tests that run at once, as they wait most of their time: of the API server for controllers, of the cluster for the kubelet.
-AT_ONCE = 8
-AT_ONCE_IN_CLUSTER = 6
+AT_ONCE = 6
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
 # A backtrace pushes the message out of what is kept of a long log; `cargo test` itself still gives one.
@@ -277,9 +276,7 @@ def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
     def at_once(threads: int, harness: Sequence[str]) -> Outcome:
         return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
 
-    passed = settle(
-        plan.summary, at_once(AT_ONCE_IN_CLUSTER, [plan.filter]), lambda names: at_once(1, ["--exact", *names])
-    )
+    passed = settle(plan.summary, at_once(AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names]))
     alone = names_alone(ignored_tests(plan, target, env), plan.filter)
     if not alone and not plan.filter:
         raise LabError(
