@@ -10,14 +10,16 @@ FROM ${BUILD_IMAGE} AS build
 WORKDIR /src
 # The commit, for the first line of the log and for leaderboard_build_info: --build-arg REVISION="$(git rev-parse --short HEAD)"
 ARG REVISION=""
-# cargo's profile of the operator; `local/lab dockerfile`, which builds this file in the tests, gives `local`.
+# cargo's profile of the operator and its choice of packages; `local/lab dockerfile`, which builds this file in the tests, gives those of
+# the tests, so that what cargo has compiled for them is not compiled again.
 ARG PROFILE=release
+ARG PACKAGES="--package leaderboard-operator"
 COPY . .
 # Two builds, as the runner is static and small: it is copied into every Pod and runs inside any image.
 RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,target=/src/target \
     triple="$(rustc -vV | sed -n 's/^host: //p')" \
     && LEADERBOARD_REVISION="$REVISION" \
-       cargo build --locked --profile "$PROFILE" --features otel -p leaderboard-operator --bin leaderboard-operator \
+       cargo build --locked --profile "$PROFILE" $PACKAGES --features otel --bin leaderboard-operator \
     && RUSTFLAGS="-C target-feature=+crt-static" \
        cargo build --locked --release --target "$triple" -p leaderboard-runner \
     && install -D -t /out "target/$PROFILE/leaderboard-operator" "target/$triple/release/leaderboard-runner"

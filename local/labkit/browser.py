@@ -134,9 +134,9 @@ def tab() -> Iterator[Tab]:
         raise LabError(f"there is no Chromium on this machine: install it (Debian: apt-get install {PACKAGE})")
     with tempfile.TemporaryDirectory() as home:
         (theirs_in, to), (back, theirs_out) = os.pipe(), os.pipe()
-        # The browser reads file 3 and writes file 4.
+        # The browser reads file 3 and writes file 4. Debian's sh can't name a file above 9.
         shell = f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}'
-        argv = ["sh", "-c", shell, found, *FLAGS, f"--user-data-dir={home}", "about:blank"]
+        argv = ["bash", "-c", shell, found, *FLAGS, f"--user-data-dir={home}", "about:blank"]
         process = subprocess.Popen(
             argv, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

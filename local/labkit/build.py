@@ -22,6 +22,7 @@ PROFILE = "local"
 PROGRAMS_SECONDS, RUNNER_SECONDS, STAND_INS_SECONDS = 420, 45, 30
 # The test program that costs nearly nothing on top of what is built anyway.
 CHEAPEST_TEST = "programs"
+SELECTION = ("--workspace", "--test", CHEAPEST_TEST)
 STATIC = "-C target-feature=+crt-static"
 
 
@@ -37,8 +38,7 @@ def check_cargo() -> None:
 
 def programs(settings: Settings) -> None:
     """Builds every program of the workspace: the operator and the stand-in of EvalAI among them."""
-    selection = ["--workspace", "--bins", "--test", CHEAPEST_TEST]
-    cargo(settings, ["build", *selection, "--profile", PROFILE], "building the programs", PROGRAMS_SECONDS)
+    cargo(settings, ["build", *SELECTION, "--bins", "--profile", PROFILE], "building the programs", PROGRAMS_SECONDS)
 
 
 def static_programs(settings: Settings) -> None:

@@ -67,7 +67,7 @@ def run(settings: Settings, profile: str) -> None:
 
 def make(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, str]) -> None:
     """Builds the Dockerfile of the repository as it is."""
-    arguments = {"BUILD_IMAGE": BUILD, "BASE_IMAGE": BASE, "REVISION": REVISION, "PROFILE": profile}
+    arguments = {"BUILD_IMAGE": BUILD, "BASE_IMAGE": BASE, "REVISION": REVISION, **selection(profile)}
     options = [word for name, value in arguments.items() for word in ("--build-arg", f"{name}={value}")]
     started = time.monotonic()
     say(f"building the Dockerfile (from nothing {USUAL_MINUTES.get(profile, 25)} min, else a minute)")
@@ -75,6 +75,13 @@ def make(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, st
     log = settings.logs / "dockerfile.log"
     own.build(root / "Dockerfile", root, BUILT, [*options, *volumes(mounts)], "building the Dockerfile", log)
     say(f"the Dockerfile is built ({seconds(time.monotonic() - started)})")
+
+
+def selection(profile: str) -> dict[str, str]:
+    """Arguments of the Dockerfile for cargo: what is built in the profile of the tests has their choice of packages, and so the features
+    with which all dependencies are compiled already. A release has the Dockerfile's own choice."""
+    packages = {"PACKAGES": " ".join(build.SELECTION)} if profile == build.PROFILE else {}
+    return {"PROFILE": profile, **packages}
 
 
 def try_programs(settings: Settings, own: Engine, spec: ImageSpec) -> None:
@@ -187,7 +194,7 @@ def warm(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, st
 def cache_key(settings: Settings, profile: str) -> str:
     """What the crates of others are compiled from."""
     lock = (settings.repository / "Cargo.lock").read_bytes()
-    words = [rustc(settings, "--version", "--verbose"), profile, str(cargo_home(os.environ))]
+    words = [rustc(settings, "--version", "--verbose"), *selection(profile).values(), str(cargo_home(os.environ))]
     return hashlib.sha256(lock + "\n".join(words).encode()).hexdigest()
 
 

@@ -103,6 +103,12 @@ class Summary:
     passed_alone: list[Failure] = field(default_factory=list)
     cases: list[str] = field(default_factory=list)
 
+    def take(self, other: "Summary") -> None:
+        """Adds what failed in a part of the run."""
+        self.failed += other.failed
+        self.passed_alone += other.passed_alone
+        self.cases += other.cases
+
     def lines(self) -> list[str]:
         """At most MOST_LINES of them; none if nothing failed."""
         names = [f"FAILED: {failure.name}" for failure in self.failed]

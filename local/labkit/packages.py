@@ -9,6 +9,7 @@ from pathlib import Path
 from .console import run_long, say
 from .errors import LabError
 from .settings import Settings
+from .tools import lock
 
 # program -> Debian package
 PROGRAMS = {
@@ -61,7 +62,8 @@ def install(settings: Settings, packages: Sequence[str]) -> None:
         )
     say(f"installing the Debian packages {names}, usually {UPDATE_SECONDS + INSTALL_SECONDS} s")
     env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    with no_services():
+    # Of two at once the second would fail.
+    with lock(settings.cache / "packages.lock", "the system's packages"), no_services():
         argv = ["apt-get", "update", "--quiet"]
         run_long(argv, "updating the package lists", settings.logs / "apt-update.log", env=env, usual=UPDATE_SECONDS)
         argv = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]

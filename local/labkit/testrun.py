@@ -1,7 +1,7 @@
 """Owns the order of all tests and what each layer needs around it. Called by `lab test`, which `make test` and `.ci/run` call.
 
 A layer's own output goes through unchanged, so that the closing lines of the runners can be seen; a table and a summary of what
-failed close the run.
+failed close the run. The layer of the cluster mostly waits, so those that compute run next to it (`lanes`).
 """
 
 import json
@@ -11,18 +11,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import IO, Any
 
 from . import (
+    apiserver,
     awsrecorded,
     build,
+    chartalerts,
     charttest,
     cluster,
     demo,
     dockerfile,
     gpus,
     kube,
+    lanes,
+    packages,
     pagetest,
     pythonenv,
     quickstart,
@@ -39,8 +43,7 @@ from .toolsets import ENVTEST_TOOLS
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
 # Tests that run at once, as they wait most of their time: of the API server for controllers, of the cluster for the kubelet.
-AT_ONCE = 4
-AT_ONCE_IN_CLUSTER = 6
+AT_ONCE = 6
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
 # A backtrace pushes the message out of what is kept of a long log; `cargo test` itself still gives one.
@@ -69,6 +72,8 @@ class Layer:
     work: Callable[[Plan], None]
     # Needs root: for a node, or to install what is missing.
     needs_root: bool = False
+    # One of LANES: it runs next to those of the other lane. Empty: it runs before them.
+    lane: str = ""
 
 
 @dataclass(frozen=True)
@@ -92,16 +97,51 @@ class Result:
 
 
 def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -> bool:
-    """Runs the layers in order, going on after a failure; returns whether all of them passed."""
+    """Runs the layers, going on after a failure; returns whether all of them passed."""
+    started = time.monotonic()
     chosen = [layer for layer in LAYERS if not (core and layer.needs_root) and (not only or layer.name in only)]
     if not chosen:
         raise LabError("no layer is left to run: the cluster's needs a node, so leave --core out")
     plan = Plan(settings, name_filter)
     results: list[Result] = []
-    for layer in chosen:
+    in_turn, at_once = in_lanes(chosen)
+    for layer in in_turn:
         results.append(run_layer(plan, layer, results))
-    print("\n".join([table(results), *plan.summary.lines()]), flush=True)
+    if at_once:
+        results += side_by_side(plan, at_once, results)
+    results.sort(key=lambda result: NAMES.index(result.name))
+    print("\n".join([table(results, time.monotonic() - started), *plan.summary.lines()]), flush=True)
     return not any(result.failure for result in results)
+
+
+def in_lanes(chosen: Sequence[Layer]) -> tuple[list[Layer], list[list[Layer]]]:
+    """Of the layers those that run in turn, and then those that run at once: each lane in turn. No lanes where one would do."""
+    found = [[layer for layer in chosen if layer.lane == lane] for lane in LANES]
+    if not all(found):
+        return list(chosen), []
+    return [layer for layer in chosen if not layer.lane], found
+
+
+def side_by_side(plan: Plan, at_once: Sequence[Sequence[Layer]], before: Sequence[Result]) -> list[Result]:
+    """Runs each lane next to the others; the results as the layers end."""
+    names = " next to ".join(", ".join(layer.name for layer in lane) for lane in at_once)
+    say(f"{names}: each prints its output when it ends; until then it is in {plan.settings.logs}/test-*.log")
+    results = []
+    for ended in lanes.run([[job(plan, layer, before) for layer in lane] for lane in at_once], plan.settings.logs):
+        result, summary = ended.value or (
+            Result(ended.job.name, ended.seconds, "its process ended without a result, see above"),
+            Summary(),
+        )
+        results.append(result)
+        plan.summary.take(summary)
+        say(f"{result.name} took {seconds(result.seconds)}: {result.failure or result.lacks or 'passed'}")
+    return results
+
+
+def job(plan: Plan, layer: Layer, before: Sequence[Result]) -> lanes.Job:
+    """A layer as work for a process of its own, which gives back what it found."""
+    own = replace(plan, summary=Summary())
+    return lanes.Job(layer.name, lambda: (run_layer(own, layer, before), own.summary))
 
 
 def run_layer(plan: Plan, layer: Layer, before: Sequence[Result]) -> Result:
@@ -121,18 +161,17 @@ def run_layer(plan: Plan, layer: Layer, before: Sequence[Result]) -> Result:
     return Result(layer.name, time.monotonic() - started, failure, lacks)
 
 
-def table(results: Sequence[Result]) -> str:
-    """Each layer with its time, and what failed or was not run."""
+def table(results: Sequence[Result], whole: float) -> str:
+    """Each layer with its time, what failed or was not run, and the time of the whole run."""
     lines = [""]
     for result in results:
         lacks = f"not run: {result.lacks}" if result.lacks else ""
         lines.append(f"{result.name:<9}{seconds(result.seconds):>13}   {result.failure or lacks or 'passed'}")
-    total = seconds(sum(result.seconds for result in results))
     failed = [result.name for result in results if result.failure]
     left_out = [result.name for result in results if result.lacks]
     end = f"failed: {', '.join(failed)}" if failed else "passed"
     end += f"; not run: {', '.join(left_out)}" if left_out else ""
-    lines.append(f"{'all':<9}{total:>13}   {end}")
+    lines.append(f"{'all':<9}{seconds(whole):>13}   {end}")
     return "\n".join(lines)
 
 
@@ -144,6 +183,13 @@ def lab(plan: Plan) -> None:
     # 5: no test has such a name, which is for other layers to have.
     if code not in (0, 5 if plan.filter else 0):
         raise LabError("python3 -m unittest found failures, see above")
+
+
+def make_tools(plan: Plan) -> None:
+    """What would otherwise be built next to tests with limits of time."""
+    packages.ensure(plan.settings)
+    tools.ensure(plan.settings, [*cluster.tools_of(plan.settings), *apiserver.TOOLS, chartalerts.TOOL, gpus.TOOL])
+    pythonenv.ensure(plan.settings)
 
 
 def compile_all(plan: Plan) -> None:
@@ -230,9 +276,7 @@ def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
     def at_once(threads: int, harness: Sequence[str]) -> Outcome:
         return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
 
-    passed = settle(
-        plan.summary, at_once(AT_ONCE_IN_CLUSTER, [plan.filter]), lambda names: at_once(1, ["--exact", *names])
-    )
+    passed = settle(plan.summary, at_once(AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names]))
     alone = names_alone(ignored_tests(plan, target, env), plan.filter)
     if not alone and not plan.filter:
         raise LabError(
@@ -391,14 +435,17 @@ def require_target(settings: Settings, name: str) -> None:
         raise LabError(f"there is no test program {name}: tests/{name}.rs is missing")
 
 
+# The cluster waits most of its time: for the kubelet, for runs, for what dies. The others compute.
+WAITS, COMPUTES = LANES = ("waits", "computes")
 LAYERS = (
-    Layer("lab", "local/ itself, in Python", lab),
+    Layer("lab", "local/ itself, in Python", lab, lane=COMPUTES),
+    Layer("tools", "etcd, the API server and all others, kept from run to run", make_tools, needs_root=True),
     Layer("build", "all tests, and the programs they run", compile_all),
-    Layer("unit", "pure logic, mock clients, and processes on this machine", unit),
-    Layer("api", "a real API server, without nodes", api),
-    Layer("page", "the operator's page, in a headless Chromium", page, needs_root=True),
-    Layer("chart", "the Helm chart, against an API server", chart),
-    Layer("image", "the Dockerfile, by a container engine", image, needs_root=True),
-    Layer("cluster", "a real node with containers", in_cluster, needs_root=True),
+    Layer("unit", "pure logic, mock clients, and processes on this machine", unit, lane=COMPUTES),
+    Layer("api", "a real API server, without nodes", api, lane=COMPUTES),
+    Layer("page", "the operator's page, in a headless Chromium", page, needs_root=True, lane=COMPUTES),
+    Layer("chart", "the Helm chart, against an API server", chart, lane=COMPUTES),
+    Layer("image", "the Dockerfile, by a container engine", image, needs_root=True, lane=COMPUTES),
+    Layer("cluster", "a real node with containers", in_cluster, needs_root=True, lane=WAITS),
 )
 NAMES = tuple(layer.name for layer in LAYERS)

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
 
-from labkit import dockerfile, engine, enginecheck, layer, leftovers, packages, testrun
+from labkit import build, dockerfile, engine, enginecheck, layer, leftovers, packages, testrun
 from labkit.enginecheck import Built, Member
 from labkit.errors import LabError, NotRun
 from labkit.image_spec import parse
@@ -124,12 +124,15 @@ class Text(unittest.TestCase):
 
     def test_each_argument_that_is_given_is_one_of_its_own(self) -> None:
         declared = set(re.findall(r"^ARG (\w+)=", TEXT, re.MULTILINE))
-        self.assertEqual(declared, {"BUILD_IMAGE", "BASE_IMAGE", "REVISION", "PROFILE"})
+        self.assertEqual(declared, {"BUILD_IMAGE", "BASE_IMAGE", "REVISION", *dockerfile.selection(build.PROFILE)})
 
     def test_a_release_is_built_unless_told_otherwise(self) -> None:
         self.assertRegex(TEXT, r"(?m)^ARG PROFILE=release$")
+        self.assertRegex(TEXT, r'(?m)^ARG PACKAGES="--package leaderboard-operator"$')
+        self.assertEqual(dockerfile.selection("release"), {"PROFILE": "release"})
         workflow = (REPOSITORY / ".github" / "workflows" / "release.yaml").read_text()
-        self.assertNotIn("PROFILE=", workflow)
+        for argument in dockerfile.selection(build.PROFILE):
+            self.assertNotIn(f"{argument}=", workflow)
 
 
 class Machine(unittest.TestCase):
@@ -216,7 +219,7 @@ class NotRunLayers(unittest.TestCase):
         with redirect_stderr(StringIO()):
             result = testrun.run_layer(testrun.Plan(SimpleNamespace(), ""), testrun.Layer("image", "it", work), [])
         self.assertEqual((result.failure, result.lacks), ("", "no engine"))
-        lines = testrun.table([testrun.Result("lab", 1.0, ""), result]).splitlines()
+        lines = testrun.table([testrun.Result("lab", 1.0, ""), result], 1.0).splitlines()
         self.assertTrue(lines[2].endswith("   not run: no engine"))
         self.assertTrue(lines[3].endswith("   passed; not run: image"))
 

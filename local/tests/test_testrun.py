@@ -1,15 +1,18 @@
 """What is run again, what the closing tables of a test run look like, and that nothing is lost on the way."""
 
 import io
+import os
 import sys
+import tempfile
 import unittest
-from collections.abc import Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
 
 from labkit import testrun
+from labkit.errors import LabError
 from labkit.failures import Failure, Reader, Summary
 
 
@@ -115,3 +118,37 @@ class Streaming(unittest.TestCase):
         shown = io.TextIOWrapper(io.BytesIO())
         with redirect_stdout(shown), patch.object(testrun, "AFTER_END", 0.1):
             self.assertEqual(testrun.stream(plan, [sys.executable, "-c", script], {}, Reader()), 0)
+
+
+class SideBySide(unittest.TestCase):
+    """Which layers run next to the cluster's, and what becomes of what they find."""
+
+    def test_what_computes_runs_next_to_the_cluster_in_whole_runs_alone(self) -> None:
+        in_turn, at_once = testrun.in_lanes(testrun.LAYERS)
+        self.assertEqual([layer.name for layer in in_turn], ["tools", "build"])
+        names = [[layer.name for layer in lane] for lane in at_once]
+        self.assertEqual(names, [["cluster"], ["lab", "unit", "api", "page", "chart", "image"]])
+        for only in (["cluster"], ["build", "unit", "api", "chart"]):
+            chosen = [layer for layer in testrun.LAYERS if layer.name in only]
+            self.assertEqual(testrun.in_lanes(chosen), (chosen, []))
+
+    def run_both(self, unit: Callable[[testrun.Plan], None]) -> tuple[list[testrun.Result], Summary]:
+        """The results of `unit` and of a cluster's layer that passes."""
+        layers = [testrun.Layer("cluster", "it", lambda _: None), testrun.Layer("unit", "it", unit)]
+        shown = io.TextIOWrapper(io.BytesIO())
+        with tempfile.TemporaryDirectory() as folder, redirect_stdout(shown), redirect_stderr(io.StringIO()):
+            plan = testrun.Plan(SimpleNamespace(logs=Path(folder)), "")
+            return testrun.side_by_side(plan, [[layer] for layer in layers], []), plan.summary
+
+    def test_what_fails_in_a_lane_is_in_the_tables(self) -> None:
+        def fails(plan: testrun.Plan) -> None:
+            plan.summary.failed += outcome("a").failures
+            raise LabError("found failures")
+
+        results, summary = self.run_both(fails)
+        self.assertEqual({one.name: one.failure for one in results}, {"unit": "found failures", "cluster": ""})
+        self.assertEqual(summary.failed, outcome("a").failures)
+
+    def test_a_layer_whose_process_dies_has_failed(self) -> None:
+        results, _ = self.run_both(lambda _: os._exit(0))
+        self.assertEqual({one.name: bool(one.failure) for one in results}, {"unit": True, "cluster": False})

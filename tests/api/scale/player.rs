@@ -246,9 +246,16 @@ async fn set_status<K>(api: &Api<K>, name: &str, status: &Value)
 where
     K: Resource + Clone + std::fmt::Debug + serde::de::DeserializeOwned,
 {
-    api.patch_status(name, &PatchParams::default(), &Patch::Merge(status))
-        .await
-        .unwrap();
+    let patched = async || {
+        api.patch_status(name, &PatchParams::default(), &Patch::Merge(status))
+            .await
+    };
+    let answer = match patched().await {
+        // The server may close a connection while a request is on its way; the same patch twice is one.
+        Err(kube::Error::Service(_)) => patched().await,
+        answer => answer,
+    };
+    answer.unwrap();
 }
 
 fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
