@@ -6,6 +6,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
 use super::labels::{OfFailure, OfTrack, Reason, Standing, State};
+use super::leader::LeaderGauge;
 use super::{Metrics, whole, zero};
 
 #[derive(Debug)]
@@ -13,7 +14,7 @@ pub(super) struct Submissions {
     states: Family<State, Gauge>,
     reasons: Family<Standing, Gauge>,
     observed: Family<Reason, Gauge>,
-    repeating_teams: Gauge,
+    repeating_teams: LeaderGauge,
     failures: Family<OfFailure, Counter>,
     gpu: Family<OfTrack, Counter>,
 }
@@ -54,7 +55,7 @@ impl Submissions {
         self.states.clear();
         self.reasons.clear();
         self.observed.clear();
-        self.repeating_teams.set(0);
+        self.repeating_teams.clear();
     }
 }
 
