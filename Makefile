@@ -86,7 +86,10 @@ deny: ## Check licenses, bans, sources and unused dependencies (needs cargo-deny
 chart-test: ## Check the chart: its values, what each of them renders, and what an API server makes of it
 	$(LAB) chart-test
 
-.PHONY: chart-docs install-yaml
+.PHONY: book chart-docs install-yaml
+book: ## Make a book of the documents, target/book/index.html (builds mdBook the first time)
+	$(LAB) book
+
 chart-docs: ## Write docs/reference and the tables of the chart's values and of the metrics
 	$(LAB) chart-docs
 

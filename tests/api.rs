@@ -40,6 +40,7 @@ mod api {
     mod pod;
     mod pod_security;
     mod process;
+    mod prometheus;
     mod queue;
     mod restore;
     mod retention;

@@ -118,7 +118,9 @@ esac
 
 name=try-$$
 stop() {
-  docker rm --force "$name-simulator" "$name-agent" >"$out/docker.log" 2>&1 || true
+  # One after the other: the agent has the simulator's network, and podman removes no container on which another depends.
+  docker rm --force "$name-agent" >"$out/docker.log" 2>&1 || true
+  docker rm --force "$name-simulator" >>"$out/docker.log" 2>&1 || true
 }
 trap stop EXIT
 

@@ -14,6 +14,7 @@ SUFFIXES = {
     "Counter": ("_total",),
     "Histogram": ("_bucket", "_sum", "_count"),
     "Gauge": ("",),
+    "LeaderGauge": ("",),
     "FloatCounter": ("_total",),
     "FloatGauge": ("",),
     "Info": ("_info",),

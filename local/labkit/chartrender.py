@@ -6,6 +6,7 @@ Called by `charttest` and by `lab install-yaml`. Rendering asks no cluster; kube
 import json
 import re
 import tempfile
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -149,15 +150,26 @@ def queries(kube: Kube, chart: Path, repository: Path) -> str:
     values = {"prometheusRule.enabled": True, "dashboard.enabled": True}
     kinds = [f"{MONITORING}/{kind}" for kind in MONITORING_KINDS]
     rendered = objects(kube, template(kube, chart, values, kinds))
-    asked = [
-        *of_alerts(rendered[f"PrometheusRule/{RELEASE}"]["spec"]["groups"]),
-        *of_dashboard(json.loads(rendered[f"ConfigMap/{RELEASE}-dashboard"]["data"]["leaderboard-operator.json"])),
-    ]
+    rules = rendered[f"PrometheusRule/{RELEASE}"]["spec"]
+    dashboard = json.loads(rendered[f"ConfigMap/{RELEASE}-dashboard"]["data"]["leaderboard-operator.json"])
+    as_they_are(kube, chart / "files", rules, dashboard)
+    asked = [*of_alerts(rules["groups"]), *of_dashboard(dashboard)]
     metrics, literals = chartmetrics.of_repository(repository)
     wrong = [f"{name}: {one}" for name, query in asked for one in chartmetrics.faults(query, metrics, literals)]
     if wrong:
         raise LabError("; ".join(wrong))
     return f"{len(asked)} queries, {len(metrics)} metrics"
+
+
+def as_they_are(kube: Kube, files: Path, rules: Mapping[str, Any], dashboard: Mapping[str, Any]) -> None:
+    """A real Prometheus reads the files (`tests/api/prometheus.rs`), so the objects must hold the same."""
+    written = textwrap.indent((files / "alerts.yaml").read_text(), "  ")
+    head = "apiVersion: v1\nkind: Written\nmetadata: {name: alerts}\nspec:\n"
+    wanted = objects(kube, head + written)["Written/alerts"]["spec"]
+    if rules != wanted:
+        raise LabError("the PrometheusRule differs from files/alerts.yaml")
+    if dashboard != json.loads((files / "dashboard.json").read_text()):
+        raise LabError("the ConfigMap of the dashboard differs from files/dashboard.json")
 
 
 def of_alerts(groups: Sequence[dict[str, Any]]) -> Iterator[tuple[str, str]]:

@@ -15,6 +15,7 @@ from . import (
     apidocs,
     apiserver,
     artifacthub,
+    book,
     chartalerts,
     chartcases,
     chartdocs,
@@ -58,6 +59,7 @@ def run(settings: Settings, update: bool) -> None:
     check("what Artifact Hub reads", lambda: artifacthub.check(settings.repository))
     check("one version", lambda: release.version(settings.repository))
     check("a runbook for each alert", lambda: doccheck.runbooks(settings.repository))
+    check("the documents as a book", lambda: book.make(settings))
     check("when each alert fires", lambda: chartalerts.fire(settings.repository, folder))
     started = time.monotonic()
     with apiserver.running(settings, folder) as kube:

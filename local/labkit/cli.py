@@ -10,6 +10,7 @@ from pathlib import Path
 from . import (
     apidocs,
     aws,
+    book,
     build,
     chartdocs,
     chartrender,
@@ -79,6 +80,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser(
         "chart-docs", help="write docs/reference and the tables of the chart's values and of the metrics"
     )
+    commands.add_parser("book", help="make a book of the documents with mdBook, and check its links")
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
@@ -149,6 +151,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             metricdocs.update(settings.repository)
             apidocs.update(settings.repository)
             programdocs.update(settings.repository)
+        case "book":
+            say(book.make(settings))
         case "install-yaml":
             helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")

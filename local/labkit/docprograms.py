@@ -1,7 +1,7 @@
 """Owns the programs on the PATH of a page's shell. Runs as a program under each of their names.
 
-It notes its words. kubectl and helm then run in earnest, with what keeps them from waiting for nodes that never come; the others print
-what the next program of the line needs, and do nothing.
+It notes its words. kubectl and helm then run in earnest, with what keeps them from waiting for nodes that never come, and so do those
+for which there is something that answers (`docanswers`); the others print what the next program of the line needs, and do nothing.
 """
 
 import json
@@ -28,6 +28,8 @@ PRINTS: dict[str, tuple[str, int]] = {
 }
 # Behind these words, and behind `file://`, is the name of a file.
 FILES = ("--values", "--config-file", "--template-file", "--file", "--decisions")
+# Commands of the plugin that ask no cluster.
+OFFLINE = ("completion", "man")
 # What `leaderboard-operator import` prints, in the folder: docs/import.md shows it.
 IMPORTED = "challenge.yaml"
 # Added behind the words of kubectl, where the last of two flags counts.
@@ -54,9 +56,18 @@ def is_plugins(words: Sequence[str]) -> bool:
     return verb(words) == PLUGIN.partition("-")[2]
 
 
+def variable(program: str) -> str:
+    """What names the place of a program that runs in earnest."""
+    return f"DOCUMENTS_{program.upper().replace('-', '_')}"
+
+
 def changed(words: Sequence[str]) -> list[str] | None:
-    """The words with which kubectl or helm runs; None if it does not."""
+    """The words with which a program runs in earnest; None if it does not."""
     words, what = list(words), verb(words)
+    if words[0] == "man" or (words[0] == PLUGIN and what in OFFLINE):
+        return words
+    if words[0] == "curl":
+        return [*words, "--fail"]
     if words[0] == "kubectl" and is_plugins(words):
         return words
     if words[0] == "kubectl":
@@ -101,15 +112,17 @@ def main(argv: Sequence[str]) -> int:
     folder = Path(os.environ["DOCUMENTS_FOLDER"])
     note = {"place": os.environ["DOCUMENTS_PLACE"], "words": words, "code": None, "error": ""}
     run = changed(words)
-    if run is None:
+    program = os.environ.get(variable(words[0]))
+    if run is None or program is None:
         if "--password-stdin" in words:
             sys.stdin.read()
         sys.stdout.write(printed(words, folder))
         name = missing(words)
         note |= {"error": f"there is no file {name}" if name else ""}
     else:
-        command = [os.environ[f"DOCUMENTS_{run[0].upper()}"], *run[1:]]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        # man starts others; kubectl is to find the plugin of this name alone.
+        env = {**os.environ, "PATH": os.defpath} if words[0] == "man" else None
+        done = subprocess.run([program, *run[1:]], env=env, capture_output=True, text=True, check=False)
         sys.stdout.write(done.stdout)
         note |= {"code": done.returncode, "error": done.stderr[-1000:]}
     # The plugin has noted itself.

@@ -1,9 +1,10 @@
 """Owns whether what the documents show can be typed: each command runs in a shell, page by page.
 
 Called by `charttest`. The shell is bash with nothing on its PATH but standard tools and stand-ins (`docprograms`). kubectl and helm run
-in earnest, against an API server without nodes; every other program is noted with its words, which are then held against what is known
-of it: AWS's models, the Makefile, `local/lab`, the repository's files. The operator's own parsers read the words of its two programs:
-`tests/support/pages.rs`. `docpages` reads the pages, `docscene` has the manifests.
+in earnest, against an API server without nodes, and curl against EvalAI's stand-in (`docanswers`); every other program is noted with
+its words, which are then held against what is known of it: AWS's models, the Makefile, `local/lab`, the repository's files. The
+operator's own parsers read the words of its two programs: `tests/support/pages.rs`. `docpages` reads the pages, `docscene` has the
+manifests.
 """
 
 import json
@@ -18,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import docpages, docprograms, docscene, pythonenv
+from . import docanswers, docpages, docprograms, docscene, pythonenv
 from .docpages import Block
 from .errors import LabError
 from .kube import Kube
@@ -40,19 +41,19 @@ TOOLS = [
     "sed",
     "sha256sum",
     "sh",
+    "shred",
     "touch",
     "tr",
 ]
 # Noted, and held against nothing but the files that they name.
 ELSEWHERE = {
     "cosign": "needs a release that is signed",
-    "curl": "needs EvalAI and a token; was run against the stand-in by hand",
+    "curl": "needs curl; runs where the machine has it",
     "docker": "needs a container engine",
     "eksctl": "needs AWS",
     "gh": "needs a release",
-    "man": "needs man-db",
+    "man": "needs man-db; runs where the machine has it",
     "oras": "needs a registry",
-    "shred": "removes what is not there",
 }
 # Blocks that nobody types, by what they begin with.
 NOT_TYPED = {
@@ -106,8 +107,11 @@ def check(settings: Settings, kube: Kube) -> str:
     found = docpages.of_repository(settings.repository)
     docscene.prepare(settings.repository, kube)
     applied, faults = docscene.manifests(settings.repository, kube, found)
-    with tempfile.TemporaryDirectory(prefix="leaderboard-documents-") as folder:
-        notes, said = typed(settings.repository, kube, Path(folder), found)
+    with (
+        tempfile.TemporaryDirectory(prefix="leaderboard-documents-") as folder,
+        docanswers.running(settings, Path(folder)) as more,
+    ):
+        notes, said = typed(settings.repository, Kube(kube.tools, {**kube.env, **more}), Path(folder), found)
     faults += [*said, *judged(notes), *services(kube, notes), *of_words(settings, notes)]
     if faults:
         raise LabError("; ".join(faults[:12]))
@@ -136,10 +140,13 @@ def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) ->
         home = folder / str(number)
         furnish(repository, home)
         script = text([block for block in found if block.page == page])
+        script = script.replace(docanswers.EVALAI, kube.env.get("DOCUMENTS_EVALAI", docanswers.EVALAI))
         env = {
             **kube.env,
             "PATH": str(programs),
             "HOME": str(home / "home"),
+            "MANPATH": str(home / "home" / ".local" / "share" / "man"),
+            "MANPAGER": "cat",
             "PYTHONPATH": str(repository / "local"),
             "PYTHONDONTWRITEBYTECODE": "1",
             "DOCUMENTS_FOLDER": str(folder),

@@ -77,13 +77,17 @@ SETS: dict[str, ToolSet] = {
             },
         ),
         ToolSet("pause", "-s -w", {"pause": Tool(".", 2)}),
-        # Without what finds the targets of each cloud, which the rules' tests do not need.
+        # Without what finds the targets of each cloud, which no test needs, and without the web pages.
         ToolSet(
             "prometheus",
             "-s -w",
-            {"promtool": Tool("github.com/prometheus/prometheus/cmd/promtool", 120)},
+            {
+                "promtool": Tool("github.com/prometheus/prometheus/cmd/promtool", 120),
+                "prometheus": Tool("github.com/prometheus/prometheus/cmd/prometheus", 30),
+            },
             tags="remove_all_sd",
         ),
+        ToolSet("otelcol", "-s -w", {"otelcol": Tool(".", 60)}),
         ToolSet("gpu", "-s -w", {"fake-gpu": Tool(".", 30)}),
         ToolSet(
             "containerd",

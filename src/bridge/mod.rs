@@ -109,6 +109,7 @@ impl Shared {
 pub async fn run(clients: Clients, aws: Aws, scope: Scope, telemetry: Observability) -> Result<(), TaskFailed> {
     let shared = Arc::new(Shared::new(clients, aws, scope, telemetry.clone()));
     telemetry.readiness.registered();
+    telemetry.metrics.expect_messages(&route::OUTCOMES);
     let mut events = shared.leaderboards.subscribe();
     let mut pollers = Pollers::new(shared.clone());
     loop {

@@ -71,6 +71,20 @@ impl DeadReason {
     }
 }
 
+/// All that becomes of messages, as the metric's label has it.
+pub const OUTCOMES: [&str; 10] = [
+    "dead_letter",
+    "created",
+    "bumped",
+    "repeat",
+    "retried",
+    "unknown",
+    "foreign",
+    "deleting",
+    "refused",
+    "blocked",
+];
+
 /// What becomes of a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum MessageOutcome {

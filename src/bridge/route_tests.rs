@@ -1,5 +1,6 @@
 //! Tables of what becomes of each message.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use serde_json::json;
@@ -281,4 +282,24 @@ fn each_outcome_of_ingest_settles_its_message() {
             "{outcome:?} after {age} s"
         );
     }
+}
+
+#[test]
+fn each_outcome_has_a_sample_from_the_start() {
+    let dead = DeadReason::Malformed(String::new());
+    let later = [
+        Later::Unknown,
+        Later::Foreign,
+        Later::Deleting,
+        Later::Refused,
+        Later::Blocked,
+    ];
+    let done = [Done::Created, Done::Bumped, Done::Repeat];
+    let all: BTreeSet<_> = [MessageOutcome::Dead(dead), MessageOutcome::Lapse]
+        .into_iter()
+        .chain(later.map(|why| wait(1, why)))
+        .chain(done.map(MessageOutcome::Delete))
+        .map(|outcome| outcome.as_str())
+        .collect();
+    assert_eq!(all, OUTCOMES.into());
 }

@@ -1,4 +1,6 @@
-//! What is left of one submission's life outside the cluster: its trace at a collector, and its lines in the log.
+//! What is left of one submission's life outside the cluster: its trace at an OpenTelemetry Collector, and its lines in the log.
+
+mod collector;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
@@ -6,9 +8,6 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use axum::Router;
-use axum::body::Bytes;
-use axum::routing::post;
 use evalai_stand_in::Knobs;
 use evalai_stand_in::faults::{Failure, Fault, When};
 use evalai_stand_in::model::Status;
@@ -20,12 +19,10 @@ use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::trace_id::TraceId;
 use leaderboard_operator::observability::traces::{Traces, otlp};
 use leaderboard_operator::pod::report::REPORT_KEY;
-use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
+use opentelemetry_proto::tonic::common::v1::KeyValue;
 use opentelemetry_proto::tonic::common::v1::any_value::Value as Any;
 use opentelemetry_proto::tonic::trace::v1::Span;
-use prost::Message;
 use serde_json::{Value, json};
-use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tracing::Dispatch;
 
@@ -33,45 +30,10 @@ use super::boards::make_table;
 use super::counts::lifecycle::{Controller, Scenario, Watched, World};
 use super::{operator, world};
 use crate::support::{apiserver, ministack};
-
-/// Longer than a batch is filled.
-const LIMIT: Duration = Duration::from_mins(1);
+use collector::Collector;
 
 /// Far longer than anything here takes.
 const LINES: Duration = Duration::from_mins(2);
-
-/// A collector on loopback.
-struct Collector {
-    url: String,
-    spans: watch::Receiver<Vec<Span>>,
-}
-
-impl Collector {
-    async fn start() -> Self {
-        let (kept, spans) = watch::channel(Vec::new());
-        let take = async move |body: Bytes| {
-            let request = ExportTraceServiceRequest::decode(body).unwrap();
-            let scopes = request.resource_spans.into_iter().flat_map(|of| of.scope_spans);
-            kept.send_modify(|all: &mut Vec<Span>| all.extend(scopes.flat_map(|scope| scope.spans)));
-        };
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let url = format!("http://{}/v1/traces", listener.local_addr().unwrap());
-        tokio::spawn(async move { axum::serve(listener, Router::new().route("/v1/traces", post(take))).await });
-        Self { url, spans }
-    }
-
-    /// Once it has a span of each name.
-    async fn with(&mut self, names: &[&str]) -> Vec<Span> {
-        let all = self
-            .spans
-            .wait_for(|spans| names.iter().all(|name| spans.iter().any(|span| span.name == *name)));
-        let found = match tokio::time::timeout(LIMIT, all).await {
-            Ok(all) => Some(all.unwrap().clone()),
-            Err(_) => None,
-        };
-        found.unwrap_or_else(|| panic!("not all of {names:?}: {:?}", self.spans.borrow()))
-    }
-}
 
 #[derive(Clone, Default)]
 struct Lines(Arc<watch::Sender<Vec<u8>>>);
@@ -120,20 +82,17 @@ fn traces(url: &str) -> (Traces, otlp::Sending) {
 }
 
 fn attributes(span: &Span) -> BTreeMap<&str, String> {
-    let text = |value: &Any| match value {
+    let of = span.attributes.iter();
+    of.map(|one| (one.key.as_str(), text(one).unwrap())).collect()
+}
+
+fn text(attribute: &KeyValue) -> Option<String> {
+    Some(match attribute.value.as_ref()?.value.as_ref()? {
         Any::StringValue(text) => text.clone(),
         Any::IntValue(number) => number.to_string(),
         Any::BoolValue(flag) => flag.to_string(),
         other => panic!("an attribute of another kind: {other:?}"),
-    };
-    let of = span.attributes.iter();
-    of.map(|one| {
-        (
-            one.key.as_str(),
-            text(one.value.as_ref().unwrap().value.as_ref().unwrap()),
-        )
     })
-    .collect()
 }
 
 fn check_tree(spans: &[Span], uid: &str, namespace: &str) {
@@ -238,6 +197,10 @@ async fn a_life_is_one_trace_and_one_line_for_each_transition() {
     let api: Api<Submission> = Api::namespaced(world.client.clone(), &world.namespace);
     let uid = api.get("one").await.unwrap().metadata.uid.unwrap();
     check_tree(&spans, &uid, &world.namespace);
+    for resource in &collector.resources {
+        let service = resource.attributes.iter().find(|of| of.key == "service.name");
+        assert_eq!(service.and_then(text).as_deref(), Some("leaderboard-operator"));
+    }
     check_lines(&lines.of_submissions(), &uid, &world.namespace);
     controller.end().await;
     sending.finish().await;

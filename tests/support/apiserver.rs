@@ -20,6 +20,7 @@ use kube::{Client, Config};
 use serde_json::json;
 use tokio::sync::OnceCell;
 
+use super::tools;
 use control_plane::{apiserver_arguments, etcd_arguments, free_ports, kubeconfig, probe};
 
 #[path = "control_plane.rs"]
@@ -177,14 +178,7 @@ fn programs() -> Result<PathBuf, String> {
     let folder = if let Some(folder) = std::env::var_os("KUBEBUILDER_ASSETS") {
         PathBuf::from(folder)
     } else {
-        let lab = Path::new(env!("CARGO_MANIFEST_DIR")).join("local/lab");
-        let output = Command::new(&lab).arg("tools").args(PROGRAMS).output();
-        let output = output.map_err(|error| format!("{} does not run ({error}); {HOW_TO_RUN}", lab.display()))?;
-        if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr);
-            return Err(format!("`local/lab tools` failed: {}; {HOW_TO_RUN}", said.trim()));
-        }
-        PathBuf::from(String::from_utf8_lossy(&output.stdout).trim())
+        tools::of_lab(&PROGRAMS).map_err(|error| format!("{error}; {HOW_TO_RUN}"))?
     };
     match PROGRAMS.iter().find(|program| !folder.join(program).is_file()) {
         None => Ok(folder),

@@ -5,3 +5,4 @@ pub mod apiserver;
 pub mod images;
 pub mod ministack;
 pub mod throttle;
+pub mod tools;

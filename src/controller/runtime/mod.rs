@@ -41,6 +41,7 @@ use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::node;
 use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::phases::Phase;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history;
 use crate::kubernetes::objects::{Job, Node, Pod};
@@ -259,6 +260,7 @@ impl Parts {
             return Ok(());
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
+        self.telemetry.metrics.expect_phases(&Phase::ALL.map(Phase::as_str));
         let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (rows, changed_rows) = mpsc::unbounded_channel();
         let (evalai, changed) = mpsc::unbounded_channel();

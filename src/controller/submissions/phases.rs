@@ -35,6 +35,19 @@ pub enum Phase {
 }
 
 impl Phase {
+    pub const ALL: [Self; 10] = [
+        Self::Intake,
+        Self::Accept,
+        Self::Wait,
+        Self::Schedule,
+        Self::Start,
+        Self::Run,
+        Self::Attempt,
+        Self::Archive,
+        Self::Record,
+        Self::Publish,
+    ];
+
     /// As metrics and traces name it.
     pub fn as_str(self) -> &'static str {
         match self {

@@ -44,6 +44,10 @@ impl Reconciles {
             errors: zero(r, "reconcile_errors", "Failed reconciliations by kind and reason"),
         }
     }
+
+    pub(super) fn leave_to_the_leader(&self) {
+        self.waiting.clear();
+    }
 }
 
 impl Metrics {

@@ -4,20 +4,20 @@ use std::time::Duration;
 
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
-use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
 use super::labels::{Call, MessageOutcome, Op, OpOutcome, ServiceOp};
+use super::leader::LeaderGauge;
 use super::{Metrics, Timings, add, timings, whole, zero};
 
 #[derive(Debug)]
 pub(super) struct Evalai {
     requests: Family<OpOutcome, Counter>,
     duration: Timings<Op>,
-    budget_used: Gauge,
-    budget_limit: Gauge,
-    waiting: Gauge,
+    budget_used: LeaderGauge,
+    budget_limit: LeaderGauge,
+    waiting: LeaderGauge,
 }
 
 impl Evalai {
@@ -42,6 +42,12 @@ impl Evalai {
                 "Updates and questions that wait for a request to EvalAI",
             ),
         }
+    }
+
+    pub(super) fn leave_to_the_leader(&self) {
+        self.budget_used.clear();
+        self.budget_limit.clear();
+        self.waiting.clear();
     }
 }
 
@@ -105,6 +111,13 @@ impl Metrics {
     /// What became of a message.
     pub fn sqs_message(&self, outcome: &'static str) {
         self.messages.total.get_or_create(&MessageOutcome { outcome }).inc();
+    }
+
+    /// These outcomes begin at zero: Prometheus sees no increase in a sample that begins with 1.
+    pub fn expect_messages(&self, outcomes: &[&'static str]) {
+        for outcome in outcomes {
+            let _ = self.messages.total.get_or_create(&MessageOutcome { outcome });
+        }
     }
 
     /// A message has made or resumed a Submission, so long after it was sent.

@@ -10,6 +10,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
 use super::labels::{OfFailure, OfTeam, OfTrack, Reason, Standing, State};
+use super::leader::LeaderGauge;
 use super::{Metrics, whole, zero};
 
 /// Teams of a Leaderboard that have a sample of their own: a series for each of thousands would burden Prometheus.
@@ -22,7 +23,7 @@ pub(super) struct Submissions {
     states: Family<State, Gauge>,
     reasons: Family<Standing, Gauge>,
     observed: Family<Reason, Gauge>,
-    repeating_teams: Gauge,
+    repeating_teams: LeaderGauge,
     failures: Family<OfFailure, Counter>,
     gpu: Family<OfTrack, Counter>,
     team_gpu: Family<OfTeam, Counter>,
@@ -85,7 +86,7 @@ impl Submissions {
         self.states.clear();
         self.reasons.clear();
         self.observed.clear();
-        self.repeating_teams.set(0);
+        self.repeating_teams.clear();
     }
 }
 
