@@ -66,7 +66,7 @@ class Lanes(unittest.TestCase):
         self.assertEqual([(one.job.name, one.value) for one in ended], [("a", None), ("b", 1)])
         self.assertIn("last words", shown)
 
-    def test_how_far_each_is_is_told_from_time_to_time(self) -> None:
+    def test_progress_of_each_is_shown_from_time_to_time(self) -> None:
         wait, go = gate()
 
         def slow() -> None:
