@@ -13,7 +13,7 @@ use super::memory::Memory;
 use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
-use crate::controller::objects::{key_of, log_span_of, uid, uid_of};
+use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::lock::lock;
 use crate::services::ObjectKey;
 use crate::services::evalai::{
