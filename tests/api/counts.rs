@@ -26,8 +26,6 @@ const TRIES: usize = 3;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct Cost {
-    /// Writes until its Leaderboard, which was new, is Ready and nothing more comes of that.
-    pub preparation: BTreeMap<String, u64>,
     /// Requests to the API server by verb and resource. Watches, the Lease and questions after rights are the process's own.
     pub writes: BTreeMap<String, u64>,
     /// Writes of its Leaderboard's counts, which all submissions share: at most one in five seconds.
@@ -97,11 +95,6 @@ fn differences(expected: &Table, seen: &Table) -> Vec<String> {
             ));
         }
         for (what, expected, seen) in [
-            (
-                "writes until its Leaderboard is ready",
-                expected.preparation.values().sum(),
-                cost.preparation.values().sum(),
-            ),
             (
                 "writes of the Leaderboard's counts",
                 expected.leaderboard_writes.values().sum(),

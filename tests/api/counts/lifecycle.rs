@@ -1,6 +1,5 @@
 //! One submission's whole life with a controller on a thread of its own, whose allocations are counted there.
 
-use std::collections::BTreeMap;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -104,8 +103,7 @@ impl Scenario {
                 controller.quiet().await;
             }
         }
-        let mut preparation = controller.requests().await;
-        let requests = preparation.split_off(before.0);
+        let requests = controller.requests().await.split_off(before.0);
         let reconciles = controller.reconciles() - before.1;
         let s3_requests = world.s3.requests() - before.2;
         let memory = controller.end().await;
@@ -116,13 +114,8 @@ impl Scenario {
             allocated_kilobytes: memory.bytes_total >> 10,
             ..Cost::default()
         };
-        let is_write = |request: &&Request| !is_read(request);
-        preparation
-            .iter()
-            .filter(is_write)
-            .for_each(|request| add(&mut cost.preparation, request));
-        for request in &requests {
-            let of = if is_read(request) {
+        for request in requests {
+            let of = if is_read(&request) {
                 &mut cost.reads
             } else if request.resource() == OF_THE_LEADERBOARD {
                 // However many submissions there are, they share one in some seconds.
@@ -130,15 +123,11 @@ impl Scenario {
             } else {
                 &mut cost.writes
             };
-            add(of, request);
+            *of.entry(format!("{} {}", request.verb, request.resource()))
+                .or_insert(0) += 1;
         }
         cost
     }
-}
-
-fn add(to: &mut BTreeMap<String, u64>, request: &Request) {
-    let name = format!("{} {}", request.verb, request.resource());
-    *to.entry(name).or_insert(0) += 1;
 }
 
 /// Where a controller's spans and log lines go.
