@@ -140,7 +140,7 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "list watch create delete", "batch/jobs", namespace),
         *may(controller, "list watch patch delete", "pods", namespace),
         *may(controller, "get", "pods:log", namespace),
-        *may(controller, "list", "events", namespace),
+        *may(controller, "list watch", "events", namespace),
         *may(controller, "create patch", "events.k8s.io/events", namespace),
         *may(controller, "list watch create patch", "networking.k8s.io/networkpolicies", namespace),
         *may(controller, "get list create patch delete", "resource.k8s.io/resourceclaimtemplates", namespace),

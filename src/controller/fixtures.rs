@@ -32,10 +32,11 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
+use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
-use crate::controller::submissions::team_history;
+use crate::controller::submissions::team_history::Teams;
 use crate::kubernetes::Namespaces;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Store, Synced};
@@ -109,6 +110,10 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let tasks = Tasks::new(stopped);
     let (answering, answered) = mpsc::unbounded_channel();
     let (waking, woken) = mpsc::unbounded_channel();
+    let teams = Teams::default();
+    for submission in &cluster.submissions {
+        teams.changed(None, Some(submission));
+    }
     let (looks, wanted) = mpsc::unbounded_channel();
     let context = Context {
         settings: settings(),
@@ -116,6 +121,8 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         memory: Memory::default(),
         archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), noting(&answering)),
         lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
+        causes: Causes::default(),
+        teams,
         images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
         foreign_runs: ForeignRuns::start(&aws, &tasks, noting(&answering)),
         other_results: OtherResults::start(&aws, &tasks, noting(&answering)),
@@ -170,7 +177,7 @@ fn stores(cluster: Cluster) -> Stores {
     policies_synced.set(true);
     Stores {
         leaderboards: Store::of(cluster.leaderboards, |_| None),
-        submissions: Store::of(cluster.submissions, team_history::index),
+        submissions: Store::of(cluster.submissions, |_| None),
         jobs: Store::of(cluster.jobs, |_| None),
         pods: Store::of(cluster.pods, owner_uid),
         policies: Store::of(cluster.policies, |_| None),

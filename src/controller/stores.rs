@@ -15,7 +15,6 @@ use leaderboard_api::{Leaderboard, Submission, names};
 /// Caches of the API server, filled by one task each.
 pub struct Stores {
     pub leaderboards: Store<Leaderboard>,
-    /// Those with an end of some attempt by their Leaderboard too.
     pub submissions: Store<Submission>,
     pub jobs: Store<Job>,
     /// By the UID of their Job too.

@@ -10,6 +10,7 @@ pub mod objects;
 pub mod preflight;
 mod source;
 mod store;
+mod uncached;
 mod watch;
 mod write;
 
@@ -25,7 +26,8 @@ pub use call::{CallError, call, call_within};
 pub use feed::{WatchEvent, WatchEvents};
 pub use item::{Item, Malformed, Watchable};
 pub use namespaces::Namespaces;
-pub use store::{Index, Store};
+pub use store::{Index, Store, Tally};
+pub use uncached::spawn_uncached;
 pub use watch::{PAGE, Shape, Synced, Unreadable, Watch, spawn_watch};
 pub use write::{Writes, Written};
 

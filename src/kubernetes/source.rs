@@ -136,6 +136,21 @@ fn begin<K: Watchable>(api: &Api<Item<K>>, config: &Config) -> Events<K> {
     Box::pin(watcher(api.clone(), config.clone()).default_backoff())
 }
 
+/// Tells the probe of a watch what an error means for it.
+pub(super) fn report(probe: &WatchProbe, error: &Error) {
+    match error {
+        // Both come from a watch that had been let in.
+        Error::WatchError(_) | Error::WatchFailed(_) => probe.running(),
+        _ if is_refusal(error) => probe.refused(),
+        _ => probe.failed(),
+    }
+}
+
+/// The server has forgotten where the watch was: usual after an outage.
+pub(super) fn is_forgotten(error: &Error) -> bool {
+    matches!(error, Error::WatchError(status) if status.code == 410)
+}
+
 /// The right to list or to watch is missing.
 pub(super) fn is_refusal(error: &Error) -> bool {
     match error {

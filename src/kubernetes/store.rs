@@ -13,6 +13,9 @@ use super::Watchable;
 /// By what objects are looked up besides their names, if at all.
 pub type Index<K> = fn(&K) -> Option<String>;
 
+/// Receives each change of a cache: what was there before, and what is there now. Keeps sums, so that nobody walks through all.
+pub type Tally<K> = Arc<dyn Fn(Option<&K>, Option<&K>) + Send + Sync>;
+
 /// Reads a cache. Clones are the same one.
 pub struct Store<K>(Arc<Shared<K>>);
 
@@ -36,6 +39,7 @@ pub struct Ended;
 pub(super) struct Writer<K> {
     store: Store<K>,
     ready: watch::Sender<bool>,
+    tallies: Vec<Tally<K>>,
 }
 
 /// Namespace and name in one.
@@ -60,7 +64,7 @@ impl<K: Watchable> Store<K> {
     /// A cache that holds these and never changes.
     #[cfg(test)]
     pub(crate) fn of(objects: impl IntoIterator<Item = K>, index: Index<K>) -> Self {
-        let mut writer = Writer::new(index);
+        let mut writer = Writer::new(index, Vec::new());
         for object in objects {
             writer.put(object);
         }
@@ -116,7 +120,7 @@ impl<K: Watchable> Store<K> {
 }
 
 impl<K: Watchable> Writer<K> {
-    pub(super) fn new(index: Index<K>) -> Self {
+    pub(super) fn new(index: Index<K>, tallies: Vec<Tally<K>>) -> Self {
         let (sender, ready) = watch::channel(false);
         let cache = Cache {
             by_key: HashMap::new(),
@@ -130,6 +134,7 @@ impl<K: Watchable> Writer<K> {
         Self {
             store: Store(Arc::new(shared)),
             ready: sender,
+            tallies,
         }
     }
 
@@ -158,6 +163,8 @@ impl<K: Watchable> Writer<K> {
                 .or_insert_with(|| Vec::with_capacity(1));
             all.push(Arc::clone(&object));
         }
+        drop(cache);
+        self.tell(before.as_deref(), Some(&object));
         (object, before)
     }
 
@@ -166,7 +173,13 @@ impl<K: Watchable> Writer<K> {
         let mut cache = self.store.write();
         let before = cache.by_key.remove(key)?;
         cache.leave(&before, self.store.0.index);
+        drop(cache);
+        self.tell(Some(&before), None);
         Some(before)
+    }
+
+    fn tell(&self, before: Option<&K>, now: Option<&K>) {
+        self.tallies.iter().for_each(|tally| tally(before, now));
     }
 
     /// The keys for which this does not hold.
@@ -205,7 +218,7 @@ mod tests {
 
     #[test]
     fn the_index_follows_an_object_that_is_replaced_or_removed() {
-        let mut writer = Writer::new(owner);
+        let mut writer = Writer::new(owner, Vec::new());
         let store = writer.store().clone();
         let uids = |value: &str| {
             let mut uids: Vec<_> = store
@@ -231,5 +244,24 @@ mod tests {
         writer.remove("n/a");
         assert!(writer.remove("n/a").is_none() && store.is_empty());
         assert!(store.read().by_index.is_empty(), "nothing is left of what is gone");
+    }
+
+    #[test]
+    fn a_tally_receives_what_each_change_replaces() {
+        let told = Arc::new(std::sync::Mutex::new(Vec::new()));
+        let notes = Arc::clone(&told);
+        let uid = |pod: Option<&Pod>| pod.map(|pod| pod.metadata.uid.to_string());
+        let tally: Tally<Pod> = Arc::new(move |before, now| notes.lock().unwrap().push((uid(before), uid(now))));
+        let mut writer = Writer::new(owner, vec![tally]);
+        writer.put(pod("a", "1", "job-1"));
+        writer.put(pod("a", "2", "job-1"));
+        writer.remove("n/a");
+        writer.remove("n/a");
+        let (one, two) = (|| Some("1".to_owned()), || Some("2".to_owned()));
+        assert_eq!(
+            *told.lock().unwrap(),
+            [(None, one()), (one(), two()), (two(), None)],
+            "what is not there has no end"
+        );
     }
 }

@@ -16,7 +16,7 @@ use super::feed::{Feed, WatchEvents};
 use super::item::{Item, Watchable};
 use super::objects::Texts;
 use super::source::{self, Source, is_refusal};
-use super::store::{Index, Store, Writer, key_of};
+use super::store::{Index, Store, Tally, Writer, key_of};
 use crate::lock::lock;
 use crate::observability::Observability;
 use crate::observability::metrics::WatchMetrics;
@@ -74,6 +74,7 @@ pub struct Shape<K> {
     /// Drops what is never read, before an object is cached.
     pub trim: fn(&mut K),
     pub index: Index<K>,
+    pub tallies: Vec<Tally<K>>,
 }
 
 impl<K> Default for Shape<K> {
@@ -81,6 +82,7 @@ impl<K> Default for Shape<K> {
         Self {
             trim: |_| {},
             index: |_| None,
+            tallies: Vec::new(),
         }
     }
 }
@@ -120,10 +122,10 @@ impl<K: Watchable> Watch<K> {
 pub fn spawn_watch<K: Watchable>(
     apis: Vec<Api<Item<K>>>,
     config: Config,
-    Shape { trim, index }: Shape<K>,
+    Shape { trim, index, tallies }: Shape<K>,
     telemetry: &Observability,
 ) -> Watch<K> {
-    let writer = Writer::<K>::new(index);
+    let writer = Writer::<K>::new(index, tallies);
     let watch = Watch {
         store: writer.store().clone(),
         synced: Synced::default(),
@@ -358,21 +360,13 @@ impl<K: Watchable> Task<K> {
     fn error(&mut self, source: usize, error: &Error) {
         self.metrics.failed();
         let from = &mut self.sources[source];
-        match error {
-            // Both come from a watch that had been let in.
-            Error::WatchError(_) | Error::WatchFailed(_) => from.probe.running(),
-            _ if is_refusal(error) => {
-                from.probe.refused();
-                from.is_synced = false;
-                self.synced.set(false);
-            }
-            _ => from.probe.failed(),
+        source::report(&from.probe, error);
+        if is_refusal(error) {
+            from.is_synced = false;
+            self.synced.set(false);
         }
         let cause = from.cause(client_errors::watch(error));
-        if let Error::WatchError(status) = error
-            && status.code == 410
-        {
-            // The server has forgotten where the watch was: usual after an outage.
+        if source::is_forgotten(error) {
             tracing::info!(kind = self.kind, error = cause, "listing again");
         } else {
             tracing::warn!(kind = self.kind, error = cause, "a watch has failed and is retried");

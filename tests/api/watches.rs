@@ -3,15 +3,18 @@
 use std::time::Duration;
 
 use futures::StreamExt;
+use k8s_openapi::api::core::v1::Event;
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::watcher::Config;
 use kube::{Api, ResourceExt};
 use leaderboard_api::Submission;
+use leaderboard_operator::controller::submissions::observe::causes::OF_PODS;
 use leaderboard_operator::kubernetes::preflight::{Need, access_missing, await_kinds};
-use leaderboard_operator::kubernetes::{Shape, WatchEvents, guarded, spawn_watch};
+use leaderboard_operator::kubernetes::{Shape, WatchEvents, guarded, objects, spawn_uncached, spawn_watch};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use serde_json::json;
+use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use crate::support::apiserver::server;
@@ -61,6 +64,62 @@ async fn creations_changes_and_deletions_are_events() {
     submissions.delete("one", &DeleteParams::default()).await.unwrap();
     next(&mut events, |object, is_gone| object.name_any() == "one" && is_gone).await;
     assert!(watch.store.is_empty() && telemetry.readiness.missing().is_empty());
+}
+
+/// An event of a Pod, as its source writes it: the scheduler names itself in the newer field alone.
+fn event(namespace: &str, source: &str, reason: &str) -> Event {
+    let is_new = source == "default-scheduler";
+    let time = "2026-01-01T00:00:00.000000Z";
+    let event = json!({
+        "metadata": {"generateName": "p.", "namespace": namespace},
+        "involvedObject": {"kind": "Pod", "namespace": namespace, "name": "p", "uid": "u"},
+        "reason": reason, "message": "m", "type": "Normal",
+        "source": {"component": (!is_new).then_some(source)},
+        "reportingComponent": if is_new { source } else { "" },
+        "reportingInstance": if is_new { "one" } else { "" },
+        "action": if is_new { "Scheduling" } else { "" },
+        "eventTime": is_new.then_some(time),
+    });
+    serde_json::from_value(event).unwrap()
+}
+
+#[tokio::test]
+async fn of_the_events_of_pods_those_of_kubelet_and_scheduler_are_not_sent() {
+    let (client, namespace) = (server().await.client(), server().await.namespace("events").await);
+    let (_sender, stop) = Stop::new();
+    let telemetry = Observability::new(stop);
+    let api = Api::<Event>::namespaced(client.clone(), &namespace);
+    let make = async |source: &str, reason: &str| {
+        let event = event(&namespace, source, reason);
+        api.create(&PostParams::default(), &event).await.unwrap();
+    };
+    for (source, reason) in [
+        ("kubelet", "Pulled"),
+        ("karpenter", "Nominated"),
+        ("default-scheduler", "FailedScheduling"),
+    ] {
+        make(source, reason).await;
+    }
+    let (sender, mut heard) = mpsc::unbounded_channel();
+    let take = move |event: objects::Event| sender.send(event.reason.unwrap_or_default().to_string()).unwrap();
+    let config = Config::default().fields(OF_PODS);
+    spawn_uncached(
+        "events of Pods",
+        vec![guarded(client, Some(&namespace))],
+        config,
+        &telemetry,
+        take,
+    );
+    let mut next = async || timeout(LIMIT, heard.recv()).await.expect("an event in time").unwrap();
+    assert_eq!(next().await, "Nominated", "what was there");
+    for (source, reason) in [
+        ("default-scheduler", "FailedScheduling"),
+        ("kubelet", "Started"),
+        ("cluster-autoscaler", "NotTriggerScaleUp"),
+    ] {
+        make(source, reason).await;
+    }
+    assert_eq!(next().await, "NotTriggerScaleUp", "what came");
 }
 
 #[tokio::test]

@@ -13,7 +13,7 @@ use kube::api::{Patch, PatchParams};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client, ResourceExt};
 
-use super::state::{Applied, Entry, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
+use super::state::{Applied, Entry, Found, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
 use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::objects::{Wake, key_of, uid_of};
 use crate::controller::slots::SlotAllocator;
@@ -200,16 +200,12 @@ fn is_refusal(code: u16) -> bool {
     (400..500).contains(&code) && ![408, 409, 429].contains(&code)
 }
 
-/// What was measured last of this generation: by a Pod that is there, else by one that is gone, as the condition says; while the
-/// condition says something else, as this process remembers it.
-pub(super) fn measured(
-    stores: &Stores,
-    state: &LeaderboardState,
-    leaderboard: &Leaderboard,
-) -> Option<WorkspaceVerdict> {
+/// What was measured last of this generation: by a Pod, as this process has seen it, else by one that is gone, as the condition says;
+/// while the condition says something else, as this process remembers it.
+pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
-        // The condition does not show it, and each reconcile would look at all Pods.
+        // The condition does not show it.
         return None;
     }
     let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation);
@@ -217,7 +213,8 @@ pub(super) fn measured(
         let (of, verdict) = state.read(&uid, |entry| entry.measured.clone())?;
         (of == generation).then_some(verdict)
     };
-    by_pods(stores, leaderboard)
+    let found = state
+        .found(&uid, generation)
         .or_else(|| known(leaderboard))
         .or_else(remembered)
 }
@@ -228,16 +225,21 @@ pub(super) fn remember(state: &LeaderboardState, leaderboard: &Leaderboard, foun
     state.change(&uid_of(leaderboard), |entry| entry.measured = Some(found));
 }
 
-/// What the Pod that ended its `workspace` last has found, of those that this generation's Jobs made.
-fn by_pods(stores: &Stores, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
-    let generation = leaderboard.metadata.generation.unwrap_or_default().to_string();
-    let is_ours = |pod: &Arc<Pod>| {
-        is_pod_of(pod, leaderboard)
-            && pod.metadata.annotations.leaderboard_generation.as_deref() == Some(generation.as_str())
+/// Remembers what a Pod has found. That of the newest spec counts, and of its Pods that of the one that ended its `workspace` last.
+pub fn note_finding(state: &LeaderboardState, leaderboard: &Leaderboard, pod: &Pod) -> bool {
+    let generation = pod.metadata.annotations.leaderboard_generation.as_deref();
+    let Some((at, verdict)) = finding(pod) else {
+        return false;
     };
-    let pods = stores.pods.state();
-    let found = pods.iter().filter(|pod| is_ours(pod)).filter_map(|pod| finding(pod));
-    found.max_by_key(|(at, _)| *at).map(|(_, verdict)| verdict)
+    if let Some(generation) = generation.and_then(|generation| generation.parse().ok()) {
+        let found = Found {
+            generation,
+            at,
+            verdict,
+        };
+        state.note_found(&uid_of(leaderboard), found);
+    }
+    true
 }
 
 /// Pods of a Leaderboard that have not ended, counted only once it is being deleted: the policy goes with it.
@@ -258,7 +260,7 @@ fn is_pod_of(pod: &Pod, leaderboard: &Leaderboard) -> bool {
 }
 
 /// What a Pod has found of its isolation, and when.
-pub fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
+fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
     let mut containers = pod.status.init_container_statuses.iter();
     let end = containers.find(|c| &*c.name == names::CONTAINER_WORKSPACE)?.ended()?;
     let verdict = WorkspaceVerdict::parse(end.message.as_deref()?)?;

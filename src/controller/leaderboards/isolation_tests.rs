@@ -98,8 +98,8 @@ fn only_what_was_measured_is_called_enforced() {
 async fn what_a_pod_found_outlives_it_until_the_spec_changes() {
     let around = surroundings(Cluster::default(), "http://127.0.0.1:1").await;
     let said = |leaderboard: &Leaderboard| {
-        let (stores, state) = (&around.context.stores, &around.context.leaderboards);
-        let found = measured(stores, state, leaderboard);
+        let state = &around.context.leaderboards;
+        let found = measured(state, leaderboard);
         if let Some(found) = &found {
             remember(state, leaderboard, found);
         }
@@ -131,6 +131,44 @@ async fn what_a_pod_found_outlives_it_until_the_spec_changes() {
     let mut edited = shown(reasons::FORBIDDEN, 2);
     edited.metadata.generation = Some(3);
     assert_eq!(said(&edited).1, reasons::NOT_MEASURED, "of another spec");
+}
+
+#[test]
+fn the_newest_pod_of_the_newest_spec_counts_also_when_it_is_gone() {
+    use WorkspaceReason::{Enforced, NotEnforced, NotMeasured};
+    let state = LeaderboardState::default();
+    let of = |generation: i64| leaderboard(&json!({}), generation);
+    let found = |generation: i64| measured(&state, &of(generation)).map(|verdict| verdict.reason);
+    let pod = |generation: &str, second: i64, reason: WorkspaceReason| -> Pod {
+        let at = Timestamp::from_second(second).unwrap().to_string();
+        let ended = json!({"terminated": {"exitCode": 0, "message": verdict(reason).to_json(), "finishedAt": at}});
+        let status = json!({"name": "workspace", "image": "i", "imageID": "", "ready": false, "restartCount": 0, "state": ended});
+        let annotations = json!({names::ANNOTATION_GENERATION: generation});
+        let pod = json!({"metadata": {"annotations": annotations}, "status": {"initContainerStatuses": [status]}});
+        serde_json::from_value(pod).unwrap()
+    };
+    assert_eq!(found(2), None);
+    for (what, pod, expected) in [
+        ("the first", pod("2", 10, Enforced), Some(Enforced)),
+        (
+            "an earlier one of the same spec",
+            pod("2", 5, NotMeasured),
+            Some(Enforced),
+        ),
+        (
+            "a later one of an older spec",
+            pod("1", 20, NotMeasured),
+            Some(Enforced),
+        ),
+        ("a later one", pod("2", 11, NotEnforced), Some(NotEnforced)),
+        ("one of no spec", pod("", 30, Enforced), Some(NotEnforced)),
+    ] {
+        assert!(note_finding(&state, &of(2), &pod), "{what}");
+        assert_eq!(found(2), expected, "{what}");
+    }
+    assert_eq!(found(3), None, "of another spec");
+    let silent = serde_json::from_value(json!({"metadata": {}})).unwrap();
+    assert!(!note_finding(&state, &of(2), &silent));
 }
 
 #[test]

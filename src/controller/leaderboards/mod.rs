@@ -35,14 +35,13 @@ use super::objects::{key_of, uid_of};
 use super::settings::Settings;
 use super::slots::SlotAllocator;
 use super::writes::{apply_status, set_finalizer};
-use crate::controller::stores::Stores;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::{team_history, team_use};
+use crate::controller::submissions::team_history::Teams;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::{LimitsState, Metrics};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
-use leaderboard_api::{Leaderboard, Submission, names};
+use leaderboard_api::{Leaderboard, names};
 use looks::Look;
 use probe::Probe;
 use state::{COUNTS_EVERY, LeaderboardState, Looked, Policy, RESYNC, SOONEST};
@@ -56,6 +55,7 @@ pub struct Uses<'a> {
     pub policies: Policies<'a>,
     pub settings: &'a Settings,
     pub slots: &'a SlotAllocator,
+    pub teams: &'a Teams,
     pub external: &'a ExternalSystems,
     pub looks: &'a UnboundedSender<Look>,
     pub metrics: &'a Metrics,
@@ -176,19 +176,18 @@ fn observe(
     let (counts, in_use) = uses.slots.census(leaderboard);
     let (stores, hub) = (uses.policies.stores, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
-    let ended = ended(stores, leaderboard);
     LeaderboardView {
         now,
         leaderboard: Arc::clone(leaderboard),
         all: stores.leaderboards.state(),
         counts,
         check: uses.slots.last_check(leaderboard),
-        teams: team_history::teams(&ended),
-        gpu_use: team_use::teams(&ended),
+        teams: uses.teams.failures(leaderboard),
+        gpu_use: uses.teams.gpu_use(leaderboard),
         in_use,
         pods: isolation::pods_left(stores, leaderboard),
         policy,
-        measured: isolation::measured(stores, uses.policies.state, leaderboard),
+        measured: isolation::measured(uses.policies.state, leaderboard),
         refusal: None,
         is_looked_at: true,
         invalid_pod: probe.invalid_pod(),
@@ -201,13 +200,6 @@ fn observe(
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),
     }
-}
-
-/// Its Submissions that have an end of some attempt, or of a Job.
-fn ended(stores: &Stores, leaderboard: &Leaderboard) -> Vec<Arc<Submission>> {
-    let namespace = leaderboard.metadata.namespace.as_deref().unwrap_or_default();
-    let name = leaderboard.metadata.name.as_deref().unwrap_or_default();
-    stores.submissions.indexed(&team_history::key_of(namespace, name))
 }
 
 /// Writes the status if it says something new; returns when to look again.

@@ -50,6 +50,14 @@ impl Applied {
     }
 }
 
+/// What a Pod has found of its isolation, made from which generation, and when.
+#[derive(Clone, Debug)]
+pub(super) struct Found {
+    pub(super) generation: i64,
+    pub(super) at: Option<Timestamp>,
+    pub(super) verdict: WorkspaceVerdict,
+}
+
 /// What the looks at a Leaderboard have found.
 #[derive(Clone, Default)]
 pub(super) struct Looked {
@@ -70,6 +78,8 @@ pub(super) struct Entry {
     pub(super) applied: Option<Applied>,
     /// What was measured last, of which generation.
     pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
+    /// What its Pods have found.
+    pub(super) found: Option<Found>,
     /// The Lease of the installation that drives it, where that is another one.
     pub(super) foreign: Option<Foreign>,
 }
@@ -102,6 +112,20 @@ impl LeaderboardState {
         self.change(uid, |entry| {
             if let Some(applied) = &mut entry.applied {
                 applied.unseen = None;
+            }
+        });
+    }
+
+    pub(super) fn found(&self, uid: &str, generation: Option<i64>) -> Option<WorkspaceVerdict> {
+        let found = self.read(uid, |entry| entry.found.clone())?;
+        (Some(found.generation) == generation).then_some(found.verdict)
+    }
+
+    pub(super) fn note_found(&self, uid: &str, found: Found) {
+        let order = |found: &Found| (found.generation, found.at);
+        self.change(uid, |entry| {
+            if entry.found.as_ref().is_none_or(|known| order(known) <= order(&found)) {
+                entry.found = Some(found);
             }
         });
     }

@@ -6,7 +6,7 @@ use kube::Client;
 use kube::runtime::events::Recorder;
 use tokio::sync::mpsc::UnboundedSender;
 
-use crate::controller::leaderboards::isolation::Policies;
+use crate::controller::leaderboards::isolation::{self, Policies};
 use crate::controller::leaderboards::looks::{self, Look};
 use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::leaderboards::{self, probe};
@@ -20,10 +20,13 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
+use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::reruns::Reruns;
+use crate::controller::submissions::team_history::Teams;
 use crate::controller::submissions::{act, observe};
+use crate::kubernetes::objects::Pod;
 use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
 use crate::services::ObjectKey;
@@ -38,6 +41,8 @@ pub struct Context {
     pub memory: Memory,
     pub archive: ArchiveWorkers,
     pub lookups: Lookups,
+    pub causes: Causes,
+    pub teams: Teams,
     pub images: Images,
     pub foreign_runs: ForeignRuns,
     pub other_results: OtherResults,
@@ -62,6 +67,8 @@ impl Context {
             slots: &self.slots,
             archive: &self.archive,
             lookups: &self.lookups,
+            causes: &self.causes,
+            teams: &self.teams,
             images: &self.images,
             foreign_runs: &self.foreign_runs,
             other_results: &self.other_results,
@@ -95,6 +102,7 @@ impl Context {
             policies: self.policies(),
             settings: &self.settings,
             slots: &self.slots,
+            teams: &self.teams,
             external: &self.external,
             looks: &self.looks,
             metrics: &self.metrics,
@@ -123,6 +131,12 @@ impl Context {
             slots: &self.slots,
             wake: &self.wake,
         }
+    }
+
+    /// A Pod may have measured its isolation. Returns whether it has.
+    pub fn measured(&self, pod: &Pod) -> bool {
+        let board = Stores::leaderboard_of(&pod.metadata).and_then(|board| self.stores.leaderboards.get(&board));
+        board.is_some_and(|board| isolation::note_finding(&self.leaderboards, &board, pod))
     }
 
     /// Drops everything that is remembered of an object that is gone.

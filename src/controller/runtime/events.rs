@@ -15,7 +15,6 @@ use tokio::sync::mpsc;
 
 use super::queue::{Class, Key, Queue, urgency};
 use super::{Shared, Watches};
-use crate::controller::leaderboards::isolation;
 use crate::controller::objects::{Wake, key_of};
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::{Job, Pod};
@@ -188,7 +187,7 @@ fn of_pod(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Pod>) -> Option<(ObjectR
             measured.remove(&uid);
             false
         } else {
-            isolation::finding(pod).is_some() && measured.insert(uid)
+            !measured.contains(&uid) && shared.context.measured(pod) && measured.insert(uid)
         };
         if let Some(board) = board.filter(|_| is_awaited || is_measured) {
             shared.queues.leaderboards.add(&board, Class::Refresh);

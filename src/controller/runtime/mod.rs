@@ -38,15 +38,16 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
+use crate::controller::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, Objects};
 use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::node;
 use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::phases::Phase;
 use crate::controller::submissions::reruns::Reruns;
-use crate::controller::submissions::team_history;
-use crate::kubernetes::objects::{Job, Node, Pod};
+use crate::controller::submissions::team_history::Teams;
+use crate::kubernetes::objects::{Event, Job, Node, Pod};
 use crate::kubernetes::preflight::{self, access_missing, await_kinds, kinds_missing, watch_access};
-use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
+use crate::kubernetes::{Namespaces, Shape, Tally, Watch, Watchable, spawn_uncached, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::page::{Page, Reads};
@@ -57,6 +58,7 @@ use crate::services::meter::Meter;
 use crate::services::table::Recorder;
 use backoff::BackoffMap;
 use context::Context;
+use counts::Census;
 use leader::{Leader, Leadership};
 use leaderboard_api::{Leaderboard, Submission};
 use queue::Class;
@@ -120,6 +122,7 @@ pub async fn run(
         }
         let parts = Parts {
             client: clients.api,
+            watch_client: clients.watch,
             settings,
             aws: aws.counted_by(Meter::for_metrics(&telemetry.metrics)),
             watches,
@@ -175,9 +178,21 @@ fn all<K: Watchable<Scope = NamespaceResourceScope>>(
     spawn_watch(namespaces.apis(client), config, shape, telemetry)
 }
 
+/// What is kept of Submissions in sums.
+fn tallies(teams: &Teams, census: &Arc<Census>) -> Vec<Tally<Submission>> {
+    let (teams, census) = (teams.clone(), Arc::clone(census));
+    vec![
+        Arc::new(move |before, now| teams.changed(before, now)),
+        Arc::new(move |before, now| census.changed(before, now)),
+    ]
+}
+
 struct Watches {
     leaderboards: Watch<Leaderboard>,
     submissions: Watch<Submission>,
+    /// What the cache of Submissions adds up to.
+    teams: Teams,
+    census: Arc<Census>,
     jobs: Watch<Job>,
     pods: Watch<Pod>,
     policies: Watch<NetworkPolicy>,
@@ -189,8 +204,9 @@ impl Watches {
     fn start(client: &Client, settings: &Settings, telemetry: &Observability) -> Self {
         let namespaces = &settings.namespaces;
         let children = || Config::default().labels(&children_selector());
+        let (teams, census) = (Teams::default(), Arc::new(Census::default()));
         let submissions = Shape {
-            index: team_history::index,
+            tallies: tallies(&teams, &census),
             ..Shape::default()
         };
         let pods = Shape {
@@ -200,6 +216,8 @@ impl Watches {
         Self {
             leaderboards: all(namespaces, client, Config::default(), Shape::default(), telemetry),
             submissions: all(namespaces, client, Config::default(), submissions, telemetry),
+            teams,
+            census,
             jobs: all(namespaces, client, children(), Shape::default(), telemetry),
             pods: all(namespaces, client, children(), pods, telemetry),
             policies: all(namespaces, client, children(), Shape::default(), telemetry),
@@ -248,6 +266,7 @@ impl Watches {
 /// What one process is made of.
 struct Parts {
     client: Client,
+    watch_client: Client,
     settings: Settings,
     aws: Aws,
     watches: Watches,
@@ -326,7 +345,7 @@ impl Parts {
         let gauges = counts::keep(
             hub.clone(),
             watches.leaderboards.store.clone(),
-            watches.submissions.store.clone(),
+            Arc::clone(&watches.census),
             self.settings.operator.clone(),
             telemetry.clone(),
         );
@@ -346,6 +365,8 @@ impl Parts {
             memory: Memory::default(),
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered()),
             lookups: Lookups::start(client.clone(), tasks, answered()),
+            causes: self.causes(queues),
+            teams: self.watches.teams.clone(),
             images: Images::start(aws, client.clone(), tasks, answered()),
             foreign_runs: ForeignRuns::start(aws, tasks, answered()),
             other_results: OtherResults::start(aws, tasks, answered()),
@@ -362,11 +383,30 @@ impl Parts {
             wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
         };
         context.stores.fill(&context.slots);
+        for pod in context.stores.pods.state() {
+            context.measured(&pod);
+        }
         if let Some(nodes) = &self.watches.nodes {
             let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), answered());
             tasks.stay("nodes", woken);
         }
         context
+    }
+
+    /// Why Jobs have no Pod and Pods no node, as events say. Without the right to them no reason is shown, and `/readyz` names it.
+    fn causes(&self, queues: &Queues) -> Causes {
+        let causes = Causes::default();
+        let objects = Objects {
+            jobs: self.watches.jobs.store.clone(),
+            pods: self.watches.pods.store.clone(),
+        };
+        for (name, selector) in [("events of Jobs", OF_JOBS), ("events of Pods", OF_PODS)] {
+            let wake = events::waking(&queues.submissions, &self.watches.submissions.store);
+            let take = causes.taking(objects.clone(), wake);
+            let apis = self.settings.namespaces.apis::<Event>(&self.watch_client);
+            spawn_uncached(name, apis, Config::default().fields(selector), &self.telemetry, take);
+        }
+        causes
     }
 
     /// Restores the policies next to the reconciles.

@@ -26,7 +26,7 @@ const OF_RUNS: [Right; 14] = [
     ("batch", "jobs", &["list", "watch", "create", "delete"]),
     ("", "pods", &["list", "watch", "patch", "delete"]),
     ("", "pods/log", &["get"]),
-    ("", "events", &["list"]),
+    ("", "events", &["list", "watch"]),
     ("events.k8s.io", "events", &["create", "patch"]),
     (
         "networking.k8s.io",

@@ -14,7 +14,9 @@ use crate::controller::runtime::leader::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 20] = [
+const TASKS: [&str; 22] = [
+    "events of Jobs",
+    "events of Pods",
     "foreign runs",
     "gauges",
     "images",

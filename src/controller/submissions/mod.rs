@@ -27,5 +27,4 @@ mod result_texts;
 pub mod significance;
 pub mod spans;
 pub mod team_history;
-pub mod team_use;
 pub mod view;

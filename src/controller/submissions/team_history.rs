@@ -1,17 +1,24 @@
-//! How the attempts of a team have ended, next to those of the other teams of its Leaderboard. Pure.
+//! How the attempts of a team have ended, next to those of the other teams of its Leaderboard, and how many GPU seconds each team has
+//! used. Pure but for its lock.
 //!
-//! `observe` makes it for `decide`, the reconcile of a Leaderboard shows it, the metrics count it. What counts is in each Submission's
-//! status, so a resume, which takes the failure away, does not take it out of the count; only a run that finishes does.
+//! Told by the cache of Submissions of each change, so that nobody walks through all that have ended. `observe` asks it for `decide`, the
+//! reconcile of a Leaderboard shows it. What counts is in each Submission's status, so a resume, which takes the failure away, does not
+//! take it out of the count; only a run that finishes does.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::{Arc, Mutex};
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::team_use;
+use crate::lock::lock;
 use leaderboard_api::infrastructure_failures::MAX_TEAMS;
-use leaderboard_api::{InfrastructureFailures, Submission, TeamFailures, conditions, reasons};
+use leaderboard_api::{
+    InfrastructureFailures, Leaderboard, MAX_USING_TEAMS, Submission, TeamFailures, TeamUse, conditions, reasons,
+};
 
+/// Finishes of a Leaderboard that are remembered with their nodes, the latest: enough to compare a team's failures with.
+const FINISHES: usize = 1_000;
 /// How long ended attempts count against further Jobs.
 const A_DAY: SignedDuration = SignedDuration::from_hours(24);
 
@@ -50,96 +57,259 @@ impl TeamHistory {
     }
 }
 
-/// The history of a submission's team. `all`: the Submissions of its Leaderboard that have an end of some attempt.
-pub fn of(all: &[Arc<Submission>], submission: &Submission, now: Timestamp) -> TeamHistory {
-    let Some(team) = submission.team() else {
-        return TeamHistory::default();
-    };
-    let own = all.iter().filter(|other| other.team() == Some(team));
-    let last_finish = own.clone().filter_map(|one| finish(one)).max();
-    let failures: Vec<&InfrastructureFailures> = own.filter_map(|one| failures(one)).collect();
-    let is_recent = |one: &&&InfrastructureFailures| now.duration_since(one.last_time.0) < A_DAY;
-    let row: Vec<_> = failures
-        .iter()
-        .filter(|one| Some(one.last_time.0) > last_finish)
-        .collect();
-    let since = row.iter().map(|one| one.first_time.0).min();
-    TeamHistory {
-        within_a_day: failures.iter().filter(is_recent).map(|one| number(one)).sum(),
-        in_a_row: row.iter().map(|one| number(one)).sum(),
-        nodes: row.iter().flat_map(|one| one.nodes.iter().cloned()).collect(),
-        others: since.map_or_else(Others::default, |since| others(all, submission, team, since)),
+/// What the teams of all Leaderboards have come to. Clones are the same.
+#[derive(Clone, Default)]
+pub struct Teams(Arc<Mutex<HashMap<String, Board>>>);
+
+/// One Leaderboard.
+#[derive(Default)]
+struct Board {
+    teams: BTreeMap<String, Team>,
+    /// The latest, the oldest first.
+    finishes: BTreeSet<Finish>,
+}
+
+#[derive(Default)]
+struct Team {
+    /// Its Submissions that count for anything here.
+    submissions: usize,
+    /// Also of one that was deleted since.
+    last_finish: Option<Timestamp>,
+    /// By the UID of the Submission.
+    failures: BTreeMap<String, Failures>,
+    gpu_seconds: i64,
+}
+
+struct Failures {
+    simulator: Option<String>,
+    of: InfrastructureFailures,
+}
+
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Finish {
+    at: Timestamp,
+    uid: String,
+    team: String,
+    simulator: Option<String>,
+    node: Option<String>,
+}
+
+/// What a Submission counts for: it has an end of some attempt, or of a Job that had a GPU.
+#[derive(PartialEq)]
+struct Ended {
+    board: String,
+    team: String,
+    uid: String,
+    simulator: Option<String>,
+    finish: Option<Finish>,
+    failures: Option<InfrastructureFailures>,
+    gpu_seconds: i64,
+}
+
+impl Teams {
+    /// The cache has changed.
+    pub fn changed(&self, before: Option<&Submission>, now: Option<&Submission>) {
+        let (before, now) = (before.and_then(Ended::of), now.and_then(Ended::of));
+        if before == now {
+            return;
+        }
+        let mut boards = lock(&self.0);
+        if let Some(ended) = before
+            && let Some(board) = boards.get_mut(&ended.board)
+        {
+            board.leaves(&ended);
+            if board.teams.is_empty() {
+                boards.remove(&ended.board);
+            }
+        }
+        if let Some(ended) = now {
+            boards.entry(ended.board.clone()).or_default().enters(ended);
+        }
+    }
+
+    /// The history of a submission's team.
+    pub fn history(&self, submission: &Submission, now: Timestamp) -> TeamHistory {
+        let boards = lock(&self.0);
+        let board = boards.get(&key(submission));
+        let team = submission.team();
+        let found = board
+            .zip(team)
+            .map(|(board, team)| board.history(submission, team, now));
+        found.unwrap_or_default()
+    }
+
+    /// The teams of a Leaderboard that have such failures in a row, those with the most first.
+    pub fn failures(&self, leaderboard: &Leaderboard) -> Vec<TeamFailures> {
+        self.of(leaderboard, Board::failures)
+    }
+
+    /// The teams of a Leaderboard that have used the most GPU seconds, the most first.
+    pub fn gpu_use(&self, leaderboard: &Leaderboard) -> Vec<TeamUse> {
+        self.of(leaderboard, Board::gpu_use)
+    }
+
+    fn of<T>(&self, leaderboard: &Leaderboard, read: impl FnOnce(&Board) -> Vec<T>) -> Vec<T> {
+        let meta = &leaderboard.metadata;
+        let name = meta.name.as_deref().unwrap_or_default();
+        let boards = lock(&self.0);
+        boards
+            .get(&key_of(meta.namespace.as_deref(), name))
+            .map(read)
+            .unwrap_or_default()
     }
 }
 
-fn others(all: &[Arc<Submission>], submission: &Submission, team: &str, since: Timestamp) -> Others {
-    let simulator = simulator(submission);
-    let is_other = |one: &&Arc<Submission>| one.team().is_some_and(|other| other != team);
-    let is_same = |one: &&Arc<Submission>| simulator.is_some() && self::simulator(one) == simulator;
-    let mut found = Others::default();
-    for one in all.iter().filter(is_other).filter(is_same) {
-        if finish(one).is_some_and(|at| at >= since) {
-            found.finished += 1;
-            let node = one.status.as_ref().and_then(|status| status.node_name.clone());
-            found.finished_on.extend(node);
+impl Ended {
+    fn of(submission: &Submission) -> Option<Self> {
+        let (finished, failures) = (finish(submission), failures(submission));
+        let gpu_seconds = gpu_seconds(submission);
+        if finished.is_none() && failures.is_none() && gpu_seconds <= 0 {
+            return None;
         }
-        if let Some(failures) = failures(one).filter(|failures| failures.last_time.0 >= since) {
-            found.failed += number(failures);
-            found.failed_on.extend(failures.nodes.iter().cloned());
-        }
-    }
-    found
-}
-
-/// The teams of a Leaderboard that have such failures in a row, those with the most first.
-pub fn teams(all: &[Arc<Submission>]) -> Vec<TeamFailures> {
-    let mut last_finish: BTreeMap<&str, Timestamp> = BTreeMap::new();
-    for one in all {
-        if let Some((team, at)) = one.team().zip(finish(one)) {
-            let last = last_finish.entry(team).or_insert(at);
-            *last = at.max(*last);
-        }
-    }
-    let mut found: BTreeMap<&str, TeamFailures> = BTreeMap::new();
-    for one in all {
-        let Some((team, failures)) = one.team().zip(failures(one)) else {
-            continue;
-        };
-        if last_finish.get(team).is_some_and(|at| failures.last_time.0 <= *at) {
-            continue;
-        }
-        let known = found.entry(team).or_insert_with(|| TeamFailures {
-            team: team.to_owned(),
-            number: 0,
-            last_time: failures.last_time.clone(),
+        let team = submission.team()?.to_owned();
+        let uid = submission.metadata.uid.clone().unwrap_or_default();
+        let simulator = simulator(submission).map(str::to_owned);
+        let finish = finished.map(|at| Finish {
+            at,
+            uid: uid.clone(),
+            team: team.clone(),
+            simulator: simulator.clone(),
+            node: submission.status.as_ref().and_then(|status| status.node_name.clone()),
         });
-        known.number = known.number.saturating_add(failures.number);
-        if failures.last_time.0 > known.last_time.0 {
-            known.last_time = failures.last_time.clone();
-        }
+        Some(Self {
+            board: key(submission),
+            team,
+            uid,
+            simulator,
+            finish,
+            failures: failures.cloned(),
+            gpu_seconds: gpu_seconds.max(0),
+        })
     }
-    let mut teams: Vec<TeamFailures> = found.into_values().collect();
-    teams.sort_by(|one, other| other.number.cmp(&one.number).then_with(|| one.team.cmp(&other.team)));
-    teams.truncate(MAX_TEAMS);
-    teams
 }
 
-/// By what the cache finds the Submissions of a Leaderboard that have an end of some attempt, or of a Job that had a GPU.
-pub fn index(submission: &Submission) -> Option<String> {
-    let has_end =
-        finish(submission).is_some() || failures(submission).is_some() || team_use::gpu_seconds(submission) > 0;
-    has_end.then(|| key(submission))
+impl Board {
+    fn enters(&mut self, ended: Ended) {
+        let team = self.teams.entry(ended.team).or_default();
+        team.submissions += 1;
+        team.gpu_seconds = team.gpu_seconds.saturating_add(ended.gpu_seconds);
+        team.last_finish = team.last_finish.max(ended.finish.as_ref().map(|finish| finish.at));
+        if let Some(of) = ended.failures {
+            let simulator = ended.simulator;
+            team.failures.insert(ended.uid, Failures { simulator, of });
+        }
+        self.finishes.extend(ended.finish);
+        if self.finishes.len() > FINISHES {
+            self.finishes.pop_first();
+        }
+    }
+
+    fn leaves(&mut self, ended: &Ended) {
+        if let Some(finish) = &ended.finish {
+            self.finishes.remove(finish);
+        }
+        let Some(team) = self.teams.get_mut(&ended.team) else {
+            return;
+        };
+        team.submissions -= 1;
+        team.gpu_seconds = team.gpu_seconds.saturating_sub(ended.gpu_seconds);
+        team.failures.remove(&ended.uid);
+        if team.submissions == 0 {
+            self.teams.remove(&ended.team);
+        }
+    }
+
+    fn history(&self, submission: &Submission, name: &str, now: Timestamp) -> TeamHistory {
+        let Some(team) = self.teams.get(name) else {
+            return TeamHistory::default();
+        };
+        let is_recent = |one: &&InfrastructureFailures| now.duration_since(one.last_time.0) < A_DAY;
+        let all = team.failures.values().map(|failures| &failures.of);
+        let since = team.in_a_row().map(|one| one.first_time.0).min();
+        TeamHistory {
+            within_a_day: all.filter(is_recent).map(number).sum(),
+            in_a_row: team.in_a_row().map(number).sum(),
+            nodes: team.in_a_row().flat_map(|one| one.nodes.iter().cloned()).collect(),
+            others: since.map_or_else(Others::default, |since| self.others(submission, name, since)),
+        }
+    }
+
+    /// What other teams came to with the same simulator.
+    fn others(&self, submission: &Submission, team: &str, since: Timestamp) -> Others {
+        let mut found = Others::default();
+        let Some(simulator) = simulator(submission) else {
+            return found;
+        };
+        let finishes = self.finishes.iter().rev().take_while(|finish| finish.at >= since);
+        for finish in finishes.filter(|one| one.team != team && one.simulator.as_deref() == Some(simulator)) {
+            found.finished += 1;
+            found.finished_on.extend(finish.node.clone());
+        }
+        let others = self.teams.iter().filter(|(other, _)| *other != team);
+        let failures = others.flat_map(|(_, other)| other.failures.values());
+        for one in failures.filter(|one| one.simulator.as_deref() == Some(simulator) && one.of.last_time.0 >= since) {
+            found.failed += number(&one.of);
+            found.failed_on.extend(one.of.nodes.iter().cloned());
+        }
+        found
+    }
+
+    fn failures(&self) -> Vec<TeamFailures> {
+        let of_team = |(name, team): (&String, &Team)| {
+            let number = |sum: i32, one: &InfrastructureFailures| sum.saturating_add(one.number);
+            Some(TeamFailures {
+                team: name.clone(),
+                number: team.in_a_row().fold(0, number),
+                last_time: team
+                    .in_a_row()
+                    .map(|one| &one.last_time)
+                    .max_by_key(|time| time.0)?
+                    .clone(),
+            })
+        };
+        let mut teams: Vec<TeamFailures> = self.teams.iter().filter_map(of_team).collect();
+        teams.sort_by(|one, other| other.number.cmp(&one.number).then_with(|| one.team.cmp(&other.team)));
+        teams.truncate(MAX_TEAMS);
+        teams
+    }
+
+    fn gpu_use(&self) -> Vec<TeamUse> {
+        let used = self.teams.iter().filter(|(_, team)| team.gpu_seconds > 0);
+        let mut found: Vec<(&String, i64)> = used.map(|(name, team)| (name, team.gpu_seconds)).collect();
+        found.sort_by_key(|(_, gpu_seconds)| Reverse(*gpu_seconds));
+        found.truncate(MAX_USING_TEAMS);
+        let shown = found.into_iter().map(|(team, gpu_seconds)| TeamUse {
+            team: team.clone(),
+            gpu_seconds,
+        });
+        shown.collect()
+    }
+}
+
+impl Team {
+    /// Failures since it has last finished.
+    fn in_a_row(&self) -> impl Iterator<Item = &InfrastructureFailures> {
+        let all = self.failures.values().map(|failures| &failures.of);
+        all.filter(|one| Some(one.last_time.0) > self.last_finish)
+    }
+}
+
+fn key(submission: &Submission) -> String {
+    key_of(
+        submission.metadata.namespace.as_deref(),
+        &submission.spec.leaderboard_name,
+    )
 }
 
 /// Namespace and Leaderboard.
-pub fn key(submission: &Submission) -> String {
-    let namespace = submission.metadata.namespace.as_deref().unwrap_or_default();
-    key_of(namespace, &submission.spec.leaderboard_name)
+fn key_of(namespace: Option<&str>, leaderboard: &str) -> String {
+    format!("{}/{leaderboard}", namespace.unwrap_or_default())
 }
 
-/// The same of a Leaderboard itself.
-pub fn key_of(namespace: &str, leaderboard: &str) -> String {
-    format!("{namespace}/{leaderboard}")
+/// What the Jobs of a submission have used.
+fn gpu_seconds(submission: &Submission) -> i64 {
+    let usage = submission.status.as_ref().and_then(|status| status.usage);
+    usage.map_or(0, |usage| usage.gpu_seconds)
 }
 
 fn failures(submission: &Submission) -> Option<&InfrastructureFailures> {

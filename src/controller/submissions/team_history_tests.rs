@@ -1,5 +1,6 @@
 //! The table of repeated failures: a row for each case.
 
+use leaderboard_api::Use;
 use serde_json::{Value, json};
 
 use super::*;
@@ -65,15 +66,30 @@ fn submission(number: usize, run: &Run) -> Submission {
     serde_json::from_value(object).unwrap()
 }
 
+/// As the cache shows these Submissions.
+fn shown<'a>(all: impl IntoIterator<Item = &'a Submission>) -> Teams {
+    let teams = Teams::default();
+    for one in all {
+        teams.changed(None, Some(one));
+    }
+    teams
+}
+
+fn submissions(runs: &[Run]) -> Vec<Submission> {
+    runs.iter().enumerate().map(|(i, run)| submission(i, run)).collect()
+}
+
+fn board() -> Leaderboard {
+    let mut board = crate::controller::fixtures::leaderboard("lb", "http://127.0.0.1:9");
+    board.metadata.namespace = Some("n".into());
+    board
+}
+
 /// Whether an attempt of team `a` that ends so at hour 20 on node `n9` would be the agent's fault, with two free.
 fn is_blamed(before: &[Run]) -> bool {
-    let all: Vec<_> = before
-        .iter()
-        .enumerate()
-        .map(|(i, run)| Arc::new(submission(i, run)))
-        .collect();
     let own = submission(99, &run("a", Resumed(0), 20, "n9"));
-    of(&all, &own, at(20)).blames_agent(Some("n9"), 2)
+    let teams = shown(&submissions(before));
+    teams.history(&own, at(20)).blames_agent(Some("n9"), 2)
 }
 
 type Case = (&'static str, bool, Vec<Run>);
@@ -181,8 +197,8 @@ fn neither_a_node_nor_a_finish_between_nor_a_like_name_makes_a_row() {
 #[test]
 fn without_free_failures_the_first_one_is_free_all_the_same() {
     let own = submission(99, &run("a", Resumed(0), 20, "n9"));
-    let others = [Arc::new(submission(0, &run("b", Finished, 15, "n9")))];
-    assert!(!of(&others, &own, at(20)).blames_agent(Some("n9"), 0));
+    let others = shown(&submissions(&[run("b", Finished, 15, "n9")]));
+    assert!(!others.history(&own, at(20)).blames_agent(Some("n9"), 0));
 }
 
 #[test]
@@ -194,16 +210,13 @@ fn within_a_day_every_attempt_of_the_team_counts_also_those_that_were_resumed() 
         run("b", Failed(8), 10, "n1"),
         run("a", Finished, 15, "n1"),
     ];
-    let all: Vec<_> = runs
-        .iter()
-        .enumerate()
-        .map(|(i, run)| Arc::new(submission(i, run)))
-        .collect();
-    let found = of(&all, &all[0], at(20));
+    let all = submissions(&runs);
+    let teams = shown(&all);
+    let found = teams.history(&all[0], at(20));
     assert_eq!((found.within_a_day, found.in_a_row), (3, 0));
     let mut nobodys = submission(9, &runs[0]);
     nobodys.spec.team = None;
-    assert_eq!(of(&all, &nobodys, at(20)), TeamHistory::default());
+    assert_eq!(teams.history(&nobodys, at(20)), TeamHistory::default());
 }
 
 #[test]
@@ -215,32 +228,102 @@ fn a_leaderboard_shows_the_teams_with_the_most_failures_in_a_row() {
         run("c", Failed(5), 9, "n1"),
         run("c", Finished, 10, "n1"),
     ];
-    let all: Vec<_> = runs
-        .iter()
-        .enumerate()
-        .map(|(i, run)| Arc::new(submission(i, run)))
-        .collect();
-    let shown: Vec<_> = teams(&all)
+    let found: Vec<_> = shown(&submissions(&runs))
+        .failures(&board())
         .into_iter()
         .map(|t| (t.team, t.number, t.last_time.0))
         .collect();
-    assert_eq!(shown, [("b".to_owned(), 3, at(12)), ("a".to_owned(), 1, at(10))]);
-    let many: Vec<_> = (0..40)
-        .map(|i| {
-            let mut one = submission(i, &runs[0]);
-            one.spec.team.as_mut().unwrap().name = Some(format!("team {i}"));
-            Arc::new(one)
-        })
-        .collect();
-    assert_eq!(teams(&many).len(), MAX_TEAMS);
+    assert_eq!(found, [("b".to_owned(), 3, at(12)), ("a".to_owned(), 1, at(10))]);
+    let of_team = |i: usize| {
+        let mut one = submission(i, &runs[0]);
+        one.spec.team.as_mut().unwrap().name = Some(format!("team {i}"));
+        one
+    };
+    let many: Vec<_> = (0..40).map(of_team).collect();
+    assert_eq!(shown(&many).failures(&board()).len(), MAX_TEAMS);
 }
 
 #[test]
-fn only_submissions_with_an_end_are_found_by_their_leaderboard() {
-    let found = |end| index(&submission(0, &run("a", end, 10, "n1")));
-    assert_eq!(found(Finished).as_deref(), Some("n/lb"));
-    assert_eq!(found(Resumed(1)).as_deref(), Some("n/lb"));
-    let mut live = submission(0, &run("a", Resumed(1), 10, "n1"));
-    live.status.as_mut().unwrap().infrastructure_failures = None;
-    assert_eq!(index(&live), None);
+fn the_teams_that_have_used_the_most_come_first_and_no_more_than_ten() {
+    let used = |number: usize, team: &str, gpu_seconds: i64| {
+        let mut one = submission(number, &run("a", Resumed(0), 10, "n1"));
+        one.spec.team.as_mut().unwrap().name = Some(team.to_owned());
+        let status = one.status.as_mut().unwrap();
+        status.infrastructure_failures = None;
+        status.usage = Some(Use { gpus: 4, gpu_seconds });
+        one
+    };
+    let sums = |all: &[Submission]| -> Vec<(String, i64)> {
+        let found = shown(all).gpu_use(&board()).into_iter();
+        found.map(|team| (team.team, team.gpu_seconds)).collect()
+    };
+    let all = [("b", 5), ("a", 3), ("b", 7), ("c", 0), ("d", 12)];
+    let all: Vec<_> = (0..)
+        .zip(all)
+        .map(|(i, (team, seconds))| used(i, team, seconds))
+        .collect();
+    assert_eq!(sums(&all), [("b".into(), 12), ("d".into(), 12), ("a".into(), 3)]);
+    let many: Vec<_> = (1..=30)
+        .map(|i| used(i, &format!("team-{i}"), i64::try_from(i).unwrap()))
+        .collect();
+    assert_eq!(sums(&many).len(), MAX_USING_TEAMS);
+    assert_eq!(sums(&many)[0], ("team-30".into(), 30));
+}
+
+#[test]
+fn whatever_changes_the_sums_are_those_of_what_is_there() {
+    let state = |teams: &Teams, own: &Submission| {
+        let board = board();
+        (
+            teams.history(own, at(20)),
+            teams.failures(&board),
+            teams.gpu_use(&board),
+        )
+    };
+    let own = submission(99, &run("a", Resumed(0), 20, "n9"));
+    let before = submissions(&twice_and(vec![
+        run("b", Finished, 15, "n3"),
+        run("c", Failed(1), 16, "n4"),
+    ]));
+    let mut after = before.clone();
+    // One has used a GPU, one fails again, one is resumed and runs, one is gone.
+    after[0].status.as_mut().unwrap().usage = Some(Use {
+        gpus: 1,
+        gpu_seconds: 60,
+    });
+    after[1] = submission(1, &run("a", Failed(2), 17, "n7"));
+    after[3].status.as_mut().unwrap().infrastructure_failures = None;
+    after.remove(2);
+    let teams = shown(&before);
+    teams.changed(Some(&before[0]), Some(&after[0]));
+    teams.changed(Some(&before[1]), Some(&after[1]));
+    teams.changed(Some(&before[2]), None);
+    teams.changed(Some(&before[3]), Some(&after[2]));
+    assert_eq!(state(&teams, &own), state(&shown(&after), &own));
+    assert_eq!(
+        (state(&teams, &own).0.in_a_row, state(&teams, &own).2[0].gpu_seconds),
+        (3, 60)
+    );
+    for one in &after {
+        teams.changed(Some(one), None);
+    }
+    assert!(lock(&teams.0).is_empty(), "nothing is left of what is gone");
+}
+
+#[test]
+fn a_finish_counts_although_it_was_deleted_and_no_more_than_a_thousand_are_kept() {
+    let all = submissions(&[
+        run("a", Failed(1), 10, "n1"),
+        run("a", Finished, 11, "n1"),
+        run("a", Failed(2), 12, "n2"),
+    ]);
+    let teams = shown(&all);
+    teams.changed(Some(&all[1]), None);
+    assert_eq!(teams.history(&all[0], at(20)).in_a_row, 2);
+    let hours = 0..i64::try_from(FINISHES).unwrap() + 500;
+    let many: Vec<_> = hours.map(|hour| run("b", Finished, hour, "n3")).collect();
+    let teams = shown(&submissions(&many));
+    let boards = lock(&teams.0);
+    let kept = &boards["n/lb"].finishes;
+    assert_eq!((kept.len(), kept.first().unwrap().at), (FINISHES, at(500)));
 }

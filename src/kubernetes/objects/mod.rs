@@ -4,12 +4,14 @@
 //! and texts that many objects share are stored once (`Texts`). Every field is optional and every enum a text: whatever a newer
 //! API server sends can be read.
 
+mod event;
 mod job;
 mod meta;
 mod node;
 mod pod;
 mod texts;
 
+pub use event::{Event, Involved};
 pub use job::{Job, JobCondition, JobStatus};
 pub use meta::{Annotations, Labels, Meta, Owner};
 pub use node::{Node, NodeCondition, NodeSpec, NodeStatus, Taint};

@@ -94,6 +94,8 @@ impl Scenario {
             controller.requests().await.len(),
             controller.reconciles(),
             world.s3.requests(),
+            world.evalai_requests(),
+            world.table.requests(),
         );
         if has_submission {
             world.live(&controller).await;
@@ -106,9 +108,13 @@ impl Scenario {
         let requests = controller.requests().await.split_off(before.0);
         let reconciles = controller.reconciles() - before.1;
         let s3_requests = world.s3.requests() - before.2;
+        let evalai_requests = world.evalai_requests() - before.3;
+        let table_requests = world.table.requests() - before.4;
         let memory = controller.end().await;
         let mut cost = Cost {
             s3_requests,
+            evalai_requests,
+            table_requests,
             reconciles,
             allocations: memory.count_total,
             allocated_kilobytes: memory.bytes_total >> 10,
@@ -143,7 +149,9 @@ pub struct World {
     pub namespace: String,
     aws: StandIn,
     /// Between the controller and S3.
-    s3: ministack::Proxy,
+    pub(super) s3: ministack::Proxy,
+    /// Between the controller and DynamoDB.
+    table: ministack::Proxy,
     evalai: Option<Handle>,
     bucket: String,
     labels: Vec<String>,
@@ -151,6 +159,12 @@ pub struct World {
 
 impl World {
     pub async fn new(scenario: Scenario) -> Self {
+        // No look at the report in between: how many there are would depend on the machine.
+        Self::reading_every(60, scenario).await
+    }
+
+    /// One whose reports are read once in so many seconds.
+    pub(super) async fn reading_every(seconds: u32, scenario: Scenario) -> Self {
         let _ = rustls::crypto::ring::default_provider().install_default();
         let aws = StandIn::start().await;
         let client = server().await.client();
@@ -169,6 +183,7 @@ impl World {
         s3.create_bucket().bucket(&bucket).send().await.unwrap();
         let world = Self {
             s3: ministack::server().await.proxy().await,
+            table: ministack::server().await.proxy().await,
             client,
             namespace,
             aws,
@@ -176,15 +191,14 @@ impl World {
             bucket,
             labels,
         };
-        world.make_board(scenario).await;
+        world.make_board(scenario, seconds).await;
         world
     }
 
-    async fn make_board(&self, scenario: Scenario) {
+    async fn make_board(&self, scenario: Scenario, period: u32) {
         let mut spec = json!({
             "storage": {"bucket": self.bucket, "endpoint": self.s3.endpoint()},
-            // No look at the report in between: how many there are would depend on the machine.
-            "syncPeriodSeconds": 60,
+            "syncPeriodSeconds": period,
             "pairs": 1,
             "routes": ROUTES,
         });
@@ -204,14 +218,14 @@ impl World {
             spec["tracks"] = json!([{"name": "sensors", "codename": "SENSORS", "phase": 1}]);
             let table = self.aws.name("counts");
             make_table(&self.aws, &table).await;
-            spec["table"] = json!({"name": table, "endpoint": self.aws.endpoint});
+            spec["table"] = json!({"name": table, "endpoint": self.table.endpoint()});
         }
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         let board = Kind::Leaderboard.object(BOARD, &[&json!({ "spec": spec })]);
         create(&api, board, false).await.unwrap();
     }
 
-    fn api<K>(&self) -> Api<K>
+    pub(super) fn api<K>(&self) -> Api<K>
     where
         K: Resource<Scope = NamespaceResourceScope, DynamicType = ()>,
     {
@@ -230,6 +244,26 @@ impl World {
     /// A submission from its creation until every system has its end. The controller comes to rest in between, so that it
     /// makes no difference how fast it is: with a Job, with a running Pod, and with an end.
     pub async fn live(&self, controller: &Controller) {
+        self.submit("one").await;
+        self.until("one", "it has a Job", has_job).await;
+        controller.quiet().await;
+        let player = self.play();
+        self.until("one", "it runs", is_running).await;
+        controller.quiet().await;
+        player.fall_the_curtain();
+        self.until("one", "every system has its end", is_settled).await;
+        controller.quiet().await;
+    }
+
+    /// Requests to EvalAI about submissions, lists left out.
+    fn evalai_requests(&self) -> u64 {
+        let all = self.evalai.as_ref().map(Handle::requests).unwrap_or_default();
+        let of_one = |path: &str| path.contains("/submission/") || path.contains("update_submission");
+        all.iter().map(|entry| u64::from(of_one(&entry.path))).sum()
+    }
+
+    /// Creates a Submission.
+    pub(super) async fn submit(&self, name: &str) {
         let mut spec = json!({"leaderboardName": BOARD});
         let mut metadata = json!({});
         if let Some(evalai) = &self.evalai {
@@ -247,41 +281,43 @@ impl World {
             metadata["finalizers"] = json!([names::FINALIZER_SUBMISSION]);
         }
         let api = Kind::Submission.api(&self.client, &self.namespace);
-        let submission = Kind::Submission.object("one", &[&json!({ "metadata": metadata, "spec": spec })]);
+        let submission = Kind::Submission.object(name, &[&json!({ "metadata": metadata, "spec": spec })]);
         create(&api, submission, false).await.unwrap();
-        self.until("it has a Job", |s| {
-            s.status.as_ref().is_some_and(|s| s.job_name.is_some())
-        })
-        .await;
-        controller.quiet().await;
-        let player = Player::start(Props {
+    }
+
+    /// Plays the rest of the cluster. No report comes before the last one.
+    pub(super) fn play(&self) -> Player {
+        Player::start(Props {
             client: self.client.clone(),
             namespace: self.namespace.clone(),
             s3: self.aws.aws.s3(None, Some(&self.aws.endpoint)),
             bucket: self.bucket.clone(),
             period: NO_REPORT,
             labels: self.labels.clone(),
-        });
-        self.until("it runs", |s| {
-            s.status.as_ref().is_some_and(|s| s.state == Some(State::Running))
         })
-        .await;
-        controller.quiet().await;
-        player.fall_the_curtain();
-        self.until("every system has its end", is_settled).await;
-        controller.quiet().await;
     }
 
-    async fn until(&self, what: &str, holds: impl Fn(&Submission) -> bool) {
+    pub(super) async fn until(&self, name: &str, what: &str, holds: impl Fn(&Submission) -> bool) {
         let holds = |found: Option<&Submission>| found.is_some_and(&holds);
-        let reached = timeout(LIMIT, await_condition(self.api(), "one", holds)).await;
+        let reached = timeout(LIMIT, await_condition(self.api(), name, holds)).await;
         reached
-            .unwrap_or_else(|_| panic!("not after {LIMIT:?}: {what}"))
+            .unwrap_or_else(|_| panic!("{name}: not after {LIMIT:?}: {what}"))
             .unwrap();
     }
 }
 
-fn is_read(request: &Request) -> bool {
+/// The Job is made.
+pub(super) fn has_job(submission: &Submission) -> bool {
+    submission.status.as_ref().is_some_and(|s| s.job_name.is_some())
+}
+
+/// Its agents run.
+pub(super) fn is_running(submission: &Submission) -> bool {
+    let status = submission.status.as_ref();
+    status.is_some_and(|s| s.state_of_conditions() == State::Running)
+}
+
+pub(super) fn is_read(request: &Request) -> bool {
     READS.contains(&request.verb.as_str())
 }
 
@@ -346,14 +382,14 @@ impl Controller {
     }
 
     /// What it has asked the API server for, watches and the process's own requests left out.
-    async fn requests(&self) -> Vec<Request> {
+    pub(super) async fn requests(&self) -> Vec<Request> {
         let all = server().await.requests(&self.user).into_iter();
         let counts =
             |request: &Request| request.verb != "watch" && !OF_THE_PROCESS.contains(&request.resource().as_str());
         all.filter(counts).collect()
     }
 
-    fn reconciles(&self) -> u64 {
+    pub(super) fn reconciles(&self) -> u64 {
         let text = self.telemetry.metrics.text().unwrap();
         let lines = text
             .lines()

@@ -19,7 +19,8 @@ use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
 const MAX_RECREATED: i32 = 3;
 /// When a submission in line is looked at again, should nothing wake it before.
 const BACKSTOP: Duration = Duration::from_mins(5);
-/// When a live run is looked at again, should nothing wake it before: its report, its Pod, its node or EvalAI.
+/// When a Job is looked at again, should nothing wake it before: its Pod, its node, what events say, its report or EvalAI. What a stage
+/// does by the clock it asks for itself.
 const LIVE_BACKSTOP: Duration = Duration::from_mins(5);
 /// How soon a Job that was just asked for is looked for.
 const LOOK: Duration = Duration::from_secs(15);
@@ -279,10 +280,8 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     update_evalai(draft);
     if draft.is_running() {
         record(draft);
-        draft.requeue_in(LIVE_BACKSTOP);
-    } else {
-        draft.requeue_in(draft.period());
     }
+    draft.requeue_in(LIVE_BACKSTOP);
 }
 
 fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {

@@ -1,6 +1,6 @@
 //! How long the start of a Pod may take: the pulls of its images apart from all the rest.
 //!
-//! Called by `start`. Pure. Events are not watched, and no condition covers images, so a pull is known by its containers: the
+//! Called by `start`. Pure. The kubelet's events are not watched, and no condition covers images, so a pull is known by its containers: the
 //! kubelet starts them in order, and one that was never started, has no error and is next is waiting for its image. The kubelet
 //! changes no status of a Pod while it pulls for it, so two pulls in a row look like one.
 

@@ -2,8 +2,6 @@
 //!
 //! Also of a Pod that replaces a lost one: then the submission keeps its state, with the reason `Replacing`.
 
-use std::time::Duration;
-
 use jiff::Timestamp;
 
 use super::failure::{self, infrastructure, participant};
@@ -24,7 +22,8 @@ const LOST: &str = "The Pod was lost. A new Pod will resume from the results in 
 const SILENCE: i64 = 45;
 /// The minutes of silence that are reported: a count of every one would be a write each.
 const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
-/// How long a new Pod may find no node before that is shown: the Pod whose slot it got may still be leaving.
+/// How long a new Job may be refused its Pod, or a new Pod find no node, before that is shown: the Pod whose slot it got may still be
+/// leaving.
 const SETTLE_SECONDS: i64 = 5;
 /// How long something may keep a check from starting that seldom resolves itself. A host waits for it.
 const CHECK_SECONDS: i64 = 60;
@@ -149,8 +148,13 @@ fn show_trouble(draft: &mut PlanBuilder<'_>, found: &Trouble, has_started: bool)
 fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
     draft.moves();
     let silent = draft.now().duration_since(since).as_secs();
+    let mut told = [SILENCE]
+        .into_iter()
+        .chain(REPORTED_MINUTES.map(|minutes| minutes * 60));
+    if let Some(next) = told.find(|at| silent < *at) {
+        draft.requeue_at(after(since, next));
+    }
     let message = if silent < SILENCE {
-        draft.requeue_at(after(since, SILENCE));
         PREPARED.to_owned()
     } else {
         let told = REPORTED_MINUTES.iter().rev().find(|m| silent >= **m * 60);
@@ -188,6 +192,9 @@ fn stage(pod: &PodView) -> &'static str {
 fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let had_pod = draft.status.times.scheduled.is_some();
     if let Some(words) = &job.failed_create {
+        if settles(draft, job) {
+            return;
+        }
         let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
         let (reason, what) = if is_quota {
             (reasons::QUOTA_EXCEEDED, "The namespace's quota does not allow the Pod")
@@ -201,19 +208,30 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
         }
     } else if had_pod {
         replacing(draft, LOST);
-    } else if job.created.is_some_and(|at| draft.now() >= after(at, POD_SECONDS)) {
+    } else if let Some(at) = job.created.map(|at| after(at, POD_SECONDS)) {
+        if draft.now() < at {
+            return draft.requeue_at(at);
+        }
         let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
                        cluster's controller manager runs.";
         draft.stall_with(reasons::PREPARING, message);
         show_wait(draft, reasons::PREPARING, message);
     }
-    draft.requeue_in(Duration::from_secs(15));
+}
+
+/// Shows nothing yet of a Job that is new.
+fn settles(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
+    let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
+    let Some(settled) = settled.filter(|at| draft.now() < *at) else {
+        return false;
+    };
+    draft.requeue_at(settled);
+    true
 }
 
 fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_up: Option<&ScaleUp>) {
-    let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
-    if let Some(settled) = settled.filter(|at| draft.now() < *at) {
-        return draft.requeue_at(settled);
+    if settles(draft, job) {
+        return;
     }
     let of_nodes = match scale_up {
         Some(ScaleUp::Coming(words)) => format!(" A node is on its way: {}", sentence(words)),

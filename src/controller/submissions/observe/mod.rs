@@ -1,14 +1,14 @@
 //! Reads the world of one submission into a `View`: caches and memory. Decides nothing.
 
+pub mod causes;
 pub mod job;
 pub mod lookups;
 pub mod node;
 pub mod pod;
-mod scale_up;
 
 use std::sync::Arc;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
@@ -21,21 +21,15 @@ use super::images::Images;
 use super::memory::Memory;
 use super::other_results::OtherResults;
 use super::reruns::Reruns;
-use super::team_history::{self, TeamHistory};
+use super::team_history::{TeamHistory, Teams};
 use super::view::{NodeView, ObservedJob, PodView, View};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
+use causes::Causes;
 use leaderboard_api::check::without_retries;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use lookups::Lookups;
-
-/// A Job that has had no Pod for so long may have been refused one. Asking for the events of each at once costs the API server more
-/// than all the rest.
-const REFUSED_AFTER: SignedDuration = SignedDuration::from_secs(45);
-
-/// An autoscaler has spoken after this long. A Pod that waits for the one before it to leave asks for no node.
-const SCALED_UP_AFTER: SignedDuration = SignedDuration::from_secs(20);
 
 /// What reading the world of a submission uses.
 #[derive(Clone, Copy)]
@@ -45,6 +39,8 @@ pub struct Uses<'a> {
     pub slots: &'a SlotAllocator,
     pub archive: &'a ArchiveWorkers,
     pub lookups: &'a Lookups,
+    pub causes: &'a Causes,
+    pub teams: &'a Teams,
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
     pub other_results: &'a OtherResults,
@@ -62,7 +58,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     if submission.spec.check {
         leaderboard = leaderboard.map(|found| Arc::new(without_retries(&found)));
     }
-    let (job, pod) = children(uses, &submission, now);
+    let (job, pod) = children(uses, &submission);
     let status = submission.status.as_ref();
     let is_over = status.is_some_and(SubmissionStatus::has_ended);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
@@ -93,7 +89,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         evalai_waited: uses.memory.evalai_waited(&submission),
         partial_sent: uses.memory.partial_sent(&submission),
         rerun_as: uses.reruns.of(&submission),
-        team: team_of(uses.stores, &submission, &job, now),
+        team: team_of(uses.teams, &submission, &job, now),
         evalai_writes_from: uses.external.hub.writes_from(),
         submission,
         leaderboard,
@@ -108,7 +104,7 @@ fn may_create(job: &ObservedJob) -> bool {
 }
 
 /// The Job that the present attempt should have, and its newest Pod.
-fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (ObservedJob, Option<PodView>) {
+fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<PodView>) {
     let namespace = submission.namespace().unwrap_or_default();
     let nothing = SubmissionStatus::default();
     let status = submission.status.as_ref().unwrap_or(&nothing);
@@ -129,19 +125,16 @@ fn children(uses: Uses<'_>, submission: &Submission, now: Timestamp) -> (Observe
     uses.memory.forget_job(submission);
     let pod = uses.stores.newest_pod(&found);
     let mut job = job::view(&found, pod.as_deref());
-    let is_old = job.created.is_some_and(|at| now.duration_since(at) >= REFUSED_AFTER);
-    if pod.is_none() && job.end.is_none() && is_old {
-        let by = ObjectRef::from_obj(submission);
-        job.failed_create = uses.lookups.refusal(&namespace, &name, by);
+    let Some(pod) = pod else {
+        job.failed_create = uses.causes.refusal(&job.uid).filter(|_| job.end.is_none());
+        return (ObservedJob::Ours(job), None);
+    };
+    uses.causes.has_pod(&job.uid);
+    let mut pod = pod::view(&pod);
+    if pod.unschedulable.is_some() {
+        pod.scale_up = uses.causes.scale_up(&pod.uid);
     }
-    let mut pod = pod.map(|pod| pod::view(&pod));
-    let is_waiting = job.created.is_some_and(|at| now.duration_since(at) >= SCALED_UP_AFTER);
-    if let Some(pod) = pod.as_mut().filter(|pod| is_waiting && pod.unschedulable.is_some()) {
-        pod.scale_up = uses
-            .lookups
-            .scale_up(&namespace, &pod.name, ObjectRef::from_obj(submission));
-    }
-    (ObservedJob::Ours(job), pod)
+    (ObservedJob::Ours(job), Some(pod))
 }
 
 /// The node of a Pod that has not ended. Where nodes are not watched, only that of one that runs or is being deleted is asked for.
@@ -160,7 +153,7 @@ fn node(uses: Uses<'_>, submission: &Submission, pod: Option<&PodView>) -> NodeV
 }
 
 /// How its team's attempts ended. Read only if this may be the reconcile that ends it.
-fn team_of(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Timestamp) -> TeamHistory {
+fn team_of(teams: &Teams, submission: &Submission, job: &ObservedJob, now: Timestamp) -> TeamHistory {
     let is_under_way = match job {
         ObservedJob::Ours(job) => job.end.is_none(),
         ObservedJob::Created => true,
@@ -173,11 +166,7 @@ fn team_of(stores: &Stores, submission: &Submission, job: &ObservedJob, now: Tim
     if !may_end {
         return TeamHistory::default();
     }
-    team_history::of(
-        &stores.submissions.indexed(&team_history::key(submission)),
-        submission,
-        now,
-    )
+    teams.history(submission, now)
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {

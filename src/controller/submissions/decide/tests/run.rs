@@ -372,6 +372,7 @@ fn a_job_deleted_by_hand_is_made_again_three_times() {
 fn a_job_deleted_before_it_had_a_node_is_made_again_and_not_counted() {
     let mut world = World::local().with_job();
     world.job().failed_create = Some("exceeded quota: q".into());
+    world.go_to(5);
     world.pass_to(Pending, reasons::QUOTA_EXCEEDED);
     world.job_gone();
     let plan = world.pass_to(Pending, reasons::PREPARING);

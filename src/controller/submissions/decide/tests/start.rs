@@ -13,6 +13,11 @@ use leaderboard_api::reasons;
 
 const NOT_FOUND: &str = "rpc error: code = NotFound desc = failed to pull and unpack image \"r/x:1\": not found";
 
+/// Whole seconds.
+fn whole(requeue: Option<Duration>) -> Option<u64> {
+    requeue.map(|after| after.as_secs())
+}
+
 fn back_off() -> String {
     format!("Back-off pulling image \"r/x:1\": ErrImagePull: {NOT_FOUND}")
 }
@@ -388,6 +393,9 @@ fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
     for (words, reason) in cases {
         let mut world = World::local().with_job();
         world.job().failed_create = Some(words.into());
+        let plan = world.pass_to(Pending, reasons::PREPARING);
+        assert_eq!(whole(plan.requeue), Some(5), "the Pod before it may be leaving");
+        world.go_to(5);
         let plan = world.pass_to(Pending, reason);
         assert!(plan.status.message.unwrap().contains(words));
         world.go_to(1_000_000);
@@ -402,11 +410,49 @@ fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
 fn a_job_without_a_pod_is_shown_when_it_lasts() {
     let mut world = World::local().with_job();
     world.go_to(44);
-    assert_eq!(condition(&world.pass(), STALLED).0, "False");
+    let plan = world.pass();
+    assert_eq!(condition(&plan, STALLED).0, "False");
+    assert_eq!(whole(plan.requeue), Some(1));
     world.go_to(45);
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert_eq!(condition(&plan, STALLED).0, "True");
     assert!(plan.status.message.unwrap().contains("controller manager"));
+}
+
+#[test]
+fn what_waits_is_looked_at_again_by_the_clock_or_when_it_is_woken() {
+    const BACKSTOP: u64 = 300;
+    let refused = |world: &mut World| world.job().failed_create = Some("exceeded quota: q".into());
+    let unschedulable = |world: &mut World| {
+        world.view.pod = Some(pod(0));
+        let pod = world.pod();
+        (pod.scheduled, pod.node) = (None, None);
+        pod.unschedulable = Some("0/1 nodes are available".into());
+    };
+    let prepared = |world: &mut World| world.view.pod = Some(pod(0));
+    let nothing = |_: &mut World| {};
+    let cases: [(&str, &dyn Fn(&mut World), i64, u64); 8] = [
+        ("no Pod yet", &nothing, 10, 35),
+        ("no Pod, and no reason", &nothing, 50, BACKSTOP),
+        ("a quota", &refused, 10, BACKSTOP),
+        ("no node yet", &unschedulable, 1, 4),
+        ("no node", &unschedulable, 10, BACKSTOP),
+        ("it is prepared", &prepared, 10, 35),
+        ("that takes long", &prepared, 50, 70),
+        ("that is reported for the last time", &prepared, 3600, BACKSTOP),
+    ];
+    for (what, sees, second, expected) in cases {
+        let mut world = World::local().with_job();
+        let deadlines = &mut world.leaderboard().deadlines;
+        (
+            deadlines.schedule_seconds,
+            deadlines.pull_seconds,
+            deadlines.start_seconds,
+        ) = (0, 10_000, 10_000);
+        sees(&mut world);
+        world.go_to(second);
+        assert_eq!(whole(world.pass().requeue), Some(expected), "{what}");
+    }
 }
 
 #[test]

@@ -1,0 +1,64 @@
+//! A watch without a cache: each object that is there, was added or changed is handed to a function, and nothing of it is kept.
+
+use futures::StreamExt;
+use kube::Api;
+use kube::runtime::watcher::{Config, Event};
+
+use super::item::{Item, Watchable};
+use super::source;
+use super::watch::PAGE;
+use crate::observability::Observability;
+use leaderboard_api::client_errors;
+
+/// Hands on what is there and what comes, until the process stops. `name` is of the task, and of the watch in `/livez`. It holds up no
+/// readiness: what is missing without it is for its reader to say.
+pub fn spawn_uncached<K: Watchable>(
+    name: &'static str,
+    apis: Vec<Api<Item<K>>>,
+    config: Config,
+    telemetry: &Observability,
+    take: impl FnMut(K) + Send + 'static,
+) {
+    let work = hand_on(name, apis, config.page_size(PAGE), telemetry.clone(), take);
+    telemetry.tasks.until_stop(name, work);
+}
+
+async fn hand_on<K: Watchable>(
+    name: &'static str,
+    apis: Vec<Api<Item<K>>>,
+    config: Config,
+    telemetry: Observability,
+    mut take: impl FnMut(K),
+) {
+    let metrics = telemetry.metrics.watch(&K::kind(&()));
+    let of_namespace = |api: &Api<Item<K>>| match api.namespace() {
+        Some(namespace) => telemetry.liveness.watch(&format!("{name} in {namespace}")),
+        None => telemetry.liveness.watch(name),
+    };
+    let probes: Vec<_> = apis.iter().map(of_namespace).collect();
+    let mut events = source::all(apis, &config);
+    // None of them has an end; if one ends all the same, this task ends, and with it the process.
+    while let Some((source, Some(event))) = events.next().await {
+        let probe = &probes[source];
+        match event {
+            Ok(Event::Init) => probe.listing(),
+            Ok(Event::InitDone) => probe.listed(),
+            Ok(Event::Delete(_)) => probe.running(),
+            Ok(Event::InitApply(item) | Event::Apply(item)) => {
+                metrics.event();
+                match item.object {
+                    Ok(object) => take(object),
+                    Err(_) => metrics.malformed(),
+                }
+            }
+            // Without news a watch stays where it was, until the server has forgotten that.
+            Err(error) if source::is_forgotten(&error) => probe.running(),
+            Err(error) => {
+                metrics.failed();
+                source::report(probe, &error);
+                let cause = client_errors::watch(&error);
+                tracing::warn!(watch = name, error = cause, "a watch has failed and is retried");
+            }
+        }
+    }
+}
