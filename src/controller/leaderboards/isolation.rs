@@ -213,7 +213,7 @@ pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> O
         let (of, verdict) = state.read(&uid, |entry| entry.measured.clone())?;
         (of == generation).then_some(verdict)
     };
-    let found = state
+    state
         .found(&uid, generation)
         .or_else(|| known(leaderboard))
         .or_else(remembered)

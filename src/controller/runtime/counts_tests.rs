@@ -48,7 +48,7 @@ fn each_leaderboard_shows_its_readiness_and_how_long_its_oldest_have_waited() {
         let published = ("Published", published.0, published.1, 59);
         submission(board, &[("Finished", "True", "Finished", minute), published])
     };
-    let submissions = [
+    let submissions = vec![
         submission("a", &[("Finished", "False", "Preparing", 50)]),
         submission("a", &[("Finished", "False", "Preparing", 20)]),
         // It has run and waits for its next Job.

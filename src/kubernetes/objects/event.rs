@@ -74,6 +74,11 @@ impl Event {
     fn share_texts(&mut self, texts: &mut Texts) {
         self.metadata.share_texts(texts);
     }
+
+    /// No cache holds events: each is news.
+    fn is_same_as(&self, _: &Self) -> bool {
+        false
+    }
 }
 
 watchable!(Event, NamespaceResourceScope, "Event", "", "v1", "events");

@@ -421,25 +421,26 @@ fn a_job_without_a_pod_is_shown_when_it_lasts() {
 
 #[test]
 fn what_waits_is_looked_at_again_by_the_clock_or_when_it_is_woken() {
+    type Sees = fn(&mut World);
     const BACKSTOP: u64 = 300;
-    let refused = |world: &mut World| world.job().failed_create = Some("exceeded quota: q".into());
-    let unschedulable = |world: &mut World| {
+    let refused: Sees = |world| world.job().failed_create = Some("exceeded quota: q".into());
+    let unschedulable: Sees = |world| {
         world.view.pod = Some(pod(0));
         let pod = world.pod();
         (pod.scheduled, pod.node) = (None, None);
         pod.unschedulable = Some("0/1 nodes are available".into());
     };
-    let prepared = |world: &mut World| world.view.pod = Some(pod(0));
-    let nothing = |_: &mut World| {};
-    let cases: [(&str, &dyn Fn(&mut World), i64, u64); 8] = [
-        ("no Pod yet", &nothing, 10, 35),
-        ("no Pod, and no reason", &nothing, 50, BACKSTOP),
-        ("a quota", &refused, 10, BACKSTOP),
-        ("no node yet", &unschedulable, 1, 4),
-        ("no node", &unschedulable, 10, BACKSTOP),
-        ("it is prepared", &prepared, 10, 35),
-        ("that takes long", &prepared, 50, 70),
-        ("that is reported for the last time", &prepared, 3600, BACKSTOP),
+    let prepared: Sees = |world| world.view.pod = Some(pod(0));
+    let nothing: Sees = |_| {};
+    let cases: [(&str, Sees, i64, u64); 8] = [
+        ("no Pod yet", nothing, 10, 35),
+        ("no Pod, and no reason", nothing, 50, BACKSTOP),
+        ("a quota", refused, 10, BACKSTOP),
+        ("no node yet", unschedulable, 1, 4),
+        ("no node", unschedulable, 10, BACKSTOP),
+        ("it is prepared", prepared, 10, 35),
+        ("that takes long", prepared, 50, 70),
+        ("that is reported for the last time", prepared, 3600, BACKSTOP),
     ];
     for (what, sees, second, expected) in cases {
         let mut world = World::local().with_job();
