@@ -195,8 +195,9 @@ impl ArchiveWorkers {
         });
         let now = Instant::now();
         let mut state = lock(&bucket.state);
-        let is_same =
-            |target: &Target| target.attempt == submission.present_attempt() && target.ended.is_some() == ended.is_some();
+        let is_same = |target: &Target| {
+            target.attempt == submission.present_attempt() && target.ended.is_some() == ended.is_some()
+        };
         let (uid, target) = state
             .known(uid(submission))
             .filter(|(_, target)| is_same(target))
