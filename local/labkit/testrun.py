@@ -336,7 +336,7 @@ def matrix(lines: str) -> str:
 
 def test_environment(settings: Settings) -> dict[str, str]:
     """Where the tests find an API server and the AWS stand-in."""
-    assets = tools.ensure(settings, ENVTEST_TOOLS, os.environ.get("KUBEBUILDER_ASSETS"))
+    assets = tools.ensure(settings, [*ENVTEST_TOOLS, "prometheus", "otelcol"], os.environ.get("KUBEBUILDER_ASSETS"))
     ministack = pythonenv.ensure(settings) / "ministack"
     return {"KUBEBUILDER_ASSETS": str(assets), "LEADERBOARD_MINISTACK": str(ministack)}
 
