@@ -27,12 +27,12 @@ KINDS = {".html": "text/html; charset=utf-8", ".css": "text/css", ".js": "text/j
 MOMENT = 1793534400
 # name -> width, height, colours
 PICTURES = {
-    "page-light": (1200, 800, "light"),
-    "page-dark": (1200, 800, "dark"),
-    "page-phone-light": (360, 760, "light"),
-    "page-phone-dark": (360, 760, "dark"),
+    "page-light": (1200, 1000, "light"),
+    "page-dark": (1200, 1000, "dark"),
+    "page-phone-light": (360, 1100, "light"),
+    "page-phone-dark": (360, 1100, "dark"),
 }
-LARGEST_PICTURE = 250 * 1024
+LARGEST_PICTURE = 400 * 1024
 # The view of a draw as large as the operator sends is drawn within this time, on a busy machine.
 DRAW_MS = 5000
 

@@ -94,11 +94,11 @@ def submissions(settings: Settings, kube: Kube) -> Shown:
 
     finished = submit(TEAM_B, SENSORS, "crash-once")
     failed = submit(TEAM_B, MAP, "crash-always")
-    missing = submit(TEAM_A, SENSORS, "no-such-tag")
+    useless = submit(TEAM_A, SENSORS, "nonsense")
     stopped = submit(TEAM_A, MAP, "slow")
     wait(kube, stopped, state("Running"))
     kube.run("kubectl", "leaderboard", "cancel", stopped)
-    for name, end in ((finished, "Finished"), (failed, "Failed"), (missing, "Failed"), (stopped, "Cancelled")):
+    for name, end in ((finished, "Finished"), (failed, "Failed"), (useless, "Failed"), (stopped, "Cancelled")):
         wait(kube, name, state(end))
     change(kube, {"concurrency": {"total": 2}, "agent": {"env": [{"name": "ROUTE_MS", "value": str(ROUTE_MS)}]}})
     running, other = submit(TEAM_A, SENSORS, "crash-once"), submit(TEAM_B, MAP, "standard")
@@ -120,12 +120,12 @@ def wait(kube: Kube, submission: str, what: str) -> None:
 def terminals(kube: Kube, tab: Tab, shown: Shown) -> Iterator[tuple[str, bytes]]:
     """Pictures of terminals; all that is shown is printed too."""
     sessions = {
-        "status": [f"kubectl leaderboard status {shown.running}"],
-        "submissions": ["kubectl get submissions", "kubectl leaderboard top"],
+        "submissions": ["kubectl get submissions", f"kubectl leaderboard status {shown.running}"],
+        "top": ["kubectl leaderboard status", "kubectl leaderboard top"],
         "why": [f"kubectl leaderboard why {shown.failed}"],
         "": [
             "kubectl get submissions -o wide",
-            f"kubectl describe submission {shown.running}",
+            f"kubectl describe submission {shown.failed}",
             *(f"kubectl leaderboard why {name}" for name in (shown.waiting, shown.running, shown.finished)),
         ],
     }
