@@ -55,6 +55,7 @@ mod cluster {
     mod probe_endings;
     mod probes;
     mod publish;
+    mod requeues;
     mod restarts;
     mod runs;
     mod stops;

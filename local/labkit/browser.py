@@ -1,5 +1,6 @@
 """Owns a headless Chromium and how it is spoken to: the DevTools protocol over two pipes, as `--remote-debugging-pipe` reads it."""
 
+import base64
 import json
 import os
 import select
@@ -96,10 +97,9 @@ class Tab:
         if not self.run(script):
             raise LabError(f"the page has not come to: {condition}")
 
-    def size(self, width: int, height: int) -> None:
-        self.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
-        )
+    def size(self, width: int, height: int, scale: int = 1) -> None:
+        metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": width < 500}
+        self.call("Emulation.setDeviceMetricsOverride", **metrics)
 
     def prefer(self, **features: str) -> None:
         """Media features, such as prefers_color_scheme="dark"."""
@@ -116,6 +116,16 @@ class Tab:
                 windowsVirtualKeyCode=code,
                 text=text if kind == "keyDown" else "",
             )
+
+    def fill(self, markup: str) -> None:
+        """Puts this page in place of the one that is shown."""
+        frame = self.call("Page.getFrameTree")["frameTree"]["frame"]["id"]
+        self.call("Page.setDocumentContent", frameId=frame, html=markup)
+
+    def picture(self, width: float, height: float) -> bytes:
+        """A PNG of so much of the page from its upper left corner."""
+        clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png", clip=clip)["data"])
 
     def open(self, address: str) -> None:
         """Goes to an address, and returns when it is loaded."""

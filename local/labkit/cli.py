@@ -24,6 +24,7 @@ from . import (
     kube,
     metricdocs,
     pagetest,
+    pictures,
     programdocs,
     pythonenv,
     release,
@@ -74,7 +75,10 @@ def parser() -> argparse.ArgumentParser:
     chart = commands.add_parser("chart-test", help="check the Helm chart against an API server of its own")
     chart.add_argument("--update", action="store_true", help="copy crds/ into the chart first")
     page = commands.add_parser("page-test", help="test the operator's page in a headless Chromium")
-    page.add_argument("--pictures", action="store_true", help="take the pictures of docs/images too")
+    page.add_argument("--pictures", action="store_true", help="take pictures of its test data too, in .local/pictures")
+    commands.add_parser(
+        "pictures", help="take the pictures of docs/images on the demo's cluster; prints what terminals show"
+    )
     engine = commands.add_parser("dockerfile", help="build the Dockerfile with buildah and check its image")
     engine.add_argument("--profile", default=build.PROFILE, help=f"cargo profile (default: {build.PROFILE})")
     commands.add_parser(
@@ -144,6 +148,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             charttest.run(settings, arguments.update)
         case "page-test":
             pagetest.run(settings, arguments.pictures)
+        case "pictures":
+            pictures.run(settings)
         case "dockerfile":
             dockerfile.run(settings, arguments.profile)
         case "chart-docs":

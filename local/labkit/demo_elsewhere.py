@@ -32,7 +32,15 @@ ENGINES = ("docker", "podman")
 # Pushes, pulls and one submission.
 RUN_SECONDS = 180
 STEPS = 6
+PUSH_LOG = "push.log"
 SUBMITTED = re.compile(r"^submission (\d+) is submitted", re.MULTILINE)
+# What registries and engines say to a push -> what to do about it. {registry} is its host, {names} are the repositories.
+REFUSALS = {
+    "HTTP response to HTTPS client": "it speaks plain HTTP: list {registry} as insecure, for podman in /etc/containers/registries.conf, "
+    "for docker as insecure-registries in /etc/docker/daemon.json",
+    "name unknown|does not exist": "it makes no repositories by itself, as ECR: make {names} first",
+    "authentication required|unauthorized|denied|no basic auth": "log in to {registry} first, with `login` of docker, podman or crane",
+}
 # host[:port]/path, as image references begin.
 REGISTRY = re.compile(r"[a-z0-9][a-z0-9.-]*(:\d+)?(/[a-z0-9]+([._/-][a-z0-9]+)*)?")
 
@@ -131,17 +139,29 @@ def push_all(settings: Settings, registry: str) -> dict[str, str]:
     """Makes and pushes the images; returns repository -> reference. The tag is of the content: nodes keep what they have of another."""
     search = image.Search({}, image.target_folder(settings.repository, os.environ), build.PROFILE)
     program = engine()
-    pushed = {}
+    pushed: dict[str, str] = {}
     for spec in specs(settings):
         made = image.build(settings, spec, search)
         pushed[spec.repository] = reference = f"{registry}/{spec.repository}:{made.digest.partition(':')[2][:12]}"
-        push(settings, program, made, reference)
+        try:
+            push(settings, program, made, reference)
+        except LabError as error:
+            said = (settings.logs / PUSH_LOG).read_text(errors="replace")
+            raise LabError(f"{error}{advice(said, settings, registry)}") from error
         say(f"pushed {reference}")
     return pushed
 
 
+def advice(said: str, settings: Settings, registry: str) -> str:
+    """What to do about a push that failed; empty where its own words say all that is known."""
+    found = next((what for words, what in REFUSALS.items() if re.search(words, said, re.IGNORECASE)), "")
+    path = registry.partition("/")[2]
+    names = ", ".join(f"{path}/{spec.repository}".lstrip("/") for spec in specs(settings))
+    return found and f"; {found.format(registry=registry.partition('/')[0], names=names)}"
+
+
 def push(settings: Settings, program: str | None, made: layer.Image, reference: str) -> None:
-    log = settings.logs / "push.log"
+    log = settings.logs / PUSH_LOG
     with tempfile.TemporaryDirectory(prefix="leaderboard-image-") as folder:
         archive = Path(folder) / "image.tar"
         archive.write_bytes(layer.archive(made, reference))
@@ -149,7 +169,10 @@ def push(settings: Settings, program: str | None, made: layer.Image, reference: 
             crane = tools.ensure(settings, ["crane"]) / "crane"
             commands = [[str(crane), "push", str(archive), reference]]
         else:
-            commands = [[program, "load", "--input", str(archive)], [program, "push", reference]]
+            # The nodes pull from the registry: nobody needs the engine's own copy.
+            commands = [
+                [program, *words] for words in (["load", f"--input={archive}"], ["push", reference], ["rmi", reference])
+            ]
         for command in commands:
             run_long(command, f"pushing {reference}", log)
 

@@ -1,17 +1,16 @@
-"""Owns the test of the operator's page in a headless Chromium, and its pictures in the docs.
+"""Owns the test of the operator's page in a headless Chromium, and how pictures of it are taken.
 
 Called by `lab test` and `lab page-test`. The page's files and the policy of their content are those that the operator serves
 (`src/page/web`), the view is the one that its unit tests assert (`src/page/golden`); the operator's own server has its tests in
 `src/page` and `tests/api/page.rs`.
 """
 
-import base64
 import hashlib
 import json
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,12 @@ KINDS = {".html": "text/html; charset=utf-8", ".css": "text/css", ".js": "text/j
 MOMENT = 1793534400
 # name -> width, height, colours
 PICTURES = {
-    "page-light": (1200, 800, "light"),
-    "page-dark": (1200, 800, "dark"),
-    "page-phone-light": (360, 760, "light"),
-    "page-phone-dark": (360, 760, "dark"),
+    "page-light": (1200, 1000, "light"),
+    "page-dark": (1200, 1000, "dark"),
+    "page-phone-light": (360, 1100, "light"),
+    "page-phone-dark": (360, 1100, "dark"),
 }
-LARGEST_PICTURE = 150 * 1024
+LARGEST_PICTURE = 400 * 1024
 # The view of a draw as large as the operator sends is drawn within this time, on a busy machine.
 DRAW_MS = 5000
 
@@ -129,7 +128,7 @@ def handler(page: Page) -> type[BaseHTTPRequestHandler]:
 
 
 def run(settings: Settings, pictures: bool) -> None:
-    """All checks; raises with the first one that fails. With `pictures` those of the docs are taken."""
+    """All checks; raises with the first one that fails. `pictures`: of the view of the tests, to look at a change of the page."""
     ensure_browser(settings)
     script = axe(settings)
     page = Page(settings.repository)
@@ -144,7 +143,7 @@ def run(settings: Settings, pictures: bool) -> None:
                 print(f"ok    {what:<48} {summary} ({seconds(time.monotonic() - started)})", flush=True)
             accessible(tab, page, script)
             if pictures:
-                take(tab, page, settings.repository / "docs" / "images")
+                take(tab, page, settings.state / "pictures")
     finally:
         page.close()
 
@@ -175,9 +174,14 @@ def axe(settings: Settings) -> str:
 def fresh(tab: Tab, page: Page, width: int = 1280, colours: str = "light") -> None:
     """Opens the page anew and waits until it shows what is sent."""
     page.send(event(page.view))
+    show(tab, page.address, width, colours)
+
+
+def show(tab: Tab, address: str, width: int, colours: str) -> None:
+    """Opens a page at an address, and waits until it shows what it was sent."""
     tab.prefer(prefers_color_scheme=colours)
     tab.size(width, 900)
-    tab.open(page.address)
+    tab.open(address)
     tab.wait("document.querySelector('#connection')?.dataset.state === 'live' && document.querySelector('#ended .row')")
 
 
@@ -366,12 +370,20 @@ AXE = """axe.run().then(({ passes, violations }) => JSON.stringify({
 
 
 def take(tab: Tab, page: Page, folder: Path) -> None:
-    """The pictures of docs/page.md."""
     folder.mkdir(parents=True, exist_ok=True)
+    for name, data in pictures(tab, page.address):
+        keep(folder / f"{name}.png", data)
+
+
+def pictures(tab: Tab, address: str) -> Iterator[tuple[str, bytes]]:
+    """The page at an address in both colours, on a wide screen and on a phone's."""
     for name, (width, height, colours) in PICTURES.items():
-        fresh(tab, page, width, colours)
+        show(tab, address, width, colours)
         tab.size(width, height)
-        data = base64.b64decode(tab.call("Page.captureScreenshot", format="png")["data"])
-        need(len(data) <= LARGEST_PICTURE, f"{name}.png has {len(data)} bytes, more than {LARGEST_PICTURE}")
-        (folder / f"{name}.png").write_bytes(data)
-        say(f"{folder / name}.png, {len(data) // 1024} KiB")
+        yield name, tab.picture(width, height)
+
+
+def keep(file: Path, data: bytes) -> None:
+    need(len(data) <= LARGEST_PICTURE, f"{file.name} has {len(data)} bytes, more than {LARGEST_PICTURE}")
+    file.write_bytes(data)
+    say(f"{file}, {len(data) // 1024} KiB")

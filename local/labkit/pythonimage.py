@@ -42,7 +42,8 @@ def entries(site: Path, packages: list[str], to: str) -> Iterator[Entry]:
     yield from tree(Path(sysconfig.get_path("stdlib")))
     for package in closure(site, packages):
         for file in package.files or []:
-            place = Path(str(file.locate()))
+            # As its record names it, a program is in a folder above this one.
+            place = Path(os.path.normpath(str(file.locate())))
             # Programs lie outside; what is compiled holds the day in it.
             if place.is_relative_to(site) and "__pycache__" not in file.parts:
                 yield from with_libraries(place, f"{to}/{place.relative_to(site)}")

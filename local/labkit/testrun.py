@@ -39,6 +39,8 @@ from .failures import Failure, Reader, Summary, failed_cases
 from .settings import Settings, client_environment, without_proxy
 from .toolsets import ENVTEST_TOOLS
 
+# What the tests of the API server start.
+API_TOOLS = (*ENVTEST_TOOLS, "prometheus", "otelcol")
 # Test programs of cargo with a layer of their own, as they need an API server or a node.
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
@@ -188,7 +190,7 @@ def lab(plan: Plan) -> None:
 def make_tools(plan: Plan) -> None:
     """What would otherwise be built next to tests with limits of time."""
     packages.ensure(plan.settings)
-    tools.ensure(plan.settings, [*cluster.tools_of(plan.settings), *apiserver.TOOLS, chartalerts.TOOL, gpus.TOOL])
+    tools.ensure(plan.settings, [*cluster.tools_of(plan.settings), *apiserver.TOOLS, *API_TOOLS, chartalerts.TOOL, gpus.TOOL])
     pythonenv.ensure(plan.settings)
 
 
@@ -336,7 +338,7 @@ def matrix(lines: str) -> str:
 
 def test_environment(settings: Settings) -> dict[str, str]:
     """Where the tests find an API server and the AWS stand-in."""
-    assets = tools.ensure(settings, [*ENVTEST_TOOLS, "prometheus", "otelcol"], os.environ.get("KUBEBUILDER_ASSETS"))
+    assets = tools.ensure(settings, API_TOOLS, os.environ.get("KUBEBUILDER_ASSETS"))
     ministack = pythonenv.ensure(settings) / "ministack"
     return {"KUBEBUILDER_ASSETS": str(assets), "LEADERBOARD_MINISTACK": str(ministack)}
 

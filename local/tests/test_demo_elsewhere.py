@@ -90,6 +90,7 @@ class Elsewhere(unittest.TestCase):
         notes = self.notes()
         pushed = [words[1] for name, words, _ in notes if name == "docker" and words[0] == "push"]
         self.assertEqual(len(pushed), 6)
+        self.assertEqual(pushed, [words[1] for name, words, _ in notes if name == "docker" and words[0] == "rmi"])
         self.assertTrue(all(one.startswith("registry.example/demo/") for one in pushed), pushed)
         [install] = [words for name, words, _ in notes if name == "helm"]
         self.assertIn("--namespace=leaderboard-demo", install)
@@ -123,6 +124,17 @@ class Elsewhere(unittest.TestCase):
         del self.env["KUBECONFIG"]
         with self.assertRaisesRegex(LabError, "KUBECONFIG, which is not set"):
             self.run_with([])
+
+    def test_a_push_that_is_refused_names_what_to_do(self) -> None:
+        for said, word in (
+            ("http: server gave HTTP response to HTTPS client", "list registry.example as insecure"),
+            ("name unknown: repository name not known to registry", "make demo/leaderboard-operator, demo/challenge"),
+            ("unauthorized: authentication required", "log in to registry.example"),
+            ("no space left on device", "FAIL no space left on device"),
+        ):
+            with self.subTest(word), self.assertRaisesRegex(LabError, word) as raised:
+                self.run_with([("docker push", f"FAIL {said}")])
+            self.assertNotIn("{", str(raised.exception))
 
     def test_only_what_the_machine_lacks_is_built(self) -> None:
         with mock.patch.dict(os.environ, {**self.env, "ANSWERS": "[]"}, clear=True):

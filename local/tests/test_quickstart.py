@@ -5,6 +5,7 @@ import unittest
 from importlib.metadata import PathDistribution
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
 from labkit import pythonimage, quickstart, release
 from labkit.errors import LabError
@@ -65,7 +66,7 @@ class Packages(unittest.TestCase):
     def site(self, folder: str, **requires: list[str]) -> Path:
         for name, others in requires.items():
             info = Path(folder) / f"{name}-1.dist-info"
-            info.mkdir()
+            info.mkdir(parents=True)
             lines = [f"Metadata-Version: 2.1\nName: {name}\nVersion: 1", *(f"Requires-Dist: {one}" for one in others)]
             (info / "METADATA").write_text("\n".join(lines) + "\n")
             self.assertEqual(PathDistribution(info).metadata["Name"], name)
@@ -78,6 +79,20 @@ class Packages(unittest.TestCase):
             self.assertEqual(found, ["a", "B_b", "c_c"])
             with self.assertRaisesRegex(LabError, "the Python package d is not in"):
                 pythonimage.closure(site, ["e", "d"])
+
+    def test_what_lies_outside_of_the_packages_is_left_out(self) -> None:
+        """As pip records the programs of a package. podman refuses a layer with `..` in its paths."""
+        with TemporaryDirectory() as folder:
+            site = self.site(f"{folder}/lib/site", a=[])
+            for name in ("lib/site/a.py", "bin/a"):
+                file = Path(folder) / name
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.touch()
+            (site / "a-1.dist-info" / "RECORD").write_text("a.py,,\n../../bin/a,,\n")
+            with mock.patch.object(pythonimage, "tree", return_value=[]):
+                paths = [entry.path for entry in pythonimage.entries(site, ["a"], "/packages")]
+            self.assertIn("/packages/a.py", paths)
+            self.assertFalse([path for path in paths if "bin/a" in path or ".." in path], paths)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 //! `kubectl leaderboard check` on a real cluster: a good Leaderboard, and one that is broken in each of several ways.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -20,33 +20,24 @@ const LIMIT: Duration = Duration::from_mins(8);
 const COPIES: &str = "cp -r ${LEADERBOARD_ROOT}/* /tmp/leaderboard/ && cp -r ${SCENARIO_RUNNER_ROOT}/* /tmp/scenario_runner/ && \
                       cp -r ${CARLA_PYTHON_API_ROOT}/* /tmp/CARLA/ && echo copied";
 
-fn plugin() -> PathBuf {
-    Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard")
-}
-
-/// Runs a check of this Leaderboard; its exit code, and what it printed.
-async fn check(scene: &Scene, board: &str, agent: &str) -> (Option<i32>, String) {
-    let mut command = Command::new(plugin());
-    command
-        .args([
-            "check",
-            board,
-            "--timeout",
-            "400",
-            "--image",
-            &scene.lab.challenge(agent),
-            "-n",
-            &scene.namespace,
-        ])
-        .env("PATH", "")
-        .stdin(Stdio::null())
-        .kill_on_drop(true);
-    let output = timeout(LIMIT, command.output()).await.expect("the check ends").unwrap();
+/// Runs `kubectl leaderboard` in the scene's namespace; its exit code, and what it printed.
+pub(super) async fn plugin(scene: &Scene, words: &[&str]) -> (Option<i32>, String) {
+    let program = Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard");
+    let mut command = Command::new(program);
+    command.args(words).args(["-n", &scene.namespace]);
+    command.env("PATH", "").stdin(Stdio::null()).kill_on_drop(true);
+    let output = timeout(LIMIT, command.output()).await.expect("it ends").unwrap();
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (
         output.status.code(),
         format!("{}{}", text(&output.stdout), text(&output.stderr)),
     )
+}
+
+/// Runs a check of this Leaderboard.
+async fn check(scene: &Scene, board: &str, agent: &str) -> (Option<i32>, String) {
+    let image = scene.lab.challenge(agent);
+    plugin(scene, &["check", board, "--timeout", "400", "--image", &image]).await
 }
 
 /// The streams of a log group, without the run before the slash.

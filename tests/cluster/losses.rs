@@ -13,10 +13,10 @@ use serde_json::{Value, json};
 use super::expected::SIX_ROUTES;
 use super::matrix::Case;
 use crate::operator::controller;
-use crate::scene::{Scene, done, scenario, score, state};
+use crate::scene::{Scene, done, lay_over, scenario, score, state};
 
 /// How the matrix has these cases.
-const REPEATED: &str = "Finished; at most one route of a pair repeated";
+pub(super) const REPEATED: &str = "Finished; at most one route of a pair repeated";
 
 /// Six routes for two pairs, one in 9 s: when the status has two, the run is far from its end on a busy machine too.
 fn slow() -> Value {
@@ -29,8 +29,13 @@ fn slow() -> Value {
 
 /// Starts a run and waits until it is half-way. No failure of the infrastructure is retried if `retries` is 0.
 pub(super) async fn half_way(scene: &Scene, name: &str, retries: i32) {
+    half_way_of(scene, name, json!({"retries": {"infrastructure": retries}})).await;
+}
+
+/// The same with these fields of the Leaderboard's spec.
+pub(super) async fn half_way_of(scene: &Scene, name: &str, change: Value) {
     let mut spec = slow();
-    spec["retries"] = json!({"infrastructure": retries});
+    lay_over(&mut spec, change);
     scene.leaderboard("lb", spec).await;
     scene.submit(name, "agent:standard").await;
     let half = |s: &Submission| done(s) >= 2;

@@ -8,6 +8,7 @@ use std::sync::OnceLock;
 use clap::{Args, ValueEnum};
 use serde_json::Value;
 
+use super::table::{DONE, OPEN};
 use super::text::{WIDTH, clean, join, wrap};
 
 /// The narrowest and the widest page. A text in longer lines is hard to read.
@@ -273,13 +274,17 @@ const CYAN: &str = "\u{1b}[36m";
 const DIM: &str = "\u{1b}[2m";
 const PLAIN: &str = "\u{1b}[0m";
 
-/// A line with colours: the mark at its start, and the first state in it.
+/// A line with colours: the mark at its start, its progress bar, or the first state in it.
 pub(super) fn painted(line: &str) -> String {
     let marks = [('✔', GREEN), ('✘', RED), ('!', YELLOW), ('–', DIM)];
     let first = line.chars().next();
     if let Some((mark, colour)) = marks.into_iter().find(|(mark, _)| first == Some(*mark)) {
         let rest = line.get(mark.len_utf8()..).unwrap_or_default();
         return format!("{colour}{mark}{PLAIN}{rest}");
+    }
+    if let Some(start) = line.find([DONE, OPEN]) {
+        let (before, bar) = line.split_at(start);
+        return format!("{before}{}", painted_bar(bar));
     }
     let states = [
         ("Pending", YELLOW),
@@ -300,6 +305,19 @@ pub(super) fn painted(line: &str) -> String {
         }
         None => line.to_owned(),
     }
+}
+
+/// A bar, which has its own colour once it is whole, and what stands after it.
+fn painted_bar(bar: &str) -> String {
+    let rest = bar.trim_start_matches(DONE);
+    let after = rest.trim_start_matches(OPEN);
+    let (done, open) = (&bar[..bar.len() - rest.len()], &rest[..rest.len() - after.len()]);
+    let colour = if open.is_empty() { GREEN } else { CYAN };
+    let parts = [(colour, done), (DIM, open)]
+        .into_iter()
+        .filter(|(_, part)| !part.is_empty())
+        .map(|(colour, part)| format!("{colour}{part}{PLAIN}"));
+    parts.chain(std::iter::once(after.to_owned())).collect()
 }
 
 #[cfg(test)]
@@ -345,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn marks_and_states_are_coloured_and_nothing_else() {
+    fn marks_bars_and_states_are_coloured_and_nothing_else() {
         for (line, expected) in [
             ("✔ Node  gpu-3", "\u{1b}[32m✔\u{1b}[0m Node  gpu-3"),
             ("✘ Node", "\u{1b}[31m✘\u{1b}[0m Node"),
@@ -353,6 +371,11 @@ mod tests {
                 "a  Failed   3 min  was Running before",
                 "a  \u{1b}[31mFailed\u{1b}[0m   3 min  was Running before",
             ),
+            (
+                "Pair 1:  ██░░ 1/2",
+                "Pair 1:  \u{1b}[36m██\u{1b}[0m\u{1b}[2m░░\u{1b}[0m 1/2",
+            ),
+            ("Pair 2:  ██ 2/2", "Pair 2:  \u{1b}[32m██\u{1b}[0m 2/2"),
             ("Next: Nothing.", "Next: Nothing."),
         ] {
             assert_eq!(painted(line), expected);

@@ -10,6 +10,9 @@ const LEAST: usize = 8;
 const WHOLE: [&str; 2] = ["NAMESPACE", "NAME"];
 /// What is cut at its start: the tags of an image's versions differ at the end.
 const ENDS: [&str; 1] = ["SIMULATOR"];
+/// What a bar is made of: the part that is done, and the rest.
+pub(super) const DONE: char = '█';
+pub(super) const OPEN: char = '░';
 
 /// Lines of a table with its head, of at most `width` columns as far as cutting its widest cells can help. Each cell is cleaned: many were
 /// written by strangers.
@@ -67,7 +70,9 @@ fn widths(head: &[String], rows: &[Vec<String>], width: usize) -> Vec<usize> {
 pub(super) fn bar(done: i32, total: i32, columns: usize) -> String {
     let (done, total) = (usize::try_from(done).unwrap_or(0), usize::try_from(total).unwrap_or(0));
     let filled = (done * columns).checked_div(total).unwrap_or(0).min(columns);
-    format!("{}{}", "█".repeat(filled), "░".repeat(columns - filled))
+    std::iter::repeat_n(DONE, filled)
+        .chain(std::iter::repeat_n(OPEN, columns - filled))
+        .collect()
 }
 
 #[cfg(test)]
