@@ -20,6 +20,8 @@ PRINTS: dict[str, tuple[str, int]] = {
     "aws sqs receive-message --queue-url https://sqs.us-east-1.amazonaws.com/123456789012/queue --query": (MESSAGE, 2),
     "aws sqs receive-message": (f'{{"Messages": [{MESSAGE}]}}', 99),
     "aws sts get-caller-identity": ("123456789012", 99),
+    # EvalAI's stand-in takes this token.
+    "aws secretsmanager get-secret-value --secret-id evalai": ('{"auth_token": "local-host-token"}', 99),
     "aws ecr describe-repositories": ("challenge-participant-team-7", 99),
     "aws": ("stand-in", 99),
     "make --silent install-yaml": ("apiVersion: v1\nkind: ConfigMap\nmetadata: {name: installed}", 99),

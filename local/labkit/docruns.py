@@ -251,7 +251,7 @@ def of_words(settings: Settings, notes: Sequence[Note]) -> Iterator[str]:
             )
         elif (
             note.program == "lab"
-            and f'add_parser("{words[0]}"' not in (settings.local / "labkit" / "cli.py").read_text()
+            and not re.search(rf'add_parser\(\s*"{words[0]}"', (settings.local / "labkit" / "cli.py").read_text())
         ):
             yield f"{note}: no command {words[0]}"
         elif note.program in ("check.sh", "try.sh"):
