@@ -21,8 +21,8 @@ from .settings import Settings
 # program -> Debian package
 PROGRAMS = {"curl": "curl", "man": "man-db"}
 STAND_IN = "evalai-stand-in"
-# As docs/evalai.md has them.
-EVALAI, CHALLENGE, QUEUE = "https://eval.ai", 2098, "QUEUE_NAME"
+# As the pages have them; PLACEHOLDER is what they write where a host has the name of a queue.
+EVALAI, CHALLENGE, QUEUE, PLACEHOLDER = "https://eval.ai", 2098, "leaderboard", "QUEUE_NAME"
 PATIENCE = 60
 
 

@@ -141,6 +141,7 @@ def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) ->
         furnish(repository, home)
         script = text([block for block in found if block.page == page])
         script = script.replace(docanswers.EVALAI, kube.env.get("DOCUMENTS_EVALAI", docanswers.EVALAI))
+        script = script.replace(f"/queues/{docanswers.PLACEHOLDER}/", f"/queues/{docanswers.QUEUE}/")
         env = {
             **kube.env,
             "PATH": str(programs),
