@@ -153,6 +153,9 @@ fn of_leaderboard(
             slots.wake_pending(&reference);
         }
         let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_LEADERBOARD));
+        if is_news {
+            slots.wake_live(&reference);
+        }
         is_news.then_some((reference, Class::Urgent))
     }
 }
