@@ -11,7 +11,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use crate::bench::Outcome;
-use crate::raw::{LEADERBOARD, WARM_NAME};
+use crate::names::{LEADERBOARD, WARM_NAME};
 use crate::servers::OPERATOR;
 
 /// The process's own requests, which no submission causes.

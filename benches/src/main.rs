@@ -7,6 +7,7 @@ mod audit;
 mod bench;
 mod cases;
 mod machine;
+mod names;
 mod observed;
 mod operator;
 mod player;

@@ -8,13 +8,7 @@ use serde_json::{Value, json};
 use crate::api::{self, APPLY, JSON, MERGE, Meta};
 use crate::audit;
 use crate::bench::Outcome;
-
-/// The submission whose bodies are taken.
-pub const SAMPLE: &str = "run-99999";
-/// The submission that warms everything up; it is not measured.
-pub const WARM_NAME: &str = "run-99998";
-/// Name of the Leaderboard.
-pub const LEADERBOARD: &str = "carla";
+use crate::names::{LEADERBOARD, SAMPLE};
 
 /// What is written for one submission until its Job exists.
 pub struct Bodies {

@@ -6,7 +6,8 @@ use tokio::time::{Instant, sleep};
 
 use crate::audit;
 use crate::bench::{Bench, Outcome};
-use crate::raw::{Bodies, SAMPLE, create_submission};
+use crate::names::SAMPLE;
+use crate::raw::{Bodies, create_submission};
 use crate::servers::Audit;
 use crate::world::{Setup, World};
 

@@ -11,10 +11,11 @@ use tokio::task::JoinHandle;
 use crate::api::{self, Condition, Slim};
 use crate::bench::{Bench, Outcome};
 use crate::machine::Used;
+use crate::names::{LEADERBOARD, WARM_NAME};
 use crate::observed::Observed;
 use crate::operator::Operator;
 use crate::player::{NODE, Player, Pods};
-use crate::raw::{Bodies, LEADERBOARD, WARM_NAME, create_submission, name};
+use crate::raw::{Bodies, create_submission, name};
 use crate::servers::{Audit, Servers};
 use crate::storage::{BUCKET, PAIRS, ROUTES, Storage};
 

@@ -40,7 +40,7 @@ enum Command {
     /// Create a Submission for each message of the Leaderboards' queues.
     #[command(after_help = serve::EXIT_CODES)]
     Bridge(Server),
-    /// Say what an installed operator lacks: kinds, rights, ready programs.
+    /// Show what an installed operator lacks: kinds, rights, ready programs.
     #[command(after_help = preflight::EXIT_CODES)]
     Preflight(preflight::Preflight),
     /// Prepare the volumes of a submission's Pod (an init container).

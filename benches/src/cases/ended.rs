@@ -10,8 +10,9 @@ use super::latency::{add_percentiles, to_job};
 use super::lifecycles::POD;
 use crate::api::{self, MERGE};
 use crate::bench::{Bench, Outcome};
+use crate::names::WARM_NAME;
 use crate::player::Pods;
-use crate::raw::{Bodies, WARM_NAME, create_submission, name};
+use crate::raw::{Bodies, create_submission, name};
 use crate::record::Figures;
 use crate::world::{Setup, World};
 

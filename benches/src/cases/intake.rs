@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use super::costs;
 use crate::bench::{Bench, Outcome};
-use crate::raw::{Bodies, WARM_NAME};
+use crate::names::WARM_NAME;
+use crate::raw::Bodies;
 use crate::record::Figures;
 use crate::world::{Setup, World};
 

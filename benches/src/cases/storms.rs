@@ -12,8 +12,8 @@ use crate::api::{self, JSON, MERGE};
 use crate::audit;
 use crate::bench::{Bench, Outcome};
 use crate::machine::Used;
+use crate::names::WARM_NAME;
 use crate::player::Pods;
-use crate::raw::WARM_NAME;
 use crate::record::Figures;
 use crate::world::{Setup, World};
 

@@ -4,7 +4,8 @@ use serde_json::json;
 
 use super::*;
 use crate::cli::import::entries::{Entries, parse};
-use crate::cli::import::plan::{Import, Options, PlanError, Queue, plan};
+use crate::cli::import::options::{Options, Queue};
+use crate::cli::import::plan::{Import, PlanError, plan};
 use crate::cli::import::print;
 use crate::cli::import::samples::texts;
 use crate::services::event_sources::QueueArn;

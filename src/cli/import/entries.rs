@@ -74,6 +74,29 @@ pub(super) struct BoardEntry {
     pub(super) tracks: Vec<TrackEntry>,
 }
 
+impl BoardEntry {
+    /// The name that a phase's track gets.
+    pub(super) fn track_name(&self, track: &TrackEntry) -> String {
+        let short = track.codename.to_ascii_lowercase().replace(['_', '.'], "-");
+        let short = short.trim_matches('-');
+        let same = self
+            .tracks
+            .iter()
+            .filter(|other| other.codename == track.codename)
+            .count();
+        // Names are unique, and two phases may have the same track.
+        match (same, short) {
+            (_, "") => format!("phase-{}", track.phase),
+            (1, short) => short.to_owned(),
+            (_, short) => format!(
+                "{}-{}",
+                short.get(..12).unwrap_or(short).trim_end_matches('-'),
+                track.phase
+            ),
+        }
+    }
+}
+
 /// A phase and its track.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct TrackEntry {

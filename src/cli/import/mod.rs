@@ -6,6 +6,7 @@
 
 mod decisions;
 mod entries;
+mod options;
 mod plan;
 mod print;
 mod questions;
@@ -195,13 +196,13 @@ impl Import {
         Ok(())
     }
 
-    fn options(&self, region: String) -> Result<plan::Options, Failure> {
+    fn options(&self, region: String) -> Result<options::Options, Failure> {
         let queue_region = self.queue_region.as_deref().or(Some(region.as_str()));
         let queue = self
             .queue
             .as_ref()
-            .map(|url| QueueArn::of_url(url, queue_region).map(|arn| plan::Queue { url: url.clone(), arn }));
-        Ok(plan::Options {
+            .map(|url| QueueArn::of_url(url, queue_region).map(|arn| options::Queue { url: url.clone(), arn }));
+        Ok(options::Options {
             queue: queue.transpose()?,
             namespace: self.namespace.clone(),
             service_account: self.service_account.clone(),
@@ -228,7 +229,7 @@ impl Import {
         Decisions::parse(&name.to_string_lossy(), &text).map_err(Failure::Decisions)
     }
 
-    fn heading(&self, options: &plan::Options) -> String {
+    fn heading(&self, options: &options::Options) -> String {
         let from = match &self.from_files {
             Some(_) => "files with the original pipeline's entries".to_owned(),
             None => format!(

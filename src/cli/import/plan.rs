@@ -8,9 +8,9 @@ use serde_json::{Map, Value, json};
 
 use super::decisions::{DecisionError, Decisions};
 use super::entries::{Board, BoardEntry, EVALAI, Entries, TrackEntry};
+use super::options::{Options, Queue};
 use super::questions;
 use super::taint::Taint;
-use crate::services::event_sources::QueueArn;
 
 /// Requests a minute of one operator of two, which share EvalAI's 60.
 const SHARED_BUDGET: i32 = 27;
@@ -20,34 +20,6 @@ const INSTANCE_TYPE: &str = "g5.12xlarge";
 const GPU: &str = "nvidia.com/gpu";
 /// The key of the token in its entry.
 const TOKEN_KEY: &str = "auth_token";
-
-/// What the entries do not hold.
-#[derive(Clone, Debug)]
-pub(super) struct Options {
-    pub(super) namespace: String,
-    pub(super) service_account: String,
-    pub(super) role_arn: Option<String>,
-    /// Of the entries, the buckets, the tables and the log groups.
-    pub(super) region: String,
-    /// In place of Secrets Manager's own.
-    pub(super) endpoint: Option<String>,
-    /// A decision may name it instead.
-    pub(super) challenge: Option<i64>,
-    pub(super) queue: Option<Queue>,
-    pub(super) dead_letter: Option<String>,
-    pub(super) egress: Vec<String>,
-    /// Of the GPU nodes.
-    pub(super) taints: Vec<Taint>,
-    /// Each Leaderboard has a cluster and an operator of its own.
-    pub(super) two_operators: bool,
-}
-
-/// The queue of the challenge.
-#[derive(Clone, Debug)]
-pub(super) struct Queue {
-    pub(super) url: String,
-    pub(super) arn: QueueArn,
-}
 
 /// All that is printed.
 #[derive(Clone, Debug)]
@@ -270,34 +242,13 @@ fn queue(queue: &Queue, options: &Options) -> Value {
     Value::Object(fields)
 }
 
-/// The name that a phase's track gets.
-pub(super) fn track_name(board: &BoardEntry, track: &TrackEntry) -> String {
-    let short = track.codename.to_ascii_lowercase().replace(['_', '.'], "-");
-    let short = short.trim_matches('-');
-    let same = board
-        .tracks
-        .iter()
-        .filter(|other| other.codename == track.codename)
-        .count();
-    // Names are unique, and two phases may have the same track.
-    match (same, short) {
-        (_, "") => format!("phase-{}", track.phase),
-        (1, short) => short.to_owned(),
-        (_, short) => format!(
-            "{}-{}",
-            short.get(..12).unwrap_or(short).trim_end_matches('-'),
-            track.phase
-        ),
-    }
-}
-
 fn track_names(board: &BoardEntry) -> BTreeSet<String> {
-    board.tracks.iter().map(|track| track_name(board, track)).collect()
+    board.tracks.iter().map(|track| board.track_name(track)).collect()
 }
 
 fn track(board: &BoardEntry, track: &TrackEntry, taints: &[Taint]) -> Value {
     let mut fields = json!({
-        "name": track_name(board, track), "codename": track.codename, "phase": track.phase,
+        "name": board.track_name(track), "codename": track.codename, "phase": track.phase,
         "routesFile": "/workspace/leaderboard/data/routes_testing.xml",
         "nodeSelector": {"node.kubernetes.io/instance-type": INSTANCE_TYPE},
     });

@@ -2,6 +2,7 @@ use super::*;
 use crate::cli::import::entries::{Board, Entries, parse};
 use crate::cli::import::print;
 use crate::cli::import::samples::{texts, tracks};
+use crate::services::event_sources::QueueArn;
 use leaderboard_api::{Display, Foreign, GpuMode, LeaderboardSpec, effective};
 
 fn entries() -> Entries {

@@ -4,7 +4,7 @@ use jiff::Timestamp;
 
 use super::decisions::Decisions;
 use super::entries::{BoardEntry, EVALAI, Entries};
-use super::plan::{Options, track_name};
+use super::options::Options;
 use crate::services::token::WARN_BEFORE;
 
 const NO_ROLE: &str = "podIdentity: the role that may write to bucket and log group (--role-arn); without it the Pods have no \
@@ -38,7 +38,7 @@ impl Question {
     fn is_decided(&self, board: &BoardEntry, decisions: &Decisions) -> bool {
         let is_set = |field: &&str| match field.strip_prefix(OF_TRACKS) {
             Some(field) => {
-                let names: Vec<_> = board.tracks.iter().map(|track| track_name(board, track)).collect();
+                let names: Vec<_> = board.tracks.iter().map(|track| board.track_name(track)).collect();
                 decisions.set_tracks(board.board, field, names.iter().map(String::as_str))
             }
             None => decisions.set(board.board, field),

@@ -144,7 +144,7 @@ impl Probe {
         self
     }
 
-    /// Keeps what SQS last said of the queues that the Leaderboard still names.
+    /// Keeps what SQS reported last of the queues that the Leaderboard still names.
     fn note_messages(&mut self, leaderboard: &Leaderboard, readings: &Readings) {
         let queue = leaderboard.spec.queue.as_ref();
         let read = readings.queue.as_ref();

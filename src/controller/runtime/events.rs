@@ -13,8 +13,9 @@ use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 use tokio::sync::mpsc;
 
+use super::Shared;
 use super::queue::{Class, Key, Queue, urgency};
-use super::{Shared, Watches};
+use super::watches::Watches;
 use crate::controller::objects::{Wake, key_of};
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::{Job, Pod};
@@ -152,6 +153,9 @@ fn of_leaderboard(
             slots.wake_pending(&reference);
         }
         let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_LEADERBOARD));
+        if is_news {
+            slots.wake_live(&reference);
+        }
         is_news.then_some((reference, Class::Urgent))
     }
 }

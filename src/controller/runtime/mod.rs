@@ -13,15 +13,14 @@ mod needs;
 mod queue;
 mod reconciles;
 mod sweep;
+mod watches;
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use k8s_openapi::api::networking::v1::NetworkPolicy;
-use kube::core::NamespaceResourceScope;
+use kube::Client;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::watcher::Config;
-use kube::{Api, Client};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -29,9 +28,7 @@ use tokio::time::Instant;
 use super::leaderboards::looks::{self, Look};
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
-use super::objects::children_selector;
 use super::settings::Settings;
-use super::stores::{Nodes, Stores, owner_uid};
 use crate::controller::submissions::addresses::Addresses;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
@@ -44,13 +41,12 @@ use crate::controller::submissions::observe::node;
 use crate::controller::submissions::other_results::OtherResults;
 use crate::controller::submissions::phases::Phase;
 use crate::controller::submissions::reruns::Reruns;
-use crate::controller::submissions::team_history::Teams;
-use crate::kubernetes::objects::{Event, Job, Node, Pod};
+use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, access_missing, await_kinds, kinds_missing, watch_access};
-use crate::kubernetes::{Namespaces, Shape, Tally, Watch, Watchable, spawn_uncached, spawn_watch};
+use crate::kubernetes::{Namespaces, spawn_uncached};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
-use crate::page::{Page, Reads};
+use crate::page::Page;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Arrived, Changed, Hub, Options, SweepRow, Timeouts, Timing};
@@ -58,19 +54,16 @@ use crate::services::meter::Meter;
 use crate::services::table::Recorder;
 use backoff::BackoffMap;
 use context::Context;
-use counts::Census;
 use leader::{Leader, Leadership};
-use leaderboard_api::{Leaderboard, Submission};
 use queue::Class;
 use reconciles::Queues;
+use watches::Watches;
 
 /// Reconciles under way may take this long to end after a stop.
 const DRAIN: Duration = Duration::from_secs(20);
 
 /// Plurals of the kinds that it works on.
 const KINDS: [&str; 2] = ["leaderboards", "submissions"];
-/// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
-const POLICIES_LIMIT: Duration = Duration::from_secs(5);
 
 /// Why the controller ended.
 #[derive(thiserror::Error, Debug)]
@@ -165,102 +158,6 @@ pub struct Clients {
     pub api: Client,
     pub watch: Client,
     pub lease: Client,
-}
-
-/// Watches a kind in all namespaces that are served.
-fn all<K: Watchable<Scope = NamespaceResourceScope>>(
-    namespaces: &Namespaces,
-    client: &Client,
-    config: Config,
-    shape: Shape<K>,
-    telemetry: &Observability,
-) -> Watch<K> {
-    spawn_watch(namespaces.apis(client), config, shape, telemetry)
-}
-
-/// What is kept of Submissions in sums.
-fn tallies(teams: &Teams, census: &Arc<Census>) -> Vec<Tally<Submission>> {
-    let (teams, census) = (teams.clone(), Arc::clone(census));
-    vec![
-        Arc::new(move |before, now| teams.changed(before, now)),
-        Arc::new(move |before, now| census.changed(before, now)),
-    ]
-}
-
-struct Watches {
-    leaderboards: Watch<Leaderboard>,
-    submissions: Watch<Submission>,
-    /// What the cache of Submissions adds up to.
-    teams: Teams,
-    census: Arc<Census>,
-    jobs: Watch<Job>,
-    pods: Watch<Pod>,
-    policies: Watch<NetworkPolicy>,
-    /// None: an operator without rights of the whole cluster has none to them.
-    nodes: Option<Watch<Node>>,
-}
-
-impl Watches {
-    fn start(client: &Client, settings: &Settings, telemetry: &Observability) -> Self {
-        let namespaces = &settings.namespaces;
-        let children = || Config::default().labels(&children_selector());
-        let (teams, census) = (Teams::default(), Arc::new(Census::default()));
-        let submissions = Shape {
-            tallies: tallies(&teams, &census),
-            ..Shape::default()
-        };
-        let pods = Shape {
-            index: owner_uid,
-            ..Shape::default()
-        };
-        Self {
-            leaderboards: all(namespaces, client, Config::default(), Shape::default(), telemetry),
-            submissions: all(namespaces, client, Config::default(), submissions, telemetry),
-            teams,
-            census,
-            jobs: all(namespaces, client, children(), Shape::default(), telemetry),
-            pods: all(namespaces, client, children(), pods, telemetry),
-            policies: all(namespaces, client, children(), Shape::default(), telemetry),
-            nodes: settings.has_cluster_rights.then(|| {
-                let nodes = vec![Api::all(client.clone())];
-                spawn_watch(nodes, Config::default(), Shape::default(), telemetry)
-            }),
-        }
-    }
-
-    fn stores(&self) -> Stores {
-        Stores {
-            leaderboards: self.leaderboards.store.clone(),
-            submissions: self.submissions.store.clone(),
-            jobs: self.jobs.store.clone(),
-            pods: self.pods.store.clone(),
-            policies: self.policies.store.clone(),
-            policies_synced: self.policies.synced.clone(),
-            nodes: self.nodes.as_ref().map(|nodes| Nodes {
-                store: nodes.store.clone(),
-                synced: nodes.synced.clone(),
-            }),
-        }
-    }
-
-    /// What the page reads: of a standby it is the same.
-    fn for_page(&self, leader: &Leader) -> Reads {
-        let leadership = leader.leadership();
-        Reads {
-            leaderboards: self.leaderboards.clone(),
-            submissions: self.submissions.clone(),
-            leads: Box::new(move || leadership.borrow().term().is_some()),
-        }
-    }
-
-    async fn synced(&self) {
-        // An error means that the watch's task is gone, which ends the process.
-        let _ = self.leaderboards.store.wait_until_ready().await;
-        let _ = self.submissions.store.wait_until_ready().await;
-        let _ = self.jobs.store.wait_until_ready().await;
-        let _ = self.pods.store.wait_until_ready().await;
-        let _ = tokio::time::timeout(POLICIES_LIMIT, self.policies.store.wait_until_ready()).await;
-    }
 }
 
 /// What one process is made of.

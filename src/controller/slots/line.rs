@@ -198,6 +198,12 @@ impl Line {
         pending.map(|member| member.name.clone()).collect()
     }
 
+    /// Names of those that have not ended: how long each step of them may take is in the Leaderboard's spec.
+    pub(super) fn live(&self) -> Vec<String> {
+        let live = self.members.values().filter(|member| member.stand != Stand::Over);
+        live.map(|member| member.name.clone()).collect()
+    }
+
     pub(super) fn census(&self) -> (Counts, usize) {
         (self.counts, self.in_use)
     }

@@ -128,11 +128,20 @@ impl SlotAllocator {
         self.change(&board_of(submission), |line| line.leaves(uid(submission)));
     }
 
-    /// The Leaderboard has changed: wakes those that may have waited for that.
+    /// The Leaderboard stands otherwise: wakes those that may have waited for that.
     pub fn wake_pending(&self, board: &ObjectRef<Leaderboard>) {
+        self.wake(board, Line::pending);
+    }
+
+    /// The Leaderboard's spec has changed: wakes all that have not ended.
+    pub fn wake_live(&self, board: &ObjectRef<Leaderboard>) {
+        self.wake(board, Line::live);
+    }
+
+    fn wake(&self, board: &ObjectRef<Leaderboard>, whom: fn(&Line) -> Vec<String>) {
         let key = (board.namespace.clone().unwrap_or_default(), board.name.clone());
         let mut lines = lock(&self.lines);
-        let names: Vec<String> = lines.by_board.get(&key).map(Line::pending).unwrap_or_default();
+        let names: Vec<String> = lines.by_board.get(&key).map(whom).unwrap_or_default();
         lines
             .woken
             .extend(names.iter().map(|name| ObjectRef::new(name).within(&key.0)));

@@ -402,7 +402,7 @@ async fn a_burst_is_worked_out_together() {
 }
 
 #[test]
-fn a_change_of_the_leaderboard_wakes_those_without_a_job() {
+fn a_change_of_the_leaderboard_wakes_those_that_wait_for_it() {
     let refused = json!({"jobName": "d-1", "reason": leaderboard_api::reasons::NOT_ISOLATED});
     let running = json!({"jobName": "b-1", "reason": "Running"});
     let all = [
@@ -415,6 +415,12 @@ fn a_change_of_the_leaderboard_wakes_those_without_a_job() {
     let reference = ObjectRef::from_obj(&world.leaderboard);
     world.slots.wake_pending(&reference);
     assert_eq!(world.woken(), ["a", "d"]);
+    world.slots.wake_live(&reference);
+    assert_eq!(
+        world.woken(),
+        ["a", "b", "d"],
+        "a deadline of the spec may have changed"
+    );
     world.slots.wake_pending(&ObjectRef::new("other").within("ns"));
     assert_eq!(world.woken(), [""; 0]);
 }

@@ -39,17 +39,17 @@ impl Limits {
             visible: zero(
                 r,
                 "queue_visible_messages",
-                "Messages that wait in the SQS queue, as SQS last said",
+                "Messages that wait in the SQS queue, as SQS reported last",
             ),
             in_flight: zero(
                 r,
                 "queue_in_flight_messages",
-                "Messages of the SQS queue that somebody has received and not deleted, as SQS last said",
+                "Messages of the SQS queue that somebody has received and not deleted, as SQS reported last",
             ),
             dead: zero(
                 r,
                 "dead_letter_queue_messages",
-                "Messages that lie in the dead-letter queue, as SQS last said",
+                "Messages that lie in the dead-letter queue, as SQS reported last",
             ),
         }
     }

@@ -169,7 +169,7 @@ fn ended_in_evalai(status: &str) -> String {
         }
         _ => "EvalAI resumes only what has failed; re-run it there if it is to run.",
     };
-    format!("EvalAI says {status}: nothing is run and {done}. {next}")
+    format!("EvalAI shows {status}: nothing is run and {done}. {next}")
 }
 
 /// What is said while the Leaderboard does not exist.
@@ -250,7 +250,7 @@ fn foreign_phase(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Option<S
     let (pk, ours) = (evalai.submission, evalai.phase);
     let theirs = info?.phase.filter(|theirs| *theirs != ours)?;
     Some(format!(
-        "EvalAI says that submission {pk} belongs to phase {theirs}, not to phase {ours} of this Submission, so it is not run."
+        "In EvalAI submission {pk} belongs to phase {theirs}, not to phase {ours} of this Submission, so it is not run."
     ))
 }
 

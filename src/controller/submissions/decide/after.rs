@@ -351,7 +351,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
         return Delivery::Done;
     }
     draft.status.failure = None;
-    let message = format!("EvalAI says {status}, so the result is not published.");
+    let message = format!("EvalAI shows {status}, so the result is not published.");
     draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
     draft.show(reasons::ENDED_IN_EVALAI, message);
     // While EvalAI refused the result, its row was written with the outcome that no longer holds; the status may not show it yet.

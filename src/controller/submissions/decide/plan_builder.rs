@@ -29,7 +29,7 @@ const SILENCE: Duration = Duration::from_secs(5);
 pub(super) struct Terms<'a> {
     pub(super) leaderboard: &'a LeaderboardSpec,
     pub(super) track: &'a Track,
-    /// What EvalAI says of it; none of a submission that is not EvalAI's.
+    /// What EvalAI shows of it; none of a submission that is not EvalAI's.
     pub(super) info: Option<&'a EvalaiInfo>,
 }
 

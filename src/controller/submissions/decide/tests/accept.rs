@@ -433,7 +433,7 @@ fn the_next_step_after_evalais_own_end_is_one_that_evalai_takes() {
             .status
             .message
             .unwrap();
-        assert!(message.starts_with(&format!("EvalAI says {status}: ")), "{message}");
+        assert!(message.starts_with(&format!("EvalAI shows {status}: ")), "{message}");
         assert!(message.ends_with(step), "{message}");
         assert_eq!(
             message.contains("`cancelled` is written there"),

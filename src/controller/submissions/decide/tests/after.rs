@@ -324,7 +324,7 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
         == Action::ReleaseFinalizer));
 }
 
-/// What EvalAI says of a row, as it was just read.
+/// What EvalAI shows of a row, as it was just read.
 fn says(world: &mut World, status: &str) {
     world.in_evalai().info = Some(EvalaiInfo {
         standing: Standing::Ended,

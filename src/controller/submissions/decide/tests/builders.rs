@@ -72,7 +72,7 @@ fn submission(evalai: bool) -> Submission {
     submission
 }
 
-/// What EvalAI says of a submission that wants to run.
+/// What EvalAI shows of a submission that wants to run.
 pub fn info() -> EvalaiInfo {
     EvalaiInfo {
         standing: Standing::Wanted,
