@@ -250,9 +250,8 @@ def of_words(settings: Settings, notes: Sequence[Note]) -> Iterator[str]:
             yield from (
                 f"{note}: no target {word}" for word in words if not re.match("-|.*=", word) and word not in targets
             )
-        elif (
-            note.program == "lab"
-            and not re.search(rf'add_parser\(\s*"{words[0]}"', (settings.local / "labkit" / "cli.py").read_text())
+        elif note.program == "lab" and not re.search(
+            rf'add_parser\(\s*"{words[0]}"', (settings.local / "labkit" / "cli.py").read_text()
         ):
             yield f"{note}: no command {words[0]}"
         elif note.program in ("check.sh", "try.sh"):

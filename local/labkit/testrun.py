@@ -190,7 +190,9 @@ def lab(plan: Plan) -> None:
 def make_tools(plan: Plan) -> None:
     """What would otherwise be built next to tests with limits of time."""
     packages.ensure(plan.settings)
-    tools.ensure(plan.settings, [*cluster.tools_of(plan.settings), *apiserver.TOOLS, *API_TOOLS, chartalerts.TOOL, gpus.TOOL])
+    tools.ensure(
+        plan.settings, [*cluster.tools_of(plan.settings), *apiserver.TOOLS, *API_TOOLS, chartalerts.TOOL, gpus.TOOL]
+    )
     pythonenv.ensure(plan.settings)
 
 
