@@ -136,7 +136,7 @@ fn begin<K: Watchable>(api: &Api<Item<K>>, config: &Config) -> Events<K> {
     Box::pin(watcher(api.clone(), config.clone()).default_backoff())
 }
 
-/// Tells the probe of a watch what an error means for it.
+/// Shows what an error of a watch means in its probe.
 pub(super) fn report(probe: &WatchProbe, error: &Error) {
     match error {
         // Both come from a watch that had been let in.

@@ -164,7 +164,7 @@ impl<K: Watchable> Writer<K> {
             all.push(Arc::clone(&object));
         }
         drop(cache);
-        self.tell(before.as_deref(), Some(&object));
+        self.tally(before.as_deref(), Some(&object));
         (object, before)
     }
 
@@ -174,11 +174,11 @@ impl<K: Watchable> Writer<K> {
         let before = cache.by_key.remove(key)?;
         cache.leave(&before, self.store.0.index);
         drop(cache);
-        self.tell(Some(&before), None);
+        self.tally(Some(&before), None);
         Some(before)
     }
 
-    fn tell(&self, before: Option<&K>, now: Option<&K>) {
+    fn tally(&self, before: Option<&K>, now: Option<&K>) {
         self.tallies.iter().for_each(|tally| tally(before, now));
     }
 
@@ -248,8 +248,8 @@ mod tests {
 
     #[test]
     fn a_tally_receives_what_each_change_replaces() {
-        let told = Arc::new(std::sync::Mutex::new(Vec::new()));
-        let notes = Arc::clone(&told);
+        let received = Arc::new(std::sync::Mutex::new(Vec::new()));
+        let notes = Arc::clone(&received);
         let uid = |pod: Option<&Pod>| pod.map(|pod| pod.metadata.uid.to_string());
         let tally: Tally<Pod> = Arc::new(move |before, now| notes.lock().unwrap().push((uid(before), uid(now))));
         let mut writer = Writer::new(owner, vec![tally]);
@@ -259,7 +259,7 @@ mod tests {
         writer.remove("n/a");
         let (one, two) = (|| Some("1".to_owned()), || Some("2".to_owned()));
         assert_eq!(
-            *told.lock().unwrap(),
+            *received.lock().unwrap(),
             [(None, one()), (one(), two()), (two(), None)],
             "what is not there has no end"
         );

@@ -149,12 +149,12 @@ fn of_leaderboard(
             slots.wake_pending(&reference);
             return None;
         }
-        if standings.moved(object, &standing(object)) {
-            slots.wake_pending(&reference);
-        }
+        let stands_otherwise = standings.moved(object, &standing(object));
         let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_LEADERBOARD));
         if is_news {
             slots.wake_live(&reference);
+        } else if stands_otherwise {
+            slots.wake_pending(&reference);
         }
         is_news.then_some((reference, Class::Urgent))
     }

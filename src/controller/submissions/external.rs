@@ -156,28 +156,16 @@ impl ExternalSystems {
     pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
-        if view.submission.spec.check {
+        let submission = view.submission.as_ref();
+        let row = if submission.spec.check {
             // Before its end there is nothing to learn.
-            if end {
-                let row = result_texts::trial(status);
-                self.recorder.record(
-                    table,
-                    &key_of(view.submission.as_ref()),
-                    row,
-                    end,
-                    log_span_of(&view.submission),
-                );
-            }
-            return;
-        }
-        if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
-            self.recorder.record(
-                table,
-                &key_of(view.submission.as_ref()),
-                row,
-                end,
-                log_span_of(&view.submission),
-            );
+            end.then(|| result_texts::trial(status))
+        } else {
+            result_texts::row(view.report.ours().map(Arc::as_ref), status)
+        };
+        if let Some(row) = row {
+            self.recorder
+                .record(table, &key_of(submission), row, end, log_span_of(submission));
         }
     }
 
