@@ -5,7 +5,7 @@
 
 use std::fmt;
 use std::fs::{self, File, OpenOptions, Permissions};
-use std::io::{BufReader, ErrorKind, Read};
+use std::io::{self, BufReader, ErrorKind, Read};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
@@ -51,11 +51,11 @@ pub(crate) fn parse(file: File) -> Result<Checkpoint, Unreadable> {
     if file.metadata().map_err(Unreadable::Io)?.len() > MAX_BYTES {
         return Err(Unreadable::TooLarge);
     }
-    let document: Document = serde_json::from_reader(BufReader::with_capacity(64 << 10, file.take(MAX_BYTES)))
-        .map_err(|error| Unreadable::Malformed {
-            line: error.line(),
-            column: error.column(),
-        })?;
+    let reader = PythonJson::of(BufReader::with_capacity(64 << 10, file.take(MAX_BYTES)));
+    let document: Document = serde_json::from_reader(reader).map_err(|error| Unreadable::Malformed {
+        line: error.line(),
+        column: error.column(),
+    })?;
     let Inner {
         global_record,
         progress,
@@ -94,6 +94,58 @@ pub(crate) fn open(path: &Path) -> Result<File, Unreadable> {
         Ok(file)
     } else {
         Err(Unreadable::NotRegular)
+    }
+}
+
+/// Python writes `NaN` and `Infinity` where a number is none, and reads them; JSON has neither. No number counts here, so that each is
+/// read as a 0 of the same length.
+struct PythonJson<R> {
+    inner: R,
+    place: Place,
+}
+
+#[derive(Clone, Copy)]
+enum Place {
+    Outside,
+    /// In such a word, with what is left of it.
+    Word(&'static [u8]),
+    Text,
+    /// Behind a backslash.
+    Escape,
+}
+
+impl<R> PythonJson<R> {
+    fn of(inner: R) -> Self {
+        Self {
+            inner,
+            place: Place::Outside,
+        }
+    }
+
+    fn read_as(&mut self, byte: u8) -> u8 {
+        let (place, shown) = match (self.place, byte) {
+            (Place::Word([next, rest @ ..]), _) if byte == *next => (Place::Word(rest), b' '),
+            // Another word: no JSON has this byte.
+            (Place::Word([_, ..]), _) => (Place::Outside, 0),
+            (Place::Text, b'\\') => (Place::Escape, byte),
+            (Place::Text, b'"') => (Place::Outside, byte),
+            (Place::Text | Place::Escape, _) | (_, b'"') => (Place::Text, byte),
+            (_, b'N') => (Place::Word(b"aN"), b'0'),
+            (_, b'I') => (Place::Word(b"nfinity"), b'0'),
+            _ => (Place::Outside, byte),
+        };
+        self.place = place;
+        shown
+    }
+}
+
+impl<R: Read> Read for PythonJson<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let length = self.inner.read(buffer)?;
+        for byte in buffer.iter_mut().take(length) {
+            *byte = self.read_as(*byte);
+        }
+        Ok(length)
     }
 }
 
@@ -227,6 +279,28 @@ mod tests {
         ];
         for (text, complete, partial) in cases {
             assert_eq!(read_text(text).unwrap(), Checkpoint { complete, partial }, "{text}");
+        }
+    }
+
+    #[test]
+    fn what_python_writes_for_no_number_is_no_half_of_a_file() {
+        let checkpoint = |record: &str| {
+            format!(r#"{{"_checkpoint": {{"global_record": {{}}, "progress": [1, 5], "records": [{record}]}}}}"#)
+        };
+        let of_python = r#"{"a": NaN, "b": [Infinity, -Infinity,NaN], "Infinity": "\"NaN", "c\\": NaN}"#;
+        let partial = Checkpoint {
+            complete: false,
+            partial: true,
+        };
+        assert_eq!(read_text(&checkpoint(of_python)).unwrap(), partial);
+        let whole = checkpoint(of_python);
+        for end in 0..whole.len() {
+            let torn = read_text(&whole[..end]);
+            assert!(matches!(torn, Err(Unreadable::Malformed { .. })), "{}", &whole[..end]);
+        }
+        for wrong in ["NoN", "nan", "Inf", "NaNN", "truNaN"] {
+            let error = read_text(&checkpoint(wrong));
+            assert!(matches!(error, Err(Unreadable::Malformed { .. })), "{wrong}");
         }
     }
 

@@ -303,6 +303,19 @@ mod tests {
     }
 
     #[test]
+    fn a_route_without_a_number_is_not_taken_back() {
+        let without =
+            r#"{"_checkpoint": {"global_record": {}, "progress": [2, 5], "records": [{"meta": {"mean": NaN}}]}}"#;
+        let mut folder = Folder::new();
+        folder.written(FIRST);
+        folder.written(without);
+        assert_eq!(
+            (folder.kept(), folder.restart()),
+            (without.to_owned(), without.to_owned())
+        );
+    }
+
+    #[test]
     fn a_file_without_results_replaces_nothing() {
         let mut folder = Folder::new();
         folder.written(FIRST);
