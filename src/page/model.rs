@@ -8,7 +8,7 @@ use std::sync::Arc;
 use jiff::{SignedDuration, Timestamp};
 use kube::ResourceExt;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line, sentence};
-use leaderboard_api::{Leaderboard, State, Submission, conditions};
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, conditions};
 use serde::Serialize;
 
 use super::phases::{Phases, Typical, seconds, typical};
@@ -66,6 +66,8 @@ struct Board {
     is_paused: bool,
     /// How many may run at once; none if nothing limits them.
     slots: Option<i32>,
+    /// How many of them are taken: a Pod that starts has one and does not run yet.
+    in_use: usize,
     running: usize,
     waiting: usize,
     finished: usize,
@@ -118,6 +120,7 @@ struct Sorted<'a> {
 /// What is counted of a Leaderboard's submissions.
 #[derive(Default)]
 struct Tally {
+    in_use: usize,
     running: usize,
     waiting: usize,
     finished: usize,
@@ -197,6 +200,10 @@ impl<'a> Sorted<'a> {
 
     fn tallies(&self) -> BTreeMap<Key, Tally> {
         let mut tallies: BTreeMap<Key, Tally> = BTreeMap::new();
+        let has_slot = |one: &&&Submission| one.status.as_ref().is_some_and(SubmissionStatus::has_slot);
+        for one in self.waiting.iter().chain(&self.running).filter(has_slot) {
+            tallies.entry(key(one)).or_default().in_use += 1;
+        }
         for one in &self.waiting {
             tallies.entry(key(one)).or_default().waiting += 1;
         }
@@ -245,6 +252,7 @@ fn board(leaderboard: &Leaderboard, tally: &Tally) -> Board {
         trouble: trouble(leaderboard),
         is_paused: leaderboard.spec.paused,
         slots: leaderboard.spec.concurrency.total,
+        in_use: tally.in_use,
         running: tally.running,
         waiting: tally.waiting,
         finished: tally.finished,

@@ -54,6 +54,27 @@ fn each_list_has_its_order() {
 }
 
 #[test]
+fn a_slot_is_in_use_from_its_job_on() {
+    let waits_with = |name: &str, reason: &str, job: Option<&str>, retry: i32| {
+        let mut one = waiting(name, "a", None, reason, "");
+        let status = Arc::make_mut(&mut one).status.as_mut().unwrap();
+        (status.job_name, status.retry) = (job.map(str::to_owned), retry);
+        one
+    };
+    let all = [
+        running("runs", "a", 1, 1, &[(1, 0)]),
+        waits_with("pulls", "ImagePull", Some("pulls-1"), 0),
+        waits_with("again", "NodeLost", None, 1),
+        waits_with("waits", "WaitingForSlot", None, 0),
+        finished("done", "a", "1.00", 5, 1),
+    ];
+    let view = view(&leaderboards(), &all);
+    let busy = &view["leaderboards"]["rows"][1];
+    let counts = ["slots", "inUse", "running", "waiting"].map(|key| busy[key].as_u64().unwrap());
+    assert_eq!(counts, [4, 3, 1, 3]);
+}
+
+#[test]
 fn failures_are_counted_by_class_and_reason_for_a_day() {
     let crash = ("AgentCrashed", "It crashed");
     let all = [

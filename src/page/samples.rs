@@ -57,7 +57,8 @@ pub(super) fn running(name: &str, team: &str, attempt: i64, hours: i64, pairs: &
         .collect();
     let started = hours * HOUR;
     let status = json!({
-        "attempt": attempt, "reason": "Running", "track": "sensors", "nodeName": format!("gpu-{hours}"), "pairs": pairs,
+        "attempt": attempt, "reason": "Running", "track": "sensors", "jobName": format!("{name}-{attempt}"),
+        "nodeName": format!("gpu-{hours}"), "pairs": pairs,
         "progress": {"done": done, "total": total, "text": format!("{done}/{total}")},
         "score": {"driving": "41.20", "final": false, "text": format!("~4{hours}.20")},
         "times": {"submitted": ago(started + hours * 20 * MINUTE), "scheduled": ago(started + 7 * MINUTE), "started": ago(started)},

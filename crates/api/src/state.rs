@@ -59,6 +59,12 @@ impl SubmissionStatus {
         }
     }
 
+    /// Whether the present attempt takes up one of the slots that `concurrency.total` counts: it has a Job, also while that starts, or has
+    /// lost one to the infrastructure and is about to get another.
+    pub fn has_slot(&self) -> bool {
+        !self.has_ended() && (self.job_name.is_some() || self.retry > 0)
+    }
+
     /// Whether its run continues from stored results.
     pub fn is_resumed(&self) -> bool {
         self.plan.as_ref().is_some_and(|plan| plan.resume) || self.attempt > Some(1)

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use kube::ResourceExt;
-use leaderboard_api::{Leaderboard, State, Submission};
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus};
 use serde_json::{Value, json};
 
 use super::facts;
@@ -16,6 +16,7 @@ type Key = (String, String, String);
 /// What a team has in a Leaderboard.
 #[derive(Clone, Debug, Default)]
 struct Use {
+    /// Those with a slot, also while their Pod starts.
     running: usize,
     waiting: usize,
     first_in_line: Option<i32>,
@@ -42,6 +43,7 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
         let status = one.status.as_ref();
         match status.and_then(facts::state) {
             Some(State::Running | State::Resumed) => each.running += 1,
+            Some(State::Pending) if status.is_some_and(SubmissionStatus::has_slot) => each.running += 1,
             None | Some(State::Pending) => each.waiting += 1,
             Some(State::Finished) => each.finished += 1,
             Some(State::Failed) => each.failed += 1,

@@ -127,7 +127,7 @@ function typical(runs) {
 }
 
 function board(row, context) {
-  const slots = row.slots === null ? "no limit" : `of ${row.slots}`;
+  const slots = row.slots === null ? "no limit" : `${number(row.inUse)} of ${row.slots} slots`;
   const marks = [row.isPaused ? element("span", { class: "badge waiting" }, "paused") : null];
   marks.push(row.trouble === null ? null : element("span", { class: "badge failed" }, "not ready"));
   const counts = [

@@ -147,6 +147,31 @@ carla-20     Team Eight  0        1 (#1)   0         1       0          0"
 }
 
 #[test]
+fn a_pod_that_starts_uses_a_slot() {
+    let starts = with(
+        waiting(),
+        &json!({"reason": "ImagePull", "jobName": "submission-47-1", "waiting": null}),
+    );
+    let again = with(waiting(), &json!({"reason": "Replacing", "retry": 1, "waiting": null}));
+    let all = [
+        named("submission-45", &waiting()),
+        named("submission-47", &starts),
+        named("submission-48", &again),
+    ];
+    let lines = top::lines(&all, &[leaderboard()], frame());
+    assert_eq!(lines[1], "carla      carla-20     2/2    1");
+    assert!(
+        lines[4].starts_with("carla-20     Team Seven  2        1 (#3) "),
+        "{}",
+        lines[4]
+    );
+    assert_eq!(
+        (&top::value(&all)[0]["running"], &top::value(&all)[0]["waiting"]),
+        (&json!(2), &json!(1))
+    );
+}
+
+#[test]
 fn programs_get_the_same_facts() {
     let value = why::value(&submission(&crashed()), Observed::Missing);
     assert_eq!(value["state"], "Failed");
