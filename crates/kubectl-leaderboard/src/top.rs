@@ -1,6 +1,6 @@
 //! `top`: who uses the slots of each Leaderboard and who waits, by team. Pure.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use kube::ResourceExt;
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus};
@@ -108,8 +108,14 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Fr
         .collect();
     let mut lines = table(&["NAMESPACE", "LEADERBOARD", "SLOTS", "WAITING"], &rows, frame.width);
     lines.push(String::new());
-    let rows: Vec<Vec<String>> = uses.iter().map(|(key, each)| row(key, each)).collect();
-    let head = [
+    // Leaderboards of several namespaces may have one name.
+    let namespaces: BTreeSet<&String> = boards.keys().map(|(namespace, _)| namespace).collect();
+    lines.extend(of_teams(&uses, namespaces.len() > 1, frame));
+    lines
+}
+
+fn of_teams(uses: &[(Key, Use)], is_qualified: bool, frame: Frame) -> Vec<String> {
+    let mut head = vec![
         "LEADERBOARD",
         "TEAM",
         "RUNNING",
@@ -119,8 +125,14 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Fr
         "CANCELLED",
         "CRASHES",
     ];
-    lines.extend(table(&head, &rows, frame.width));
-    lines
+    let mut rows: Vec<Vec<String>> = uses.iter().map(|(key, each)| row(key, each)).collect();
+    if is_qualified {
+        head.insert(0, "NAMESPACE");
+        for (row, ((namespace, ..), _)) in rows.iter_mut().zip(uses) {
+            row.insert(0, namespace.clone());
+        }
+    }
+    table(&head, &rows, frame.width)
 }
 
 fn row((_, board, team): &Key, each: &Use) -> Vec<String> {

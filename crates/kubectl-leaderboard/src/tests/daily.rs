@@ -172,6 +172,22 @@ fn a_pod_that_starts_uses_a_slot() {
 }
 
 #[test]
+fn teams_of_leaderboards_that_share_a_name_are_told_apart_by_their_namespace() {
+    let mut other = named("submission-40", &driving());
+    other.metadata.namespace = Some("carla-test".to_owned());
+    let lines = top::lines(&[named("submission-40", &driving()), other], &[leaderboard()], frame());
+    assert_eq!(
+        lines[4..].iter().map(|line| &line[..30]).collect::<Vec<_>>(),
+        [
+            "NAMESPACE   LEADERBOARD  TEAM  ",
+            "carla       carla-20     Team S",
+            "carla-test  carla-20     Team S",
+        ]
+        .map(|line| &line[..30])
+    );
+}
+
+#[test]
 fn programs_get_the_same_facts() {
     let value = why::value(&submission(&crashed()), Observed::Missing);
     assert_eq!(value["state"], "Failed");
