@@ -41,7 +41,7 @@ pub async fn explain(cluster: &Cluster, name: &str, format: Format) -> Result<Ex
 pub async fn survey(cluster: &Cluster, scope: &Scope, format: Format) -> Result<ExitCode, Error> {
     let submissions = cluster.submissions(scope).await?;
     let leaderboards = cluster.leaderboards(scope).await?;
-    let value = Value::Array(submissions.iter().map(status::value).collect());
+    let value = overview::value(&submissions, leaderboards.as_deref(), Timestamp::now());
     if let Some(lines) = output::document(format, &value) {
         print(&lines);
         return Ok(ExitCode::SUCCESS);

@@ -7,11 +7,13 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::ResourceExt;
+use serde_json::Value;
 
 use super::board::{self, Observed};
 use super::facts;
 use super::table::table;
 use super::text::{Frame, clean, join, span, wrap};
+use super::why;
 use leaderboard_api::conditions;
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 
@@ -114,6 +116,25 @@ pub fn lines(
     let hint = format!("`kubectl leaderboard why NAME -n {namespace}` has the details and the next step.");
     lines.extend(wrap(&hint, frame.width));
     lines
+}
+
+/// The same for programs: those that have a line, each as `why NAME` has it.
+pub fn value(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>, now: Timestamp) -> Value {
+    let place = Place {
+        namespace: "",
+        is_all: true,
+    };
+    let board_of = |submission: &Submission| {
+        let Some(all) = leaderboards else {
+            return Observed::Forbidden;
+        };
+        let is_its = |board: &&Leaderboard| {
+            board.namespace() == submission.namespace() && board.name_any() == submission.spec.leaderboard_name
+        };
+        all.iter().find(is_its).map_or(Observed::Missing, Observed::Found)
+    };
+    let shown = submissions.iter().filter(|one| row(place, one, now).is_some());
+    Value::Array(shown.map(|one| why::value(one, board_of(one))).collect())
 }
 
 /// What is wrong with the existing Leaderboards, and with those that submissions name.

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use super::{
     assert_width, cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, waiting, with,
 };
-use crate::overview::{Place, lines, nothing};
+use crate::overview::{Place, lines, nothing, value};
 use leaderboard_api::{Leaderboard, Submission};
 
 fn printed(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> String {
@@ -58,6 +58,38 @@ unpublished  Finished  3 min   EvalAI: Refused.
 
 `kubectl leaderboard why NAME -n carla` has the details and the next step."
     );
+}
+
+#[test]
+fn programs_get_those_that_have_a_line_with_their_next_steps() {
+    let mut elsewhere = named("elsewhere", &waiting());
+    elsewhere.metadata.namespace = Some("carla-test".to_owned());
+    let submissions = [
+        named("well", &running()),
+        named("done", &finished()),
+        named("third", &waiting()),
+        named("crashed", &crashed()),
+        elsewhere,
+    ];
+    let found = |boards: Option<&[Leaderboard]>| value(&submissions, boards, frame().now);
+    let shown = found(Some(&[leaderboard()]));
+    let names: Vec<_> = shown
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|one| one["name"].clone())
+        .collect();
+    assert_eq!(names, ["third", "crashed", "elsewhere"]);
+    assert_eq!(shown[1]["failure"]["charged"], true);
+    let step = shown[1]["nextSteps"][0].as_str().unwrap();
+    assert!(step.starts_with("Look at agent/agent2/leaderboard.log"), "{step}");
+    let problems = |all: &Value, at: usize| all[at]["leaderboardProblems"].as_array().unwrap().len();
+    assert_eq!(
+        (problems(&shown, 0), problems(&shown, 2)),
+        (0, 1),
+        "each has the Leaderboard of its namespace"
+    );
+    assert_eq!(problems(&found(None), 0), 1, "one that may not be read may be paused");
 }
 
 #[test]
