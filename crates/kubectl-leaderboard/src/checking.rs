@@ -19,11 +19,8 @@ use crate::commands::{frame, note_interruption};
 use crate::error::Error;
 use crate::output::{print, width};
 use crate::transitions::Waiting;
-use leaderboard_api::conditions;
 use leaderboard_api::{Leaderboard, State, Submission};
 
-/// How long a check that has ended may take to ask the table.
-const TABLE_SECONDS: i64 = 60;
 /// How long the operator may take to note a check in its Leaderboard.
 const NOTE: Duration = Duration::from_secs(20);
 
@@ -123,29 +120,22 @@ async fn wait(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<W
                 print(&transitions.observe(&submission, now).lines);
                 patience.observe(&submission, now);
                 last = submission;
-                if is_over(&last, now) {
-                    return Ok(Waited {
-                        submission: last,
-                        given_up: None,
-                    });
-                }
             }
             Ok(Some(Ok(None)) | None) => return Err(Error::Gone(name)),
             Ok(Some(Err(error))) => note_interruption(error, &mut interruption)?,
             Err(_) => {}
         }
-        if let Some(why) = patience.given_up(Timestamp::now()) {
+        let now = Timestamp::now();
+        if patience.is_over(now) {
+            return Ok(Waited {
+                submission: last,
+                given_up: None,
+            });
+        }
+        if let Some(why) = patience.given_up(now) {
             return give_up(cluster, last, why).await;
         }
     }
-}
-
-/// Whether nothing more is to come: it has ended, and the table has answered, or does not in time.
-fn is_over(submission: &Submission, now: Timestamp) -> bool {
-    let Some(status) = &submission.status else { return false };
-    let finished = conditions::get(&status.conditions, conditions::FINISHED).filter(|c| c.status == "True");
-    let is_late = finished.is_some_and(|c| now.duration_since(c.last_transition_time.0).as_secs() >= TABLE_SECONDS);
-    submission.check_end().is_some() || is_late
 }
 
 /// Cancels the check, so that the operator notes it as failed; what it waited for is what is shown.

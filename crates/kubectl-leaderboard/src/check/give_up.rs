@@ -1,10 +1,12 @@
 //! When a check has waited long enough for something that seldom resolves itself. Pure: the time is handed in.
 
 use jiff::{SignedDuration, Timestamp};
-use leaderboard_api::{Submission, reasons};
+use leaderboard_api::{Submission, SubmissionStatus, reasons};
 
 /// How long a check waits for what only a person changes.
 const STUCK: SignedDuration = SignedDuration::from_secs(60);
+/// How long a check that has ended may take to ask the table.
+const TABLE: SignedDuration = SignedDuration::from_secs(60);
 
 /// What a check waits for, and since when.
 #[derive(Clone, Debug)]
@@ -14,6 +16,10 @@ pub struct Patience {
     limit_seconds: i64,
     reason: Option<String>,
     since: Timestamp,
+    /// When its run was first seen to have ended, by the clock of this machine.
+    ended: Option<Timestamp>,
+    /// It has ended, and the table has answered.
+    is_over: bool,
 }
 
 impl Patience {
@@ -25,6 +31,8 @@ impl Patience {
             limit_seconds,
             reason: None,
             since: now,
+            ended: None,
+            is_over: false,
         }
     }
 
@@ -35,15 +43,21 @@ impl Patience {
         if reason != self.reason {
             (self.reason, self.since) = (reason, now);
         }
+        let has_ended = status.is_some_and(SubmissionStatus::has_ended);
+        self.ended = has_ended.then(|| self.ended.unwrap_or(now));
+        self.is_over = submission.check_end().is_some();
     }
 
     /// When there is something to decide, whatever the check shows until then.
     pub fn next(&self) -> Timestamp {
-        if self.is_for_a_person() {
-            self.until.min(self.since.checked_add(STUCK).unwrap_or(Timestamp::MAX))
-        } else {
-            self.until
-        }
+        let stuck = self.is_for_a_person().then(|| later(self.since, STUCK));
+        let late = self.ended.map(|ended| later(ended, TABLE));
+        [stuck, late].into_iter().flatten().fold(self.until, Timestamp::min)
+    }
+
+    /// Whether nothing more is to come: it has ended, and the table has answered, or does not in time.
+    pub fn is_over(&self, now: Timestamp) -> bool {
+        self.is_over || self.ended.is_some_and(|ended| now >= later(ended, TABLE))
     }
 
     /// Why it is given up; none as long as waiting may help.
@@ -75,4 +89,8 @@ impl Patience {
         ];
         self.reason.as_deref().is_none_or(|reason| LASTING.contains(&reason))
     }
+}
+
+fn later(time: Timestamp, by: SignedDuration) -> Timestamp {
+    time.checked_add(by).unwrap_or(Timestamp::MAX)
 }

@@ -357,6 +357,27 @@ fn one_that_is_given_up_shows_what_it_waited_for() {
 }
 
 #[test]
+fn a_table_that_does_not_answer_is_waited_for_a_minute_after_the_end() {
+    let later = |seconds| now().checked_add(jiff::SignedDuration::from_secs(seconds)).unwrap();
+    let ended = |recorded: Value| {
+        check(&json!({
+            "attempt": 1, "reason": "Finished", "times": {"finished": "2026-11-01T11:00:00Z"},
+            "conditions": [condition("Finished", "True", "Finished", ""), recorded],
+        }))
+    };
+    let mut patience = Patience::new(now(), 900);
+    patience.observe(&ended(condition("Recorded", "False", "Waiting", "")), now());
+    patience.observe(
+        &ended(condition("Recorded", "False", "Waiting", "No answer.")),
+        later(30),
+    );
+    assert_eq!((patience.next(), patience.is_over(later(59))), (later(60), false));
+    assert!(patience.is_over(later(60)) && patience.given_up(later(60)).is_none());
+    patience.observe(&ended(condition("Recorded", "True", "Recorded", "")), later(40));
+    assert!(patience.is_over(later(40)));
+}
+
+#[test]
 fn only_what_a_person_has_to_change_is_given_up_after_a_minute() {
     let later = |seconds| now().checked_add(jiff::SignedDuration::from_secs(seconds)).unwrap();
     for (reason, seconds) in [
