@@ -120,6 +120,8 @@ impl Requeue {
             .filter(|one| is_named(one) && self.is_chosen(one, now))
             .collect();
         found.sort_by_key(|one| one.name_any());
+        // A name that is given twice is one submission.
+        found.dedup_by_key(|one| one.name_any());
         found
     }
 

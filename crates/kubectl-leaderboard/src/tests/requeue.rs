@@ -56,6 +56,13 @@ fn all() -> Vec<Submission> {
 }
 
 #[test]
+fn a_name_that_is_given_twice_is_one_submission() {
+    let found = [named("crashed", &crashed()), named("crashed", &crashed())];
+    let wanted = parsed("crashed crashed").unwrap();
+    assert_eq!(wanted.chosen(&found, now()).len(), 1);
+}
+
+#[test]
 fn what_is_chosen_is_what_the_flags_say() {
     for (arguments, expected) in [
         ("--all", &["crashed", "lost", "old"][..]),
