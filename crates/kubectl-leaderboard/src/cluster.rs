@@ -20,7 +20,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::board::Observed;
-use super::error::{Error, of_kubeconfig};
+use super::error::{Error, of_kubeconfig, of_log};
 use super::near;
 use leaderboard_api::names::LABEL_SUBMISSION;
 use leaderboard_api::{Leaderboard, Submission};
@@ -156,9 +156,10 @@ impl Cluster {
         container: &str,
     ) -> Result<impl Stream<Item = std::io::Result<String>> + use<>, Error> {
         let api = self.api::<Pod>();
-        let reader = self
+        let opened = self
             .in_time(api.log_stream(pod, &of_container(container, false)))
-            .await??;
+            .await?;
+        let reader = opened.map_err(of_log)?;
         Ok(futures::io::AsyncBufReadExt::lines(Box::pin(reader)))
     }
 
@@ -166,7 +167,7 @@ impl Cluster {
     pub fn followed_log(&self, pod: &str, container: &str) -> impl Stream<Item = Result<String, Error>> + use<> {
         let (api, pod, params) = (self.api::<Pod>(), pod.to_owned(), of_container(container, true));
         let opened = async move {
-            let reader = api.log_stream(&pod, &params).await.map_err(Error::from)?;
+            let reader = api.log_stream(&pod, &params).await.map_err(of_log)?;
             let lines = futures::io::AsyncBufReadExt::lines(Box::pin(reader));
             Ok(lines.map_err(|error| Error::Api(error.to_string())))
         };

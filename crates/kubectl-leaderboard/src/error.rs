@@ -145,6 +145,14 @@ fn message(error: &kube::Error) -> String {
     phrase(&text::kube(error))
 }
 
+/// Why there is no log. A Pod that is gone by now is no sign of a missing definition.
+pub(super) fn of_log(error: kube::Error) -> Error {
+    match &error {
+        kube::Error::Api(status) if status.is_not_found() => Error::Api(message(&error)),
+        _ => error.into(),
+    }
+}
+
 /// Why no cluster is configured. The text of a parser may show a part of the file, and with it perhaps a token.
 pub(super) fn of_kubeconfig(error: &(dyn StdError + 'static)) -> Error {
     let mut next = Some(error);

@@ -125,6 +125,7 @@ fn log(query: &str) -> (u16, String) {
         Some("agent-1") => {
             "Traceback (most recent call last):\n  File \"agent.py\", line 7\n\tred \u{1b}[31mtext\u{1b}[0m\nlast line"
         }
+        Some("simulator-1") => return refusal(404, "NotFound", "pods \"runs-1-abcde\" not found"),
         _ => {
             let waits = "container \"agent-2\" in pod \"runs-1-abcde\" is waiting to start: ContainerCreating";
             return refusal(400, "BadRequest", waits);
@@ -300,6 +301,7 @@ fn logs_have_the_label_of_their_container_and_come_in_its_order() {
         &[
             &["logs", "submission-43"],
             &["logs", "submission-43", "--of", "start"],
+            &["logs", "submission-43", "--of", "simulator", "--pair", "1"],
             &["logs", "submission-43", "--pair", "3"],
             &["logs", "submission-42", "--pair", "2"],
             &["logs", "submission-42", "--pair", "2", "-f"],
