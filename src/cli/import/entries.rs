@@ -77,20 +77,15 @@ pub(super) struct BoardEntry {
 impl BoardEntry {
     /// The name that a phase's track gets.
     pub(super) fn track_name(&self, track: &TrackEntry) -> String {
-        let short = track.codename.to_ascii_lowercase().replace(['_', '.'], "-");
-        let short = short.trim_matches('-');
-        let same = self
-            .tracks
-            .iter()
-            .filter(|other| other.codename == track.codename)
-            .count();
+        let short = track.short_name();
+        let same = self.tracks.iter().filter(|other| other.short_name() == short).count();
         // Names are unique, and two phases may have the same track.
-        match (same, short) {
+        match (same, short.as_str()) {
             (_, "") => format!("phase-{}", track.phase),
             (1, short) => short.to_owned(),
             (_, short) => format!(
                 "{}-{}",
-                short.get(..12).unwrap_or(short).trim_end_matches('-'),
+                short.get(..12).unwrap_or(&short).trim_end_matches('-'),
                 track.phase
             ),
         }
@@ -103,6 +98,14 @@ pub(super) struct TrackEntry {
     pub(super) phase: i64,
     /// In upper case, as agents get it.
     pub(super) codename: String,
+}
+
+impl TrackEntry {
+    /// The codename as a DNS label has it.
+    fn short_name(&self) -> String {
+        let short = self.codename.to_ascii_lowercase().replace(['_', '.'], "-");
+        short.trim_matches('-').to_owned()
+    }
 }
 
 /// A key of an entry that is not taken over, and why.

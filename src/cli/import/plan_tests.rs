@@ -255,6 +255,18 @@ fn two_phases_of_one_track_have_names_of_their_own() {
 }
 
 #[test]
+fn tracks_whose_codenames_differ_in_what_no_name_has_are_named_by_their_phase() {
+    let mut texts = texts();
+    let phases = [("1", "leaderboard-20:map_x"), ("2", "leaderboard-20:map-x")];
+    texts.insert("evalai-tracks", tracks(&phases));
+    let entries = parse(&texts, &[Board::Twenty]).unwrap();
+    let import = planned(&entries, &options());
+    let tracks = specs(&import)[0].tracks.clone();
+    let tracks: Vec<_> = tracks.iter().map(|t| (t.name.as_str(), t.codename.as_str())).collect();
+    assert_eq!(tracks, [("map-x-1", "MAP_X"), ("map-x-2", "MAP-X")]);
+}
+
+#[test]
 fn a_token_that_is_none_or_ends_soon_is_a_matter_for_a_person() {
     let mut entries = entries();
     let first = |entries: &Entries| planned(entries, &options()).decide[0].clone();
