@@ -26,6 +26,9 @@ pub struct Report {
     file: Option<PathBuf>,
 }
 
+/// The file whose objects name teams.
+const SUBMISSIONS: &str = "submissions.json";
+
 /// One file of the archive, and what it counts.
 struct Part {
     file: &'static str,
@@ -38,6 +41,11 @@ struct Part {
 pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
     let now = Timestamp::now();
     let parts = ask(cluster).await;
+    let submissions = parts.iter().find(|part| part.file == SUBMISSIONS);
+    let names = submissions
+        .and_then(|part| part.objects.as_deref().ok())
+        .map(redact::names)
+        .unwrap_or_default();
     let (mut files, mut missing, mut counts) = (Vec::new(), Vec::new(), Vec::new());
     for part in parts {
         match part.objects {
@@ -45,7 +53,7 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
                 counts.push(counted(objects.len(), part.one, part.many));
                 files.push((
                     part.file.to_owned(),
-                    format!("{:#}\n", redact::objects(part.file, objects)),
+                    format!("{:#}\n", redact::objects(part.file, objects, &names)),
                 ));
             }
             // An archive of nothing helps nobody.
@@ -85,7 +93,7 @@ async fn ask(cluster: &Cluster) -> [Part; 4] {
     let (pods, events) = (documents(cluster.pods().await), documents(cluster.events().await));
     [
         part("leaderboards.json", "Leaderboard", "Leaderboards", leaderboards),
-        part("submissions.json", "submission", "submissions", submissions),
+        part(SUBMISSIONS, "submission", "submissions", submissions),
         part("pods.json", "Pod", "Pods", pods),
         part("events.json", "event", "events", events),
     ]

@@ -1,5 +1,7 @@
 //! Takes out of objects what a report must not hold. Pure.
 
+use std::collections::BTreeSet;
+
 use serde_json::{Value, json};
 
 /// What stands where something was taken out.
@@ -16,13 +18,25 @@ const DROPPED: [&str; 6] = [
 /// Reasons whose messages quote a checkpoint, and with it routes.
 const OF_RESULTS: [&str; 3] = ["InvalidResults", "NotEligible", "UnexplainedScores"];
 
-/// The objects of one file.
-pub(super) fn objects(file: &str, objects: Vec<Value>) -> Value {
+/// Names of the teams of submissions that have no id: counts and messages call these by their name.
+pub(super) fn names(submissions: &[Value]) -> BTreeSet<String> {
+    let teams = submissions
+        .iter()
+        .flat_map(|one| [&one["spec"]["team"], &one["status"]["team"]]);
+    let without_id = teams.filter(|team| team["id"].is_null());
+    without_id
+        .filter_map(|team| team["name"].as_str())
+        .map(str::to_owned)
+        .collect()
+}
+
+/// The objects of one file, without these names of teams.
+pub(super) fn objects(file: &str, objects: Vec<Value>, names: &BTreeSet<String>) -> Value {
     let is_of_pods = file.starts_with("pods");
     let all = objects
         .into_iter()
         .map(|object| if is_of_pods { pod(&object) } else { object });
-    Value::Array(all.map(redacted).collect())
+    Value::Array(all.map(|object| redacted(object, names)).collect())
 }
 
 /// Of a Pod, how its containers fare: its spec has the plan and the environment.
@@ -52,9 +66,9 @@ fn container(status: &Value) -> Value {
            "state": state["state"], "lastState": state["lastState"]})
 }
 
-fn redacted(value: Value) -> Value {
+fn redacted(value: Value, names: &BTreeSet<String>) -> Value {
     match value {
-        Value::Array(items) => Value::Array(items.into_iter().map(redacted).collect()),
+        Value::Array(items) => Value::Array(items.into_iter().map(|item| redacted(item, names)).collect()),
         Value::Object(fields) => {
             let quotes = fields
                 .get("reason")
@@ -67,12 +81,15 @@ fn redacted(value: Value) -> Value {
                     "message" | "note" if quotes => json!(REMOVED),
                     "env" => without_values(value),
                     "team" => team(&value),
-                    _ => redacted(value),
+                    _ => redacted(value, names),
                 };
                 (key, value)
             });
             Value::Object(fields.collect())
         }
+        Value::String(text) => Value::String(names.iter().fold(text, |text, name| {
+            text.replace(&format!("team {name}"), &format!("team {REMOVED}"))
+        })),
         scalar => scalar,
     }
 }
@@ -88,10 +105,11 @@ fn without_values(env: Value) -> Value {
     Value::Array(names.collect())
 }
 
-/// The id of a team. In a Leaderboard's counts the team is its id.
+/// The id of a team. In a Leaderboard's counts the team is its id, or its name if it has none; EvalAI's ids are numbers.
 fn team(team: &Value) -> Value {
     match team {
         Value::Object(_) => json!({"id": team["id"]}),
+        Value::String(text) if !text.bytes().all(|byte| byte.is_ascii_digit()) => json!(REMOVED),
         other => other.clone(),
     }
 }
@@ -113,9 +131,34 @@ mod tests {
         });
         let board =
             json!({"spec": {"agent": {"env": [{"name": "TOKEN", "value": secret}]}, "podOverrides": {"x": secret}}});
-        let text = objects("submissions.json", vec![submission, board]).to_string();
+        let text = objects("submissions.json", vec![submission, board], &BTreeSet::new()).to_string();
         assert!(!text.contains(secret), "{text}");
         for kept in ["stays", "TOKEN", "\"id\":\"7\"", "InvalidResults"] {
+            assert!(text.contains(kept), "{kept}: {text}");
+        }
+    }
+
+    #[test]
+    fn a_team_without_an_id_is_named_neither_in_counts_nor_in_messages() {
+        let ended =
+            "Node gpu-3 was lost. Within a day 2 attempts of team Team Seven ended like this in this Leaderboard.";
+        let submission = json!({
+            "spec": {"team": {"name": "Team Seven"}},
+            "status": {"team": {"name": "Team Seven", "displayName": "Team Seven"}, "failure": {"reason": "NodeLost", "message": ended}},
+        });
+        let numbered = json!({"spec": {"team": {"id": "8", "name": "gpu"}}});
+        let board = json!({"status": {"gpuUse": [{"team": "Team Seven", "gpuSeconds": 4}, {"team": "8", "gpuSeconds": 2}],
+                                      "infrastructureFailures": [{"team": "Team Seven", "number": 2}]}});
+        let all = vec![
+            submission,
+            numbered,
+            board,
+            json!({"reason": "NodeLost", "note": ended}),
+        ];
+        let names = names(&all);
+        let text = objects("submissions.json", all, &names).to_string();
+        assert!(!text.contains("Seven"), "{text}");
+        for kept in ["\"team\":\"8\"", "attempts of team <removed> ended", "gpu-3"] {
             assert!(text.contains(kept), "{kept}: {text}");
         }
     }
@@ -125,7 +168,7 @@ mod tests {
         let event = |reason: &str, note: &str| json!({"reason": reason, "note": note, "regarding": {"name": "a"}});
         let mut events: Vec<Value> = OF_RESULTS.iter().map(|reason| event(reason, "s3cr3t")).collect();
         events.push(event("Replacing", "stays"));
-        let text = objects("events.json", events).to_string();
+        let text = objects("events.json", events, &BTreeSet::new()).to_string();
         assert!(!text.contains("s3cr3t"), "{text}");
         assert!(text.contains("InvalidResults") && text.contains("stays"), "{text}");
     }
@@ -138,7 +181,7 @@ mod tests {
             "spec": {"nodeName": "gpu-3", "containers": [{"env": [{"name": "LEADERBOARD_RUN", "value": "s3cr3t"}]}]},
             "status": {"phase": "Failed", "containerStatuses": [{"name": "agent-1", "image": "a:1", "state": ended}]},
         });
-        let text = objects("pods.json", vec![pod]).to_string();
+        let text = objects("pods.json", vec![pod], &BTreeSet::new()).to_string();
         assert!(!text.contains("s3cr3t") && !text.contains("LEADERBOARD_RUN"), "{text}");
         assert!(text.contains("\"exitCode\":1") && text.contains("gpu-3"), "{text}");
     }
