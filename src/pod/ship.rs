@@ -131,6 +131,8 @@ impl Shipper {
 
     /// Sends every `period` until `done` is true, and then once more. Tells what has become of the lines.
     pub async fn run(mut self, period: Duration, mut done: watch::Receiver<bool>, told: watch::Sender<Option<Logs>>) {
+        // Noted before this life of logcopy has stored anything: its next one must not take what is stored for what was sent.
+        self.write_note().await;
         let mut complained = false;
         while !*done.borrow_and_update() {
             let sent = self.pass(false).await;

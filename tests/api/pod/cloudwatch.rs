@@ -160,6 +160,26 @@ async fn what_becomes_of_the_lines_is_known() {
 }
 
 #[tokio::test]
+async fn what_is_stored_and_was_refused_until_a_restart_is_sent_after_it() {
+    let (mut pod, group) = pod_with_logs().await;
+    let log = "agent/agent1/leaderboard.log";
+    pod.append(log, b"one\n");
+    pod.setting.run.log_group.as_mut().unwrap().name = "no-such-group".to_owned();
+    let (_sender, is_over) = watch::channel(true);
+    let (told, _) = watch::channel(None);
+    let refused = shipper(&pod, ship::STREAM_A_DAY);
+    refused.run(Duration::from_secs(1), is_over, told).await;
+    let stamp = Tree::open(pod.logs()).unwrap().file(log).unwrap().unwrap().1;
+    let wanted = [Wanted::new(log, stamp, Haste::Now)];
+    let stored = pod.uploader().sync(&wanted, Window::default()).await.unwrap();
+    assert_eq!(stored.objects, 1);
+    pod.setting.run.log_group.as_mut().unwrap().name.clone_from(&group);
+    shipper(&pod, ship::STREAM_A_DAY).pass(true).await.unwrap();
+    let logs = pod.aws.logs(None, None);
+    assert_eq!(all(&logs, &group, "77/agent-1").await, ["one"]);
+}
+
+#[tokio::test]
 async fn workspace_and_contents_have_streams_of_their_own() {
     let (pod, group) = pod_with_logs().await;
     let logs = pod.aws.logs(None, None);
