@@ -85,7 +85,7 @@ impl BoardEntry {
             (1, short) => short.to_owned(),
             (_, short) => format!(
                 "{}-{}",
-                short.get(..12).unwrap_or(&short).trim_end_matches('-'),
+                short.get(..12).unwrap_or(short).trim_end_matches('-'),
                 track.phase
             ),
         }
