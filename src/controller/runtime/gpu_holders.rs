@@ -110,7 +110,7 @@ mod tests {
         serde_json::from_value(object).unwrap()
     }
 
-    /// Its Pod has had four GPUs for so many minutes, and Jobs before it used 100 GPU seconds.
+    /// The Pod has had four GPUs for so many minutes, and Jobs before it used 100 GPU seconds.
     fn running(minutes: u32, running: &str, stopped: &str) -> Value {
         let condition = |name: &str, status: &str, since: &str| json!({"type": name, "status": status, "reason": "R", "message": "", "lastTransitionTime": since});
         json!({
