@@ -195,7 +195,8 @@ fn decisions_of(page: &str) -> String {
         Some((field, _)) => format!("{field}https://sqs.us-west-2.amazonaws.com/123456789012/dead"),
         None => line
             .replace("$s3", "https://bucket.example")
-            .replace("$account", "123456789012"),
+            .replace("$account", "123456789012")
+            .replace("$challenge", "2098"),
     });
     lines.collect::<Vec<_>>().join("\n")
 }
@@ -226,6 +227,10 @@ async fn the_decisions_of_the_documents_leave_no_question_and_the_api_server_acc
         std::fs::write(file, decisions_of(page)).unwrap();
         let (manifests, notes) = texts(&import(&[always.as_slice(), more.as_slice()].concat()).await);
         assert!(!notes.contains("to decide:"), "{page}: {notes}");
+        // What the cluster has of them belongs to other tests.
+        let has_group = page == "migrate.md";
+        assert_eq!(notes.contains("\nlog collectors: "), has_group, "{page}: {notes}");
+        assert!(!notes.contains("log collectors: not known"), "{page}: {notes}");
         let (accepted, shown) = dry_run(&manifests).await;
         assert!(accepted && !shown.contains("Warning"), "{page}: {shown}\n{manifests}");
         assert_eq!(shown.lines().count(), 4, "{page}: {shown}");

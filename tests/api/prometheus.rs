@@ -53,13 +53,14 @@ const OF_STANDBY: [&str; 5] = [
 
 /// What two lives may leave no sample of, with the reason. Everything else in docs/metrics.md must be there, and every other query of the
 /// dashboard must have an answer.
-const ABSENT: [(&str, &str); 7] = [
+const ABSENT: [(&str, &str); 8] = [
     (
         "leaderboard_evalai_token_expiry_timestamp_seconds",
         "the token does not say when it ends",
     ),
     ("leaderboard_gpu_seconds_total", "the Leaderboard gives no GPU"),
     ("leaderboard_team_gpu_seconds_total", "the Leaderboard gives no GPU"),
+    ("leaderboard_submission_gpu_seconds", "the Leaderboard gives no GPU"),
     ("leaderboard_lease_errors_total", "nothing disturbs the Lease"),
     (
         "leaderboard_queue_oldest_message_timestamp_seconds",

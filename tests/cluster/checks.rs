@@ -86,6 +86,7 @@ async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
                 "✔ Route          1/1 done",
                 "✔ Table          would take a row; a check writes none",
                 "✔ CloudWatch     takes the lines",
+                "✔ Log collectors no DaemonSet collects the lines of containers",
                 "The check passed",
             ],
         );

@@ -13,7 +13,10 @@ use kube::ResourceExt;
 use serde_json::json;
 
 use crate::board::Observed;
-use crate::check::{self, Outcome, Patience, Readers, Seen, Wanted, ask_for_readers, findings, submission};
+use crate::check::{
+    self, Collectors, Outcome, Patience, Readers, Seen, Wanted, ask_for_collectors, ask_for_readers, findings,
+    submission,
+};
 use crate::cluster::{Cluster, Scope};
 use crate::commands::{frame, note_interruption};
 use crate::error::Error;
@@ -49,6 +52,12 @@ struct Waited {
     given_up: Option<String>,
 }
 
+/// Who else reads the queue, and who else stores the lines.
+struct Others {
+    readers: Readers,
+    collectors: Collectors,
+}
+
 /// Checks a Leaderboard; the exit code says whether it passed.
 pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error> {
     let leaderboard = leaderboard(cluster, wanted.name.as_deref()).await?;
@@ -68,7 +77,7 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
         _ = tokio::signal::ctrl_c() => Err(Error::Interrupted),
     };
     let shown = match waited {
-        Ok((waited, readers)) => show(cluster, &name, &waited, &readers).await,
+        Ok((waited, others)) => show(cluster, &name, &waited, &others).await,
         Err(error) => Err(error),
     };
     if wanted.keep {
@@ -93,15 +102,19 @@ async fn leaderboard(cluster: &Cluster, name: Option<&str>) -> Result<Leaderboar
     }
 }
 
-/// Waits for the end of a check, and asks meanwhile who else reads the queue.
-async fn run(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<(Waited, Readers), Error> {
+/// Waits for the end of a check, and asks meanwhile who else reads the queue. Who else stores the lines depends on the Pod's node.
+async fn run(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<(Waited, Others), Error> {
     let board = cluster.leaderboard(&created.spec.leaderboard_name).await?;
     let queue = board
         .observed()
         .leaderboard()
         .and_then(|board| board.spec.queue.as_ref());
     let (waited, readers) = tokio::join!(wait(cluster, created, seconds), ask_for_readers(queue));
-    Ok((waited?, readers))
+    let waited = waited?;
+    let status = waited.submission.status.as_ref();
+    let node = status.and_then(|status| status.node_name.as_deref());
+    let collectors = ask_for_collectors(cluster, node).await;
+    Ok((waited, Others { readers, collectors }))
 }
 
 async fn wait(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<Waited, Error> {
@@ -161,7 +174,7 @@ async fn give_up(cluster: &Cluster, last: Submission, why: String) -> Result<Wai
 }
 
 /// Prints what was found. The Leaderboard is read again: the check's Pod has measured its isolation.
-async fn show(cluster: &Cluster, name: &str, waited: &Waited, readers: &Readers) -> Result<ExitCode, Error> {
+async fn show(cluster: &Cluster, name: &str, waited: &Waited, others: &Others) -> Result<ExitCode, Error> {
     let check = waited.submission.name_any();
     let noted = |board: &Leaderboard| {
         let status = board.status.as_ref();
@@ -180,7 +193,8 @@ async fn show(cluster: &Cluster, name: &str, waited: &Waited, readers: &Readers)
         leaderboard,
         submission: Some(&waited.submission),
         given_up: waited.given_up.as_deref(),
-        readers,
+        readers: &others.readers,
+        collectors: &others.collectors,
     });
     let status = waited.submission.status.as_ref();
     let has_finished = status.is_some_and(|status| status.state_of_conditions() == State::Finished);

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use clap::Args;
 use futures::{Stream, StreamExt, TryFutureExt, TryStreamExt};
+use k8s_openapi::api::apps::v1::DaemonSet;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{DeleteParams, ListParams, LogParams, PartialObjectMeta, Patch, PatchParams, PostParams};
@@ -129,6 +130,23 @@ impl Cluster {
     /// All events.
     pub async fn events(&self) -> Result<Vec<Event>, Error> {
         list(self, &self.api::<Event>(), None).await
+    }
+
+    /// All `DaemonSets` of the cluster.
+    pub async fn daemon_sets(&self) -> Result<Vec<DaemonSet>, Error> {
+        list(self, &Api::all(self.client.clone()), None).await
+    }
+
+    /// The uids of what owns the Pods of a namespace that are on a node.
+    pub async fn owners_on_node(&self, namespace: &str, node: &str) -> Result<Vec<String>, Error> {
+        let api: Api<Pod> = Api::namespaced(self.client.clone(), namespace);
+        let params = ListParams::default().fields(&format!("spec.nodeName={node}"));
+        let pods = self.in_time(api.list_metadata(&params)).await??;
+        let owners = pods
+            .items
+            .into_iter()
+            .flat_map(|pod| pod.metadata.owner_references.unwrap_or_default());
+        Ok(owners.map(|owner| owner.uid).collect())
     }
 
     /// The newest Pod of a submission.

@@ -4,6 +4,7 @@
 //! writes: all pure. This file reads and writes. Standard output is YAML alone; what a person has to know is a comment of it and on
 //! standard error.
 
+mod collectors;
 mod decisions;
 mod entries;
 mod options;
@@ -23,6 +24,7 @@ use std::process::ExitCode;
 use clap::Args;
 use jiff::Timestamp;
 
+use self::collectors::Collectors;
 use self::decisions::{DecisionError, Decisions};
 use self::entries::{Board, EVALAI, EntryError, TRACKS, Texts};
 use self::plan::PlanError;
@@ -174,17 +176,21 @@ impl Import {
         let entries = entries::parse(&texts, &boards).map_err(Failure::Entries)?;
         let decisions = self.decisions()?;
         let options = self.options(region)?;
-        let import = plan::plan(&entries, &options, &decisions, Timestamp::now())?;
+        let mut import = plan::plan(&entries, &options, &decisions, Timestamp::now())?;
         let mut readers = Vec::new();
         for (url, region) in &import.queues {
             let queue = QueueArn::of_url(url, region.as_deref().or(Some(options.region.as_str())))?;
             let found = event_sources::readers(aws, &queue, self.endpoint.as_deref()).await;
             readers.extend(reader_lines(&queue, &found));
         }
-        let text = print::yaml(&import, &self.heading(&options), &readers)?;
+        let collectors = self.collectors(&mut import).await;
+        let found = [("Other readers of the queue", readers), ("Log collectors", collectors)];
+        let text = print::yaml(&import, &self.heading(&options), &found)?;
+        let [(_, readers), (_, collectors)] = &found;
         // What a person has to know goes before the manifests, and is not lost in a pipe.
         for (title, lines) in [
-            ("other readers of the queue", &readers),
+            ("other readers of the queue", readers),
+            ("log collectors", collectors),
             ("not taken over", &import.dropped),
             ("to decide", &import.decide),
         ] {
@@ -194,6 +200,18 @@ impl Import {
         }
         write_out(&text)?;
         Ok(())
+    }
+
+    /// What else would store the lines. Where nothing does, there is no question about it.
+    async fn collectors(&self, import: &mut plan::Import) -> Vec<String> {
+        if import.log_groups.is_empty() {
+            return Vec::new();
+        }
+        let collectors: Collectors = collectors::ask().await;
+        if collectors.is_nobody() {
+            import.decide.retain(|question| question != questions::FLUENTD);
+        }
+        collectors.lines(&self.namespace, &import.log_groups)
     }
 
     fn options(&self, region: String) -> Result<options::Options, Failure> {

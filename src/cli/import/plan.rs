@@ -33,6 +33,8 @@ pub(super) struct Import {
     pub(super) values: Value,
     /// The queues that are read, by URL and region.
     pub(super) queues: BTreeSet<(String, Option<String>)>,
+    /// The log groups that are written to.
+    pub(super) log_groups: BTreeSet<String>,
 }
 
 /// One object, with comments before fields of its spec.
@@ -89,6 +91,10 @@ pub(super) fn plan(
         decide: questions::open(entries, options, decisions, now),
         values: values(options, &specs),
         queues: specs.iter().filter_map(queue_of).collect(),
+        log_groups: specs
+            .iter()
+            .filter_map(|spec| Some(spec.log_group.as_ref()?.name.clone()))
+            .collect(),
     })
 }
 

@@ -97,7 +97,12 @@ fn what_is_printed_reads_back_as_it_was_planned() {
         let read: Value = serde_saphyr::from_str(&text).unwrap();
         assert_eq!(read, document.object, "{text}");
     }
-    let text = print::yaml(&import, "Made by a test.", &["none".into()]).unwrap();
+    let text = print::yaml(
+        &import,
+        "Made by a test.",
+        &[("Other readers of the queue", vec!["none".into()])],
+    )
+    .unwrap();
     assert_eq!(text.matches("\n---\n").count(), 4);
     assert!(text.lines().all(|line| line.chars().count() <= 130), "{text}");
     for expected in [

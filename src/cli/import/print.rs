@@ -36,17 +36,22 @@ const ORDER: [&str; 24] = [
     "url",
 ];
 
-/// The whole output. `readers` shows who else reads the queue.
-pub(super) fn yaml(import: &Import, heading: &str, readers: &[String]) -> Result<String, serde_saphyr::ser::Error> {
+/// The whole output. `found` is what was found of AWS and the cluster, each with its title.
+pub(super) fn yaml(
+    import: &Import,
+    heading: &str,
+    found: &[(&str, Vec<String>)],
+) -> Result<String, serde_saphyr::ser::Error> {
     let mut text = comment(heading, "");
-    for (title, lines) in [
-        ("Other readers of the queue:", readers),
-        ("Not taken over:", &import.dropped),
-        ("What a person must still decide:", &import.decide),
-    ] {
+    let found = found.iter().map(|(title, lines)| (*title, lines));
+    let own = [
+        ("Not taken over", &import.dropped),
+        ("What a person must still decide", &import.decide),
+    ];
+    for (title, lines) in found.chain(own) {
         if !lines.is_empty() {
             text += "#\n";
-            text += &comment(title, "");
+            text += &comment(&format!("{title}:"), "");
         }
         for line in lines {
             text += &item(line);

@@ -15,7 +15,8 @@ const NO_TAINTS: &str = "tracks[].tolerations: do the GPU nodes have a taint (--
                          tolerated submissions stay Unschedulable";
 const NO_DEAD_LETTERS: &str = "queue.deadLetterURL: a queue for messages that cannot be used (--dead-letter); the original had none, and \
                                without one they stay in the queue until it drops them";
-const FLUENTD: &str = "logGroup: does the original's FluentD run on these nodes? Then each line is stored twice: leave logGroup out, or take \
+/// Left out where the cluster shows that no program collects logs.
+pub(super) const FLUENTD: &str = "logGroup: does the original's FluentD run on these nodes? Then each line is stored twice: leave logGroup out, or take \
                        the namespace out of FluentD's source (docs/migrate.md, Logs twice)";
 
 /// Before the name of a field of each track.

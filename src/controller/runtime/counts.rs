@@ -9,12 +9,13 @@ use std::time::Duration;
 use jiff::Timestamp;
 use kube::ResourceExt;
 
+use super::gpu_holders::{Holder, Holders};
 use crate::controller::leaderboards::operator;
 use crate::controller::submissions::act::awaits_publication;
 use crate::kubernetes::Store;
 use crate::lock::lock;
 use crate::observability::Observability;
-use crate::observability::metrics::{BoardState, Standing};
+use crate::observability::metrics::{BoardState, OfSubmission, Standing};
 use crate::services::evalai::Hub;
 use leaderboard_api::{FailureClass, Leaderboard, State, Submission, SubmissionStatus, conditions, reasons};
 
@@ -50,6 +51,7 @@ pub(super) async fn keep(
     let mut tick = tokio::time::interval(EVERY);
     let mut shown: BTreeSet<String> = BTreeSet::new();
     let mut standings: BTreeMap<Standing, usize> = BTreeMap::new();
+    let mut holders: BTreeSet<OfSubmission> = BTreeSet::new();
     loop {
         tokio::select! { _ = tick.tick() => {}, () = telemetry.stop.wait() => return }
         let load = hub.load();
@@ -71,15 +73,32 @@ pub(super) async fn keep(
         telemetry
             .metrics
             .set_repeating_teams(repeating_teams(&leaderboards.state()));
-        let boards = boards(&leaderboards.state(), &census, &us, Timestamp::now());
+        let now = Timestamp::now();
+        let boards = boards(&leaderboards.state(), &census, &us, now);
         for (leaderboard, state) in &boards {
             telemetry.metrics.set_leaderboard(leaderboard, *state);
         }
         for gone in shown.iter().filter(|leaderboard| !boards.contains_key(*leaderboard)) {
             telemetry.metrics.forget_leaderboard(gone);
         }
+        holders = show_gpu_use(&telemetry, census.gpu_use(boards.keys(), now), &holders);
         shown = boards.into_keys().collect();
     }
+}
+
+/// Shows what the submissions have used that hold GPUs, and those no more that held some before.
+fn show_gpu_use(
+    telemetry: &Observability,
+    used: BTreeMap<OfSubmission, i64>,
+    before: &BTreeSet<OfSubmission>,
+) -> BTreeSet<OfSubmission> {
+    for gone in before.iter().filter(|of| !used.contains_key(*of)) {
+        telemetry.metrics.forget_live_gpu_use(gone);
+    }
+    for (of, seconds) in &used {
+        telemetry.metrics.set_live_gpu_use(of, *seconds);
+    }
+    used.into_keys().collect()
 }
 
 /// What there is of Submissions, in numbers.
@@ -92,6 +111,7 @@ struct Counted {
     compared: BTreeMap<&'static str, usize>,
     /// By Leaderboard, as `namespace/name`.
     waits: BTreeMap<String, Waits>,
+    holders: Holders,
 }
 
 /// Since when Submissions of a Leaderboard wait, and how many since the same time.
@@ -107,6 +127,7 @@ struct Entry {
     standing: Standing,
     compared: Option<&'static str>,
     wait: Option<Wait>,
+    holder: Option<Holder>,
 }
 
 #[derive(PartialEq)]
@@ -141,6 +162,12 @@ impl Census {
         COMPARED.map(|reason| (reason, counted.compared.get(reason).copied().unwrap_or(0)))
     }
 
+    /// What those submissions of these Leaderboards have used until now that hold GPUs.
+    fn gpu_use<'a>(&self, boards: impl Iterator<Item = &'a String>, now: Timestamp) -> BTreeMap<OfSubmission, i64> {
+        let counted = lock(&self.0);
+        boards.flat_map(|board| counted.holders.gpu_use(board, now)).collect()
+    }
+
     /// How long the oldest have waited.
     fn show_waits(&self, boards: &mut BTreeMap<String, BoardState>, now: Timestamp) {
         let counted = lock(&self.0);
@@ -162,6 +189,9 @@ impl Counted {
         count(&mut self.standings, entry.standing, is_there);
         if let Some(reason) = entry.compared {
             count(&mut self.compared, reason, is_there);
+        }
+        if let Some(holder) = entry.holder {
+            self.holders.take(holder, is_there);
         }
         let Some(wait) = entry.wait else { return };
         let waits = self.waits.entry(wait.board.clone()).or_default();
@@ -195,6 +225,7 @@ impl Entry {
             standing: standing(submission),
             compared: compared.and_then(|compared| known(&compared.reason)),
             wait: Wait::of(submission),
+            holder: Holder::of(submission),
         }
     }
 }
@@ -279,7 +310,7 @@ fn boards(
     boards
 }
 
-fn board_name(namespace: Option<String>, name: &str) -> String {
+pub(super) fn board_name(namespace: Option<String>, name: &str) -> String {
     format!("{}/{name}", namespace.unwrap_or_default())
 }
 

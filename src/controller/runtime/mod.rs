@@ -7,6 +7,7 @@ pub mod backoff;
 pub mod context;
 mod counts;
 mod events;
+mod gpu_holders;
 mod inbox;
 pub mod leader;
 mod needs;

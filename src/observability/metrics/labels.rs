@@ -1,5 +1,5 @@
 //! The label sets of the families. Values are kinds, outcomes and other fixed words; names are those of
-//! Leaderboards and queues, and of a bounded number of teams.
+//! Leaderboards and queues, and of a bounded number of teams and of submissions that hold GPUs.
 
 use prometheus_client::encoding::EncodeLabelSet;
 
@@ -66,6 +66,14 @@ pub(super) struct OfTrack {
 pub(super) struct OfTeam {
     pub leaderboard: String,
     pub team: String,
+}
+
+/// A submission of a Leaderboard, or all those of it that have no sample of their own.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, EncodeLabelSet)]
+pub struct OfSubmission {
+    /// `namespace/name`.
+    pub leaderboard: String,
+    pub submission: String,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, EncodeLabelSet)]

@@ -1,7 +1,8 @@
 //! Every metric of the operator, as one typed struct: what is counted, with which labels.
 //!
 //! Parts call the methods; the health server asks for the text. Labels hold kinds, outcomes and other fixed values, the names of
-//! Leaderboards and queues, which are few, and those of the first teams of each Leaderboard: never those of a Submission or an image.
+//! Leaderboards and queues, which are few, those of the first teams of each Leaderboard, and those of submissions as long as they hold
+//! GPUs: never those of an image, nor of what has ended.
 
 mod boards;
 mod labels;
@@ -29,10 +30,10 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Metric, Registry};
 
 pub use boards::BoardState;
-pub use labels::Standing;
+pub use labels::{OfSubmission, Standing};
 pub use limits::LimitsState;
 pub use reconciles::QueueMetrics;
-pub use submissions::FailedAttempt;
+pub use submissions::{FailedAttempt, OTHERS};
 pub use watches::WatchMetrics;
 
 use super::REVISION;

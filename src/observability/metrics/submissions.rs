@@ -9,14 +9,14 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
-use super::labels::{OfFailure, OfTeam, OfTrack, Reason, Standing, State};
+use super::labels::{OfFailure, OfSubmission, OfTeam, OfTrack, Reason, Standing, State};
 use super::leader::LeaderGauge;
 use super::{Metrics, whole, zero};
 
 /// Teams of a Leaderboard that have a sample of their own: a series for each of thousands would burden Prometheus.
 const MAX_TEAMS: usize = 50;
-/// The team of all others.
-const OTHER_TEAMS: &str = "other";
+/// The team of all others, and the submission of all others.
+pub const OTHERS: &str = "other";
 
 #[derive(Debug)]
 pub(super) struct Submissions {
@@ -27,6 +27,7 @@ pub(super) struct Submissions {
     failures: Family<OfFailure, Counter>,
     gpu: Family<OfTrack, Counter>,
     team_gpu: Family<OfTeam, Counter>,
+    live_gpu: Family<OfSubmission, Gauge>,
     /// Those with a sample of their own, by Leaderboard.
     teams: Mutex<BTreeMap<String, BTreeSet<String>>>,
 }
@@ -65,6 +66,11 @@ impl Submissions {
                 "team_gpu_seconds",
                 "GPUs times seconds as in `leaderboard_gpu_seconds_total`, by Leaderboard and team, as `status.gpuUse` names it: the first 50 teams of a Leaderboard, all others as `other`",
             ),
+            live_gpu: zero(
+                r,
+                "submission_gpu_seconds",
+                "GPUs times seconds that a submission has used so far, over all its Jobs, while it holds GPUs; of a Leaderboard the first 500, all others together as `other`",
+            ),
             teams: Mutex::default(),
         }
     }
@@ -78,7 +84,7 @@ impl Submissions {
             known.insert(team.clone());
             team
         } else {
-            OTHER_TEAMS.to_owned()
+            OTHERS.to_owned()
         }
     }
 
@@ -87,6 +93,7 @@ impl Submissions {
         self.reasons.clear();
         self.observed.clear();
         self.repeating_teams.clear();
+        self.live_gpu.clear();
     }
 }
 
@@ -142,6 +149,16 @@ impl Metrics {
         }
         let of = OfTrack { leaderboard, track };
         self.submissions.gpu.get_or_create(&of).inc_by(seconds);
+    }
+
+    /// So much has a submission used that holds GPUs at present.
+    pub fn set_live_gpu_use(&self, of: &OfSubmission, seconds: i64) {
+        self.submissions.live_gpu.get_or_create(of).set(seconds);
+    }
+
+    /// It holds none any more: a series for each submission of a season would burden Prometheus.
+    pub fn forget_live_gpu_use(&self, of: &OfSubmission) {
+        self.submissions.live_gpu.remove(of);
     }
 
     /// The failure of an attempt is stored.

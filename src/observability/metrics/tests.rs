@@ -23,6 +23,7 @@ fn all(program: Program) -> Metrics {
     metrics.set_oldest_message("https://q/1", Some(1_800_000_000_500));
     metrics.set_repeating_teams(1);
     metrics.gpus_used("ns/board".into(), "sensors".into(), Some("7"), 400);
+    metrics.set_live_gpu_use(&live(), 240);
     metrics.attempt_failed(FailedAttempt {
         leaderboard: "ns/board".into(),
         class: "Participant",
@@ -51,6 +52,14 @@ const FAILED: Standing = Standing {
     reason: "AgentCrashed",
     class: "Participant",
 };
+
+/// A submission that holds GPUs.
+fn live() -> OfSubmission {
+    OfSubmission {
+        leaderboard: "ns/board".into(),
+        submission: "submission-1".into(),
+    }
+}
 
 /// A Leaderboard with everything that has a limit.
 fn limits() -> LimitsState {
@@ -84,6 +93,7 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_teams_with_repeated_infrastructure_failures 1",
         "leaderboard_gpu_seconds_total{leaderboard=\"ns/board\",track=\"sensors\"} 400",
         "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"7\"} 400",
+        "leaderboard_submission_gpu_seconds{leaderboard=\"ns/board\",submission=\"submission-1\"} 240",
         "leaderboard_submission_failures_total{leaderboard=\"ns/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"} 1",
         "leaderboard_ready{leaderboard=\"ns/board\"} 1",
         "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9.0",
@@ -246,6 +256,14 @@ fn what_nobody_stands_for_and_an_empty_queue_have_no_samples() {
         !text.contains("_by_reason{") && !text.contains("_oldest_message_timestamp_seconds{"),
         "{text}"
     );
+}
+
+#[test]
+fn a_submission_that_holds_no_gpu_any_more_has_no_sample() {
+    let metrics = all(Program::Controller);
+    metrics.forget_live_gpu_use(&live());
+    let text = metrics.text().unwrap();
+    assert!(!text.contains("submission=\""), "{text}");
 }
 
 #[test]

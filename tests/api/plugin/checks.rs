@@ -2,9 +2,11 @@
 
 use std::process::Stdio;
 
-use kube::ResourceExt;
-use kube::api::{DynamicObject, ListParams};
+use k8s_openapi::api::apps::v1::DaemonSet;
+use k8s_openapi::api::core::v1::Pod;
+use kube::api::{DynamicObject, ListParams, PostParams};
 use kube::runtime::wait::await_condition;
+use kube::{Api, ResourceExt};
 use serde_json::{Value, json};
 use tokio::io::AsyncReadExt;
 use tokio::process::Command;
@@ -109,6 +111,61 @@ async fn a_check_is_created_followed_printed_and_deleted() {
         one.is_none()
     });
     timeout(LIMIT, Box::pin(gone)).await.expect("it is deleted").unwrap();
+}
+
+/// The original's FluentD, and its Pod on a node.
+async fn fluentd(terminal: &Terminal, node: &str) {
+    let (client, namespace) = (&terminal.client, &terminal.namespace);
+    let container =
+        json!({"name": "fluentd", "image": "fluent/fluentd-kubernetes-daemonset:v1.16.1-debian-cloudwatch-1.2"});
+    let labels = json!({"k8s-app": "fluentd"});
+    let set = json!({
+        "metadata": {"name": "fluentd"},
+        "spec": {"selector": {"matchLabels": labels},
+                 "template": {"metadata": {"labels": labels}, "spec": {"containers": [container]}}},
+    });
+    let sets: Api<DaemonSet> = Api::namespaced(client.clone(), namespace);
+    let set: DaemonSet = serde_json::from_value(set).unwrap();
+    let set = sets.create(&PostParams::default(), &set).await.unwrap();
+    let owner = json!({"apiVersion": "apps/v1", "kind": "DaemonSet", "name": "fluentd", "uid": set.uid()});
+    let pod = json!({
+        "metadata": {"name": "fluentd-1", "ownerReferences": [owner]},
+        "spec": {"nodeName": node, "containers": [container], "automountServiceAccountToken": false},
+    });
+    let pods: Api<Pod> = Api::namespaced(client.clone(), namespace);
+    pods.create(&PostParams::default(), &serde_json::from_value(pod).unwrap())
+        .await
+        .unwrap();
+}
+
+#[tokio::test]
+async fn what_collects_the_lines_on_the_node_of_the_check_too_is_noted() {
+    let terminal = Terminal::new().await;
+    let spec = json!({"check": {"image": "host/baseline:1"}, "logGroup": {"name": "group"}});
+    terminal.leaderboard(&spec).await;
+    fluentd(&terminal, "node-a").await;
+    let name = format!("FluentD (DaemonSet {}/fluentd)", terminal.namespace);
+    for (node, expected) in [
+        ("node-a", [format!("! Log collectors {name},"), "on node-a".to_owned()]),
+        (
+            "node-b",
+            ["✔ Log collectors none on node-b; elsewhere".to_owned(), name.clone()],
+        ),
+    ] {
+        let mut command = check(&terminal, &[]);
+        let status = ended("Finished", &json!({"nodeName": node}));
+        let ((code, out, err), object) = tokio::join!(output(&mut command), play(&terminal, &status));
+        assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
+        let words = out.split_whitespace().collect::<Vec<_>>().join(" ");
+        for part in expected {
+            assert!(words.contains(&part), "{part}\n\n{out}");
+        }
+        let name = object.name_any();
+        let gone = await_condition(terminal.api(Kind::Submission), &name, |one: Option<&DynamicObject>| {
+            one.is_none()
+        });
+        timeout(LIMIT, Box::pin(gone)).await.expect("it is deleted").unwrap();
+    }
 }
 
 #[tokio::test]

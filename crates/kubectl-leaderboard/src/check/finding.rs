@@ -19,6 +19,7 @@ pub enum Part {
     Route,
     Table,
     Logs,
+    Collectors,
 }
 
 impl Part {
@@ -40,6 +41,7 @@ impl Part {
             Self::Route => "Route",
             Self::Table => "Table",
             Self::Logs => "CloudWatch",
+            Self::Collectors => "Log collectors",
         }
     }
 }

@@ -1,8 +1,9 @@
 //! `check`: what one route with one pair shows of every part of a Leaderboard.
 //!
 //! `parts` turns the objects into findings (`finding`), `table` prints them, `plan` makes the Submission, `give_up` decides when waiting is
-//! over, `readers` asks who else reads the queue. All but the program that `readers` starts is pure.
+//! over, `readers` asks who else reads the queue, `collectors` who else stores the lines. All but what these two ask is pure.
 
+mod collectors;
 mod finding;
 mod give_up;
 mod parts;
@@ -10,6 +11,9 @@ mod plan;
 mod readers;
 mod table;
 
+#[cfg(test)]
+pub use collectors::Collector;
+pub use collectors::{Collectors, ask as ask_for_collectors};
 #[cfg(test)]
 pub use finding::{Mark, Part};
 pub use give_up::Patience;

@@ -6,6 +6,7 @@ use leaderboard_api::conditions;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, State, Submission, SubmissionStatus, reasons};
 
+use super::collectors::Collectors;
 use super::finding::{Finding, Mark, Part, finding_of};
 use super::readers::Readers;
 use crate::why;
@@ -25,6 +26,7 @@ pub struct Seen<'a> {
     /// Why it was given up, if it was.
     pub given_up: Option<&'a str>,
     pub readers: &'a Readers,
+    pub collectors: &'a Collectors,
 }
 
 /// What broke: the part, what was found, and the next step.
@@ -64,6 +66,7 @@ pub fn findings(seen: Seen<'_>) -> Vec<Finding> {
         all.push(table(status));
     }
     all.extend(logs(seen.leaderboard, status));
+    all.extend(seen.collectors.finding(seen.leaderboard));
     for fault in faults {
         if let Some(finding) = all.iter_mut().find(|finding| finding.part == fault.part) {
             *finding = Finding {

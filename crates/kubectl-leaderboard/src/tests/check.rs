@@ -3,9 +3,15 @@
 use serde_json::{Value, json};
 
 use super::{assert_width, condition, now, plan_with, with};
-use crate::check::{Mark, Outcome, Part, Patience, Readers, Seen, findings, lines};
+use crate::check::{Collector, Collectors, Mark, Outcome, Part, Patience, Readers, Seen, findings, lines};
 use crate::text::WIDTH;
 use leaderboard_api::{Leaderboard, State, Submission};
+
+/// Nothing else stores the lines.
+const NOBODY: Collectors = Collectors::Known {
+    found: Vec::new(),
+    node: None,
+};
 
 /// A Leaderboard of EvalAI with a queue, a table and a log group, that is Ready.
 fn leaderboard(conditions: &Value) -> Leaderboard {
@@ -116,6 +122,7 @@ pub(super) fn table(
         submission: Some(&submission),
         given_up,
         readers,
+        collectors: &NOBODY,
     });
     let state = submission
         .status
@@ -142,6 +149,7 @@ const PASSED: &str = "\
 ✔ Route          1/1 done, driving score 98.00
 ✔ Table          would take a row; a check writes none
 ✔ CloudWatch     takes the lines, /carla: check-carla-20-x7k2p/…
+✔ Log collectors no DaemonSet collects the lines of containers
 
 The check passed.";
 
@@ -207,6 +215,7 @@ fn a_fault_marks_its_part_and_leaves_open_what_was_not_reached() {
 – Route          not reached
 ✔ Table          would take a row; a check writes none
 – CloudWatch     not reached
+✔ Log collectors no DaemonSet collects the lines of containers
 
 The check failed: 1 part is broken (✘). Parts that were not reached may be broken, too.";
     assert!(text.ends_with(end), "{text}");
@@ -287,6 +296,7 @@ fn every_failure_has_its_part() {
             submission: Some(&submission),
             given_up: None,
             readers: &Readers::Nobody,
+            collectors: &NOBODY,
         });
         let broken: Vec<Part> = found
             .iter()
@@ -394,4 +404,88 @@ fn only_what_a_person_has_to_change_is_given_up_after_a_minute() {
         assert_eq!(patience.given_up(later(seconds - 1)), None, "{reason:?}");
         assert!(patience.given_up(later(seconds)).is_some(), "{reason:?}");
     }
+}
+
+/// The original's FluentD with the log group of its variables, or none of them.
+fn fluentd(group: &str, is_on_node: Option<bool>) -> Collector {
+    let set = json!({
+        "metadata": {"name": "fluentd", "namespace": "kube-system", "uid": "u1"},
+        "spec": {"selector": {}, "template": {"spec": {
+            "containers": [{"name": "fluentd", "image": "fluent/fluentd-kubernetes-daemonset:v1.16.1-debian-cloudwatch-1.2",
+                            "env": [{"name": "LOG_GROUP_NAME", "value": group}]}],
+            "volumes": [{"name": "fluentd-config", "configMap": {"name": "fluentd-config"}}],
+        }}},
+    });
+    let set = serde_json::from_value(set).unwrap();
+    let of = leaderboard_api::log_collectors::find(&[set]).remove(0);
+    Collector { of, is_on_node }
+}
+
+/// The lines about those who collect logs, and whether the check passed.
+fn of_collectors(collectors: &Collectors, change: impl Fn(&mut Leaderboard)) -> (String, bool) {
+    let mut board = good_leaderboard();
+    change(&mut board);
+    let submission = check(&passed());
+    let mut found = findings(Seen {
+        leaderboard: &board,
+        submission: Some(&submission),
+        given_up: None,
+        readers: &Readers::Nobody,
+        collectors,
+    });
+    let outcome = Outcome::of(&found, true);
+    found.retain(|finding| finding.part == Part::Collectors);
+    (lines(&found, outcome, WIDTH).join("\n"), outcome.has_passed)
+}
+
+#[test]
+fn what_else_stores_the_lines_is_a_note_with_both_ways_out() {
+    let known = |group: &str, is_on_node| Collectors::Known {
+        found: vec![fluentd(group, is_on_node)],
+        node: Some("gpu-3".to_owned()),
+    };
+    let (text, has_passed) = of_collectors(&known("/carla", Some(true)), |_| {});
+    let expected = "\
+! Log collectors FluentD (DaemonSet kube-system/fluentd), on gpu-3, has the log group /carla, too:
+                 each line is stored twice
+                 → Leave the namespace out of what it reads and restart it, or remove logGroup from
+                 the Leaderboard (docs/migrate.md, Logs twice):
+                   kubectl -n kube-system edit configmap fluentd-config # exclude_path [\"/var/log/containers/*_carla_*.log\"]
+                   kubectl -n kube-system rollout restart daemonset fluentd
+                   kubectl -n carla patch leaderboard carla-20 --type merge --patch '{\"spec\":{\"logGroup\":null}}'";
+    assert!(text.starts_with(expected), "{text}");
+    assert!(has_passed && text.ends_with("with 1 note (!)."), "{text}");
+    let cases = [
+        (
+            known("/other", Some(true)),
+            "! Log collectors FluentD",
+            "each line may be stored twice",
+        ),
+        (
+            known("/other", None),
+            "! Log collectors FluentD",
+            "may run on the nodes of the Pods",
+        ),
+        (
+            known("/carla", Some(false)),
+            "✔ Log collectors none on gpu-3; elsewhere FluentD",
+            "",
+        ),
+        (NOBODY, "✔ Log collectors no DaemonSet", ""),
+        (
+            Collectors::Unknown("missing right: daemonsets.apps is forbidden".to_owned()),
+            "– Log collectors not known: missing right: daemonsets.apps is forbidden",
+            "kubectl get daemonsets --all-namespaces --output wide",
+        ),
+    ];
+    for (collectors, start, part) in cases {
+        let (text, has_passed) = of_collectors(&collectors, |_| {});
+        let words = text.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(
+            text.starts_with(start) && words.contains(part) && has_passed,
+            "{part}: {text}"
+        );
+    }
+    let (text, _) = of_collectors(&known("/carla", Some(true)), |board| board.spec.log_group = None);
+    assert!(!text.contains("Log collectors"), "{text}");
 }
