@@ -12,6 +12,7 @@ mod print;
 mod questions;
 mod rows;
 #[cfg(test)]
+#[path = "tests/samples.rs"]
 mod samples;
 mod table;
 mod taint;

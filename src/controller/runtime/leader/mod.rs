@@ -12,11 +12,7 @@ pub mod fence;
 pub mod record;
 
 #[cfg(test)]
-pub(crate) mod fake_server;
-#[cfg(test)]
-mod simulation;
-#[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::time::Duration;
 

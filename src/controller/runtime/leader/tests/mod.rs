@@ -1,5 +1,8 @@
 //! Whole elections on tokio's paused clock against one Lease on a mock of the API server, with faults.
 
+pub(crate) mod fake_server;
+mod simulation;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -8,9 +11,9 @@ use serde_json::json;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
-use super::fake_server::{FakeServer, Fault};
 use super::*;
 use crate::observability::shutdown::Stop;
+use fake_server::{FakeServer, Fault};
 
 /// Longer than anything an election may take.
 const LIMIT: Duration = Duration::from_mins(5);
