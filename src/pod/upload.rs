@@ -1,7 +1,7 @@
 //! When which file is stored: the rules, and the memory of what is stored already.
 //!
 //! `decide_upload` is pure. [`send::Uploader`] carries it out; `logcopy` calls that each round, `workspace` fills the memory
-//! with what it restored. [`quota`] says how much may be stored and sent. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
+//! with what it restored. [`quota`] decides how much may be stored and sent. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
 //! logcopy does not send everything again.
 
 pub mod complaints;

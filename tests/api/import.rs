@@ -56,7 +56,7 @@ fn texts(output: &Output) -> (String, String) {
     (text(&output.stdout), text(&output.stderr))
 }
 
-/// What kubectl says of a stream of manifests.
+/// What kubectl answers to a stream of manifests.
 async fn dry_run(manifests: &str) -> (bool, String) {
     let mut command = server().await.kubectl();
     command.args([

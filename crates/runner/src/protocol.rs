@@ -140,7 +140,7 @@ impl fmt::Display for Member {
     }
 }
 
-/// What a member's file says. The number is the round: the crashes of that side before it.
+/// What a member's file means. The number is the round: the crashes of that side before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mark {
     /// Simulator: the server answers. Agent: the command is about to start.

@@ -56,7 +56,7 @@ fn all() -> Vec<Submission> {
 }
 
 #[test]
-fn what_is_chosen_is_what_the_flags_say() {
+fn the_flags_choose_the_submissions() {
     for (arguments, expected) in [
         ("--all", &["crashed", "lost", "old"][..]),
         ("-l a=b", &["crashed", "lost", "old"]),

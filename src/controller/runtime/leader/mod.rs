@@ -165,7 +165,7 @@ pub fn start(client: kube::Client, settings: Settings, telemetry: &Observability
         is_drained,
     };
     let elector = elector::Elector::new(client, settings, outlets, telemetry);
-    // Its orderly end says that the Lease is lost or released.
+    // Its orderly end means that the Lease is lost or released.
     let task = telemetry.tasks.may_end("lease", elector.run(released));
     Leader {
         name,

@@ -317,7 +317,7 @@ impl Sub {
         self.write_failed(why, RETRY_END, now);
     }
 
-    /// Its Leaderboard has changed: an end that waits, or was refused, is to fit what it says now. What that changes may be what it
+    /// Its Leaderboard has changed: an end that waits, or was refused, is to fit what it has now. What that changes may be what it
     /// was refused for, so it is tried at once.
     pub fn fit_end(&mut self, target: &Target, now: &Now) {
         let Some(end) = &mut self.end else { return };

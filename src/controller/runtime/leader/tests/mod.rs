@@ -133,7 +133,7 @@ async fn a_standby_takes_over_fifteen_seconds_after_the_last_sign_and_waits_for_
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_live_leader_is_left_alone_whatever_its_clock_says() {
+async fn a_live_leader_is_left_alone_whatever_its_clock_shows() {
     let server = FakeServer::default();
     server.with(|state| state.put(Some("alive"), 3, &json!({})));
     let candidate = Candidate::start(&server, someone());

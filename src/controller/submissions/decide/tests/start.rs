@@ -100,7 +100,7 @@ fn an_image_that_cannot_be_pulled_is_its_owners_failure() {
 }
 
 #[test]
-fn a_container_that_cannot_be_set_up_or_started_says_why() {
+fn a_container_that_cannot_be_set_up_or_started_shows_why() {
     let cases = [
         (
             "agent-1",
@@ -158,7 +158,7 @@ fn a_cause_that_is_fixed_is_forgotten() {
 }
 
 #[test]
-fn a_crashing_init_container_says_why_all_the_time() {
+fn a_crashing_init_container_shows_why_all_the_time() {
     let mut world = World::local().with_pod();
     let mut contents = ended("contents", 1, "", 3, 5);
     contents.last.as_mut().unwrap().why = Some("no space left".into());

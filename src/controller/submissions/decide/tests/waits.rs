@@ -94,7 +94,7 @@ fn a_wait_for_a_slot_is_no_stall_and_names_its_reason() {
 }
 
 #[test]
-fn a_wait_for_a_node_says_whether_one_is_on_its_way() {
+fn a_wait_for_a_node_shows_whether_one_is_on_its_way() {
     let coming = ScaleUp::Coming("pod triggered scale-up: [{gpu 0->1 (max: 2)}]".into());
     let refused = ScaleUp::Refused("pod didn't trigger scale-up: 1 max node group size reached".into());
     for (said, expected) in [
