@@ -212,7 +212,7 @@ async fn write_status(
     now: Timestamp,
 ) -> Result<Duration, CallError> {
     let uid = uid_of(leaderboard);
-    if state.awaits_write(&uid, number(&leaderboard.metadata.resource_version), now) {
+    if state.awaits_write(&uid, number(leaderboard.metadata.resource_version.as_deref()), now) {
         return Ok(SOONEST);
     }
     let old = leaderboard.status.clone().unwrap_or_default();
@@ -233,14 +233,11 @@ async fn write_status(
         return Ok(RESYNC);
     }
     let version = apply_status(client, leaderboard, &plan.status).await?;
-    state.change(&uid, |entry| entry.written = Some((now, number(&Some(version)))));
+    state.change(&uid, |entry| entry.written = Some((now, number(Some(&version)))));
     Ok(RESYNC)
 }
 
 /// Versions of one kind grow; the API promises that they can be compared as numbers.
-fn number(version: &Option<impl AsRef<str>>) -> u64 {
-    version
-        .as_ref()
-        .and_then(|version| version.as_ref().parse().ok())
-        .unwrap_or(0)
+fn number(version: Option<&str>) -> u64 {
+    version.and_then(|version| version.parse().ok()).unwrap_or(0)
 }
