@@ -14,7 +14,7 @@ use std::str::FromStr;
 use thiserror::Error;
 
 /// The sub-folder that only `logcopy` writes.
-pub const LOGCOPY_FOLDER: &str = "logcopy";
+const LOGCOPY_FOLDER: &str = "logcopy";
 
 /// In an agent's sub-folder: the last whole checkpoint, kept by the agent's runner. No message; it is the one file there that
 /// is not empty.

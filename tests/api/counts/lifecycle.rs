@@ -96,7 +96,7 @@ impl Scenario {
             controller.reconciles(),
             world.s3.counts().requests,
             world.evalai_requests(),
-            world.table.requests(),
+            world.table.counts().requests,
         );
         if has_submission {
             world.live(&controller).await;
@@ -110,7 +110,7 @@ impl Scenario {
         let reconciles = controller.reconciles() - before.1;
         let s3_requests = world.s3.counts().requests - before.2;
         let evalai_requests = world.evalai_requests() - before.3;
-        let table_requests = world.table.requests() - before.4;
+        let table_requests = world.table.counts().requests - before.4;
         let memory = controller.end().await;
         let mut cost = Cost {
             s3_requests,

@@ -21,7 +21,7 @@ use crate::call::{call, of};
 use crate::folders;
 
 /// The honest agent of the image.
-pub const HONEST: &str = "/usr/bin/challenge-agent";
+const HONEST: &str = "/usr/bin/challenge-agent";
 const TERMINATION_LOG: &str = "/dev/termination-log";
 const WORK: &str = "/tmp/agent";
 const LOG: &str = "/tmp/agent/leaderboard.log";
