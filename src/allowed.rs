@@ -1,7 +1,7 @@
 //! What Leaderboards may name where the operator acts with an AWS identity of its own: entries of Secrets Manager, and queues. Pure.
 //!
 //! Who may edit Leaderboards in one namespace could otherwise have any entry sent to a server of their own, and any queue emptied. The
-//! chart hands in what `leaderboards[]` of its values says; without it, as on a person's machine, everything is allowed. Asked by the
+//! chart hands in what `leaderboards[]` of its values has; without it, as on a person's machine, everything is allowed. Asked by the
 //! controller, which then reads no token and shows `NotAllowed`, and by the bridge, which then reads no queue.
 
 use std::collections::BTreeMap;
@@ -134,7 +134,7 @@ fn is_queue(pattern: &str, url: &str) -> bool {
     !url.contains(['?', '#']) && matches(pattern, name)
 }
 
-/// Whether a text is as the pattern says: `*` stands for any text, also none; all else for itself.
+/// Whether a text matches the pattern: `*` stands for any text, also none; all else for itself.
 fn matches(pattern: &str, text: &str) -> bool {
     let mut parts = pattern.split('*');
     let first = parts.next().unwrap_or_default();

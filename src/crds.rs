@@ -1,6 +1,6 @@
 //! The CustomResourceDefinitions, as they are installed and as they lie in `crds/`.
 //!
-//! Called by `leaderboard-operator crd` and by the tests. It owns what the derived schema does not say as an API server
+//! Called by `leaderboard-operator crd` and by the tests. It owns what the derived schema does not have as an API server
 //! wants it; the schema itself is in `api`. Pure.
 
 use k8s_openapi::apiextensions_apiserver::pkg::apis::apiextensions::v1::CustomResourceDefinition;
@@ -19,7 +19,7 @@ pub enum CrdError {
     Build {
         /// Kind of the definition.
         kind: &'static str,
-        /// What serde says.
+        /// What serde reports.
         source: serde_json::Error,
     },
     /// A definition that is not YAML; a mistake in `crates/api`.
@@ -27,7 +27,7 @@ pub enum CrdError {
     Print {
         /// Kind of the definition.
         kind: &'static str,
-        /// What the printer says.
+        /// What the printer reports.
         source: serde_saphyr::ser::Error,
     },
 }
@@ -111,7 +111,7 @@ fn without_rules(value: &mut Value) {
     }
 }
 
-/// Lists without a key are replaced as a whole by who applies them. The types say which ones have a key.
+/// Lists without a key are replaced as a whole by who applies them. The types show which ones have a key.
 fn whole_lists(value: &mut Value) {
     match value {
         Value::Array(list) => list.iter_mut().for_each(whole_lists),

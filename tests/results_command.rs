@@ -180,7 +180,7 @@ fn as_original_keeps_its_mistakes() {
 }
 
 #[test]
-fn scores_that_do_not_follow_are_told_or_refused() {
+fn scores_that_do_not_follow_are_reported_or_refused() {
     let folder = tempfile::tempdir().unwrap();
     let case = inputs("v2/case25");
     let told = |flags: &[&str]| stderr(&results("v2", folder.path(), flags, &case));

@@ -1,8 +1,8 @@
 //! A submission of 20 routes on 4 pairs as plain processes, killed in every part at every moment: the final score is always that
-//! of a run nobody touched. The programs are the real ones (runner, workspace, logcopy) and the stand-ins for simulator and
+//! of a run that nobody disturbed. The programs are the real ones (runner, workspace, logcopy) and the stand-ins for simulator and
 //! agent, the test plays the kubelet, and S3 is a stand-in.
 //!
-//! `LEADERBOARD_KILL_RUNS` says how many runs, `LEADERBOARD_TEST_SEED` repeats one that failed.
+//! `LEADERBOARD_KILL_RUNS` sets how many runs, `LEADERBOARD_TEST_SEED` repeats one that failed.
 
 #![allow(
     clippy::unwrap_used,
@@ -11,6 +11,8 @@
     reason = "clippy knows a test by its attribute; what tests call is a test too"
 )]
 
+#[path = "support/files.rs"]
+mod files;
 #[allow(dead_code, reason = "each test program uses its own part of it")]
 #[path = "support/ministack.rs"]
 mod ministack;

@@ -20,7 +20,7 @@ KUBERNETES = {
     "Toleration": {"effect", "operator", "tolerationSeconds"},
     "Condition": {"lastTransitionTime", "message", "observedGeneration", "reason", "status", "type"},
 }
-# What a field says that has only the text of its type.
+# The text of a field that has only the text of its type.
 FOREIGN = "Time is a wrapper around time.Time"
 INTRODUCTIONS = {
     "Leaderboard": (

@@ -33,7 +33,7 @@ def operations(services: list[str]) -> dict[str, list[str]]:
 
 
 def deploy(folder: str) -> dict[str, Any]:
-    """Makes the stacks, and says what is there then."""
+    """Makes the stacks, and prints what is there then."""
     formation = boto3.client("cloudformation")
     for name, parameters in STACKS.items():
         given = [{"ParameterKey": key, "ParameterValue": value} for key, value in parameters.items()]

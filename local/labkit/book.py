@@ -77,7 +77,7 @@ def stage(repository: Path, source: Path) -> int:
     pages = [name for name in others if name.endswith(".md") and f"]({name})" not in rest]
     lines = [f"- [{title(repository / name)}]({name})" for name in pages]
     head = "# Summary\n\n[leaderboard-operator](README.md)\n"
-    text = "\n".join([head + rest.rstrip(), "\n# Pages beside the files\n", *lines, ""])
+    text = "\n".join([head + rest.rstrip(), "\n# Pages outside docs\n", *lines, ""])
     (source / "SUMMARY.md").write_text(text)
     return len(ENTRY.findall(text))
 

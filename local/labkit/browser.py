@@ -178,7 +178,7 @@ def attached(one: Tab) -> Tab:
 
 
 def complaints(one: Tab) -> list[str]:
-    """What the browser has to say against the page: errors of scripts, and what the policy of its content forbids."""
+    """What the browser reports against the page: errors of scripts, and what the policy of its content forbids."""
     found = []
     for event in one.events:
         params = event.get("params", {})

@@ -1,4 +1,4 @@
-"""Owns the list of the lab's background processes: command line, environment, configuration and the probe that says "ready".
+"""Owns the list of the lab's background processes: command line, environment, configuration and the probe that reports "ready".
 
 Pure but for reading file contents into a digest; `cluster` starts them.
 """

@@ -52,7 +52,7 @@ def bar(what: str, spent: float, usual: float) -> str:
 
 
 def network_failure(output: str) -> str | None:
-    """The line of a registry client's output that says that the network failed, if there is one."""
+    """The line of a registry client's output that reports that the network failed, if there is one."""
     lines = [line.strip() for line in output.splitlines()]
     return next((line for line in reversed(lines) if any(word in line for word in NETWORK_WORDS)), None)
 

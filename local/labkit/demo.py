@@ -170,7 +170,7 @@ def words(text: str) -> str:
 
 
 def apply_leaderboard(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
-    """Step 8: the Leaderboard; waits until the controller says that it can serve."""
+    """Step 8: the Leaderboard; waits until the controller reports that it can serve."""
     step(8, f"the Leaderboard {LEADERBOARD} in the namespace {NAMESPACE}", "3 s")
     apply(settings, kube, "leaderboard.yaml", pinned)
     wanted = ["wait", "--for=condition=Ready", f"leaderboard/{LEADERBOARD}", f"--namespace={NAMESPACE}"]

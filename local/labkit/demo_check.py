@@ -14,7 +14,7 @@ CONDITIONS = ("Finished", "Archived", "Recorded", "Published")
 
 @dataclass(frozen=True)
 class Findings:
-    """What the four places say of one run."""
+    """What the four places show of one run."""
 
     # The Submission, as the API server has it.
     submission: dict[str, Any]

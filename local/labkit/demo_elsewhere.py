@@ -34,7 +34,7 @@ RUN_SECONDS = 180
 STEPS = 6
 PUSH_LOG = "push.log"
 SUBMITTED = re.compile(r"^submission (\d+) is submitted", re.MULTILINE)
-# What registries and engines say to a push -> what to do about it. {registry} is its host, {names} are the repositories.
+# What registries and engines answer to a push -> what to do about it. {registry} is its host, {names} are the repositories.
 REFUSALS = {
     "HTTP response to HTTPS client": "it speaks plain HTTP: list {registry} as insecure, for podman in /etc/containers/registries.conf, "
     "for docker as insecure-registries in /etc/docker/daemon.json",
@@ -153,7 +153,7 @@ def push_all(settings: Settings, registry: str) -> dict[str, str]:
 
 
 def advice(said: str, settings: Settings, registry: str) -> str:
-    """What to do about a push that failed; empty where its own words say all that is known."""
+    """What to do about a push that failed; empty where its own words show all that is known."""
     found = next((what for words, what in REFUSALS.items() if re.search(words, said, re.IGNORECASE)), "")
     path = registry.partition("/")[2]
     names = ", ".join(f"{path}/{spec.repository}".lstrip("/") for spec in specs(settings))
@@ -229,7 +229,7 @@ def submit_and_follow(kube: Kube, agent: str) -> str:
 
 
 def check(settings: Settings, kube: Kube, name: str) -> None:
-    """Raises with every difference from local/challenge/expected.json. What S3 and DynamoDB hold, conditions of the Submission say."""
+    """Raises with every difference from local/challenge/expected.json. What S3 and DynamoDB hold is in conditions of the Submission."""
     expected = json.loads((settings.local / "challenge" / "expected.json").read_text())
     submission = kube.json("kubectl", "get", "submission", name, f"--namespace={NAMESPACE}")
     argv = ["exec", f"--namespace={NAMESPACE}", "deployment/evalai", "--", "evalai-stand-in", "leaderboard"]

@@ -85,7 +85,7 @@ def selection(profile: str) -> dict[str, str]:
 
 
 def try_programs(settings: Settings, own: Engine, spec: ImageSpec) -> None:
-    """Runs the programs of the image in it: they say which build they are."""
+    """Runs the programs of the image in it: they print which build they are."""
     version = release.version(settings.repository)
     printed = {"leaderboard-operator": f"leaderboard-operator {version} ({REVISION})"}
     for item in enginecheck.programs(spec):

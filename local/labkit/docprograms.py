@@ -109,7 +109,7 @@ def printed(words: Sequence[str], folder: Path) -> str:
 
 
 def main(argv: Sequence[str]) -> int:
-    """`argv[0]` is the program's path: its name says which one it is."""
+    """`argv[0]` is the program's path: its name shows which one it is."""
     words = [Path(argv[0]).name, *argv[1:]]
     folder = Path(os.environ["DOCUMENTS_FOLDER"])
     note = {"place": os.environ["DOCUMENTS_PLACE"], "words": words, "code": None, "error": ""}

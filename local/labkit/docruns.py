@@ -128,7 +128,7 @@ def how(note: Note) -> str:
 
 
 def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) -> tuple[list[Note], list[str]]:
-    """Types each page into a shell of its own; gives what was started, and what the shells say against it."""
+    """Types each page into a shell of its own; gives what was started, and what the shells report against it."""
     faults: list[str] = []
     programs = folder / "programs"
     programs.mkdir()
@@ -232,7 +232,7 @@ def judged(notes: Sequence[Note]) -> Iterator[str]:
 
 
 def services(kube: Kube, notes: Sequence[Note]) -> Iterator[str]:
-    """Services that a line asks through the API server, which says the same of one without Pods and of one that is not there."""
+    """Services that a line asks through the API server, which answers the same for one without Pods and of one that is not there."""
     for note in notes:
         for namespace, name, port in SERVICE.findall(" ".join(note.words)):
             argv = ["get", "service", name, f"--namespace={namespace}", "--output=jsonpath={.spec.ports[*].port}"]

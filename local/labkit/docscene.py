@@ -104,7 +104,7 @@ def manifests(repository: Path, kube: Kube, found: Sequence[Block]) -> tuple[int
 
 
 def applied(repository: Path, kube: Kube, page: str, kind: str, text: str) -> str:
-    """What the server says against it; empty where nothing."""
+    """What the server answers against it; empty where nothing."""
     if kind == "other":
         return "a manifest of nothing that is known: give it a kind, or a reason in docscene.py"
     if kind == "values":

@@ -72,7 +72,7 @@ def read_layer(pushed: bytes) -> Layer:
 
 
 def faults(built: Built, base: Sequence[str], spec: ImageSpec) -> list[str]:
-    """Where the image differs from a base of these digests with the programs of `spec`, run as `spec` says."""
+    """Where the image differs from a base of these digests with the programs of `spec`, run as `spec` has it."""
     found = [*of_config(built.config, spec)]
     if [layer.digest for layer in built.layers[: len(base)]] != list(base):
         return [*found, "its first layers are not those of its base"]

@@ -59,7 +59,7 @@ def next_life(file: Path) -> int:
 
 
 def call(settings: Settings, method: str, path: str, body: Any = None, token: str | None = None) -> Any:
-    """A JSON request to the stand-in; raises with its answer if it says no."""
+    """A JSON request to the stand-in; raises with its answer if it refuses."""
     data = None if body is None else json.dumps(body).encode()
     return request(settings, method, path, data, "application/json", token)
 

@@ -90,7 +90,7 @@ class Reader:
         return [Failure(name, self._panics.get(name) or [self._output.get(name, [])]) for name in self._names]
 
     def is_whole(self) -> bool:
-        """Whether each test program that began has come to its end, and said which tests failed."""
+        """Whether each test program that began has come to its end, and reported which tests failed."""
         return self._running == 0 and bool(self._names)
 
 

@@ -28,7 +28,7 @@ TEMPLATE = SEPARATOR.join(FIELDS) + '{"\\n"}'
 
 @dataclass(frozen=True)
 class Seen:
-    """What one version of the object says."""
+    """What one version of the object shows."""
 
     state: str
     progress: str
@@ -52,7 +52,7 @@ class Seen:
         """For people, without what does not change at the end."""
         end = [name for name, truth in (("EvalAI", self.published), ("DynamoDB", self.recorded)) if truth == "True"]
         stored = f"stored in S3{''.join(f', {place}' for place in end)}" if self.state == "Finished" else ""
-        # While routes are driven the columns say it all.
+        # While routes are driven the columns show it all.
         note = stored or ("" if self.reason in ("Running", "Resumed") else self.message or self.reason)
         return f"{self.state or 'New':<10}{self.progress:<7}{self.score:<9}{note}".rstrip()
 

@@ -129,7 +129,7 @@ def architecture() -> str:
 
 
 def run_config(spec: ImageSpec) -> dict[str, object]:
-    """The part of the image's configuration that says how it is run; what is empty is left out."""
+    """The part of the image's configuration that defines how it is run; what is empty is left out."""
     default_path = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"}
     values: dict[str, object] = {
         "Env": [f"{key}={value}" for key, value in sorted((default_path | dict(spec.env)).items())],

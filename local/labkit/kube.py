@@ -37,7 +37,7 @@ class Kube:
         return [str(self.tools / argv[0]), *argv[1:]]
 
     def json(self, *argv: str) -> Any:
-        """What `kubectl get … ` says, as JSON."""
+        """What `kubectl get … ` prints, as JSON."""
         return json.loads(self.run(*argv, "--output=json"))
 
 

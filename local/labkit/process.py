@@ -43,7 +43,7 @@ def state(stat: str) -> str:
 
 
 def same(identity: Identity, stat: str, cmdline: bytes, boot: str) -> bool:
-    """Whether what /proc says of a pid is the process of `identity`, still running."""
+    """Whether what /proc shows of a pid is the process of `identity`, still running."""
     return (
         boot == identity.boot
         and state(stat) not in "ZX"
@@ -156,7 +156,7 @@ def ended(handle: int, patience: float) -> bool:
 
 
 def wait_until(probe: Callable[[], bool], patience: float, pause: float = 0.05) -> bool:
-    """Asks `probe` until it says yes, at most `patience` seconds; for what can't be watched."""
+    """Asks `probe` until it is true, at most `patience` seconds; for what can't be watched."""
     deadline = time.monotonic() + patience
     while True:
         if probe():
@@ -176,7 +176,7 @@ def write_whole(file: Path, text: str, mode: int = 0o600) -> None:
 
 
 def tail(log: Path, lines: int = 1) -> str:
-    """The last lines of a log that say anything, for an error message."""
+    """The last lines of a log that are not empty, for an error message."""
     try:
         with log.open("rb") as handle:
             handle.seek(max(0, log.stat().st_size - 8192))

@@ -106,7 +106,7 @@ def operator(repository: Path) -> str:
 
 
 def helps(plugin: str) -> Iterator[tuple[str, str]]:
-    """The commands whose help says what their exit codes mean, each with that text."""
+    """The commands whose help shows what their exit codes mean, each with that text."""
     for command, text in HELP.findall(plugin):
         if codes := CODES.search(text):
             yield command.strip(), f"Exit code {' '.join(codes[1].split())}"

@@ -20,7 +20,7 @@ def ensure(settings: Settings) -> Path:
     """Makes the virtual environment if it is not there, and returns its folder of programs."""
     requirements = settings.local / "requirements.txt"
     folder = home(settings)
-    # Scripts in it hold its name, so it can't be renamed: the mark says that it is whole.
+    # Scripts in it hold its name, so it can't be renamed: the mark shows that it is whole.
     mark = folder / ".complete"
     if not mark.exists():
         with lock(settings.cache / f"{folder.name}.lock", "the Python environment"):

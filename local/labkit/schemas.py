@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 REFERENCE = "#/definitions/"
-# The document says "string" of these, and the server takes numbers too.
+# The document has "string" for these, and the server takes numbers too.
 LENIENT = {
     "io.k8s.apimachinery.pkg.util.intstr.IntOrString": {"type": ["string", "integer"]},
     "io.k8s.apimachinery.pkg.api.resource.Quantity": {"type": ["string", "number"]},

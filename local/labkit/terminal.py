@@ -29,7 +29,7 @@ pre { display: inline-block; padding: 14px 18px; background: #0f1216; color: #e8
 
 
 def shown(argv: Sequence[str], env: Mapping[str, str], columns: int) -> str:
-    """What a command writes to a terminal of so many columns, with its colours. How it ends is its own affair: it says so there."""
+    """What a command writes to a terminal of so many columns, with its colours. How it ends is its own affair: it shows that there."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
     with subprocess.Popen(argv, env=dict(env), stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs):

@@ -314,7 +314,7 @@ def settle(summary: Summary, first: Outcome, again: Callable[[Sequence[str]], Ou
 
 
 def ignored_tests(plan: Plan, targets: Sequence[str], env: dict[str, str]) -> str:
-    """What the test program says of its ignored tests."""
+    """What the test program lists as its ignored tests."""
     argv = [*cargo_argv(targets), "--", "--ignored", "--list", "--format=terse"]
     whole = {**os.environ, **env}
     done = subprocess.run(argv, cwd=plan.settings.repository, env=whole, capture_output=True, text=True, check=False)

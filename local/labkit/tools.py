@@ -152,7 +152,7 @@ def build_one(settings: Settings, tool_set: ToolSet, name: str, label: str, held
 
 @contextmanager
 def lock(file: Path, what: str) -> Iterator[int]:
-    """Holds an exclusive lock; says so when another process holds it first. The system drops it with the last holder.
+    """Holds an exclusive lock; reports it when another process holds it first. The system drops it with the last holder.
 
     Gives the lock's descriptor, for a child that must hold it too.
     """

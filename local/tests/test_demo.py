@@ -15,7 +15,7 @@ EXPECTED: dict[str, Any] = json.loads((LOCAL / "challenge" / "expected.json").re
 
 
 def good() -> Findings:
-    """What the four places say after the standard run."""
+    """What the four places show after the standard run."""
     metrics = EXPECTED["metrics"]
     conditions = [
         {"type": name, "status": "True", "lastTransitionTime": "2026-11-20T10:00:31Z"} for name in demo_check.CONDITIONS

@@ -23,7 +23,7 @@ use leaderboard_api::{
 };
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
-pub const SWEEP_AGE_MS: i64 = 120_000;
+const SWEEP_AGE_MS: i64 = 120_000;
 
 /// Longest time one request to the API server may take.
 const CALL_LIMIT: Duration = Duration::from_secs(8);
@@ -159,7 +159,7 @@ pub enum IngestError {
 }
 
 /// Decides what an incoming submission means for the object of its name, read uncached.
-pub fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &Incoming) -> Ingest {
+fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &Incoming) -> Ingest {
     let Some(existing) = existing else {
         if was_run_before(&incoming.source) {
             return Ingest::NotNew;

@@ -57,7 +57,7 @@ enum VerifyName {
     Refuse,
 }
 
-/// What the exit code of `results` says.
+/// What the exit code of `results` means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: the four files are written. 2: the files or the arguments are refused. 1: \
     something can't be read or written. Unless it is 0, what had been in the folder is still there.";
 

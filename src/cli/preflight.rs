@@ -1,4 +1,4 @@
-//! Subcommand `preflight`: says what an installed operator lacks. `helm test` runs it as the controller's service account.
+//! Subcommand `preflight`: reports what an installed operator lacks. `helm test` runs it as the controller's service account.
 
 use std::env;
 use std::net::{IpAddr, SocketAddr};
@@ -16,7 +16,7 @@ use crate::kubernetes::Namespaces;
 use crate::observability::logging::Format;
 use leaderboard_api::client_errors;
 
-/// What the exit code says.
+/// What the exit code means.
 pub(super) const EXIT_CODES: &str =
     "Exit code 0: nothing is missing. 1: something is. 2: arguments or RUST_LOG are refused.";
 /// Between two looks.
@@ -129,7 +129,7 @@ mod tests {
     use crate::observability::shutdown::Stop;
 
     #[tokio::test]
-    async fn a_program_says_itself_what_it_lacks() {
+    async fn a_program_reports_itself_what_it_lacks() {
         let _ = rustls::crypto::ring::default_provider().install_default();
         let http = reqwest::Client::builder().no_proxy().build().unwrap();
         let (_sender, stop) = Stop::new();

@@ -28,10 +28,10 @@ use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 
-/// What the exit code of controller and bridge says.
+/// What the exit code of controller and bridge means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, which is the last line of its log. 2: arguments or \
     RUST_LOG are refused. 130: a second Ctrl-C.";
-/// What the exit code of a Pod's programs says.
+/// What the exit code of a Pod's programs means.
 pub(super) const POD_EXIT_CODES: &str =
     "Exit code 0: its work is done. 1: an error, which is the last line of its log. 2: the arguments are refused.";
 /// Environment variable with the log filter.

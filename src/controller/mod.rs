@@ -3,10 +3,6 @@
 //! The folders show the way of an event, and each imports only what stands after it: `runtime` (watches, Lease, queues) reconciles
 //! Leaderboards by `leaderboards` and Submissions by `submissions` (observe, decide, act); both ask `slots` whose turn it is.
 
-#[cfg(test)]
-mod cache_tests;
-#[cfg(test)]
-pub(crate) mod fixtures;
 pub mod gpu_claims;
 pub mod leaderboards;
 pub mod network_policy;
@@ -17,3 +13,8 @@ pub mod slots;
 pub mod stores;
 pub mod submissions;
 pub mod writes;
+
+#[cfg(test)]
+mod tests;
+#[cfg(test)]
+pub(crate) use tests::fixtures;

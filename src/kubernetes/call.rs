@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[tokio::test(start_paused = true)]
-    async fn a_failure_says_what_was_called_and_why() {
+    async fn a_failure_shows_what_was_called_and_why() {
         let refused = |code| async move {
             Err::<(), _>(kube::Error::Api(
                 Status::failure("No.", "Reason").with_code(code).boxed(),

@@ -28,7 +28,7 @@ pub use item::{Item, Malformed, Watchable};
 pub use namespaces::Namespaces;
 pub use store::{Index, Store, Tally};
 pub use uncached::spawn_uncached;
-pub use watch::{PAGE, Shape, Synced, Unreadable, Watch, spawn_watch};
+pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
 pub use write::{Writes, Written};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.

@@ -11,7 +11,7 @@ use crate::observability::Observability;
 use leaderboard_api::client_errors;
 
 /// Hands on what is there and what comes, until the process stops. `name` is of the task, and of the watch in `/livez`. It holds up no
-/// readiness: what is missing without it is for its reader to say.
+/// readiness: what is missing without it is for its reader to report.
 pub fn spawn_uncached<K: Watchable>(
     name: &'static str,
     apis: Vec<Api<Item<K>>>,

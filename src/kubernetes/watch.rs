@@ -25,7 +25,7 @@ use crate::observability::shutdown::Stop;
 use leaderboard_api::client_errors;
 
 /// Objects of one page of a list, each of up to 50 KB: a page is in memory as a whole while it is decoded.
-pub const PAGE: u32 = 100;
+pub(super) const PAGE: u32 = 100;
 
 /// A running watch. Clones are the same one.
 pub struct Watch<K: Watchable> {

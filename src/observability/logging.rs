@@ -14,7 +14,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 use super::json_lines::JsonLines;
 
 /// What is logged by default. The libraries' own warnings are repeated by us as sentences.
-pub const DEFAULT_FILTER: &str = "info,kube_client=warn,kube_runtime=error,aws_config=warn,aws_smithy_runtime=warn,hyper=warn,hyper_util=warn,tower=warn,rustls=warn";
+const DEFAULT_FILTER: &str = "info,kube_client=warn,kube_runtime=error,aws_config=warn,aws_smithy_runtime=warn,hyper=warn,hyper_util=warn,tower=warn,rustls=warn";
 
 /// The format of a line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]

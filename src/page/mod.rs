@@ -15,6 +15,7 @@ mod routes;
 mod rows;
 
 #[cfg(test)]
+#[path = "tests/samples.rs"]
 mod samples;
 
 use std::net::{Ipv4Addr, SocketAddr};

@@ -145,7 +145,7 @@ fn team(submission: &Submission) -> Option<String> {
     team.name.as_deref().or(team.id.as_deref()).map(name)
 }
 
-/// What the status says, or nothing before there is one.
+/// What the status shows, or nothing before there is one.
 fn with_status<T>(submission: &Submission, read: impl FnOnce(&SubmissionStatus) -> T) -> T {
     match &submission.status {
         Some(status) => read(status),

@@ -342,7 +342,7 @@ mod seen_on_a_volume {
     }
 
     #[test]
-    fn a_refused_checkpoint_says_why_and_spoils_the_run_when_its_agent_is_done() {
+    fn a_refused_checkpoint_shows_why_and_spoils_the_run_when_its_agent_is_done() {
         let mut volume = Volume::new();
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 1, 2));
         volume.round();

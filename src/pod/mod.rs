@@ -6,6 +6,7 @@
 
 pub mod daily;
 #[cfg(test)]
+#[path = "tests/fixtures.rs"]
 pub(crate) mod fixtures;
 pub mod gather;
 pub mod identity;

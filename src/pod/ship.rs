@@ -159,7 +159,7 @@ impl Shipper {
         }
     }
 
-    /// What a pass shows of the lines; nothing while CloudWatch does not answer, or nothing was printed.
+    /// What a round shows of the lines; nothing while CloudWatch does not answer, or nothing was printed.
     fn what_of(&self, sent: &Result<(), LogsError>) -> Option<Logs> {
         match sent {
             Err(error) if error.is_transient() => None,
@@ -232,7 +232,7 @@ impl Shipper {
         Ok(more)
     }
 
-    /// Says in the stream and in logcopy's own log that no more of it comes today.
+    /// Writes to the stream and to logcopy's own log that no more of it comes today.
     async fn end_for_today(&mut self, path: &str, stream: &str) -> Result<(), LogsError> {
         let text = format!(
             "logcopy: the daily limit of {} bytes of this stream is reached; it goes on tomorrow (UTC). {path} in S3 has \

@@ -1,6 +1,6 @@
 //! A folder whose content strangers write: opened without following anything, read within limits.
 //!
-//! Called by everything in the Pod that touches the `logs` volume. An agent can put links, pipes and millions of files into
+//! Called by everything in the Pod that reads or writes the `logs` volume. An agent can put links, pipes and millions of files into
 //! its folder; none of that may lead out of the volume, block a reader, or cost more than a bound.
 
 use std::collections::BTreeMap;

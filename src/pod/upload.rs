@@ -1,7 +1,7 @@
 //! When which file is stored: the rules, and the memory of what is stored already.
 //!
 //! `decide_upload` is pure. [`send::Uploader`] carries it out; `logcopy` calls that each round, `workspace` fills the memory
-//! with what it restored. [`quota`] says how much may be stored and sent. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
+//! with what it restored. [`quota`] decides how much may be stored and sent. Nothing here lists the bucket: what is stored is remembered next to the files, so that a restarted
 //! logcopy does not send everything again.
 
 pub mod complaints;
@@ -26,7 +26,7 @@ use super::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::MIN_PART;
 
 /// A changed file that is not otherwise due is stored this long after the last time.
-pub const AT_LEAST_EVERY: Duration = Duration::from_mins(1);
+const AT_LEAST_EVERY: Duration = Duration::from_mins(1);
 /// Growth of a large file that is worth the four requests of an append.
 const WORTH_APPENDING: u64 = 1 << 20;
 /// Bytes read at each end of a large file to check that it only grew.

@@ -1,4 +1,4 @@
-//! Says that something in a few folders may have changed, so that a round need not wait for its period.
+//! Reports that something in a few folders may have changed, so that a round need not wait for its period.
 //!
 //! Called by `logcopy`. It never reports what changed: who is woken reads everything again. Where inotify does not work (some sandboxed
 //! runtimes do not carry it between containers), the period is all there is.

@@ -1,7 +1,7 @@
 //! S3, seen as the folder of one run: every key is below the run's prefix.
 //!
 //! Called by the controller (report, owner, texts) and by the programs in the Pod (everything). Knows keys and bytes; what
-//! is stored when, and what the documents say, is for its callers.
+//! is stored when, and what the documents mean, is for its callers.
 
 mod error;
 mod keeping;
@@ -69,7 +69,7 @@ enum Before {
     Nothing,
     /// The object with this entity tag.
     Tagged(String),
-    /// It is not known, or this S3 knows no conditions.
+    /// It is not known, or this S3 has no conditions.
     Anything,
 }
 
@@ -175,7 +175,7 @@ impl Archive {
         while let Some(chunk) = output.body.try_next().await.map_err(|e| self.broken(OP, key, &e))? {
             tail.extend_from_slice(&chunk);
             if tail.len() as u64 > bytes {
-                // A stand-in that knows no ranges sends everything.
+                // A stand-in without ranges sends everything.
                 return Err(self.error(OP, key, Cause::TooLarge(bytes)));
             }
         }
@@ -309,7 +309,7 @@ impl Archive {
         Ok(())
     }
 
-    /// S3 says 403 for a missing object to whom may list one prefix only. The list of that prefix distinguishes the two.
+    /// S3 answers 403 for a missing object to whom may list one prefix only. The list of that prefix distinguishes the two.
     async fn is_unlisted(&self, key: &str) -> bool {
         let listing = self.list(key, 1).await;
         listing.is_ok_and(|listing| listing.objects.iter().all(|object| object.key != key))

@@ -14,7 +14,7 @@ use super::meter::Meter;
 use super::names::{Addresses, Given, Names};
 use leaderboard_api::names::OPERATOR;
 
-/// Where nothing says which region.
+/// Where nothing sets the region.
 pub const USUAL_REGION: &str = "us-east-1";
 /// Time an AWS call may take, with its retries.
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);

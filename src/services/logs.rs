@@ -12,7 +12,7 @@ use crate::services::fault::{self, Fault};
 use leaderboard_api::LogGroup;
 
 /// Events of one request.
-pub const MAX_EVENTS: usize = 10_000;
+const MAX_EVENTS: usize = 10_000;
 /// Bytes of one request, each event counted with its overhead.
 pub const MAX_BYTES: usize = 1 << 20;
 /// What each event costs beyond its text.

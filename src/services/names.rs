@@ -26,7 +26,7 @@ const MOST_KEPT: usize = 256;
 /// Addresses by name, in small letters.
 pub type Addresses = BTreeMap<String, Vec<IpAddr>>;
 
-/// What a look-up has found; an error says why there is nothing.
+/// What a look-up has found; an error shows why there is nothing.
 pub type Answer = Result<Vec<IpAddr>, String>;
 
 type LookUp = dyn Fn(String) -> BoxFuture<'static, std::io::Result<Vec<IpAddr>>> + Send + Sync;

@@ -94,7 +94,7 @@ async fn ask(scheme: &str, port: u16, addresses: &[&str]) -> String {
 }
 
 #[tokio::test]
-async fn a_pod_reaches_a_service_by_a_name_that_no_resolver_knows() {
+async fn a_pod_reaches_a_service_by_a_name_that_no_resolver_has() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
     let router = axum::Router::new().fallback(|| async { axum::http::StatusCode::IM_A_TEAPOT });
@@ -118,7 +118,7 @@ async fn a_name_that_was_not_given_is_asked_of_nobody() {
 }
 
 #[tokio::test]
-async fn the_certificate_is_asked_for_by_name_and_one_that_nobody_knows_is_refused() {
+async fn the_certificate_is_asked_for_by_name_and_an_unknown_one_is_refused() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
     let hello = tokio::spawn(async move {

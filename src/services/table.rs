@@ -40,7 +40,7 @@ const ENDS: [&str; 3] = ["FINISHED", "FAILED", "CANCELLED"];
 /// A row is written only over an older attempt, or over the same one before its end.
 const CONDITION: &str = "attribute_not_exists(#attempt) OR #attempt < :attempt \
      OR (#attempt = :attempt AND NOT (#status IN (:end0, :end1, :end2)))";
-/// What a cancelled submission's row says.
+/// What a cancelled submission's row shows.
 const CANCELLED: &str = ENDS[2];
 /// A cancel that EvalAI shows after it has refused a result is written over the end that the row had. Nothing leads back from it.
 const OR_CANCELLED: &str = " OR (#attempt = :attempt AND #status IN (:end0, :end1))";

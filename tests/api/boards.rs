@@ -1,5 +1,5 @@
-//! What a Leaderboard's status says while its places in AWS and its token are missing, silent or there, and what the
-//! controller's metrics say of the calls.
+//! What a Leaderboard's status shows while its places in AWS and its token are missing, silent or there, and what the
+//! controller's metrics show of the calls.
 
 use std::time::Duration;
 
@@ -110,7 +110,7 @@ impl World {
         Api::namespaced(server().await.client(), &self.namespace)
     }
 
-    /// Waits until the Leaderboard says so.
+    /// Waits until the Leaderboard shows this.
     async fn says(&self, status: &str, reason: &str) -> Condition {
         let api = self.boards().await;
         let found =
@@ -252,7 +252,7 @@ async fn a_bucket_that_is_away_for_a_moment_changes_nothing() {
     world.edit(1).await;
     let silent = "leaderboard_cloud_calls_total{service=\"s3\",op=\"ListObjectsV2\",outcome=\"unavailable\"}";
     world.counted(silent).await;
-    // The pass that has seen it is over when the status speaks of the edit.
+    // The reconcile that has seen it is over when the status speaks of the edit.
     let api = world.boards().await;
     let observed = |board: Option<&Leaderboard>| {
         board.is_some_and(|b| b.status.as_ref().and_then(|s| s.observed_generation) == b.metadata.generation)

@@ -33,6 +33,7 @@ use crate::support::{apiserver, ministack};
 
 /// Far longer than anything here takes, so that a busy machine fails no test.
 pub(super) const LIMIT: Duration = Duration::from_mins(2);
+/// Queues, metrics and readiness report no changes: they are asked this often.
 const POLL: Duration = Duration::from_millis(100);
 
 /// The AWS stand-in, shared by all tests; queues and tables have names of their own.

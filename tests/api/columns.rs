@@ -112,7 +112,7 @@ fn layout(lines: &[Vec<String>]) -> String {
 }
 
 #[tokio::test]
-async fn submissions_in_the_table() {
+async fn submissions_fill_their_columns() {
     let server = server().await;
     let (client, namespace) = (server.client(), server.namespace("columns").await);
     let api = Kind::Submission.api(&client, &namespace);
@@ -143,7 +143,7 @@ submission-42   local         sensors   Running   Resumed   12/20      ~41.20   
 }
 
 #[tokio::test]
-async fn leaderboards_in_the_table() {
+async fn leaderboards_fill_their_columns() {
     let server = server().await;
     let (client, namespace) = (server.client(), server.namespace("columns").await);
     let api = Kind::Leaderboard.api(&client, &namespace);

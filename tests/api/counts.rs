@@ -52,7 +52,7 @@ struct Table {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_submission_costs_what_the_table_says() {
+async fn a_submission_costs_what_the_table_expects() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(TABLE);
     if env::var_os(UPDATE).is_some() {
         return fs::write(path, text(&measured().await)).unwrap();

@@ -375,7 +375,7 @@ fn refused(status: Status, wanted: Outcome) -> Option<Ended> {
 }
 
 #[tokio::test]
-async fn the_table_of_ends() {
+async fn each_end_is_published_as_its_table_shows() {
     let mut world = World::new().await;
     let wanted = [Outcome::Finished, Outcome::Failed, Outcome::Cancelled].into_iter();
     let cases: Vec<_> = wanted

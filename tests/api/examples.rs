@@ -96,7 +96,7 @@ fn no_example_lets_pods_reach_more_than_single_addresses() {
 }
 
 #[test]
-fn examples_run_what_their_comments_say() {
+fn examples_run_what_their_comments_describe() {
     let read = |name: &str| std::fs::read_to_string(folder("examples").join(name)).unwrap();
     let leaderboard = |name: &str| -> Leaderboard { serde_saphyr::from_str(&read(name)).unwrap() };
     for (name, pairs, repetitions) in [

@@ -1,4 +1,4 @@
-//! Two controllers as processes, with submissions coming in: the leader ends, told to or killed, and the other one goes on. How long
+//! Two controllers as processes, with submissions coming in: the leader ends, stopped or killed, and the other one goes on. How long
 //! that takes is printed; that no two of them ever wrote in turns is asserted, from the API server's own log.
 #![cfg(test)]
 
@@ -24,6 +24,7 @@ use crate::support::apiserver::{Request, server};
 
 /// Between two submissions: there is always something to write.
 const PERIOD: Duration = Duration::from_millis(250);
+/// The audit log of the API server is read this often.
 const LOOK: Duration = Duration::from_millis(100);
 /// What a process does that does not lead, too.
 const OF_THE_PROCESS: [&str; 2] = ["leases", "selfsubjectaccessreviews"];
@@ -67,7 +68,7 @@ impl Replica {
         self.child = command.spawn().unwrap();
     }
 
-    /// Ends it; hands back when it was told to.
+    /// Ends it; hands back when it was asked to.
     async fn end(&mut self, end: End) -> Timestamp {
         let pid = Pid::from_raw(i32::try_from(self.child.id().expect("it runs")).unwrap());
         let at = Timestamp::now();

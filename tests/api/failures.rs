@@ -24,7 +24,7 @@ use super::bridge::{LIMIT, StandIn};
 use super::world::{HOST, NODE, PARTICIPANT, ROUTE, World, ago, running};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn routes_that_an_agent_prints_are_for_hosts_unless_they_say_otherwise() {
+async fn routes_that_an_agent_prints_are_for_hosts_unless_they_want_it_otherwise() {
     let world = World::new().await;
     world.leaderboard("closed", 1, "Hosts").await;
     world.leaderboard("open", 2, "Participants").await;
@@ -101,7 +101,7 @@ async fn failed(world: &World) -> (u64, String) {
     (pk, name)
 }
 
-/// A host re-runs an ended submission, and both objects say so.
+/// A host re-runs an ended submission, and both objects show it.
 async fn is_named_by_its_rerun(world: &World, old: u64, name: &str) {
     let (new, rerun) = world.rerun("lb", 1, old).await;
     let statuses = [old, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));

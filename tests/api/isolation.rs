@@ -23,7 +23,7 @@ use crate::support::apiserver::server;
 
 const NAME: &str = "carla";
 const POLICY: &str = "leaderboard-carla";
-/// Rights are known to the API server a moment after they were given.
+/// A right applies a moment after it was given, and the API server reports nothing then: it is asked this often.
 const POLL: Duration = Duration::from_millis(50);
 
 /// A namespace and a place in S3, before there is a Leaderboard or a controller.
@@ -113,7 +113,7 @@ impl World {
         self.until(&name, "its Job is made", |_: &Job| true).await
     }
 
-    /// Waits until the Leaderboard's condition `Isolated` says so.
+    /// Waits until the Leaderboard's condition `Isolated` shows it.
     async fn says(&self, status: &str, reason: &str) -> Condition {
         let holds = |board: &Leaderboard| isolated(board).is_some_and(|c| c.status == status && c.reason == reason);
         let board = self.until(NAME, reason, holds).await;
@@ -321,7 +321,7 @@ async fn operator_with_few_rights(world: &World, policies: &[&str]) -> Operator 
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_right_to_policies_no_job_is_made_and_both_objects_say_what_to_do() {
+async fn without_a_right_to_policies_no_job_is_made_and_both_objects_show_what_to_do() {
     let world = World::new().await;
     let operator = operator_with_few_rights(&world, &["get", "list", "watch"]).await;
     world.leaderboard(&json!({})).await;
@@ -359,7 +359,7 @@ async fn without_a_right_to_policies_no_job_is_made_and_both_objects_say_what_to
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_right_to_observe_policies_no_job_is_made_and_it_is_said() {
+async fn without_a_right_to_observe_policies_no_job_is_made_and_it_is_shown() {
     let world = World::new().await;
     let operator = operator_with_few_rights(&world, &["get", "create", "patch"]).await;
     world.leaderboard(&json!({})).await;

@@ -1,4 +1,4 @@
-//! The smallest valid objects, and JSON merge patches on them: a test says only what it is about.
+//! The smallest valid objects, and JSON merge patches on them: a test has only what it is about.
 
 use kube::api::{Api, PostParams};
 use kube::core::{ApiResource, DynamicObject};

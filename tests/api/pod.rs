@@ -42,6 +42,7 @@ use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
+use crate::support::files::until_there;
 use crate::support::ministack::{self, server};
 
 const LIMIT: u64 = 1 << 30;
@@ -147,6 +148,12 @@ impl Pod {
         file.exists(&self.path(STATUS_FOLDER))
     }
 
+    async fn until_has(&self, file: StatusFile) {
+        let path = file.path(&self.path(STATUS_FOLDER));
+        let there = tokio::time::timeout(PATIENCE, until_there(&path)).await;
+        there.unwrap_or_else(|_| panic!("no {}", path.display()));
+    }
+
     async fn stored(&self, key: &str) -> Option<Vec<u8>> {
         self.archive.get(key, LIMIT).await.unwrap().map(|object| object.bytes)
     }
@@ -186,7 +193,7 @@ impl Pod {
         Logcopy { end, task }
     }
 
-    /// Waits for a report that says so. S3 has nothing to wait on, so it is asked.
+    /// Waits for a report of which this holds.
     async fn reported(&self, what: impl Fn(&Report) -> bool) -> Report {
         let seen = until(|| async { self.report().await.filter(|report| what(report)) });
         seen.await
@@ -216,7 +223,7 @@ impl Logcopy {
     }
 }
 
-/// Asks until there is an answer.
+/// Asks until there is an answer. For what is in S3, which reports no changes.
 async fn until<T, F: Future<Output = Option<T>>>(ask: impl Fn() -> F) -> T {
     let asking = async {
         loop {
@@ -229,10 +236,6 @@ async fn until<T, F: Future<Output = Option<T>>>(ask: impl Fn() -> F) -> T {
     tokio::time::timeout(PATIENCE, asking)
         .await
         .expect("it never came to be")
-}
-
-async fn until_true(what: impl Fn() -> bool) {
-    until(|| std::future::ready(what().then_some(()))).await;
 }
 
 /// Two pairs of two routes each.

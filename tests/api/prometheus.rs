@@ -158,7 +158,7 @@ async fn live(world: &World, queue: &str) {
     world.until(&name, "every system has its end", is_everywhere).await;
 }
 
-/// The programs are up, and Prometheus has no complaint about what they say.
+/// The programs are up, and Prometheus has no complaint about what they expose.
 async fn check_targets(prometheus: &Prometheus, count: usize) {
     eventually("no target has an error", async || {
         let targets = prometheus.get("targets", &[]).await["activeTargets"].clone();

@@ -59,7 +59,7 @@ async fn a_queue_gives_messages_back_until_they_are_deleted() {
 }
 
 #[tokio::test]
-async fn a_dead_letter_says_why_and_from_where_it_came() {
+async fn a_dead_letter_shows_why_and_from_where_it_came() {
     let stand_in = StandIn::start().await;
     let (url, dead) = (stand_in.queue("q.fifo").await, stand_in.queue("dead.fifo").await);
     let send = stand_in.sqs().send_message().queue_url(&url).message_body("{}");

@@ -366,7 +366,7 @@ async fn ends_are_shown(season: &Season) {
     }
 }
 
-/// Each run goes on where it was, and its Submission says so.
+/// Each run goes on where it was, and its Submission shows it.
 async fn runs_are_resumed(season: &Season) {
     for name in [season.running.1.as_str(), LOCAL_RUNNING] {
         season.world.job(name, 0).await;

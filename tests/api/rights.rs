@@ -22,6 +22,7 @@ use super::world::World;
 use crate::support::apiserver::server;
 
 const CHART: &str = include_str!("../../charts/leaderboard-operator/templates/controller-rbac.yaml");
+/// A right applies a moment after it was given, and the API server reports nothing then: it is asked this often.
 const POLL: std::time::Duration = std::time::Duration::from_millis(50);
 const GROUP: &str = "rbac.authorization.k8s.io";
 

@@ -124,7 +124,7 @@ async fn measure(size: &Size) {
     let (cancelled, others) = pks.split_at(size.cancels);
     let times = world.cancel(cancelled, size.cancel_over).await;
     let mut undone = world.settle(size, cancelled).await;
-    let stopped = world.player.seen().told_to_stop;
+    let stopped = world.player.seen().asked_to_stop;
     let waits = cancelled
         .iter()
         .filter_map(|pk| Some(between(times[pk], *stopped.get(&name(*pk))?)));
@@ -143,7 +143,7 @@ async fn measure(size: &Size) {
         })
         .await;
     // A list may have shown a cancel that was being written over.
-    let stopped = world.player.seen().told_to_stop;
+    let stopped = world.player.seen().asked_to_stop;
     undone.retain(|pk| !stopped.contains_key(&name(*pk)));
     let rest: BTreeSet<String> = others.iter().chain(&undone).map(|pk| name(*pk)).collect();
     world
@@ -193,15 +193,15 @@ struct World {
     changes: std::pin::Pin<Box<dyn futures::Stream<Item = Submission> + Send>>,
 }
 
-/// What the Submissions' statuses have said.
+/// What the Submissions' statuses have shown.
 #[derive(Default)]
 struct Seen {
     states: BTreeMap<String, State>,
     terminal: BTreeMap<String, Timestamp>,
     published: BTreeSet<String>,
-    /// When each ended, as its status says.
+    /// When each ended, as its status shows.
     finished: BTreeMap<String, Timestamp>,
-    /// Nothing more is to be said of them to EvalAI.
+    /// Nothing more of them is to be sent to EvalAI.
     settled: BTreeSet<String>,
 }
 
@@ -318,7 +318,7 @@ impl World {
         }
     }
 
-    /// Cancels at random moments, and says when each was.
+    /// Cancels at random moments, and returns when each was.
     async fn cancel(&self, pks: &[u64], over: Duration) -> BTreeMap<u64, Timestamp> {
         let seed = fastrand::u64(..);
         println!("the moments of the cancels are of seed {seed}");
@@ -338,27 +338,20 @@ impl World {
 
     /// Waits until each cancelled submission is stopped, or EvalAI has forgotten that it was cancelled; gives the latter.
     async fn settle(&mut self, size: &Size, pks: &[u64]) -> Vec<u64> {
-        let end = Instant::now() + size.limit;
-        loop {
-            let stopped = self.player.seen().told_to_stop;
-            let state = self.evalai.state();
-            let (undone, open): (Vec<u64>, Vec<u64>) = pks
-                .iter()
-                .filter(|pk| !stopped.contains_key(&name(**pk)))
-                .partition(|pk| state.submissions[*pk].status != Stored::Cancelled);
-            if open.is_empty() {
-                return undone;
-            }
-            assert!(
-                Instant::now() < end,
-                "not asked to stop after {:?}: {open:?}",
-                size.limit
-            );
-            tokio::time::sleep(Duration::from_millis(200)).await;
-        }
+        let (mut undone, mut open) = (Vec::new(), Vec::new());
+        // A Pod that was asked to stop is noticed by the next request, and EvalAI gets some in every sweep.
+        let settled = self.evalai.wait_until(|state, _| {
+            let stopped = self.player.seen().asked_to_stop;
+            let left = pks.iter().filter(|pk| !stopped.contains_key(&name(**pk)));
+            (undone, open) = left.partition(|pk| state.submissions[*pk].status != Stored::Cancelled);
+            open.is_empty()
+        });
+        let in_time = tokio::time::timeout(size.limit, settled).await;
+        assert!(in_time.is_ok(), "not asked to stop after {:?}: {open:?}", size.limit);
+        undone
     }
 
-    /// Says which write it was that undid each cancel.
+    /// Prints which write it was that undid each cancel.
     fn explain(&self, undone: &[u64], times: &BTreeMap<u64, Timestamp>) {
         let log = self.evalai.requests();
         for pk in undone {

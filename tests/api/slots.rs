@@ -163,7 +163,7 @@ async fn a_check_starts_while_the_leaderboard_is_paused_and_others_wait() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_that_no_other_system_knows_of_is_deleted_at_once() {
+async fn one_that_no_other_system_has_is_deleted_at_once() {
     let world = World::new().await;
     let operator = world.operator().await;
     world.submit("first").await;

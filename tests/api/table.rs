@@ -344,7 +344,7 @@ async fn of_many_writers_at_once_the_end_of_the_last_attempt_wins() {
 }
 
 #[tokio::test]
-async fn a_table_that_cannot_be_used_says_what_to_do() {
+async fn a_table_that_cannot_be_used_is_shown_with_the_next_step() {
     let stand_in = StandIn::start().await;
     let missing = Table::describe(&stand_in.aws, &named(&stand_in, "nowhere"))
         .await

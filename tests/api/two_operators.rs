@@ -74,7 +74,7 @@ async fn of_two_operators_in_one_namespace_one_makes_the_jobs_and_the_other_take
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_another_installation_drives_is_not_touched_while_its_lease_is_held() {
+async fn what_another_installation_drives_is_left_alone_while_its_lease_is_held() {
     let world = World::new().await;
     world.leaderboard("theirs", 1, "Hosts").await;
     world.leaderboard("ours", 2, "Hosts").await;

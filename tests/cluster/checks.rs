@@ -114,7 +114,7 @@ async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
     .await;
 }
 
-/// A name, what of the Leaderboard is broken, the agent of its check, and what the check says.
+/// A name, what of the Leaderboard is broken, the agent of its check, and what the check reports.
 fn broken_parts(missing: &str) -> [(&'static str, Value, &'static str, &'static [&'static str]); 4] {
     let root = json!([{"name": "LEADERBOARD_ROOT", "value": "/nothing"}]);
     [

@@ -25,7 +25,7 @@ fn looked_for(pod: &Pod) -> Duration {
     took.next_back().expect("workspace has not ended").try_into().unwrap()
 }
 
-/// Whether the Leaderboard's condition `Isolated` says so.
+/// Whether the Leaderboard's condition `Isolated` shows it.
 fn says(status: &'static str, reason: &'static str) -> impl Fn(Option<&Leaderboard>) -> bool {
     move |found: Option<&Leaderboard>| {
         let status_of = found.and_then(|board| board.status.as_ref());

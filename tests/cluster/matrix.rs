@@ -1,5 +1,5 @@
 //! The matrix of what can happen to a submission: one line a case, with what was done, what everybody was to see of it, what
-//! they saw, and how long it took until `kubectl get submissions` said so.
+//! they saw, and how long it took until `kubectl get submissions` showed it.
 //!
 //! A case is opened before its cause and closed when its end is known; one that is neither closed nor filtered out is shown
 //! as failed. Each line is printed at once, and `make test` prints the table at its end. The cases are in the modules
@@ -101,7 +101,7 @@ impl Case {
         settled
     }
 
-    /// What EvalAI says at the end.
+    /// What EvalAI shows at the end.
     pub fn evalai(&mut self, status: Status) {
         self.also(&format!("EvalAI {}", status.as_str()));
     }
@@ -223,7 +223,7 @@ pub async fn together(width: usize, cases: Vec<LocalBoxFuture<'_, ()>>) {
     );
 }
 
-/// What a panic says.
+/// What a panic prints.
 fn message(panic: &(dyn Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
     let text = text.or_else(|| panic.downcast_ref::<String>().cloned());

@@ -63,7 +63,7 @@ async fn cancelled_after_a_list(scene: &Scene, evalai: &Evalai, phase: u64) {
     case.close();
 }
 
-/// True if EvalAI says `cancelled` at the end, or if a write of the operator was being worked on when the cancel came.
+/// True if EvalAI shows `cancelled` at the end, or if a write of the operator was being worked on when the cancel came.
 async fn cancelled_at_the_worst_moment(scene: &Scene, evalai: &Evalai, phase: u64) -> bool {
     let before = evalai.requests().last().map_or(0, |entry| entry.id);
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;

@@ -46,7 +46,7 @@ async fn an_api_server_out_of_reach_costs_nothing() {
     .await;
 }
 
-/// Bucket, table and queue of a Leaderboard that names their endpoints are there, whatever the operator's environment says.
+/// Bucket, table and queue of a Leaderboard that names their endpoints are there, whatever the operator's environment has.
 #[tokio::test]
 async fn the_endpoints_of_a_leaderboard_win_over_the_environment() {
     scenario("matrix-endpoints", async |scene: &Scene| {

@@ -297,7 +297,7 @@ async fn run(scene: &Scene, evalai: &Evalai, phase: u64, row: Row) {
         }
     }
     let ended = case.ends(scene, &name, LIMIT).await;
-    // Where two routes may be done as well as one or none, nothing is said of them.
+    // Where two routes may be done as well as one or none, nothing is shown of them.
     let progress = ended.status.and_then(|status| status.progress);
     if let Some(progress) = progress.filter(|_| row.expected.contains("routes;")) {
         case.also(&format!("{} routes", progress.text));

@@ -431,7 +431,7 @@ fn fake_node(label: &str) -> Node {
     serde_json::from_value(node).unwrap()
 }
 
-/// Says of a Pod what its kubelet would: all of it runs.
+/// Reports of a Pod what its kubelet would: all of it runs.
 async fn play_kubelet(scene: &Scene, pod: &Pod) {
     let spec = pod.spec.as_ref().unwrap();
     let now = jiff::Timestamp::now();

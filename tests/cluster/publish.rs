@@ -1,4 +1,4 @@
-//! EvalAI's message in, the score out: status, S3, DynamoDB and EvalAI's leaderboard say the same.
+//! EvalAI's message in, the score out: status, S3, DynamoDB and EvalAI's leaderboard show the same.
 
 use std::time::Duration;
 
@@ -23,7 +23,7 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
             state.seed.challenges[0].phases[0].is_partial_submission_evaluation_enabled = true;
         };
         evalai.handle.with_state(first_phase_shows_partials);
-        // A run that is over at once would be finished before its turn comes to say that it runs.
+        // A run that is over at once would be finished before its turn comes to report that it runs.
         let change = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]}});
         scene.evalai_leaderboard("lb", &evalai, change).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));

@@ -67,7 +67,7 @@ fn assert_layout(keys: &BTreeMap<String, i64>) {
             format!("simulator/console-{pair}.log"),
         ]);
     }
-    // The sidecar's own log is stored once it has something to say.
+    // The sidecar's own log is stored once it has something to log.
     let found: BTreeSet<String> = keys
         .keys()
         .filter(|key| *key != "logcopy/logcopy.log")

@@ -71,7 +71,7 @@ const LATE: [Kind; 5] = [
 enum Moment {
     /// So long after the kill before, or the start.
     After(Duration),
-    /// So long after the last agent has said that it is done: mostly before the results are stored.
+    /// So long after the last agent has reported that it is done: mostly before the results are stored.
     AllDone(Duration),
     /// Once S3 knows of so many routes.
     Stored(u32),
@@ -280,7 +280,7 @@ async fn until_all_done(status: PathBuf) {
     }
 }
 
-/// S3 has nothing to wait on, so it is asked.
+/// S3 reports no changes, so it is asked.
 async fn until_stored(archive: Archive, routes: u32) {
     while report(&archive).await.is_none_or(|report| report.done < routes) {
         tokio::time::sleep(ASK_EVERY).await;
@@ -292,7 +292,7 @@ fn number(variable: &str) -> Option<u64> {
     std::env::var(variable).ok().map(|text| text.parse().unwrap())
 }
 
-/// The results of a run that nobody touches, and how long it takes.
+/// The results of a run that nobody disturbs, and how long it takes.
 async fn undisturbed(bucket: &str, format: LeaderboardVersion, random: &mut Rng) -> (Results, Duration) {
     let began = Instant::now();
     let (results, _) = one(bucket, format, random, &[], &mut Tally::default()).await;

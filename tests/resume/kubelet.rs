@@ -14,6 +14,7 @@ use tokio::sync::mpsc;
 
 use super::process::{children, gone, kill_container, terminate};
 use super::submission::{PAIRS, Submission, make_volumes};
+use crate::files::until_there;
 
 /// A container of the Pod.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -40,7 +41,7 @@ pub fn members() -> impl Iterator<Item = Member> {
         .flat_map(|pair| [Side::Simulator, Side::Agent].map(|side| Member { side, pair }))
 }
 
-/// Whether all agents say that they are done.
+/// Whether all agents report that they are done.
 pub fn all_done(status: &Path) -> bool {
     let mut agents = members().filter(|member| member.side == Side::Agent);
     agents.all(|agent| StatusFile::Of(agent, Mark::Done).exists(status))
@@ -120,6 +121,10 @@ impl<'a> Kubelet<'a> {
 
     pub fn has(&self, file: StatusFile) -> bool {
         file.exists(&self.places().status())
+    }
+
+    pub async fn until_has(&self, file: StatusFile) {
+        until_there(&file.path(&self.places().status())).await;
     }
 
     pub fn start(&mut self, name: Name) {

@@ -4,7 +4,7 @@
 use std::fs::{self, File};
 use std::path::Path;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fastrand::Rng;
 use leaderboard_api::{LeaderboardVersion, RouteSlice};
@@ -12,6 +12,7 @@ use leaderboard_operator::pod::gather::results_plan;
 use leaderboard_operator::pod::report::Report;
 use leaderboard_operator::pod::run::STATUS_FOLDER;
 use serde_json::json;
+use tokio::time::timeout;
 
 use super::kubelet::Kubelet;
 use super::measure::{Sink, most_memory, serve};
@@ -115,19 +116,22 @@ fn put(logs: &Path, pair: usize, text: &str) {
     fs::rename(next, folder.join("agent_results.json")).unwrap();
 }
 
-/// Waits for a report that says so, while logcopy stays below its memory.
+/// Waits for a report that shows it, while logcopy stays below its memory.
 async fn reported(sink: &Sink, pid: u32, what: impl Fn(&Report) -> bool) -> Report {
-    let began = Instant::now();
-    loop {
-        let memory = most_memory(pid);
-        assert!(memory < MEMORY, "{} MiB", memory >> 20);
-        let report = Report::parse(&sink.report.lock().unwrap());
-        match report {
-            Ok(report) if what(&report) => return report,
-            report => assert!(began.elapsed() < LIMIT, "{report:?}"),
+    let mut reports = sink.report.subscribe();
+    let found = async {
+        loop {
+            let memory = most_memory(pid);
+            assert!(memory < MEMORY, "{} MiB", memory >> 20);
+            let report = Report::parse(&reports.borrow_and_update());
+            match report {
+                Ok(report) if what(&report) => return report,
+                _ => reports.changed().await.unwrap(),
+            }
         }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+    };
+    let found = timeout(LIMIT, found).await;
+    found.unwrap_or_else(|_| panic!("{:?}", Report::parse(&sink.report.borrow())))
 }
 
 fn two_routes(pair: usize) -> RouteSlice {

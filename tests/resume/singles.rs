@@ -82,14 +82,14 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
         members.map(move |member| StatusFile::Of(member, mark))
     };
     for file in of(Side::Simulator, Mark::Start(0)) {
-        until(|| kubelet.has(file)).await;
+        kubelet.until_has(file).await;
     }
     let simulators: Vec<Name> = members().filter(|m| m.side == Side::Simulator).map(Name::Of).collect();
     for name in &simulators {
         kubelet.signal(*name, Signal::SIGSTOP);
     }
     for file in of(Side::Agent, Mark::Crash(0)) {
-        until(|| kubelet.has(file)).await;
+        kubelet.until_has(file).await;
     }
     for name in &simulators {
         kubelet.signal(*name, Signal::SIGCONT);
@@ -105,17 +105,12 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
 /// have been final in it.
 async fn rounds_past(proxy: &Proxy, settled: Instant) {
     while Instant::now() < settled {
-        let known = proxy.requests();
-        until(|| proxy.requests() > known).await;
+        let known = proxy.counts().requests;
+        proxy.until(|counts| counts.requests > known).await;
     }
 }
 
-async fn until(what: impl Fn() -> bool) {
-    while !what() {
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
-}
-
+/// S3 reports no changes, so it is asked.
 async fn until_reported(submission: &Submission, done: u32) {
     while report(&submission.archive)
         .await
@@ -125,9 +120,9 @@ async fn until_reported(submission: &Submission, done: u32) {
     }
 }
 
-/// While S3 is away, SIGTERM ends logcopy when its time is over and not before, and it says what that means.
+/// While S3 is away, SIGTERM ends logcopy when its time is over and not before, and it logs what that means.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_last_flush_that_finds_no_s3_ends_in_time_and_says_so() {
+async fn a_last_flush_that_finds_no_s3_ends_in_time_and_logs_it() {
     let bucket = server().await.bucket().await;
     let proxy = server().await.proxy().await;
     let mut submission = Submission::on(&proxy.endpoint(), &bucket, LeaderboardVersion::V2, &mut Rng::new()).await;

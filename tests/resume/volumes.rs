@@ -1,5 +1,5 @@
 //! Volumes that take nothing: a full disk, and a log folder that is read-only. Each test runs again in a mount namespace of its own,
-//! so that nothing of it is seen outside; where the machine allows none, the test says so.
+//! so that nothing of it is seen outside; where the machine allows none, the test reports it.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;

@@ -30,6 +30,7 @@ const PROGRAMS: [&str; 3] = ["etcd", "kube-apiserver", "kubectl"];
 const HOW_TO_RUN: &str = "run these tests with `make test`, or set KUBEBUILDER_ASSETS to a folder that holds them";
 /// An idle machine needs 4 s.
 const START_LIMIT: Duration = Duration::from_mins(3);
+/// A starting API server reports nothing when it is ready: it is asked this often.
 const POLL: Duration = Duration::from_millis(50);
 /// A free port can be taken by somebody else before the server has it.
 const TRIES: usize = 3;
@@ -223,7 +224,7 @@ impl Attempt {
         Ok(())
     }
 
-    /// What a program that ended too early said last.
+    /// What a program that ended too early printed last.
     fn ended(&mut self) -> Option<String> {
         self.children.iter_mut().find_map(|(program, child)| {
             let status = child.try_wait().ok().flatten()?;

@@ -45,7 +45,7 @@ pub const USER_AGENT: &str = "leaderboard-tests";
 /// Marks the tests' namespaces, where no service account may write.
 pub const LABEL: &str = "leaderboard.carla.org/test";
 
-/// What the environment says about the cluster.
+/// What the environment has about the cluster.
 pub struct Lab {
     /// The machine's address, from Pods too.
     pub host: String,
@@ -120,7 +120,7 @@ pub async fn scenario(name: &str, body: impl AsyncFnOnce(&Scene)) {
     }
 }
 
-/// Says something at once, also in a test that passes.
+/// Prints something at once, also in a test that passes.
 pub fn say(line: &str) {
     _ = writeln!(std::io::stderr(), "{line}");
 }

@@ -26,7 +26,7 @@ pub fn free_ports<const N: usize>() -> io::Result<[u16; N]> {
     Ok(ports)
 }
 
-/// Writes what the API server reads at its start. The users have all rights, and their names for tokens; the rules say which of their
+/// Writes what the API server reads at its start. The users have all rights, and their names for tokens; the rules define which of their
 /// requests are logged.
 pub fn prepare(folder: &Path, users: impl IntoIterator<Item: AsRef<str>>, rules: &Value) -> Result<(), String> {
     let failed = |error: io::Error| format!("{} cannot be prepared: {error}", folder.display());

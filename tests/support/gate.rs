@@ -1,7 +1,7 @@
 //! A gate between the operator and a server that a test can shut: S3 or the API server is away, SQS takes no deletion, or
 //! DynamoDB gives no right to write.
 //!
-//! Bytes pass through it unread but for the search for a word. Of HTTP it knows one answer.
+//! Bytes pass through it unread but for the search for a word. Of HTTP it has one answer.
 
 use std::time::Duration;
 
@@ -18,13 +18,13 @@ enum Mode {
     Open,
     /// Connections are taken and nothing is answered.
     Shut,
-    /// Connections break on which the client says this word.
+    /// Connections break on which the client sends this word.
     Without(&'static str),
     /// Requests that hold this word are refused, as AWS refuses who has no right to them.
     Denied(&'static str),
 }
 
-/// What AWS says to who has no right.
+/// What AWS answers to who has no right.
 const NO_RIGHT: &str =
     r#"{"__type":"com.amazon.coral.service#AccessDeniedException","Message":"not authorized to perform this action"}"#;
 

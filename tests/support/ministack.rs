@@ -8,7 +8,7 @@ use std::fs::File;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use aws_config::timeout::TimeoutConfig;
@@ -22,6 +22,7 @@ use tokio::sync::{OnceCell, watch};
 const VARIABLE: &str = "LEADERBOARD_MINISTACK";
 /// It needs half a second on an idle machine.
 const START_LIMIT: Duration = Duration::from_mins(2);
+/// Another program, which reports nothing when it is ready: it is asked this often.
 const POLL: Duration = Duration::from_millis(50);
 /// A free port can be taken by somebody else before the stand-in has it.
 const TRIES: usize = 3;
@@ -157,13 +158,22 @@ async fn is_healthy(address: SocketAddr) -> bool {
     matches!(answer, Ok(Ok(answer)) if answer.starts_with(b"HTTP/1.1 200"))
 }
 
+/// What a proxy has seen.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Counts {
+    /// Bytes that clients have sent.
+    pub sent: u64,
+    /// Requests that clients have sent.
+    pub requests: u64,
+    /// Connections that were closed at once, since it was away.
+    pub refused: u64,
+}
+
 /// Forwards connections, unless it is away; counts what clients send.
 pub struct Proxy {
     address: SocketAddr,
     away: watch::Sender<bool>,
-    sent: Arc<AtomicU64>,
-    requests: Arc<AtomicU64>,
-    refused: Arc<AtomicU64>,
+    counts: Arc<watch::Sender<Counts>>,
     task: tokio::task::JoinHandle<()>,
 }
 
@@ -172,19 +182,18 @@ impl Proxy {
         let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let address = listener.local_addr().unwrap();
         let (away, is_away) = watch::channel(false);
-        let sent = Arc::new(AtomicU64::new(0));
-        let requests = Arc::new(AtomicU64::new(0));
-        let counters = (Arc::clone(&sent), Arc::clone(&requests));
-        let refused = Arc::new(AtomicU64::new(0));
-        let refusals = Arc::clone(&refused);
+        let counts = Arc::new(watch::Sender::new(Counts::default()));
+        let counting = Arc::clone(&counts);
         let task = tokio::spawn(async move {
             while let Ok((client, _)) = listener.accept().await {
-                let (mut away, counters) = (is_away.clone(), counters.clone());
-                refusals.fetch_add(u64::from(*away.borrow()), Ordering::Relaxed);
+                let (mut away, counts) = (is_away.clone(), Arc::clone(&counting));
+                if *away.borrow() {
+                    counts.send_modify(|counts| counts.refused += 1);
+                }
                 tokio::spawn(async move {
                     tokio::select! {
                         _ = away.wait_for(|away| *away) => {}
-                        () = forward(client, to, &counters) => {}
+                        () = forward(client, to, &counts) => {}
                     }
                 });
             }
@@ -192,9 +201,7 @@ impl Proxy {
         Self {
             address,
             away,
-            sent,
-            requests,
-            refused,
+            counts,
             task,
         }
     }
@@ -209,19 +216,14 @@ impl Proxy {
         self.away.send_replace(away);
     }
 
-    /// Bytes that clients have sent.
-    pub fn sent(&self) -> u64 {
-        self.sent.load(Ordering::Relaxed)
+    pub fn counts(&self) -> Counts {
+        *self.counts.borrow()
     }
 
-    /// Requests that clients have sent.
-    pub fn requests(&self) -> u64 {
-        self.requests.load(Ordering::Relaxed)
-    }
-
-    /// Connections that were closed at once, since it was away.
-    pub fn refused(&self) -> u64 {
-        self.refused.load(Ordering::Relaxed)
+    /// Waits until this holds of what it has seen, without a limit of its own.
+    pub async fn until(&self, holds: impl Fn(Counts) -> bool) {
+        let mut counts = self.counts.subscribe();
+        counts.wait_for(|counts| holds(*counts)).await.unwrap();
     }
 }
 
@@ -234,7 +236,7 @@ impl Drop for Proxy {
 /// Ends the first line of each request, and nothing that the tests store.
 const REQUEST: &[u8] = b" HTTP/1.1\r\n";
 
-async fn forward(mut client: TcpStream, to: SocketAddr, (bytes, requests): &(Arc<AtomicU64>, Arc<AtomicU64>)) {
+async fn forward(mut client: TcpStream, to: SocketAddr, counts: &watch::Sender<Counts>) {
     let Ok(mut server) = TcpStream::connect(to).await else {
         return;
     };
@@ -247,10 +249,13 @@ async fn forward(mut client: TcpStream, to: SocketAddr, (bytes, requests): &(Arc
             match from_client.read(&mut buffer).await {
                 Ok(0) | Err(_) => break,
                 Ok(len) => {
-                    bytes.fetch_add(len as u64, Ordering::Relaxed);
                     seen.extend(&buffer[..len]);
                     let lines = seen.windows(REQUEST.len()).filter(|window| *window == REQUEST);
-                    requests.fetch_add(lines.count() as u64, Ordering::Relaxed);
+                    let lines = lines.count() as u64;
+                    counts.send_modify(|counts| {
+                        counts.sent += len as u64;
+                        counts.requests += lines;
+                    });
                     // The beginning of a line's end that the next read may complete.
                     seen.drain(..seen.len().saturating_sub(REQUEST.len() - 1));
                     if to_server.write_all(&buffer[..len]).await.is_err() {

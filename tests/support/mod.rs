@@ -2,6 +2,7 @@
 //! serves the whole test program and ends with it, however that ends.
 
 pub mod apiserver;
+pub mod files;
 pub mod images;
 pub mod ministack;
 pub mod throttle;

@@ -39,7 +39,7 @@ const SCENARIO: &str = include_str!("../../local/challenge/contents/leaderboard/
 pub enum Stage {
     /// Its message has not been taken.
     Unknown,
-    /// Its row says `SUBMITTED`.
+    /// Its row has `SUBMITTED`.
     Accepted,
     /// The results of so many routes of each pair are stored and in EvalAI.
     Driven(usize),

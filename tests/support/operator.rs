@@ -19,7 +19,7 @@ use tokio::time::{sleep, timeout};
 use super::gate::Gate;
 use super::scene::{Scene, say};
 
-/// What the programs log, unless `LEADERBOARD_TEST_LOG` says otherwise.
+/// What the programs log, unless `LEADERBOARD_TEST_LOG` sets it otherwise.
 const LOG: &str = "info,leaderboard_operator=debug";
 /// Name of each test's Lease, in its namespace.
 pub const LEASE: &str = "operator";

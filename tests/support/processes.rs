@@ -58,7 +58,7 @@ pub fn kill_container(pod: &Pod, container: &str) {
     }
 }
 
-/// The same for one that may have ended; says whether anything was killed.
+/// The same for one that may have ended; returns whether anything was killed.
 pub fn kill_if_running(pod: &Pod, container: &str) -> bool {
     let processes = of_container(&id_of(pod, container)).into_iter();
     processes.flat_map(|process| kill(process, Signal::SIGKILL)).count() > 0

@@ -27,7 +27,7 @@ impl Registry {
         Self::start(true).await
     }
 
-    /// One that takes connections and never says a word.
+    /// One that takes connections and never answers.
     pub async fn that_is_silent() -> Self {
         Self::start(false).await
     }
@@ -61,7 +61,7 @@ async fn serve(mut client: TcpStream, answers: bool) {
     }
 }
 
-/// Pushes an image that says it is for another kind of machine only; hands back its tag's name.
+/// Pushes an image that is marked as for another kind of machine only; hands back its tag's name.
 pub async fn image_for_other_machines(lab: &Lab) -> String {
     let url = |tag: &str| format!("http://{}/v2/challenge/agent/manifests/{tag}", lab.registry);
     let http = reqwest::Client::builder().no_proxy().build().unwrap();

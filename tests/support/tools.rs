@@ -30,7 +30,7 @@ pub async fn program(name: &'static str) -> PathBuf {
     folder.unwrap_or_else(|why| panic!("{why}")).join(name)
 }
 
-/// Starts a program that says on standard error, in a line with `listens`, at which address of loopback. It ends when it is dropped, and
+/// Starts a program that prints on standard error, in a line with `listens`, at which address of loopback. It ends when it is dropped, and
 /// with the test.
 pub async fn start(program: &Path, arguments: &[String], listens: &'static str) -> (Child, SocketAddr) {
     // A killed test drops nothing; the kernel ends its children all the same.

@@ -3,7 +3,6 @@
 use std::time::{Duration, Instant};
 
 use futures::future::try_join_all;
-use leaderboard_operator::kubernetes::PAGE;
 use serde::Deserialize;
 
 use crate::api;
@@ -16,6 +15,8 @@ use crate::world::{Setup, World};
 
 const SIZES: [usize; 2] = [1_000, 5_000];
 const QUICK_SIZES: [usize; 2] = [300, 1_000];
+/// Objects of a page, as in the operator's own lists.
+const PAGE: u32 = 100;
 /// Taken in at once while the number grows.
 const BLOCK: usize = 250;
 const BLOCK_CAP: Duration = Duration::from_mins(3);

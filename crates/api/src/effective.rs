@@ -92,7 +92,7 @@ pub fn results_url(storage: &Storage, run_id: &RunId) -> String {
     )
 }
 
-/// The plan of a submission's first attempt. `image` is the participant's, `resume` says that stored results are taken up.
+/// The plan of a submission's first attempt. `image` is the participant's, `resume` means that stored results are taken up.
 pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String, resume: bool) -> RunPlan {
     let shape = shape(spec, track);
     RunPlan {

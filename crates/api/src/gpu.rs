@@ -1,4 +1,4 @@
-//! The parts of a Leaderboard that say which container gets which GPU and where a simulator draws, and what a Submission's status
+//! The parts of a Leaderboard that define which container gets which GPU and where a simulator draws, and what a Submission's status
 //! remembers of nodes without one.
 //!
 //! Owned by `api`; `leaderboard_parts` hands it on.
@@ -169,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gpu_says_one_thing() {
+    fn gpus_come_from_the_one_source_that_the_fields_name() {
         let selectors = vec!["device.driver == 'gpu.nvidia.com'".to_owned()];
         let class = "gpu.nvidia.com";
         let devices = |selectors| GpuSource::Claim(ClaimOf::Devices { class, selectors });

@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn what_can_never_be_pulled_says_why() {
+    fn an_image_that_can_never_be_pulled_is_refused_with_the_reason() {
         use NotAnImage::{Characters, Digest, Empty, Id, Registry, Repository, Tag, TooLong, UpperCase};
         let text = str::to_owned;
         let long_tag = format!("agent:{}", "x".repeat(129));

@@ -54,7 +54,7 @@ impl SubmissionStatus {
         Self::of_ended(spec, end, &what, generation, now)
     }
 
-    /// The status of a submission whose end every system has, for a cause that `what` says.
+    /// The status of a submission whose end every system has, for a cause that `what` names.
     pub fn of_ended(spec: &SubmissionSpec, end: ImportedEnd, what: &str, generation: i64, now: &Time) -> Self {
         let (reason, failure) = match end.state {
             ImportedState::Finished => (reasons::FINISHED, None),

@@ -1,4 +1,4 @@
-//! The part of a Leaderboard's spec that says what its Pods may reach.
+//! The part of a Leaderboard's spec that defines what its Pods may reach.
 //!
 //! Owned by `api`; `leaderboard_parts` hands it on.
 

@@ -1,4 +1,4 @@
-//! The parts of a Leaderboard's spec that say where submissions come from and where results go: EvalAI, SQS, S3,
+//! The parts of a Leaderboard's spec that define where submissions come from and where results go: EvalAI, SQS, S3,
 //! DynamoDB and CloudWatch, each with its own rules and defaults.
 //!
 //! Owned by `api`; `leaderboard_parts` hands them on.

@@ -77,7 +77,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn the_state_follows_the_conditions_whatever_the_stored_one_says() {
+    fn the_state_follows_the_conditions_whatever_the_stored_one_is() {
         let failure =
             json!({"class": "Participant", "charged": true, "reason": "AgentCrashed", "message": "It crashed."});
         for (expected, attempt, finished, running, failed) in [

@@ -70,7 +70,7 @@ pub async fn read(object: &str, storage: Option<&Storage>, mut show: impl FnMut(
     let complaint = async {
         let mut text = Vec::new();
         if let Some(errors) = errors {
-            // What cannot be read is not shown; the exit status says that it failed.
+            // What cannot be read is not shown; the exit status shows that it failed.
             let _ = errors.take(LONGEST_ERROR).read_to_end(&mut text).await;
         }
         text

@@ -58,7 +58,7 @@ struct Others {
     collectors: Collectors,
 }
 
-/// Checks a Leaderboard; the exit code says whether it passed.
+/// Checks a Leaderboard; the exit code shows whether it passed.
 pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error> {
     let leaderboard = leaderboard(cluster, wanted.name.as_deref()).await?;
     let name = leaderboard.name_any();

@@ -150,7 +150,7 @@ pub async fn top(cluster: &Cluster, scope: &Scope, format: Format) -> Result<Exi
     Ok(ExitCode::SUCCESS)
 }
 
-/// Says that a watch was interrupted, and goes on, unless going on does not help.
+/// Reports that a watch was interrupted, and goes on, unless going on does not help.
 pub fn note_interruption(error: kube::runtime::watcher::Error, printed: &mut String) -> Result<(), Error> {
     let message = error::phrase(&watch_error(&error));
     if let Some(permanent) = error::permanent(error) {

@@ -63,7 +63,7 @@ pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<(), Erro
         replica: Mutex::default(),
         printed: Mutex::default(),
     });
-    // What is missing is said before a browser is sent there.
+    // What is missing is shown before a browser is sent there.
     forwards.find().await.map_err(Error::Unfit)?;
     let address = SocketAddr::from((Ipv4Addr::LOCALHOST, wanted.port));
     let taken = |error| Error::Unfit(format!("cannot listen on {address}: {error}. Choose another --port"));
@@ -222,7 +222,7 @@ fn is_ready(pod: &Pod) -> bool {
     is_ready && pod.metadata.deletion_timestamp.is_none()
 }
 
-/// Says which right is missing, and where a Role with it is.
+/// Reports which right is missing, and where a Role with it is.
 fn of_rights(error: &kube::Error, right: &str) -> String {
     let text = phrase(&client_errors::kube(error));
     match error {

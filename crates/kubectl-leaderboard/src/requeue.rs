@@ -235,7 +235,7 @@ pub fn summary(requested: usize, chosen: usize, namespace: &str, frame: Frame) -
     page.into_lines()
 }
 
-/// What is said where nothing is chosen of so many submissions.
+/// What is shown where nothing is chosen of so many submissions.
 pub fn none(number: usize, namespace: &str, frame: Frame) -> Vec<String> {
     let what = match number {
         1 => "The submission does not fit".to_owned(),

@@ -41,7 +41,7 @@ pub fn chosen<'a>(submissions: &'a [Submission], reason: Option<&str>) -> Vec<&'
     found
 }
 
-/// What is said where nothing is chosen of so many submissions.
+/// What is shown where nothing is chosen of so many submissions.
 pub fn none(number: usize, reason: Option<&str>, namespace: &str, frame: Frame) -> Vec<String> {
     let reason = reason
         .map(|reason| format!(" with the reason {reason}"))

@@ -266,7 +266,7 @@ fn without_a_cluster_its_address_is_named() {
 }
 
 #[test]
-fn what_changes_something_says_what_and_how_to_go_on() {
+fn a_command_that_changes_something_prints_what_and_how_to_go_on() {
     let stub = Stub::start(cluster);
     assert_printed(
         "changes",

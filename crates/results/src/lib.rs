@@ -5,7 +5,7 @@
 //! no clock and no file system: bytes in, texts out.
 //!
 //! The numbers are those of the Leaderboard's own merge script, bit for bit; where the outcome differs on purpose,
-//! `docs/results.md` says so and [`Plan::as_original`] switches the differences off.
+//! `docs/results.md` describes it and [`Plan::as_original`] switches the differences off.
 //!
 //! ```
 //! use leaderboard_results::{Format, Plan, offline};

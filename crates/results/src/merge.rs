@@ -20,14 +20,14 @@ pub struct PairProgress {
     pub ended: bool,
 }
 
-/// What the workers' files say together.
+/// What the workers' files have together.
 #[derive(Clone, Debug)]
 pub struct Merged {
     /// The merged file, as the original writes it.
     pub text: String,
     /// Routes finished, each repetition counted.
     pub done: u32,
-    /// Routes to drive: the plan's when it is known, else the sum of what the files say.
+    /// Routes to drive: the plan's when it is known, else the sum of what the files have.
     pub total: u32,
     /// Whether nothing is missing, so that there is a global record.
     pub is_final: bool,

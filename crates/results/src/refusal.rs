@@ -53,9 +53,9 @@ pub enum Refusal {
     Total {
         /// Whose file.
         pair: usize,
-        /// What the file says.
+        /// What the file has.
         found: u32,
-        /// What the plan says.
+        /// What the plan has.
         expected: u32,
     },
     /// More records than route runs.
@@ -65,7 +65,7 @@ pub enum Refusal {
         pair: usize,
         /// Records in the file.
         found: usize,
-        /// What the plan says.
+        /// What the plan has.
         expected: u32,
     },
     /// A sensor of no known kind.
@@ -100,7 +100,7 @@ pub enum Refusal {
         /// The route.
         record: RecordName,
     },
-    /// A route is missing although the counts say that the run is finished.
+    /// A route is missing although the counts show that the run is finished.
     #[error("results are missing: the records jump from {} to {after}", .before.as_ref().map_or("the start".to_owned(), ToString::to_string))]
     Gap {
         /// The record before the gap.
@@ -247,7 +247,7 @@ pub enum RecordProblem {
     /// The driving score is not the product.
     #[error("score_composed is {}, but score_route x score_penalty is {}", number_text(*.found), number_text(*.expected))]
     Composed {
-        /// What the record says.
+        /// What the record has.
         found: f64,
         /// What follows from its scores.
         expected: f64,
@@ -255,7 +255,7 @@ pub enum RecordProblem {
     /// The penalty is better than the infractions allow.
     #[error("score_penalty is {}, but its infractions allow {} at most", number_text(*.found), number_text(*.allowed))]
     Penalty {
-        /// What the record says.
+        /// What the record has.
         found: f64,
         /// The most that follows from its infractions.
         allowed: f64,

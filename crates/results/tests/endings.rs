@@ -15,7 +15,7 @@ fn perfect(format: Format, ids: std::ops::RangeInclusive<u32>) -> Value {
 }
 
 #[test]
-fn results_that_do_not_count_say_why() {
+fn results_that_do_not_count_show_why() {
     let run = |format, status: &str, sensors: bool| {
         let plan = pod(format, 1, &[(0, 1)]);
         let mut worker = finished(format, &[Drive::perfect(0), Drive::perfect(1).status(status)]);

@@ -36,7 +36,7 @@ fn times(name: &'static str, n: usize) -> (&'static str, Vec<String>) {
     (name, vec!["Agent did it at (x=1.0, y=2.0, z=3.0)".to_owned(); n])
 }
 
-/// What verify says of one drive, if anything.
+/// What verify finds in one drive, if anything.
 fn said(format: Format, drive: &Drive) -> Option<String> {
     let plan = pod(format, 1, &[(0, 0)]);
     let warnings = |plan: &Plan| read(plan, 0, &finished(format, std::slice::from_ref(drive)));
@@ -155,7 +155,7 @@ fn honest_of_v2() -> Vec<(Format, Drive)> {
 }
 
 #[test]
-fn honest_records_pass() {
+fn honest_records_are_accepted() {
     let table = [honest_of_v1(), honest_of_v2()].concat();
     for (format, drive) in &table {
         assert_eq!(said(*format, drive), None, "{format:?} {drive:?}");
@@ -164,7 +164,7 @@ fn honest_records_pass() {
 }
 
 #[test]
-fn forged_records_are_told() {
+fn forged_records_are_reported() {
     let name = |format| {
         if format == V1 {
             "pair 1, route RouteScenario_0: "
@@ -245,7 +245,7 @@ fn a_driving_score_that_is_no_product_is_reported() {
 /// Lower than the infractions ask for is nobody's gain: a percentage that counts, a fork that punishes more, a message that
 /// is not the evaluator's.
 #[test]
-fn what_is_no_gain_is_not_told() {
+fn what_is_no_gain_is_not_reported() {
     let foreign = vec!["Agent collided with “café” 车".to_owned()];
     for (format, drive) in [
         (V1, drive(100.0, 0.9208, &[(OFF_ROAD, vec![off_road(9.466, 7.92)])])),

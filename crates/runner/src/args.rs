@@ -1,4 +1,4 @@
-//! The command line: parsed here once into a [`Job`] that cannot hold nonsense. Called by `main`; touches nothing.
+//! The command line: parsed here once into a [`Job`] that cannot hold nonsense. Called by `main`; reads and changes nothing else.
 
 use std::ffi::{OsStr, OsString};
 use std::os::unix::ffi::{OsStrExt, OsStringExt};

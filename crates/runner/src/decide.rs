@@ -31,7 +31,7 @@ pub(crate) enum Child {
     Ended,
 }
 
-/// What a simulator knows of its agent's GPU.
+/// What a simulator has read of its agent's GPU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum AgentGpu {
     /// It does not matter, or the agent's command may have begun: from then on what lies in its folder is its own word.

@@ -54,7 +54,7 @@ impl Keeper {
         }
     }
 
-    /// Before the command starts: what is whole is kept, and what is torn or gone is replaced by what was kept. An error says why
+    /// Before the command starts: what is whole is kept, and what is torn or gone is replaced by what was kept. An error shows why
     /// that cannot be: the command would start at the first route.
     pub(crate) fn prepare(&mut self) -> Result<(), String> {
         let torn = match checkpoint::read(&self.checkpoint) {

@@ -8,7 +8,7 @@ use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-/// Such a list can name users who may not look, whatever the mode says.
+/// Such a list can name users who may not look, whatever the mode is.
 const ACCESS_LIST: &str = "system.posix_acl_access";
 /// What a reader needs to look for names and to watch, and the runner to write.
 const OPEN: u32 = 0o755;

@@ -14,7 +14,7 @@ use std::str::FromStr;
 use thiserror::Error;
 
 /// The sub-folder that only `logcopy` writes.
-pub const LOGCOPY_FOLDER: &str = "logcopy";
+const LOGCOPY_FOLDER: &str = "logcopy";
 
 /// In an agent's sub-folder: the last whole checkpoint, kept by the agent's runner. No message; it is the one file there that
 /// is not empty.
@@ -140,7 +140,7 @@ impl fmt::Display for Member {
     }
 }
 
-/// What a member's file says. The number is the round: the crashes of that side before it.
+/// What a member's file means. The number is the round: the crashes of that side before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mark {
     /// Simulator: the server answers. Agent: the command is about to start.

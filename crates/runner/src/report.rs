@@ -160,7 +160,7 @@ mod tests {
     };
 
     #[test]
-    fn the_sentence_says_what_ended_and_what_is_left() {
+    fn the_sentence_names_what_ended_and_what_is_left() {
         let partial = Ok(Checkpoint {
             complete: false,
             partial: true,

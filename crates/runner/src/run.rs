@@ -1,4 +1,4 @@
-//! One container's life: looks at the world, asks `decide`, does what it says. Called by `main`.
+//! One container's life: looks at the world, asks `decide`, does what it decides. Called by `main`.
 //!
 //! All waiting is one `poll` over signals, folders and output; a look once a second stands behind it. Policy is `decide`'s.
 
@@ -27,7 +27,7 @@ use leaderboard_runner::args::{Job, Role};
 
 /// Behind inotify, for whatever it misses.
 const SLOW_POLL: Duration = Duration::from_secs(1);
-/// Longest pause between two tries of the server's port, and between two looks at what does not tell its end.
+/// Longest pause between two tries of the server's port, and between two looks at what does not report its end.
 const PROBE_EVERY: Duration = Duration::from_millis(100);
 /// Shortest pause between two tries of the port. The pauses grow with the time the server takes.
 const FIRST_PROBE: Duration = Duration::from_millis(2);

@@ -1,5 +1,5 @@
 //! The command's output: one pipe for stdout and stderr, copied byte for byte to our own stdout and to
-//! a log. Called by `run` when `poll` says so; it never blocks on the container's stdout, and holds
+//! a log. Called by `run` when `poll` reports it; it never blocks on the container's stdout, and holds
 //! at most one buffer.
 
 use std::fs::{File, OpenOptions};
@@ -68,7 +68,7 @@ impl Tee {
         self.input.is_none() && self.pending.is_empty()
     }
 
-    /// Reads what the pipe holds, after `poll` said it is readable.
+    /// Reads what the pipe holds, after `poll` reported it as readable.
     pub(crate) fn read(&mut self) {
         let Some(input) = &mut self.input else { return };
         match input.read(&mut self.buffer) {
@@ -164,7 +164,7 @@ impl Log {
     }
 }
 
-/// Also true for a descriptor that is broken: the write then says how.
+/// Also true for a descriptor that is broken: the write then shows how.
 fn is_writable(fd: BorrowedFd<'_>) -> bool {
     poll(&mut [PollFd::new(fd, PollFlags::POLLOUT)], PollTimeout::ZERO).is_ok_and(|count| count > 0)
 }

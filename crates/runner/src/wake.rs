@@ -1,5 +1,5 @@
 //! What wakes the runner: signals (SIGCHLD among them), changes in the folders of its peer and of `logcopy`, and a checkpoint
-//! that was written. Called by `run` only. It says that something may have changed, never what: the caller looks again.
+//! that was written. Called by `run` only. It reports that something may have changed, never what: the caller looks again.
 
 use std::ffi::OsString;
 use std::io::{self, Read};
@@ -75,7 +75,7 @@ struct Written {
 }
 
 impl Folders {
-    /// Watches `root` and `folders` in it, and the writers of `file`. Without inotify (`is_wanted` says no, or the node has none
+    /// Watches `root` and `folders` in it, and the writers of `file`. Without inotify (`is_wanted` is false, or the node has none
     /// left) the caller's slow poll does alone.
     pub(crate) fn watch(root: &Path, folders: &[String], file: Option<&Path>, is_wanted: bool) -> Self {
         let opened = if is_wanted {

@@ -89,7 +89,7 @@ fn the_log_stops_at_its_limit_and_stdout_goes_on() {
 }
 
 #[test]
-fn a_log_that_cannot_be_written_is_said_once() {
+fn a_log_that_cannot_be_written_is_reported_once() {
     let pod = pod();
     let outside = pod.path("outside");
     fs::write(&outside, "precious").unwrap();
@@ -254,7 +254,7 @@ fn a_checkpoint_torn_by_a_kill_is_whole_again_before_the_next_start() {
 }
 
 #[test]
-fn a_command_that_cannot_be_started_says_why() {
+fn a_command_that_cannot_be_started_is_reported_with_the_reason() {
     let pod = pod();
     let not_executable = pod.path("text");
     fs::write(&not_executable, "#!/bin/sh\n").unwrap();

@@ -43,7 +43,7 @@ fn a_log_ends_at_its_limit_and_the_containers_own_goes_on() {
 }
 
 #[test]
-fn ends_are_told_as_a_shell_tells_them() {
+fn ends_are_reported_as_a_shell_reports_them() {
     assert_eq!(kept("9", "true").0.status.code(), Some(0));
     assert_eq!(kept("9", "kill -9 $$").0.status.code(), Some(128 + 9));
     let folder = tempfile::tempdir().unwrap();

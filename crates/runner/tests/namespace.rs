@@ -30,7 +30,7 @@ while True:
 "#;
 
 /// The words that start a program as the first process of a PID namespace. None where this machine lets nobody make one; the test
-/// says so then.
+/// reports it then.
 fn namespace() -> Option<Vec<String>> {
     let mut words = vec!["unshare", "--pid", "--fork", "--mount-proc", "--kill-child"];
     if !nix::unistd::geteuid().is_root() {
@@ -40,7 +40,7 @@ fn namespace() -> Option<Vec<String>> {
     if probe.is_ok_and(|probe| probe.status.success()) {
         return Some(words.into_iter().map(str::to_owned).collect());
     }
-    // Not captured: a test that is left out says so in any run.
+    // Not captured: a test that is left out shows it in any run.
     let _ = writeln!(
         std::io::stderr(),
         "left out: this machine lets nobody make a PID namespace; run the tests as root"

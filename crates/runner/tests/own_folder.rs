@@ -38,7 +38,7 @@ fn is_open(folder: &Path) -> bool {
     !has_list && mode & 0o005 == 0o005
 }
 
-/// Forbids it to the user of `logcopy`, whatever its mode says. False where the file system keeps no such lists.
+/// Forbids it to the user of `logcopy`, whatever its mode is. False where the file system keeps no such lists.
 fn forbid(folder: &Path) -> bool {
     const ANYBODY: u32 = u32::MAX;
     // Owner, the user, group, mask, all others: tag, permissions, who.
@@ -102,7 +102,7 @@ fn an_agent_that_names_who_may_not_look_is_seen_to_end() {
     let (mut simulator, mut agent) = (pod.simulator(), pod.agent(&script));
     support::until_exists(&said);
     if !forbid(&folder) {
-        // Not captured: a test that is left out says so in any run.
+        // Not captured: a test that is left out shows it in any run.
         let _ = writeln!(
             std::io::stderr(),
             "left out: this file system keeps no access control lists"

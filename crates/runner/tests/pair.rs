@@ -15,7 +15,7 @@ use support::{AGENT, COMPLETE, PARTIAL, Pod, SIMULATOR};
 
 const MOMENT: Duration = Duration::from_millis(300);
 
-/// An agent that waits for the file `go` in its work folder and then has complete results. It says what RESUME is.
+/// An agent that waits for the file `go` in its work folder and then has complete results. It prints what RESUME is.
 fn patient_agent(pod: &Pod) -> String {
     let (said, go) = (pod.path("work/said"), pod.path("work/go"));
     let (said, go) = (said.display(), go.display());
@@ -431,7 +431,7 @@ fn marks_that_an_agent_deletes_take_no_pair_out_of_step() {
 }
 
 #[test]
-fn a_status_folder_that_cannot_be_written_is_said_and_ends_the_container() {
+fn a_status_folder_that_cannot_be_written_is_reported_and_ends_the_container() {
     let pod = Pod::new();
     fs::write(pod.status().join("simulator-1"), "").unwrap();
     let mut simulator = pod.simulator();

@@ -14,7 +14,7 @@ use serde_json::{Number, Value, ser::PrettyFormatter};
 use crate::flags::Format;
 
 /// The infractions, in the order of V2's file. V1 has the nine that are not marked.
-pub const INFRACTIONS: [&str; 12] = [
+const INFRACTIONS: [&str; 12] = [
     "collisions_layout",
     "collisions_pedestrian",
     "collisions_vehicle",

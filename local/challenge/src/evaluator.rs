@@ -246,7 +246,7 @@ impl Worker<'_> {
         (total == self.legs.len() && (same || self.format() == Format::V1)).then_some(start)
     }
 
-    /// Runs one route up to its record. Says with which entry status the evaluation stops, if it does.
+    /// Runs one route up to its record. Returns with which entry status the evaluation stops, if it does.
     fn route(&mut self, leg: &Leg, outcome: &Outcome) -> Result<Option<&'static str>, EvaluatorError> {
         let (format, number) = (self.format(), leg.index + 1);
         self.started();

@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn the_flags_tell_the_version() {
+    fn the_version_follows_from_the_flags() {
         let v2 = parse(
             &line(&["--traffic-manager-port", "2010", "--debug-checkpoint=d", "--port=2100"]),
             None,

@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn subsets() {
+    fn subsets_select_their_routes() {
         let all: Vec<String> = ["4", "2", "0", "1"].map(String::from).to_vec();
         for (subset, expected) in [
             ("", vec!["4", "2", "0", "1"]),

@@ -34,7 +34,7 @@ impl Idle {
         self.since.send_replace(Some(Instant::now()));
     }
 
-    /// Waits until the connection has been idle for as long as `limit` says; it is asked again at each of `changes`.
+    /// Waits until the connection has been idle for as long as `limit` returns; it is asked again at each of `changes`.
     pub(crate) async fn over(&self, limit: impl Fn() -> Duration, mut changes: watch::Receiver<u64>) {
         let mut since = self.since.subscribe();
         loop {

@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_seed_says_where() {
+    fn a_bad_seed_is_refused_with_its_place() {
         let error = Seed::read("no-such-seed.json").unwrap_err().to_string();
         assert!(
             error.contains("no-such-seed.json") && error.contains("--seed"),

@@ -29,7 +29,7 @@ pub struct Published {
     pub dedup: Option<String>,
 }
 
-/// Everything the server knows.
+/// Everything the server holds.
 #[derive(Debug, Clone, Serialize)]
 pub struct State {
     /// Users, teams and challenges.

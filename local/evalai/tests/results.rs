@@ -76,7 +76,7 @@ async fn shown_metrics_keep_the_order_they_were_sent_in() {
 }
 
 #[tokio::test]
-async fn files_lie_below_challenge_phase_and_submission_and_say_their_type() {
+async fn files_lie_below_challenge_phase_and_submission_and_have_their_type() {
     let stand = Stand::start().await;
     let pk = stand.submit().await;
     stand.put(UPDATE, &put_body(pk, "finished", 1.0)).await.ok();

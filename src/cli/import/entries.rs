@@ -54,7 +54,7 @@ pub(super) type Texts = BTreeMap<&'static str, String>;
 pub(super) struct Entries {
     /// Root of EvalAI's server.
     pub(super) api_server: String,
-    /// When the token ends, if it says so; or why it is none.
+    /// When the token ends, if it shows that; or why it is none.
     pub(super) token: Result<Option<Timestamp>, TokenError>,
     /// Each Leaderboard that is asked for and has a track.
     pub(super) boards: Vec<BoardEntry>,

@@ -13,6 +13,7 @@ mod print;
 mod questions;
 mod rows;
 #[cfg(test)]
+#[path = "tests/samples.rs"]
 mod samples;
 mod table;
 mod taint;
@@ -33,7 +34,7 @@ use crate::services::aws::Aws;
 use crate::services::event_sources::{self, NotAQueue, QueueArn, Readers};
 use crate::services::token::secret_text;
 
-/// What the exit code says.
+/// What the exit code means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: the manifests are printed, or the Submissions are made. 2: entries or arguments are \
     refused. 1: something can't be read or written.";
 

@@ -1,4 +1,4 @@
-//! Which check of a Leaderboard ended last, and what its condition `Checked` says of it. Pure.
+//! Which check of a Leaderboard ended last, and what its condition `Checked` shows of it. Pure.
 
 use kube::ResourceExt;
 

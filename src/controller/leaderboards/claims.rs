@@ -21,7 +21,7 @@ pub enum Claims {
     #[default]
     NotRequired,
     InPlace,
-    /// The API server does not know claims.
+    /// The API server does not serve claims.
     NotServed,
     /// It is not there, and why.
     Missing(String),

@@ -1,4 +1,4 @@
-//! What a Leaderboard's status says, and when it may go: a pure function of what one reconcile has read.
+//! What a Leaderboard's status shows, and when it may go: a pure function of what one reconcile has read.
 
 use std::sync::Arc;
 
@@ -152,7 +152,7 @@ fn in_use(view: &LeaderboardView) -> String {
     }
 }
 
-/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong. None: what was said of an earlier
+/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong. None: what was shown of an earlier
 /// spec, or by the controller before, stays until the first look has ended.
 fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     if let Some(wrong) = of_spec(view) {
@@ -165,7 +165,7 @@ fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     is_new.then(|| (Truth::Unknown, reasons::CHECKING, FIRST_LOOK.to_owned()))
 }
 
-/// What the looks at its queue, its places and EvalAI say.
+/// What the looks at its queue, its places and EvalAI have found.
 fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
     let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
     let (evalai_truth, reason, message) = evalai(&view.evalai);

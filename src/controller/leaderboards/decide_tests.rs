@@ -1,4 +1,4 @@
-//! What a Leaderboard's status says, as tables.
+//! What a Leaderboard's status shows, as tables.
 
 use super::*;
 use serde_json::json;
@@ -135,7 +135,7 @@ fn it_stays_while_submissions_need_it() {
 }
 
 #[test]
-fn what_is_surely_wrong_comes_before_what_nobody_knows() {
+fn what_is_surely_wrong_comes_before_what_may_be_wrong() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
     let unreachable = |truth| {
         Some(Unreachable {
@@ -226,7 +226,7 @@ fn no_leaderboard_is_ready_whose_claims_cannot_be_made() {
 }
 
 #[test]
-fn a_leaderboard_says_until_when_nothing_is_written_to_evalai() {
+fn a_leaderboard_shows_until_when_nothing_is_written_to_evalai() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
     let note = || Some("EvalAI's token ends on 2026-12-01.".to_owned());
     for (evalai, ready, message) in [
@@ -332,7 +332,7 @@ fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
 }
 
 #[test]
-fn what_is_wrong_with_evalai_is_said() {
+fn what_is_wrong_with_evalai_is_shown() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
     let unread = |is_refused| {
         EvalaiStanding::QueueUnread(InboxTrouble {
@@ -375,7 +375,7 @@ fn what_it_may_not_name_comes_before_what_else_is_wrong() {
 }
 
 #[test]
-fn before_the_first_look_only_what_is_surely_wrong_is_said() {
+fn before_the_first_look_only_what_is_surely_wrong_is_shown() {
     let mut one = leaderboard("one", 1, 7, "https://e", "a/").as_ref().clone();
     one.metadata.generation = Some(2);
     let unseen = |one: &Leaderboard| LeaderboardView {

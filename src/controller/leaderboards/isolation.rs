@@ -195,13 +195,13 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
     }
 }
 
-/// No right, or a webhook or a policy of admission that says no; not a conflict, and not too many requests.
+/// No right, or a webhook or a policy of admission that refuses; not a conflict, and not too many requests.
 fn is_refusal(code: u16) -> bool {
     (400..500).contains(&code) && ![408, 409, 429].contains(&code)
 }
 
-/// What was measured last of this generation: by a Pod, as this process has seen it, else by one that is gone, as the condition says;
-/// while the condition says something else, as this process remembers it.
+/// What was measured last of this generation: by a Pod, as this process has seen it, else by one that is gone, as the condition shows;
+/// while the condition shows something else, as this process remembers it.
 pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
@@ -275,7 +275,7 @@ fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
     is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
 }
 
-/// What `Isolated` says.
+/// What `Isolated` shows.
 pub(super) fn condition(
     leaderboard: &Leaderboard,
     policy: &Policy,
@@ -306,7 +306,7 @@ pub(super) fn condition(
     }
 }
 
-/// What the condition says that a Pod which is gone had found, for this generation.
+/// What the condition shows that a Pod which is gone had found, for this generation.
 fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let known = leaderboard.condition(conditions::ISOLATED)?;
     if known.observed_generation != leaderboard.metadata.generation {

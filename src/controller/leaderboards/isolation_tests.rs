@@ -25,7 +25,7 @@ fn verdict(reason: WorkspaceReason) -> WorkspaceVerdict {
     }
 }
 
-/// A Leaderboard whose condition says this of this generation.
+/// A Leaderboard whose condition shows this of this generation.
 fn shown(reason: &str, of: i64) -> Leaderboard {
     let mut object = leaderboard(&json!({}), 2);
     let mut conditions = Vec::new();

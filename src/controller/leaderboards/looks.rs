@@ -1,5 +1,5 @@
 //! The looks at what Leaderboards name: their tokens, their places in AWS, their Pods and claims. One task for all of them, several
-//! Leaderboards at once, and one look at a time for each. A reconcile says that something is due, and is woken with what was found.
+//! Leaderboards at once, and one look at a time for each. A reconcile reports that something is due, and is woken with what was found.
 
 use std::sync::Arc;
 
@@ -24,7 +24,7 @@ pub struct Uses<'a> {
     pub wake: &'a Wake<Leaderboard>,
 }
 
-/// A Leaderboard, and what is due of it. Its state says that a look is under way.
+/// A Leaderboard, and what is due of it. Its state shows that a look is under way.
 #[derive(Debug)]
 pub struct Look {
     pub(super) leaderboard: Arc<Leaderboard>,

@@ -7,7 +7,7 @@ use tokio::time::Instant;
 
 use super::*;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
-use crate::controller::leaderboards::state::{Entry, RESYNC};
+use crate::controller::leaderboards::state::{Entry, RESYNC, SOONEST};
 use crate::controller::leaderboards::{FIRST_LOOK, Reconciled, reconcile};
 use crate::controller::network_policy::network_policy;
 use leaderboard_api::{names, reasons};
@@ -97,6 +97,28 @@ async fn a_bucket_that_never_answers_holds_up_no_reconcile_and_its_silence_wakes
     assert_eq!(ready(&status), ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)));
     assert_eq!(status["observedGeneration"], 1);
     assert!(around.wanted.try_recv().is_err(), "nothing is due so soon");
+}
+
+/// A second write would begin with the status before the first one, and date its conditions later.
+#[tokio::test(start_paused = true)]
+async fn no_status_is_written_on_top_of_one_that_the_cache_does_not_show_yet() {
+    let mut shown = leaderboard(NOBODY);
+    let mut behind = shown.clone();
+    behind.metadata.resource_version = Some("1".into());
+    let mut around = around(&behind, NOBODY).await;
+    reconciled(&mut around, &behind).await;
+    woken(&mut around).await;
+    let (_, written, first) = reconciled(&mut around, &behind).await;
+    assert_eq!(written, ["status"]);
+    let (wait, written, _) = reconciled(&mut around, &behind).await;
+    assert_eq!((wait, written), (SOONEST, Vec::new()), "the cache is behind");
+
+    shown.status = serde_json::from_value(first).unwrap();
+    let (_, written, _) = reconciled(&mut around, &shown).await;
+    assert_eq!(written, Vec::<String>::new(), "nothing has changed");
+    shown.status.as_mut().unwrap().conditions.clear();
+    let (_, written, _) = reconciled(&mut around, &shown).await;
+    assert_eq!(written, ["status"], "what is missing is written");
 }
 
 #[tokio::test(start_paused = true)]

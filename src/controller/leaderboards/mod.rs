@@ -202,7 +202,8 @@ fn observe(
     }
 }
 
-/// Writes the status if it says something new; returns when to look again.
+/// Writes the status if it shows something new; returns when to look again. On top of a status that the cache does not show yet
+/// nothing is written: conditions would get the time of the second write.
 async fn write_status(
     client: &Client,
     state: &LeaderboardState,
@@ -210,6 +211,10 @@ async fn write_status(
     plan: &LeaderboardPlan,
     now: Timestamp,
 ) -> Result<Duration, CallError> {
+    let uid = uid_of(leaderboard);
+    if state.awaits_write(&uid, number(leaderboard.metadata.resource_version.as_deref()), now) {
+        return Ok(SOONEST);
+    }
     let old = leaderboard.status.clone().unwrap_or_default();
     if old == plan.status {
         return Ok(RESYNC);
@@ -220,7 +225,6 @@ async fn write_status(
         gpu_use: old.gpu_use.clone(),
         ..plan.status.clone()
     } == old;
-    let uid = uid_of(leaderboard);
     if only_numbers && !state.is_older(&uid, now, COUNTS_EVERY) {
         return Ok(COUNTS_EVERY);
     }
@@ -228,7 +232,12 @@ async fn write_status(
     if only_numbers && old.counts == plan.status.counts && !state.is_older(&uid, now, RESYNC) {
         return Ok(RESYNC);
     }
-    apply_status(client, leaderboard, &plan.status).await?;
-    state.change(&uid, |entry| entry.written = Some(now));
+    let version = apply_status(client, leaderboard, &plan.status).await?;
+    state.change(&uid, |entry| entry.written = Some((now, number(Some(&version)))));
     Ok(RESYNC)
+}
+
+/// Versions of one kind grow; the API promises that they can be compared as numbers.
+fn number(version: Option<&str>) -> u64 {
+    version.and_then(|version| version.parse().ok()).unwrap_or(0)
 }

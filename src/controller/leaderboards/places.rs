@@ -1,6 +1,6 @@
 //! Asks AWS for a Leaderboard's bucket, table and queues: one cheap request each, all at once, each with a limit of time.
 //!
-//! Called by `probe`. When to ask, and what follows, is `reach`'s to say.
+//! Called by `probe`. When to ask, and what follows, is decided by `reach`.
 
 use std::fmt::Display;
 use std::time::Duration;
@@ -169,7 +169,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn what_a_refusal_means() {
+    fn a_refusal_of_aws_has_its_reason_and_next_step() {
         use std::mem::discriminant;
         let archive = |cause| ArchiveError {
             op: "listing",

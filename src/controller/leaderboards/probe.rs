@@ -220,7 +220,7 @@ impl Probe {
         self.token_of(leaderboard).map(|found| &found.token)
     }
 
-    /// What was found where the Leaderboard says that its token is.
+    /// What was found where the Leaderboard names its token.
     fn token_of(&self, leaderboard: &Leaderboard) -> Option<&FoundToken> {
         let place = &leaderboard.spec.evalai.as_ref()?.token;
         self.token.as_ref().filter(|found| found.place == *place)

@@ -1,8 +1,8 @@
 //! Whether a Leaderboard's bucket, table, queues and log group can be reached: when each is asked again, and what is reported.
 //!
-//! Pure: `places` asks, `decide` turns what is said into the condition `Ready`. An answer counts at once. Silence counts
+//! Pure: `places` asks, `decide` turns what is shown into the condition `Ready`. An answer counts at once. Silence counts
 //! when it has lasted for [`PATIENCE`], and then as `Unknown`: a service that is away for a minute makes nothing flap, and
-//! nobody knows yet what is wrong with one that says nothing.
+//! nobody knows yet what is wrong with one that never answers.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -45,7 +45,7 @@ impl Place {
     }
 }
 
-/// What one look has found. The sentences say what to do.
+/// What one look has found. The sentences have the next step.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Finding {
     Good,
@@ -53,11 +53,11 @@ pub enum Finding {
     Bad(String),
     /// The controller may not look; who uses it may all the same be allowed to.
     Hidden(String),
-    /// No answer, or one that says to ask later.
+    /// No answer, or one that asks to ask later.
     Silent(String),
 }
 
-/// What is said of a Leaderboard whose places cannot all be reached.
+/// What is shown of a Leaderboard whose places cannot all be reached.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Unreachable {
     /// Never True.
@@ -128,7 +128,7 @@ impl Reach {
         self.0.insert(place, known);
     }
 
-    /// When something has to be asked, or said, next; none while nothing was asked.
+    /// When something has to be asked, or shown, next; none while nothing was asked.
     pub fn next(&self, now: Timestamp) -> Option<Timestamp> {
         let asked = self.0.values().map(|known| later(known.at, pause(known.failures)));
         let said = self.0.values().filter_map(|known| known.silent.as_ref());
@@ -136,7 +136,7 @@ impl Reach {
         asked.chain(said).min()
     }
 
-    /// What is to be said at this moment; nothing if all is well, or may still be.
+    /// What is to be shown at this moment; nothing if all is well, or may still be.
     pub fn unreachable(&self, now: Timestamp) -> Option<Unreachable> {
         let mut said: Vec<_> = self
             .0
@@ -233,7 +233,7 @@ mod tests {
 
     type Case = (&'static str, Vec<(i64, Finding)>, Vec<(i64, Option<Truth>)>);
 
-    /// Looks one after the other, each with its second, and what is said at other seconds.
+    /// Looks one after the other, each with its second, and what is shown at other seconds.
     #[test]
     fn an_answer_counts_at_once_and_silence_when_it_lasts() {
         use Truth::{False, Unknown};
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edit_asks_at_once_and_another_address_knows_nothing_of_the_old_one() {
+    fn an_edit_asks_at_once_and_another_address_has_nothing_of_the_old_one() {
         let mut reach = Reach::default();
         for second in [0, 5, 15] {
             reach.take(Place::Queue, "one", 1, bad(), at(second));

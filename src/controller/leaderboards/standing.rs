@@ -1,4 +1,4 @@
-//! How a Leaderboard stands with EvalAI: what its token is, and what EvalAI's client knows of its challenge. Reads memory alone.
+//! How a Leaderboard stands with EvalAI: what its token is, and what EvalAI's client has read of its challenge. Reads memory alone.
 
 use std::sync::Arc;
 
@@ -23,12 +23,12 @@ pub enum EvalaiStanding {
     /// Not checked yet, or EvalAI does not answer.
     Unchecked(Option<String>),
     Fits {
-        /// Something to be said although it works, such as a token that ends soon.
+        /// Something to be shown although it works, such as a token that ends soon.
         note: Option<String>,
     },
 }
 
-/// How it stands, with what was found where the Leaderboard says that its token is.
+/// How it stands, with what was found where the Leaderboard names its token.
 pub(super) fn standing(
     hub: &Hub,
     leaderboard: &Leaderboard,
@@ -90,7 +90,7 @@ mod tests {
     use crate::services::evalai::Misfit;
 
     #[test]
-    fn columns_that_stay_empty_and_a_token_that_ends_soon_are_said() {
+    fn columns_that_stay_empty_and_a_token_that_ends_soon_are_shown() {
         let labels = |problems| Labels {
             at: Timestamp::UNIX_EPOCH,
             problems,

@@ -16,6 +16,8 @@ use crate::pod::workspace::WorkspaceVerdict;
 pub(super) const COUNTS_EVERY: Duration = Duration::from_secs(5);
 /// The next reconcile that something is due for is at least so far away.
 pub(super) const SOONEST: Duration = Duration::from_secs(1);
+/// The cache shows a status that was written within this time, or not for a long while.
+const SHOWS: Duration = Duration::from_secs(15);
 /// A policy that the API server did not take is applied again after this long.
 pub(super) const POLICY_AGAIN: Duration = Duration::from_secs(10);
 /// A Leaderboard is reconciled this often without any cause.
@@ -73,8 +75,8 @@ pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 #[derive(Default)]
 pub(super) struct Entry {
     pub(super) looked: Looked,
-    /// When its status was written.
-    pub(super) written: Option<Timestamp>,
+    /// When its status was written, and the version of it that the API server has made.
+    pub(super) written: Option<(Timestamp, u64)>,
     pub(super) applied: Option<Applied>,
     /// What was measured last, of which generation.
     pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
@@ -133,7 +135,13 @@ impl LeaderboardState {
     /// Whether its status was not written for so long.
     pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
         self.read(uid, |entry| entry.written)
-            .is_none_or(|at| now.duration_since(at).unsigned_abs() >= age)
+            .is_none_or(|(at, _)| now.duration_since(at).unsigned_abs() >= age)
+    }
+
+    /// Whether the status that was written last may not be in the cache yet, which shows this version.
+    pub(super) fn awaits_write(&self, uid: &str, shown: u64, now: Timestamp) -> bool {
+        let written = self.read(uid, |entry| entry.written);
+        written.is_some_and(|(_, version)| shown < version) && !self.is_older(uid, now, SHOWS)
     }
 }
 
@@ -149,7 +157,7 @@ mod tests {
         let written = (0..60).filter(|second| {
             let may = state.is_older("u", at(*second), COUNTS_EVERY);
             if may {
-                state.change("u", |entry| entry.written = Some(at(*second)));
+                state.change("u", |entry| entry.written = Some((at(*second), 1)));
             }
             may
         });

@@ -1,6 +1,6 @@
-//! How long an object that failed waits for its next pass: 1 s, doubled with each failure up to 5 minutes, jittered.
+//! How long an object that failed waits for its next reconcile: 1 s, doubled with each failure up to 5 minutes, jittered.
 //!
-//! Called by the wrapper round a pass. Keyed by UID, so that an object created again under the same name starts anew.
+//! Called by the wrapper of a reconcile. Keyed by UID, so that an object created again under the same name starts anew.
 //! Knows no client and no clock.
 
 use std::collections::HashMap;
@@ -18,7 +18,7 @@ const RETRY: Backoff = Backoff::new(Duration::from_secs(1), Duration::from_mins(
 pub struct BackoffMap(Mutex<HashMap<String, u32>>);
 
 impl BackoffMap {
-    /// A pass has failed: the time until the next one.
+    /// A reconcile has failed: the time until the next one.
     pub fn failed(&self, uid: &str) -> Duration {
         let mut map = lock(&self.0);
         let failures = map.entry(uid.to_owned()).or_default();
@@ -26,7 +26,7 @@ impl BackoffMap {
         RETRY.after(*failures)
     }
 
-    /// A pass has succeeded, so that the next failure counts as the first; or the object is gone.
+    /// A reconcile has succeeded, so that the next failure counts as the first; or the object is gone.
     pub fn forget(&self, uid: &str) {
         lock(&self.0).remove(uid);
     }

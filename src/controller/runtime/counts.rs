@@ -23,7 +23,7 @@ use leaderboard_api::{FailureClass, Leaderboard, State, Submission, SubmissionSt
 const EVERY: Duration = Duration::from_secs(5);
 /// So many failures in a row are worth a host's look.
 const REPEATED: i32 = 3;
-/// All states, so that one without submissions says 0.
+/// All states, so that one without submissions has 0.
 const STATES: [State; 6] = [
     State::Pending,
     State::Running,

@@ -10,7 +10,7 @@ use super::*;
 use crate::allowed::Allowed;
 use crate::controller::fixtures;
 use crate::controller::runtime::leader::Identity;
-use crate::controller::runtime::leader::fake_server::FakeServer;
+use crate::controller::runtime::leader::tests::fake_server::FakeServer;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.

@@ -9,6 +9,7 @@ use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{CheckEnd, State};
 
 #[cfg(test)]
+#[path = "tests/histories.rs"]
 mod histories;
 
 /// A place that has changed by one part in so many is news; in the first places of a line each step is.

@@ -38,7 +38,7 @@ pub fn check_team(name: &str) -> String {
     format!("check/{name}")
 }
 
-/// What its status says of it.
+/// What its status shows of it.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Stand {
     /// It has no slot, and may want one.
@@ -67,7 +67,7 @@ impl Member {
         };
         let times = &status.times;
         let began = times.scheduled.as_ref().or(times.started.as_ref());
-        // What never ran says nothing of how long a run takes.
+        // What never ran shows nothing of how long a run takes.
         let ended = times.started.as_ref().and(times.finished.as_ref());
         let is_deleting = submission.metadata.deletion_timestamp.is_some();
         let own = spec.check.then(|| check_team(&name));

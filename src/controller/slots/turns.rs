@@ -12,6 +12,7 @@ use jiff::Timestamp;
 use leaderboard_api::Eta;
 
 #[cfg(test)]
+#[path = "tests/day.rs"]
 mod day;
 
 /// Runs of a track that its waiting times are estimated from.

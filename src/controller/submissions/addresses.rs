@@ -38,7 +38,7 @@ pub struct Found {
     pub addresses: Answer,
 }
 
-/// An answer. An error says which service has no endpoint.
+/// An answer. An error shows which service has no endpoint.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Looked {
     /// When it was asked for.
@@ -72,7 +72,7 @@ pub type Addresses = Questions<Question>;
 pub type ObservedAddresses = Observed<Looked>;
 
 impl Addresses {
-    /// Starts the task that looks up. `region` is the one that Pods are told.
+    /// Starts the task that looks up. `region` is the one that Pods are given.
     pub fn start(names: &Names, region: Option<String>, tasks: &Tasks, wake: Wake<Submission>) -> Self {
         let names = names.clone();
         let look_up = move |question: Question, _namespace| {
@@ -116,7 +116,7 @@ async fn find(names: &Names, question: &Question, region: Option<&str>) -> Resul
     Ok(join_all(found).await)
 }
 
-/// What a Pod is given of an answer; an error says why a service has no address for it, and what to do.
+/// What a Pod is given of an answer; an error shows why a service has no address for it, and what to do.
 pub fn usable(network: &Network, looked: &Looked) -> Result<names::Addresses, String> {
     let found = looked
         .found

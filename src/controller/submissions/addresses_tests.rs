@@ -1,4 +1,4 @@
-//! What a Pod is given of what a resolver says, honest and hostile.
+//! What a Pod is given of what a resolver answers, honest and hostile.
 
 use std::sync::{Arc, Mutex};
 
@@ -122,7 +122,7 @@ async fn a_name_that_leads_to_metadata_or_to_this_machine_is_refused_even_where_
 }
 
 #[tokio::test]
-async fn public_addresses_that_are_not_allowed_are_told_in_words_that_do_not_change() {
+async fn public_addresses_that_are_not_allowed_are_shown_in_words_that_do_not_change() {
     let first = given(json!({}), &["52.218.0.1"]).await.unwrap_err();
     let second = given(json!({}), &["52.218.7.7", "52.218.8.8"]).await.unwrap_err();
     assert_eq!(first, second);
@@ -130,7 +130,7 @@ async fn public_addresses_that_are_not_allowed_are_told_in_words_that_do_not_cha
 }
 
 #[tokio::test]
-async fn what_a_resolver_says_is_a_line_and_names_what_to_do() {
+async fn an_error_of_a_resolver_is_one_line_and_names_what_to_do() {
     let names = Names::by(|_| async { Err(std::io::Error::other("no\nsuch \u{1b}[31mname.")) }.boxed());
     let spec = spec(&json!({}));
     let question = question(&spec, &spec.storage, 1);

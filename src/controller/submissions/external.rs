@@ -57,7 +57,7 @@ impl ExternalSystems {
         lock(&self.targets).get(uid(leaderboard)).cloned()
     }
 
-    /// What EvalAI is known to say of a submission.
+    /// What EvalAI is known to show of a submission.
     /// `others` are the Submissions among which the original of a re-run is looked for, until it is noted.
     pub fn evalai_view(
         &self,

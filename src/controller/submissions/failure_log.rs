@@ -55,7 +55,7 @@ impl Tail {
         self.container.starts_with("agent-")
     }
 
-    /// With a first line that says whose log it is, and where all of it is.
+    /// With a first line that shows whose log it is, and where all of it is.
     pub fn for_hosts(&self) -> String {
         format!(
             "{}{}",

@@ -145,7 +145,7 @@ impl Places {
         })
     }
 
-    /// A report that is none of ours says nothing: the run goes on from the other objects.
+    /// A report that is none of ours shows nothing: the run goes on from the other objects.
     async fn report(&self, question: &Question) -> Result<Option<Box<StoredReport>>, Unread> {
         let archive = Archive::of_run(&self.aws, &question.storage, &question.run_id);
         let object = archive
@@ -195,7 +195,7 @@ impl Places {
     }
 }
 
-/// A table that does not exist, or cannot hold such a row, holds no other program's. The Leaderboard's status says what is wrong.
+/// A table that does not exist, or cannot hold such a row, holds no other program's. The Leaderboard's status shows what is wrong.
 fn of_table(error: &TableError) -> Result<Option<ObservedRow>, Unread> {
     let is_refused = match error {
         TableError::Missing { .. }

@@ -1,4 +1,4 @@
-//! What registries know of submitted images: one question for each attempt, before its first Job.
+//! What registries report of submitted images: one question for each attempt, before its first Job.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -58,7 +58,7 @@ impl Images {
 }
 
 /// The first of the Leaderboard's pull secrets that has credentials for the registry. One that cannot be read has none: the registry
-/// then says what it lets everybody read.
+/// then shows what it lets everybody read.
 async fn credentials(client: &Client, namespace: &str, question: &Question) -> Option<Credentials> {
     let api: Api<Secret> = Api::namespaced(client.clone(), namespace);
     for name in &question.secrets {

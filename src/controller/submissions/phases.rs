@@ -97,7 +97,7 @@ pub fn ended(view: &View, new: &SubmissionStatus) -> Vec<Ended> {
 struct Found(Vec<Ended>);
 
 impl Found {
-    /// None: nobody knows when it began, so nothing is said of it.
+    /// None: nobody knows when it began, so nothing is shown of it.
     fn add(&mut self, phase: Phase, start: Option<Timestamp>, end: Timestamp) {
         let ended = start.map(|start| Ended {
             phase,

@@ -64,7 +64,7 @@ fn merge_by(key: &str, base: &mut Vec<Value>, overlay: &[Value], join: impl Fn(&
     }
 }
 
-/// Aliases go first, so that what is said of one container wins over what is said of all. A pair that this track does
+/// Aliases go first, so that what is shown of one container wins over what is shown of all. A pair that this track does
 /// not have is passed over: the overlay is the same for all tracks.
 fn merge_containers(base: &mut [Value], overlay: &[Value]) {
     let name = |item: &Value| item["name"].as_str().unwrap_or_default().to_owned();

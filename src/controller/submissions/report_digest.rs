@@ -83,7 +83,7 @@ impl ReportDigest {
         self.is_final && self.done == self.total && self.total > 0
     }
 
-    /// Whether it says how a run came to its own end, whatever becomes of its Job. Of one that was stopped for its node, or by a host,
+    /// Whether it shows how a run came to its own end, whatever becomes of its Job. Of one that was stopped for its node, or by a host,
     /// only results that count do: it goes on in another Job, which stores no report of its own before its first round.
     pub fn is_verdict(&self) -> bool {
         let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));

@@ -32,7 +32,7 @@ pub(super) fn payload(view: &View) -> Payload {
     }
 }
 
-/// The payload of a partial result. `is_shown` says that its phase's leaderboard shows it.
+/// The payload of a partial result. `is_shown` means that its phase's leaderboard shows it.
 pub(super) fn partial_payload(view: &View, is_shown: bool) -> Option<Payload> {
     let result = partial_results(texts(view)?, is_shown).to_owned();
     Some(Payload {
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_is_shown_to_hosts_alone_unless_they_say_otherwise() {
+    fn a_log_is_shown_to_hosts_alone_unless_they_want_it_otherwise() {
         let shown = |container: &str, readers| {
             let tail = Tail {
                 container: container.into(),

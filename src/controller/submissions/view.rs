@@ -25,7 +25,7 @@ pub struct View {
     pub leaderboard: Option<Arc<Leaderboard>>,
     /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place; only meaningful while it has no Job.
     pub is_policy_in_place: bool,
-    /// What its registry has told of its image.
+    /// What its registry has reported of its image.
     pub image: ObservedImage,
     /// What another program has left of it.
     pub traces: ObservedTraces,
@@ -56,7 +56,7 @@ pub struct View {
     pub record: Option<RecordView>,
     /// Routes in the last partial result that was sent to EvalAI, in this attempt.
     pub partial_sent: Option<u32>,
-    /// The submission that re-runs this one, as its status says.
+    /// The submission that re-runs this one, as its status shows.
     pub rerun_as: Option<Rerun>,
     /// How its team's attempts ended before; read only if this may be the reconcile that ends it.
     pub team: TeamHistory,
@@ -365,7 +365,7 @@ pub enum ObservedLog {
 /// What is known of the submission in EvalAI.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EvalaiView {
-    /// What EvalAI last said of it; None until it was asked.
+    /// What EvalAI last reported of it; None until it was asked.
     pub info: Option<EvalaiInfo>,
     /// When its row was read.
     pub read_at: Option<Timestamp>,
@@ -386,7 +386,7 @@ pub struct EvalaiView {
 pub struct EvalaiInfo {
     pub standing: Standing,
     pub status: String,
-    /// Phase of its row; none where EvalAI does not say.
+    /// Phase of its row; none where EvalAI does not show one.
     pub phase: Option<i64>,
     pub team_id: String,
     pub team_name: Option<String>,

@@ -1,4 +1,4 @@
-//! An event as it is read: what it says, of which object, and when.
+//! An event as it is read: what it reports, of which object, and when.
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;

@@ -14,7 +14,7 @@ use prometheus_client::registry::Registry;
 use super::labels::Reason;
 use super::{Metrics, zero};
 
-/// A gauge of the leader: who does not lead has no sample of it, where a 0 would say that something is so.
+/// A gauge of the leader: who does not lead has no sample of it, where a 0 would mean that something is so.
 #[derive(Clone, Debug)]
 pub(super) struct LeaderGauge(Arc<AtomicI64>);
 

@@ -1,4 +1,4 @@
-//! How long submissions stay in each phase of their life, and what became of the spans that say so.
+//! How long submissions stay in each phase of their life, and what became of the spans that show it.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! Sends spans to a collector by OTLP over HTTP, as the standard variables `OTEL_*` say.
+//! Sends spans to a collector by OTLP over HTTP, as the standard variables `OTEL_*` set.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -123,7 +123,7 @@ pub fn start(endpoint: Option<&str>, metrics: &Arc<Metrics>, tasks: &Tasks) -> R
     Ok((Traces(Some(outlet)), Sending { close, task }))
 }
 
-/// What the environment says of the process, and its name where that says none.
+/// What the environment has of the process, and its name where that has none.
 fn resource() -> Resource {
     let given = Resource::builder().build();
     let name = given.get(&"service.name".into()).map(|name| name.to_string());

@@ -95,7 +95,7 @@ async fn a_collector_that_refuses_costs_the_spans_and_is_counted() {
 
 #[tokio::test]
 async fn a_collector_that_never_answers_holds_nobody_up() {
-    // It takes connections and says nothing.
+    // It takes connections and never answers.
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("http://{}/v1/traces", listener.local_addr().unwrap());
     let (traces, _sending, metrics) = started(&url);

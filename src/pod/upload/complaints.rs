@@ -1,4 +1,4 @@
-//! What was left out and why, said once in logcopy's log, with the limit's name and what to do.
+//! What was left out and why, written once to logcopy's log, with the limit's name and what to do.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -72,7 +72,7 @@ impl fmt::Display for Why {
 }
 
 impl Why {
-    /// What is said once: each limit, and each file that has a reason of its own.
+    /// What is shown once: each limit, and each file that has a reason of its own.
     fn topic(&self, key: &str) -> String {
         match self {
             Self::Limit(Limit::Bytes(_)) => "bytes".to_owned(),
@@ -88,12 +88,12 @@ impl Why {
     }
 }
 
-/// What was said already.
+/// What was shown already.
 #[derive(Debug, Default)]
 pub struct Complaints(BTreeSet<String>);
 
 impl Complaints {
-    /// Says it, unless it was said.
+    /// Logs it, unless it was logged.
     pub fn say(&mut self, key: &str, why: &Why) {
         if self.is_new(key, why) {
             tracing::warn!(file = %key, "not stored: {why}");

@@ -106,7 +106,7 @@ impl Uploader {
         &self.memory
     }
 
-    /// Says once why something is not stored.
+    /// Logs once why something is not stored.
     pub fn complain(&mut self, key: &str, why: &Why) {
         self.complaints.say(key, why);
     }
@@ -263,7 +263,7 @@ impl Uploader {
         self.slow.insert(key, Slow { again, times });
     }
 
-    /// The files that are due and fit, the known logs first, and what is to be said of the others.
+    /// The files that are due and fit, the known logs first, and what is to be shown of the others.
     fn due(&self, files: &[Wanted], is_last: bool) -> (Vec<(Job, Bill)>, LeftOut) {
         let now = self.epoch.elapsed();
         let stored = self.memory.stored.iter();

@@ -35,7 +35,7 @@ pub enum Cause {
     /// More than is read.
     #[error("the object has more than the {0} bytes that are read")]
     TooLarge(u64),
-    /// No answer, or one that says to try again.
+    /// No answer, or one that asks to try again.
     #[error("S3 does not answer ({0})")]
     Away(String),
     /// Any other refusal.

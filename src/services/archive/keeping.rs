@@ -39,7 +39,7 @@ impl Keeping {
             .set_storage_class(self.class.clone())
     }
 
-    /// For one that is sent in parts; they are kept as its beginning says.
+    /// For one that is sent in parts; they are kept as its beginning requires.
     pub(super) fn of_upload(&self, request: CreateMultipartUploadFluentBuilder) -> CreateMultipartUploadFluentBuilder {
         request
             .set_server_side_encryption(self.encryption())

@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn refusals_say_what_they_are_about() {
+    fn refusals_name_what_they_are_about() {
         for (status, body, about) in [
             (401, r#"{"detail":"Invalid token"}"#, About::Token),
             (403, r#"{"detail":"Please verify your email!"}"#, About::Token),
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn throttling_says_how_long() {
+    fn throttling_shows_how_long_it_lasts() {
         for (header, seconds) in [
             (Some("56"), 56),
             (Some("0"), 1),

@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn what_starts_and_what_drops() {
+    fn a_live_row_is_started_and_an_ended_one_is_dropped() {
         for begun in [false, true] {
             for attempt in [1, 2, 7] {
                 for status in LIVE {
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_of_finals() {
+    fn finals_follow_their_table() {
         use Outcome::{Cancelled, Failed, Finished};
         for status in LIVE.into_iter().chain([S::Finished]) {
             for wanted in [Finished, Failed, Cancelled] {
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn partials_follow_only_a_run_that_evalai_knows() {
+    fn partials_follow_only_a_run_that_evalai_has() {
         for status in LIVE {
             assert_eq!(partial(status, of(1, false)), Verdict::Send);
         }

@@ -59,7 +59,7 @@ pub enum Misfit {
 
 impl Misfit {
     /// Whether it keeps results from being published.
-    pub fn prevents(&self) -> bool {
+    fn prevents(&self) -> bool {
         !matches!(self, Self::Unsent { .. })
     }
 }

@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn complete_finite_results_of_the_split_pass() {
+    fn complete_finite_results_of_the_split_are_accepted() {
         let whole = r#"[{"split":"leaderboard","show_to_participant":true,"accuracies":{"Driving score":43.1,"Route completion":100}}]"#;
         assert_eq!(checked(whole), Ok(()));
         for (result, part) in [

@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_phase_shows_partial_results_only_where_it_says_so() {
+    fn a_phase_shows_partial_results_only_where_it_is_set_to() {
         let of = |phase: Value| serde_json::from_value::<Phase>(phase).unwrap().shows_partial;
         let name = "is_partial_submission_evaluation_enabled";
         assert!(of(json!({"id": 1, name: true, "slug": "x"})));
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn an_uploaded_file_names_an_image_or_says_why_not() {
+    fn an_uploaded_file_names_an_image_or_is_refused_with_the_reason() {
         let of = |value: Value| image(value.to_string().as_bytes());
         assert_eq!(
             of(json!({"submitted_image_uri": "registry.example/a:1"})),

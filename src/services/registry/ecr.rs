@@ -79,7 +79,7 @@ impl Ecr {
         (self.place)(registry).is_some()
     }
 
-    /// Credentials for a registry; an error says what AWS has answered, for hosts.
+    /// Credentials for a registry; an error shows what AWS has answered, for hosts.
     pub(super) async fn credentials(&self, registry: &str) -> Result<Credentials, String> {
         let place = (self.place)(registry).ok_or("it is not a registry of Amazon")?;
         if let Some(known) = self.known(place.region) {

@@ -43,7 +43,7 @@ pub(super) enum Document {
     Image { config: Part, bytes: u64 },
 }
 
-/// What a config says.
+/// What a config has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Config {
     pub(super) is_linux_amd64: bool,
@@ -87,7 +87,7 @@ fn image(config: &Object<'_>, layers: &[&RawValue]) -> Result<Document, Defect> 
     Ok(Document::Image { config, bytes })
 }
 
-/// The first image of an index for our machines; else the first of unknown platform, whose config will say.
+/// The first image of an index for our machines; else the first of unknown platform, whose config will show it.
 fn for_linux_amd64(images: &[&RawValue]) -> Result<Option<Part>, Defect> {
     if images.len() > MOST_IMAGES {
         return Err(IMAGES);
@@ -105,7 +105,7 @@ fn for_linux_amd64(images: &[&RawValue]) -> Result<Option<Part>, Defect> {
     Ok(of_unknown)
 }
 
-/// None: it does not say.
+/// None: it does not have one.
 fn is_linux_amd64(object: &Object<'_>) -> Result<Option<bool>, Defect> {
     let (Some(os), Some(architecture)) = (object.text("os")?, object.text("architecture")?) else {
         return Ok(None);

@@ -116,7 +116,7 @@ fn bytes_that_are_no_document_are_refused_however_deep_they_are() {
 }
 
 #[test]
-fn a_config_tells_the_machine_and_whether_it_has_volumes() {
+fn a_config_has_the_platform_and_the_volumes() {
     let read = |value: Value| config(value.to_string().as_bytes());
     let of = |run: Value| json!({"os": "linux", "architecture": "amd64", "config": run});
     for (value, is_linux_amd64, has_volumes) in [

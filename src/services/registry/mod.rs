@@ -1,4 +1,4 @@
-//! What a registry has under the name of an image: its digest, its size, and what its config says. One question before the first Job.
+//! What a registry has under the name of an image: its digest, its size, and what its config has. One question before the first Job.
 //!
 //! Called by `controller::submissions::images`. Knows registries' HTTP API and no policy. Names and documents are a participant's:
 //! every answer is bounded and checked against its digest, addresses are checked hop by hop (`address`), and nothing that a registry
@@ -58,7 +58,7 @@ pub struct Image {
     pub may_be_local: bool,
 }
 
-/// What a registry has told of an image.
+/// What a registry has reported of an image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Facts {
     /// Of the manifest for linux/amd64.
@@ -68,7 +68,7 @@ pub struct Facts {
     pub has_volumes: bool,
 }
 
-/// Why it has told nothing.
+/// Why it has reported nothing.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// It has no such image.

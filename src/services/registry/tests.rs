@@ -34,7 +34,7 @@ fn unreachable_for(answer: Result<Facts, Fault>, words: &str) {
 }
 
 #[tokio::test]
-async fn a_tag_gives_digest_size_and_what_the_config_says() {
+async fn a_tag_gives_digest_size_platform_and_volumes() {
     let registry = ImageRegistry::start().await;
     let plain = registry.push("plain", &config(), 1000);
     let found = look_up(&registry, "plain").await.unwrap();
@@ -84,7 +84,7 @@ async fn an_index_gives_the_manifest_of_our_machines() {
 }
 
 #[tokio::test]
-async fn an_answer_that_is_not_what_its_digest_says_is_not_believed() {
+async fn an_answer_that_does_not_match_its_digest_is_refused() {
     let registry = ImageRegistry::start().await;
     let wanted = digest(b"something else");
     registry.put(
@@ -207,7 +207,7 @@ async fn credentials_are_given_as_the_registry_asks_and_to_nobody_else() {
 }
 
 #[tokio::test]
-async fn without_credentials_a_refusal_says_nothing_of_what_nodes_may_pull() {
+async fn without_credentials_a_refusal_shows_nothing_of_what_nodes_may_pull() {
     let registry = ImageRegistry::start().await;
     registry.guard("Basic realm=\"x\"", "Basic dXNlcjpzZWNyZXQ=");
     unreachable_for(look_up(&registry, "one").await, "credentials");

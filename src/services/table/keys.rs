@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_what_the_table_says() {
+    fn keys_are_those_of_the_table() {
         use {KeyType::Hash, KeyType::Range, ScalarAttributeType as Kind};
         for (team, submission, kind) in [
             ("team_id", "submission_id", Kind::S),

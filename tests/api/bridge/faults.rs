@@ -33,7 +33,7 @@ async fn what_cannot_be_used_becomes_a_dead_letter_with_its_reason() {
 }
 
 #[tokio::test]
-async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_says_so() {
+async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_shows_it() {
     let world = World::new("bridge-blocked").await;
     let url = world.stand_in.queue("q").await;
     world.leaderboard("lb", 2, json!({"url": url})).await;

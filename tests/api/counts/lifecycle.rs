@@ -38,6 +38,7 @@ const LIMIT: Duration = Duration::from_mins(3);
 /// A controller that has written nothing during so long has nothing more to write. Nobody can wait for what does not come.
 /// It is longer than the controller waits with a Leaderboard's counts.
 const QUIET: Duration = Duration::from_secs(7);
+/// The audit log of the API server is read this often.
 const LOOK: Duration = Duration::from_millis(200);
 /// The process's own requests.
 const OF_THE_PROCESS: [&str; 2] = ["leases", "selfsubjectaccessreviews"];
@@ -93,9 +94,9 @@ impl Scenario {
         let before = (
             controller.requests().await.len(),
             controller.reconciles(),
-            world.s3.requests(),
+            world.s3.counts().requests,
             world.evalai_requests(),
-            world.table.requests(),
+            world.table.counts().requests,
         );
         if has_submission {
             world.live(&controller).await;
@@ -107,9 +108,9 @@ impl Scenario {
         }
         let requests = controller.requests().await.split_off(before.0);
         let reconciles = controller.reconciles() - before.1;
-        let s3_requests = world.s3.requests() - before.2;
+        let s3_requests = world.s3.counts().requests - before.2;
         let evalai_requests = world.evalai_requests() - before.3;
-        let table_requests = world.table.requests() - before.4;
+        let table_requests = world.table.counts().requests - before.4;
         let memory = controller.end().await;
         let mut cost = Cost {
             s3_requests,

@@ -17,7 +17,7 @@ use super::lifecycle::{Controller, Scenario, Watched, World, has_job, is_read, i
 
 /// Submissions.
 const COUNT: usize = 4;
-/// As a Leaderboard reads them that says nothing else.
+/// As a Leaderboard has them that sets nothing else.
 const PERIOD: u32 = 10;
 const MINUTE: Duration = Duration::from_mins(1);
 
@@ -117,12 +117,12 @@ async fn minute(world: &World, controller: &Controller) -> Rest {
     let before = (
         controller.requests().await.len(),
         controller.reconciles(),
-        world.s3.requests(),
+        world.s3.counts().requests,
     );
     // There is no event to wait for: what does not come is what is counted.
     sleep(MINUTE).await;
     let mut rest = Rest {
-        s3_requests: world.s3.requests() - before.2,
+        s3_requests: world.s3.counts().requests - before.2,
         reconciles: controller.reconciles() - before.1,
         ..Rest::default()
     };

@@ -114,7 +114,7 @@ async fn a_broken_page_in_place_of_an_end_is_an_answer() {
 }
 
 #[tokio::test]
-async fn a_refused_end_says_why() {
+async fn a_refused_end_shows_why() {
     let mut world = World::new().await;
     let pk = world.submit();
     let mut target = world.target.clone();
@@ -153,7 +153,7 @@ async fn the_end_of_the_process_waits_for_what_is_on_its_way() {
     assert!(!world.hub.drain().await, "the server may still be working on it");
 }
 
-/// A server that gives the same texts to one connection after the other, and says when each came.
+/// A server that gives the same texts to one connection after the other, and returns when each came.
 async fn scripted(answers: Vec<String>) -> (String, mpsc::UnboundedReceiver<Instant>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());

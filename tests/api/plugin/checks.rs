@@ -1,11 +1,14 @@
 //! `check` against a real API server. No controller runs; the test writes what one would.
 
+use std::pin::pin;
 use std::process::Stdio;
 
+use futures::StreamExt;
 use k8s_openapi::api::apps::v1::DaemonSet;
 use k8s_openapi::api::core::v1::Pod;
 use kube::api::{DynamicObject, ListParams, PostParams};
 use kube::runtime::wait::await_condition;
+use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Api, ResourceExt};
 use serde_json::{Value, json};
 use tokio::io::AsyncReadExt;
@@ -19,16 +22,14 @@ use crate::api::objects::Kind;
 /// The Submission of the check that the command has created.
 async fn created(terminal: &Terminal) -> DynamicObject {
     let api = terminal.api(Kind::Submission);
-    let found = async {
-        loop {
-            let all = api.list(&ListParams::default()).await.unwrap().items;
-            if let Some(check) = all.into_iter().find(|one| one.name_any().starts_with("check-")) {
-                return check;
-            }
-            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-        }
-    };
-    timeout(LIMIT, found).await.expect("the check is created")
+    let seen = watcher(api, watcher::Config::default())
+        .default_backoff()
+        .touched_objects();
+    let mut checks = pin!(seen.filter_map(async |one| one.ok().filter(|one| one.name_any().starts_with("check-"))));
+    timeout(LIMIT, checks.next())
+        .await
+        .expect("the check is created")
+        .unwrap()
 }
 
 async fn has_no_submission(terminal: &Terminal) {

@@ -31,7 +31,7 @@ async fn replica(terminal: &Terminal, name: &str, port: &str) {
 }
 
 #[tokio::test]
-async fn dashboard_says_what_is_missing_before_a_browser_is_sent_anywhere() {
+async fn dashboard_prints_what_is_missing_before_a_browser_is_sent_anywhere() {
     let terminal = Terminal::new().await;
     terminal.leaderboard(&json!({})).await;
     let text = terminal.run(&["dashboard"]).await.refused();

@@ -16,7 +16,7 @@ use crate::api::bridge::LIMIT;
 use crate::api::objects::{Kind, merge};
 
 const DOCS: &str = include_str!("../../../docs/plugin.md");
-/// The API server applies new rights after a moment.
+/// A right applies a moment after it was given, and the API server reports nothing then: it is asked this often.
 const POLL: Duration = Duration::from_millis(50);
 
 #[tokio::test]

@@ -37,7 +37,7 @@ async fn objects_are_read_written_listed_and_deleted() {
 }
 
 #[tokio::test]
-async fn errors_say_what_to_do() {
+async fn errors_show_what_to_do() {
     let endpoint = server().await.endpoint();
     let client = server().await.aws().await.s3(None, Some(&endpoint));
     let archive = Archive::new(client, "no-such-bucket", "77/");
@@ -105,7 +105,7 @@ async fn an_object_is_replaced_whatever_was_known_of_it() {
 }
 
 #[tokio::test]
-async fn an_s3_that_knows_no_conditions_stores_all_the_same() {
+async fn an_s3_without_conditions_stores_all_the_same() {
     const REFUSED: &str = "<Error><Code>NotImplemented</Code></Error>";
     let answer = |request: axum::extract::Request| async move {
         let has_condition = |name| request.headers().contains_key(name);
@@ -131,7 +131,7 @@ async fn an_s3_that_knows_no_conditions_stores_all_the_same() {
     server.abort();
 }
 
-/// What S3 says of a stored object: how it is encrypted, with which key, and its class.
+/// What S3 has of a stored object: how it is encrypted, with which key, and its class.
 async fn kept_as(pod: &Pod, key: &str) -> (String, String, String) {
     let s3 = pod.aws.s3(None, Some(&server().await.endpoint()));
     let bucket = &pod.setting.run.plan.storage.bucket;
@@ -154,7 +154,7 @@ async fn kept_as(pod: &Pod, key: &str) -> (String, String, String) {
 }
 
 #[tokio::test]
-async fn every_object_is_kept_as_the_leaderboard_says() {
+async fn every_object_is_kept_as_the_leaderboard_sets() {
     const KEY: &str = "arn:aws:kms:us-east-1:000000000000:key/0a1b";
     let pod = Pod::new().await;
     let mut storage = pod.setting.run.plan.storage.clone();

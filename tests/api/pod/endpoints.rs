@@ -8,7 +8,7 @@ use super::super::endpoints::Elsewhere;
 use super::*;
 
 #[tokio::test]
-async fn objects_and_lines_go_where_the_leaderboard_says() {
+async fn objects_and_lines_go_where_the_leaderboard_sends_them() {
     let (mut pod, elsewhere) = (Pod::new().await, Elsewhere::start().await);
     let (endpoint, group) = (server().await.endpoint(), format!("group-{}", fastrand::u64(..)));
     pod.setting.run.plan.storage.endpoint = Some(endpoint.clone());
@@ -65,7 +65,7 @@ async fn objects_and_lines_go_where_the_leaderboard_says() {
     begins_with_its_program(&said("logcopy"));
 }
 
-/// The first line of a log says which program of which version this was.
+/// The first line of a log shows which program of which version this was.
 fn begins_with_its_program(log: &str) {
     let first = log.lines().next().unwrap_or_default();
     let first: serde_json::Value = serde_json::from_str(first).unwrap();

@@ -64,9 +64,9 @@ async fn whatever_is_in_the_place_of_a_checkpoint_the_last_good_one_stays_and_th
         let reason = report.why.unwrap();
         assert!(reason.contains(why), "{what}: {reason}");
         assert_eq!((report.done, report.is_final), (3, false), "{what}");
-        // Its runner never says done; a host or the retries end it.
+        // Its runner never reports done; a host or the retries end it.
         fs::write(pod.setting.places.stop(), "Retries").unwrap();
-        until_true(|| pod.has(StatusFile::Stored)).await;
+        pod.until_has(StatusFile::Stored).await;
         let report = pod.report().await.unwrap();
         assert!(report.is_final && !report.eligible, "{what}");
         let stored = pod.stored(CHECKPOINT).await.unwrap();
@@ -136,10 +136,10 @@ async fn s3_that_comes_back_in_the_last_flush_gets_everything() {
     proxy.set_away(true);
     pod.checkpoint(1, 1);
     pod.append("agent/agent1/leaderboard.log", b"last\n");
-    let refused = proxy.refused();
+    let before = proxy.counts().refused;
     let ending = tokio::spawn(logcopy.end());
     // It was asked to end, and has tried more than once.
-    until_true(|| proxy.refused() > refused + 20).await;
+    proxy.until(|counts| counts.refused > before + 20).await;
     assert!(!ending.is_finished());
     proxy.set_away(false);
     ending.await.unwrap();

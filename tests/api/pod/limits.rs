@@ -196,7 +196,7 @@ async fn a_file_that_never_arrives_keeps_no_report_back() {
     }
     pod.put("agent/agent2/arrives", b"x");
     let logcopy = pod.logcopy();
-    until_true(|| shelf.aborted(LOST[0]) == 1).await;
+    shelf.until(|shelf| shelf.aborted(LOST[0]) == 1).await;
     pod.checkpoint(1, 1);
     pod.reported(|report| report.done == 1).await;
     assert!(shelf.order().iter().any(|key| key == "agent/agent2/arrives"));
@@ -204,7 +204,7 @@ async fn a_file_that_never_arrives_keeps_no_report_back() {
         pod.checkpoint(pair, 2);
         pod.mark(Side::Agent, u16::try_from(pair).unwrap(), Mark::Done);
     }
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     assert!(pod.report().await.unwrap().is_final);
     assert_eq!(
         shelf.aborted(LOST[0]),
@@ -221,14 +221,14 @@ async fn the_final_report_comes_before_the_logs() {
     let (shelf, pod) = shelved().await;
     pod.append(LOG, &noise(10_000, 1));
     let logcopy = pod.logcopy();
-    until_true(|| shelf.order().iter().any(|key| key == LOG)).await;
+    shelf.until(|shelf| shelf.order().iter().any(|key| key == LOG)).await;
     // Too little to be stored before the end.
     pod.append(LOG, b"last line\n");
     for pair in [1, 2] {
         pod.checkpoint(pair, 2);
         pod.mark(Side::Agent, u16::try_from(pair).unwrap(), Mark::Done);
     }
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     let order = shelf.order();
     let last = |key: &str| order.iter().rposition(|stored| stored == key).unwrap();
     assert!(last(REPORT_KEY) < last(LOG), "{order:?}");

@@ -30,7 +30,7 @@ async fn what_storing_the_reference_costs() {
     for file in 0..FILES {
         pod.put(&path(file), &noise(FILE, file as u64));
     }
-    let (sent, requests) = (proxy.sent(), proxy.requests());
+    let (sent, requests) = (proxy.counts().sent, proxy.counts().requests);
     let logcopy = pod.logcopy();
     let mut tick = tokio::time::interval(Duration::from_secs(PERIOD));
     tick.tick().await;
@@ -57,7 +57,7 @@ async fn what_storing_the_reference_costs() {
             );
         }
     }
-    let sent = usize::try_from(proxy.sent() - sent).unwrap();
+    let sent = usize::try_from(proxy.counts().sent - sent).unwrap();
     let (seconds, hundredths) = ((ROUNDS as u64 - 1) * PERIOD, sent * 100 / size);
     println!(
         "upload: {} kB sent for {} kB: {}.{:02}x; {} requests an hour",
@@ -65,7 +65,7 @@ async fn what_storing_the_reference_costs() {
         size / 1000,
         hundredths / 100,
         hundredths % 100,
-        (proxy.requests() - requests) * 3600 / seconds
+        (proxy.counts().requests - requests) * 3600 / seconds
     );
     assert!(sent < 2 * size, "{sent} bytes for {size}");
 }

@@ -192,7 +192,7 @@ async fn a_resume_takes_up_the_checkpoints_of_the_newest_pipelines_workers() {
 }
 
 #[tokio::test]
-async fn a_failure_is_said_in_the_termination_log() {
+async fn a_failure_is_written_to_the_termination_log() {
     let mut pod = Pod::new().await;
     pod.setting.run.plan.slices = vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 1, last: 2 }];
     // It never asks S3, so that no credentials are needed.
@@ -204,7 +204,7 @@ async fn a_failure_is_said_in_the_termination_log() {
 }
 
 #[tokio::test]
-async fn a_pod_that_has_to_be_isolated_and_is_not_touches_nothing() {
+async fn a_pod_that_has_to_be_isolated_and_is_not_changes_nothing() {
     let mut pod = Pod::new().await;
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     pod.setting.api_server = listener.local_addr().ok();

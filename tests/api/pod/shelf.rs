@@ -1,12 +1,13 @@
 //! S3 in memory, as much of it as logcopy asks for: keeps the order of what is stored, and never answers for chosen keys.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use axum::body::{Body, to_bytes};
 use axum::extract::Request;
 use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
+use tokio::sync::watch;
 
 /// What is stored under a key.
 #[derive(Clone, Debug, Default)]
@@ -30,7 +31,7 @@ struct State {
 /// One bucket.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Shelf {
-    state: Arc<Mutex<State>>,
+    state: Arc<watch::Sender<State>>,
 }
 
 impl Shelf {
@@ -47,18 +48,33 @@ impl Shelf {
 
     /// What is sent to this key arrives no more.
     pub(super) fn lose(&self, key: &str) {
-        self.state.lock().unwrap().lost.insert(key.to_owned());
+        self.state.send_modify(|state| {
+            state.lost.insert(key.to_owned());
+        });
     }
 
     /// The keys that were stored, in order; each as often as it was.
     pub(super) fn order(&self) -> Vec<String> {
-        self.state.lock().unwrap().order.clone()
+        self.state.borrow().order.clone()
     }
 
     /// How often an upload to the key was given up.
     pub(super) fn aborted(&self, key: &str) -> usize {
-        let state = self.state.lock().unwrap();
+        let state = self.state.borrow();
         state.aborted.iter().filter(|aborted| *aborted == key).count()
+    }
+
+    /// Waits until this holds of it.
+    pub(super) async fn until(&self, holds: impl Fn(&Self) -> bool) {
+        let mut changes = self.state.subscribe();
+        let changed = async {
+            while !holds(self) {
+                changes.changed().await.unwrap();
+            }
+        };
+        tokio::time::timeout(super::PATIENCE, changed)
+            .await
+            .expect("it never holds");
     }
 
     async fn answer(self, request: Request) -> Response {
@@ -71,37 +87,44 @@ impl Shelf {
             let value = head.headers.get(name)?.to_str().ok()?;
             Some(value.trim_matches('"').to_owned())
         };
-        if head.method == Method::PUT && self.state.lock().unwrap().lost.contains(&key) {
+        if head.method == Method::PUT && self.state.borrow().lost.contains(&key) {
             return std::future::pending().await;
         }
         let body = to_bytes(body, usize::MAX).await.unwrap().to_vec();
-        let mut state = self.state.lock().unwrap();
-        match head.method {
-            Method::GET if query.contains("list-type=2") => state.list(&query),
-            Method::GET => state.get(&key, header("if-none-match").as_deref()),
+        let if_none_match = header("if-none-match");
+        let mut response = None;
+        self.state
+            .send_modify(|state| response = Some(state.answer(&head.method, &key, &query, if_none_match, body)));
+        response.unwrap()
+    }
+}
+
+impl State {
+    fn answer(&mut self, method: &Method, key: &str, query: &str, known: Option<String>, body: Vec<u8>) -> Response {
+        match *method {
+            Method::GET if query.contains("list-type=2") => self.list(query),
+            Method::GET => self.get(key, known.as_deref()),
             Method::PUT if query.contains("partNumber=") => {
-                state.parts += 1;
-                ([("etag", format!("\"part-{}\"", state.parts))], "").into_response()
+                self.parts += 1;
+                ([("etag", format!("\"part-{}\"", self.parts))], "").into_response()
             }
-            Method::PUT => state.put(&key, body),
+            Method::PUT => self.put(key, body),
             Method::POST if query.contains("uploads") => {
                 "<InitiateMultipartUploadResult><UploadId>u</UploadId></InitiateMultipartUploadResult>".into_response()
             }
             Method::POST if query.contains("uploadId=") => {
-                state.put(&key, Vec::new());
+                self.put(key, Vec::new());
                 "<CompleteMultipartUploadResult><ETag>\"joined\"</ETag></CompleteMultipartUploadResult>".into_response()
             }
             Method::POST => "<DeleteResult/>".into_response(),
             Method::DELETE => {
-                state.aborted.push(key);
+                self.aborted.push(key.to_owned());
                 StatusCode::NO_CONTENT.into_response()
             }
             _ => StatusCode::METHOD_NOT_ALLOWED.into_response(),
         }
     }
-}
 
-impl State {
     fn put(&mut self, key: &str, bytes: Vec<u8>) -> Response {
         self.order.push(key.to_owned());
         let etag = format!("e{}", self.order.len());

@@ -35,7 +35,7 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
         pod.mark(Side::Simulator, pair, Mark::Done);
     }
     pod.append("agent/agent1/leaderboard.log", b"last line\n");
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     // It was stored before logcopy.done was written.
     let report = pod.report().await.unwrap();
     assert!(report.is_final && report.eligible && report.stopped.is_none() && report.why.is_none());
@@ -131,7 +131,8 @@ async fn a_pod_that_lost_the_fence_stores_nothing_more_and_stops_its_containers(
     let logcopy = pod.logcopy();
     pod.reported(|report| report.round >= 1).await;
     pod.archive.put(OWNER_KEY, b"pod-2".to_vec()).await.unwrap();
-    until_true(|| pod.has(StatusFile::Cancel) && pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Cancel).await;
+    pod.until_has(StatusFile::Stored).await;
     let before = pod.keys().await;
     pod.checkpoint(1, 1);
     logcopy.end().await;
@@ -154,18 +155,18 @@ async fn the_results_wait_for_s3_to_come_back() {
         pod.mark(Side::Agent, u16::try_from(pair).unwrap(), Mark::Done);
     }
     // Several rounds have read the results and could not store them.
-    let refused = proxy.refused();
-    until_true(|| proxy.refused() > refused + 20).await;
+    let before = proxy.counts().refused;
+    proxy.until(|counts| counts.refused > before + 20).await;
     assert!(!pod.has(StatusFile::Stored) && !direct.report().await.unwrap().is_final);
     proxy.set_away(false);
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     let report = direct.report().await.unwrap();
     assert!(report.is_final && report.eligible);
     logcopy.end().await;
 }
 
 #[tokio::test]
-async fn a_stop_cancels_stores_what_there_is_and_says_so() {
+async fn a_stop_cancels_stores_what_there_is_and_reports_it() {
     for stop in [Stop::Retries, Stop::Interruption] {
         is_stopped(stop).await;
     }
@@ -181,9 +182,9 @@ async fn is_stopped(stop: Stop) {
     // As the kubelet does it: the name never holds half of the text.
     fs::write(pod.setting.places.podinfo.join("next"), stop.as_str()).unwrap();
     fs::rename(pod.setting.places.podinfo.join("next"), pod.setting.places.stop()).unwrap();
-    until_true(|| pod.has(StatusFile::Cancel)).await;
+    pod.until_has(StatusFile::Cancel).await;
     pod.append("agent/agent1/leaderboard.log", b"stopped\n");
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     let report = pod.report().await.unwrap();
     assert!(report.is_final && !report.eligible && report.done == 1);
     assert_eq!(report.stopped, Some(stop));
@@ -207,7 +208,7 @@ async fn a_pair_that_ends_with_refused_results_ends_the_run_as_invalid() {
     let report = pod.reported(|report| report.why.is_some()).await;
     assert!(!report.is_final);
     pod.mark(Side::Agent, 1, Mark::Done);
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     let report = pod.report().await.unwrap();
     assert!(report.is_final && !report.eligible && report.stopped.is_none());
     let why = report.why.unwrap();
@@ -227,7 +228,7 @@ async fn a_killed_logcopy_goes_on_where_it_was() {
     fs::write(pod.setting.places.stop(), "Cancel").unwrap();
     pod.checkpoint(2, 2);
     let logcopy = pod.logcopy();
-    until_true(|| pod.has(StatusFile::Stored)).await;
+    pod.until_has(StatusFile::Stored).await;
     let report = pod.report().await.unwrap();
     assert_eq!((report.done, report.stopped), (4, Some(Stop::Cancel)));
     assert!(pod.has(StatusFile::Cancel));

@@ -25,9 +25,9 @@ async fn a_growing_log_costs_what_it_grew_and_reads_back_byte_for_byte() {
         pod.append(LOG, &noise(grown, step as u64));
         let appends = size >= 5 * MIB;
         size += grown;
-        let before = proxy.sent();
+        let before = proxy.counts().sent;
         assert_eq!(sync(&pod, &mut uploader, LOG).await.objects, 1);
-        let cost = usize::try_from(proxy.sent() - before).unwrap();
+        let cost = usize::try_from(proxy.counts().sent - before).unwrap();
         let aim = if appends { grown } else { size };
         assert!(cost <= aim + aim / 10 + 32_000, "{cost} bytes sent for {aim} at {size}");
         assert_eq!(
@@ -49,7 +49,7 @@ async fn an_unchanged_round_sends_nothing_even_after_a_restart() {
     for path in [LOG, "simulator/empty"] {
         assert_eq!(sync(&pod, &mut uploader, path).await.objects, 1);
     }
-    let before = proxy.sent();
+    let before = proxy.counts().sent;
     let mut restarted = pod.uploader();
     for uploader in [&mut uploader, &mut restarted] {
         for path in [LOG, "simulator/empty"] {
@@ -61,7 +61,7 @@ async fn an_unchanged_round_sends_nothing_even_after_a_restart() {
         .set_modified(std::time::SystemTime::UNIX_EPOCH)
         .unwrap();
     assert_eq!(sync(&pod, &mut uploader, "simulator/empty").await.objects, 0);
-    assert_eq!(proxy.sent(), before);
+    assert_eq!(proxy.counts().sent, before);
 }
 
 #[tokio::test]
@@ -169,12 +169,12 @@ async fn results_from_memory_are_sent_when_they_change_and_not_again_after_a_res
     let first = object("first");
     let mut uploader = pod.uploader();
     assert_eq!(uploader.put(&first).await.unwrap().objects, 1);
-    let before = proxy.sent();
+    let before = proxy.counts().sent;
     for same in [&first, &object("first")] {
         assert_eq!(uploader.put(same).await.unwrap(), Sent::default());
         assert_eq!(pod.uploader().put(same).await.unwrap(), Sent::default());
     }
-    assert_eq!(proxy.sent(), before);
+    assert_eq!(proxy.counts().sent, before);
     proxy.set_away(true);
     assert!(uploader.put(&object("second")).await.is_err());
     proxy.set_away(false);

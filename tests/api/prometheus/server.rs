@@ -108,7 +108,7 @@ impl Prometheus {
     }
 }
 
-/// As the operator of Prometheus makes it of the chart's monitors, which say `honorLabels`.
+/// As the operator of Prometheus makes it of the chart's monitors, which set `honorLabels`.
 fn scrape(target: &Target) -> Value {
     let labels = json!({"job": target.job, "namespace": target.namespace, "pod": target.pod});
     json!({

@@ -42,7 +42,7 @@ pub struct Props {
 #[derive(Clone, Debug, Default)]
 pub struct Seen {
     /// The stop reached the Pod.
-    pub told_to_stop: BTreeMap<String, Timestamp>,
+    pub asked_to_stop: BTreeMap<String, Timestamp>,
     /// The last container has ended, and the Job with it.
     pub ended: BTreeMap<String, Timestamp>,
 }
@@ -138,7 +138,7 @@ async fn watch_pods(stage: Arc<Stage>) {
         if let Some(cue) = cue {
             let submission = pod.labels()[names::LABEL_SUBMISSION].clone();
             let mut seen = stage.seen.lock().unwrap();
-            seen.told_to_stop.insert(submission, Timestamp::now());
+            seen.asked_to_stop.insert(submission, Timestamp::now());
             drop(seen);
             let _ = cue.send(());
         }

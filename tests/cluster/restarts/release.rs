@@ -267,7 +267,7 @@ fn kubectl<'a>(scene: &'a Scene, arguments: &[&'a str]) -> Vec<&'a str> {
     [&["kubectl", "--namespace", &scene.namespace], arguments].concat()
 }
 
-/// Runs a program; its output, or a panic with what it said.
+/// Runs a program; its output, or a panic with what it printed.
 async fn run(command: &[&str], given: &str) -> String {
     let mut started = Command::new(command[0]);
     started

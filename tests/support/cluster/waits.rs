@@ -1,4 +1,4 @@
-//! How a scene waits for what happens in it: it watches, and says at a limit what it saw last.
+//! How a scene waits for what happens in it: it watches, and reports at a limit what it saw last.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;

@@ -140,7 +140,7 @@ fn leaderboard(leaderboard: &Leaderboard, fault: Option<&Fault>) -> Finding {
     }
 }
 
-/// A part that the operator tries from time to time, as its condition Ready says.
+/// A part that the operator tries from time to time, as its condition Ready shows.
 fn of_probe(part: Part, fault: Option<&Fault>, found: &str) -> Finding {
     match fault {
         None => finding_of(part, Mark::Works, found),
@@ -370,7 +370,7 @@ fn is_of_sidecars(text: &str) -> bool {
         || text.starts_with("Logcopy ")
 }
 
-/// The part that a reason is about; `text` says which container it is.
+/// The part that a reason is about; `text` names which container it is.
 fn part_of(reason: &str, text: &str) -> Part {
     match reason {
         reason if NO_GRAPHICS.contains(&reason) => Part::Simulator,

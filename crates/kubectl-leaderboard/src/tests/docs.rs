@@ -28,7 +28,7 @@ fn planned(request: Request, submission: &Submission) -> Result<Vec<String>, Str
 }
 
 #[test]
-fn why() {
+fn why_is_documented_as_it_is_printed() {
     for status in [crashed(), waiting()] {
         let board = leaderboard();
         assert_documented(&why::explain(&submission(&status), Observed::Found(&board), frame()));
@@ -36,7 +36,7 @@ fn why() {
 }
 
 #[test]
-fn why_of_all() {
+fn why_of_all_is_documented_as_it_is_printed() {
     let mut paused = leaderboard();
     paused.spec.paused = true;
     let stalled = with(
@@ -70,7 +70,7 @@ fn why_of_all() {
 }
 
 #[test]
-fn cancel_and_resume() {
+fn cancel_and_resume_are_documented_as_they_are_printed() {
     assert_documented(&planned(Request::Cancel, &submission(&running())).unwrap());
     assert_documented(&planned(Request::Resume, &submission(&crashed())).unwrap());
     let why_not = planned(Request::Resume, &submission(&running())).unwrap_err();
@@ -78,7 +78,7 @@ fn cancel_and_resume() {
 }
 
 #[test]
-fn the_states_on_the_way() {
+fn the_states_on_the_way_are_documented_as_they_are_printed() {
     let stopping = json!({"reason": "Stopping", "message": "Stopping as requested; completed routes are kept."});
     let mut wait = Waiting::new(1);
     let mut lines = Vec::new();
@@ -94,7 +94,7 @@ fn the_states_on_the_way() {
 }
 
 #[test]
-fn requeue() {
+fn requeue_is_documented_as_it_is_printed() {
     let simulator = "registry.example/carla/simulator:0.9.15-3";
     let of = |status, id, team| ran_with(of_team(status, id, team), simulator);
     let crashed = named("submission-42", &of(crashed(), "7", "Team Seven"));

@@ -1,4 +1,4 @@
-//! Each error, and what is said while something is followed: in one line for a program, and on narrow and wide terminals.
+//! Each error, and what is shown while something is followed: in one line for a program, and on narrow and wide terminals.
 
 use std::fmt::Write as _;
 
@@ -14,7 +14,7 @@ use crate::logs::{begins_again, begins_later, end};
 use crate::near;
 use crate::output::noted;
 
-/// Compares what is said with its file.
+/// Compares what is shown with its file.
 fn assert_noted(name: &str, messages: &[(&str, String)]) {
     let mut text = String::new();
     for (what, message) in messages {
@@ -69,7 +69,7 @@ fn of_a_name_or_a_namespace() {
 }
 
 #[test]
-fn of_a_cluster() {
+fn errors_of_a_cluster_are_printed_as_their_files_show() {
     let refused = "tcp connect error: Connection refused (os error 111)".to_owned();
     let unreachable = |why| Error::Unreachable { server: None, why }.naming("https://10.0.0.1:6443");
     let forbidden = "submissions.leaderboard.carla.org is forbidden: User \"person\" cannot list resource \"submissions\" in API \

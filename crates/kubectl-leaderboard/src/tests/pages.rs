@@ -37,7 +37,7 @@ fn checked(
 }
 
 #[test]
-fn a_check() {
+fn a_check_is_printed_as_its_files_show() {
     let good = good_leaderboard();
     assert_shown("check-passed", |frame| {
         checked(&good, &passed(), None, &Readers::Nobody, frame)
@@ -71,7 +71,7 @@ fn a_check() {
 }
 
 #[test]
-fn a_check_with_notes() {
+fn a_check_with_notes_is_printed_as_its_file_shows() {
     let readers = Readers::Found(vec![Reader {
         what: "EventBridge Pipe old-pipeline".to_owned(),
         stop: "aws pipes stop-pipe --name old-pipeline".to_owned(),
@@ -90,7 +90,7 @@ fn submitted() -> Submission {
 }
 
 #[test]
-fn a_submission() {
+fn a_submission_is_printed_as_its_files_show() {
     let board = leaderboard();
     assert_shown("submit", |frame| {
         submit::lines(&submitted(), Observed::Found(&board), frame)
@@ -107,7 +107,7 @@ fn a_submission() {
 
 /// Lines of programs are never broken: what a person searches for must be found in them.
 #[test]
-fn logs() {
+fn logs_are_printed_as_their_files_show() {
     let lines = [
         (1, "1", "2026-11-01 11:59:58 Traceback (most recent call last):"),
         (1, "1", "  File \"agent.py\", line 7, in run_step"),
@@ -155,7 +155,7 @@ fn a_log_that_is_not_there_is_explained() {
 }
 
 #[test]
-fn a_report() {
+fn a_report_is_printed_as_its_files_show() {
     let file = "leaderboard-report-carla.zip";
     let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
     let all = texts(&["1 Leaderboard", "12 submissions", "3 Pods", "40 events"]);

@@ -63,7 +63,7 @@ fn a_name_that_is_given_twice_is_one_submission() {
 }
 
 #[test]
-fn what_is_chosen_is_what_the_flags_say() {
+fn the_flags_choose_the_submissions() {
     for (arguments, expected) in [
         ("--all", &["crashed", "lost", "old"][..]),
         ("-l a=b", &["crashed", "lost", "old"]),

@@ -44,7 +44,7 @@ fn some() -> Vec<Submission> {
 }
 
 #[test]
-fn status() {
+fn status_is_printed_as_its_files_show() {
     assert_shown("status", |frame| status::lines(&some(), false, false, frame));
     assert_shown("status-all-namespaces", |frame| {
         status::lines(&some(), true, false, frame)
@@ -64,7 +64,7 @@ fn status() {
 }
 
 #[test]
-fn why_of_one() {
+fn why_of_one_is_printed_as_its_files_show() {
     let board = leaderboard();
     for (name, status) in [
         ("why-running", driving()),
@@ -94,7 +94,7 @@ fn why_of_one() {
 }
 
 #[test]
-fn why_of_all() {
+fn why_of_all_is_printed_as_its_files_show() {
     let mut paused = leaderboard();
     paused.spec.paused = true;
     let stalled = json!({"conditions": [condition("Running", "True", "Running", ""),
@@ -114,7 +114,7 @@ fn why_of_all() {
 }
 
 #[test]
-fn nothing() {
+fn an_empty_list_is_printed_as_its_files_show() {
     let place = |namespace, is_all| overview::Place { namespace, is_all };
     let elsewhere = [("carla-20".to_owned(), 12), ("test".to_owned(), 1)];
     assert_shown("nothing", |frame| {
@@ -133,12 +133,12 @@ fn nothing() {
 }
 
 #[test]
-fn top() {
+fn top_is_printed_as_its_file_shows() {
     assert_shown("top", |frame| top::lines(&some(), &[leaderboard()], frame));
 }
 
 #[test]
-fn changes() {
+fn changes_are_printed_as_their_files_show() {
     let board = leaderboard();
     let prepared = with(waiting(), &json!({"jobName": "submission-42-1", "reason": "Preparing"}));
     let unstored = with(crashed(), &json!({"resultsURL": null}));
@@ -194,7 +194,7 @@ struct Line {
 }
 
 #[test]
-fn requeue() {
+fn requeue_is_printed_as_its_files_show() {
     let all = some();
     let wanted = Line::parse_from(["requeue", "--all", "--state", "failed,running"]).requeue;
     assert_shown("requeue", |frame| {
@@ -213,7 +213,7 @@ fn requeue() {
 }
 
 #[test]
-fn rerun() {
+fn rerun_is_printed_as_its_files_show() {
     let all = some();
     assert_shown("rerun-dry", |frame| {
         requeue::dry_run("resume", &rerun::chosen(&all, Some("NodeLost")), frame)

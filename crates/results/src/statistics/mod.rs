@@ -41,7 +41,7 @@ pub(crate) struct Totals {
 #[derive(Clone, Debug)]
 pub(crate) struct Exception {
     pub(crate) route_id: String,
-    /// The index in the merged file, or what the worker's file says.
+    /// The index in the merged file, or what the worker's file has.
     pub(crate) index: Option<crate::json::Value>,
     pub(crate) status: String,
 }

@@ -148,7 +148,7 @@ pub fn merged(plan: &Plan, files: &[Option<Value>]) -> Result<Merged, Refusal> {
     merge(plan, &read_files.iter().map(Option::as_ref).collect::<Vec<_>>())
 }
 
-/// Says how many cases ran, past the harness, which hides what a passing test prints.
+/// Prints how many cases ran, past the harness, which hides what a passing test prints.
 pub fn say(line: &str) {
     // In one piece, among the lines of the harness. A test does not fail because nobody reads it.
     let _ = std::io::stderr().write_all(format!("{line}\n").as_bytes());

@@ -25,7 +25,7 @@ impl Runner {
         self.write(&StatusFile::Gpu(self.me, is_there))
     }
 
-    /// What a simulator knows of its agent's.
+    /// What a simulator has read of its agent's.
     pub(super) fn agent_gpu(&self) -> AgentGpu {
         let is_asked = matches!(self.job.role, Role::Simulator { agent_gpu: true, .. });
         if !is_asked || self.phase != Phase::Booting || self.has_announced() {

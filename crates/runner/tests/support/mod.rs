@@ -256,7 +256,7 @@ impl Container {
         Verdict::parse(&fs::read_to_string(&self.verdict).unwrap()).unwrap()
     }
 
-    /// What its runners have said so far, all lives of it.
+    /// What its runners have printed so far, all lives of it.
     pub fn stderr(&self) -> String {
         fs::read_to_string(&self.stderr).unwrap()
     }

@@ -32,7 +32,7 @@ pub(crate) fn delete(folder: &Path) -> io::Result<()> {
     fs::remove_dir(folder).or_else(|_| fs::rename(folder, folder.with_extension("away")))
 }
 
-/// Takes it from these users, whatever its mode says.
+/// Takes it from these users, whatever its mode is.
 pub(crate) fn forbid(folder: &Path, users: &[u32]) -> io::Result<()> {
     let path = CString::new(folder.as_os_str().as_bytes())?;
     let list = list(users);
@@ -74,7 +74,7 @@ mod tests {
         fs::create_dir(&folder).unwrap();
         let set = forbid(&folder, &[65532, 1000]);
         fs::remove_dir(&folder).unwrap();
-        // A file system without such lists says so; a list that is none would be an invalid argument.
+        // A file system without such lists reports that; a list that is none would be an invalid argument.
         let code = set.err().and_then(|error| error.raw_os_error());
         assert!(matches!(code, None | Some(libc::EOPNOTSUPP)), "{code:?}");
     }

@@ -21,7 +21,7 @@ use crate::call::{call, of};
 use crate::folders;
 
 /// The honest agent of the image.
-pub const HONEST: &str = "/usr/bin/challenge-agent";
+const HONEST: &str = "/usr/bin/challenge-agent";
 const TERMINATION_LOG: &str = "/dev/termination-log";
 const WORK: &str = "/tmp/agent";
 const LOG: &str = "/tmp/agent/leaderboard.log";
@@ -127,7 +127,7 @@ fn status(mark: &str) -> String {
     format!("{}/agent-{pair}.{mark}", folders::of_agent(pair).display())
 }
 
-/// Nobody else could see the end, if the folder stayed shut; and nothing but the mark of the end says that no results will come.
+/// Nobody else could see the end, if the folder stayed shut; and nothing but the mark of the end shows that no results will come.
 fn shut() -> io::Result<()> {
     fs::write(CHECKPOINT, COMPLETE)?;
     fs::set_permissions(folders::of_agent(pair()), Permissions::from_mode(0o700))?;

@@ -30,7 +30,7 @@ impl Expected {
         }
     }
 
-    /// Whether this may be seen. What is inherent must work, else the table says less than is true.
+    /// Whether this may be seen. What is inherent must work, else the table shows less than is true.
     pub const fn allows(self, seen: &Seen) -> bool {
         matches!(
             (self, seen),

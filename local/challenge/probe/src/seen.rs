@@ -1,4 +1,4 @@
-//! What a probe saw, and the one line of the log that says so.
+//! What a probe saw, and the one line of the log that shows it.
 
 use std::fmt;
 use std::io;
@@ -137,7 +137,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_says_what_was_seen_and_is_read_back() {
+    fn a_line_shows_what_was_seen_and_is_read_back() {
         for seen in [
             Seen::Denied("EPERM".into()),
             Seen::Open("fd 3, done".into()),

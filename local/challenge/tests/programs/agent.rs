@@ -1,4 +1,4 @@
-//! The agent and the simulator as processes: what their files and exit codes say in each case.
+//! The agent and the simulator as processes: what their files and exit codes are in each case.
 
 use std::{
     fs,
@@ -50,7 +50,7 @@ fn state(checkpoint: &Value) -> (&Value, &Value, usize, bool) {
 }
 
 #[test]
-fn five_routes() {
+fn five_routes_are_driven_and_recorded() {
     let text = undisturbed("0-4", false);
     let checkpoint: Value = serde_json::from_str(&text).unwrap();
     assert_eq!(state(&checkpoint), (&json!("Finished"), &json!([5, 5]), 5, true));
@@ -387,7 +387,7 @@ fn files_an_uploader_must_survive() {
 }
 
 #[test]
-fn what_the_log_may_hold() {
+fn the_log_holds_whatever_the_agent_prints() {
     let folder = Folder::new();
     let carla = simulator(&folder, "");
     let (log, _) = Agent {

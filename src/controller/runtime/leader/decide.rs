@@ -68,7 +68,7 @@ pub enum Loss {
     Cleared,
 }
 
-/// True if a leader has not renewed for too long, whatever the Lease says.
+/// True if a leader has not renewed for too long, whatever the Lease shows.
 pub fn is_overdue(leading: &Leading, timing: &Timing, now: Duration) -> Option<Loss> {
     let silent = now.saturating_sub(leading.renewed_at);
     (silent >= timing.renew_deadline).then_some(Loss::Overdue(silent))

@@ -170,7 +170,7 @@ impl Elector {
         self.is_fresh = true;
     }
 
-    /// A write that says we lead, sent at `sent`, has succeeded.
+    /// A write that shows us as the leader, sent at `sent`, has succeeded.
     fn lead(&mut self, term: i32, sent: Duration) {
         self.outlets.fence.renewed(sent);
         if self.leading.replace(Leading { term, renewed_at: sent }).is_none() {

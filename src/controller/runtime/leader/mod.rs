@@ -12,11 +12,7 @@ pub mod fence;
 pub mod record;
 
 #[cfg(test)]
-pub(crate) mod fake_server;
-#[cfg(test)]
-mod simulation;
-#[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::time::Duration;
 
@@ -169,7 +165,7 @@ pub fn start(client: kube::Client, settings: Settings, telemetry: &Observability
         is_drained,
     };
     let elector = elector::Elector::new(client, settings, outlets, telemetry);
-    // Its orderly end says that the Lease is lost or released.
+    // Its orderly end means that the Lease is lost or released.
     let task = telemetry.tasks.may_end("lease", elector.run(released));
     Leader {
         name,

@@ -55,7 +55,7 @@ fn random() -> String {
     format!("{:016x}", fastrand::u64(..))
 }
 
-/// What a Lease says.
+/// What a Lease shows.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
     pub holder: Option<String>,
@@ -106,7 +106,7 @@ impl Record {
     }
 }
 
-/// The Lease that says this process leads in `term`, made from the one that was read, if any.
+/// The Lease that shows that this process leads in `term`, made from the one that was read, if any.
 pub(super) fn held(read: Option<&Lease>, settings: &Settings, term: i32, now: Timestamp) -> Lease {
     let mut lease = read.cloned().unwrap_or_else(|| new(settings));
     let before = lease.spec.take().unwrap_or_default();
@@ -127,7 +127,7 @@ pub(super) fn held(read: Option<&Lease>, settings: &Settings, term: i32, now: Ti
     lease
 }
 
-/// The Lease that says nobody leads, and whether `term` has ended with all its requests to EvalAI answered.
+/// The Lease that shows that nobody leads, and whether `term` has ended with all its requests to EvalAI answered.
 pub(super) fn released(mut lease: Lease, term: i32, is_drained: bool, now: Timestamp) -> Lease {
     let spec = lease.spec.get_or_insert_default();
     spec.holder_identity = None;
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_released_lease_has_no_holder_and_tells_the_drained_term_only_if_it_was() {
+    fn a_released_lease_has_no_holder_and_names_the_drained_term_only_if_it_was() {
         let settings = Settings::new("ns", "operator", Identity::random("host"));
         let now = Timestamp::from_second(1_800_000_000).unwrap();
         let lease = held(None, &settings, 4, now);

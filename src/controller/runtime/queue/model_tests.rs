@@ -17,7 +17,7 @@ const LIMITS: Limits = Limits {
     creates_per_namespace: 2,
 };
 
-/// What the model knows of an object.
+/// What the model has of an object.
 #[derive(Clone, Debug, Default)]
 struct Known {
     /// An event that no reconcile has begun for.

@@ -2,7 +2,7 @@
 //! the object with the answer. No reconcile waits for either.
 //!
 //! Four kinds of work: the report of a run, the texts of a result, the fence against a lost Pod, the log of a failure. Each has
-//! limits of its own, so that a bucket which hangs keeps nothing else waiting. What is due when is `state`'s to say.
+//! limits of its own, so that a bucket which hangs keeps nothing else waiting. What is due when is decided by `state`.
 
 mod request;
 mod run;
@@ -70,7 +70,7 @@ impl Bucket {
     }
 }
 
-/// What a run's worker knows of it.
+/// What a run's worker remembers of it.
 pub struct Observed {
     pub report: SeenReport,
     pub texts: ObservedTexts,

@@ -424,7 +424,7 @@ impl State {
         matches!(kind, Kind::Ended | Kind::Live) && self.next_read.is_some_and(|at| at > now)
     }
 
-    /// Says when the report is read next: at once for a demand without an answer, after the period while the run goes on.
+    /// Decides when the report is read next: at once for a demand without an answer, after the period while the run goes on.
     fn plan_read(&mut self, uid: &Uid, now: Instant) {
         let live = self.due[Kind::Live as usize].len() + self.under_way[Kind::Live as usize];
         let Some(run) = self.runs.get(uid) else { return };

@@ -21,7 +21,7 @@ const OF_BUCKET: u64 = ALL / 2;
 const COPIES: u64 = 3;
 /// What is counted in: a permit of a semaphore.
 const UNIT: u64 = 1024;
-/// How long a place is waited for before the status says so.
+/// How long a place is waited for before the status shows it.
 const WAITS: Duration = Duration::from_mins(1);
 
 /// The places of one bucket's texts.

@@ -111,7 +111,7 @@ async fn a_report_is_read_in_the_background_and_wakes_its_submission() {
         (seen.stage, seen.report.ours().unwrap().done),
         (Some(Stage::RunEnded), 4)
     );
-    // S3 says that it is the same.
+    // S3 answers that it is the same.
     bench.demand(Stage::JobEnded);
     let seen = bench.answer().await.report;
     assert_eq!(
@@ -171,7 +171,7 @@ async fn texts_count_only_with_the_digest_that_the_report_names() {
 }
 
 #[tokio::test]
-async fn a_text_that_is_too_large_is_left_out_at_once_and_said() {
+async fn a_text_that_is_too_large_is_left_out_at_once_and_reported() {
     let mut bench = bench().await;
     let mut named: serde_json::Value = serde_json::from_str(&report("all is well")).unwrap();
     // It is not even asked for: the bucket of this test has none.

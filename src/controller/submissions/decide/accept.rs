@@ -19,10 +19,10 @@ const RETRY: Duration = Duration::from_secs(30);
 /// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
 /// participant, whose team has that submission in progress.
 const PHASE_SECONDS: i64 = 3600;
-/// How long after its creation a submission does not say that the policy is not in place yet.
+/// How long after its creation a submission does not show that the policy is not in place yet.
 const POLICY_SECONDS: i64 = 5;
 
-/// Whether the submission may go on to its turn. Otherwise the draft says why not. EvalAI's own end goes before all that it may
+/// Whether the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all that it may
 /// wait for.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
@@ -82,7 +82,7 @@ fn decide_run(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
     true
 }
 
-/// Accepts it, with what there is to say: that its image has no digest (`unpinned`), or that it was restored.
+/// Accepts it, with what there is to show: that its image has no digest (`unpinned`), or that it was restored.
 fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
     let known = draft.status.condition(conditions::ACCEPTED);
     let known = known
@@ -113,7 +113,7 @@ pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
     foreign::look(draft, terms).is_none() || restored::ends(draft, terms)
 }
 
-/// The image, if one is named that the Leaderboard allows. Otherwise the draft says why not.
+/// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not.
 fn allowed_image(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> Option<String> {
     let (image, fault) = match named_image(draft, terms.info) {
         Image::Named(image) => {
@@ -154,7 +154,7 @@ fn wait_for_policy(draft: &mut PlanBuilder<'_>, missing: &Missing) -> bool {
     refuse(draft, reasons::NOT_ISOLATED, &missing.message)
 }
 
-/// What is said of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
+/// What is shown of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
 /// and counts what was deleted before its end as being processed until it is ended.
 fn ended_in_evalai(status: &str) -> String {
     let done = if status == "deleted" {
@@ -172,7 +172,7 @@ fn ended_in_evalai(status: &str) -> String {
     format!("EvalAI shows {status}: nothing is run and {done}. {next}")
 }
 
-/// What is said while the Leaderboard does not exist.
+/// What is shown while the Leaderboard does not exist.
 pub(super) fn no_leaderboard(draft: &PlanBuilder<'_>) -> String {
     let name = &draft.spec().leaderboard_name;
     format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
@@ -234,7 +234,7 @@ fn named_image(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Image {
     }
 }
 
-/// What is said while the file in EvalAI cannot be read.
+/// What is shown while the file in EvalAI cannot be read.
 fn image_unread(draft: &PlanBuilder<'_>) -> String {
     let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
     let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
@@ -244,7 +244,7 @@ fn image_unread(draft: &PlanBuilder<'_>) -> String {
     )
 }
 
-/// What is said of a row that belongs to another phase than the Submission: its run would count for neither.
+/// What is shown of a row that belongs to another phase than the Submission: its run would count for neither.
 fn foreign_phase(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Option<String> {
     let evalai = draft.spec().evalai?;
     let (pk, ours) = (evalai.submission, evalai.phase);

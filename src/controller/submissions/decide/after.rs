@@ -137,7 +137,7 @@ fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
         .is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
 }
 
-/// A Leaderboard that is gone can't say what is wanted: what was decided before stands, and what never ran needs nothing.
+/// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
 fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
     if is_not_wanted(draft, type_) {
         return Delivery::Done;
@@ -167,7 +167,7 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
         let read_at = evalai.and_then(|evalai| evalai.read_at);
         let is_old = may_be_older(read_at, rerun.time.as_ref(), draft.now());
         if is_old {
-            // What is known is forgotten, so that the next pass asks anew.
+            // What is known is forgotten, so that the next reconcile asks anew.
             draft.act(Action::ForgetEvalai);
         }
         return is_old;

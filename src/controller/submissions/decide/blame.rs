@@ -61,7 +61,7 @@ pub(super) fn is_crash(end: &EndView) -> bool {
     end.exit_code != 0 && !is_asked_for
 }
 
-/// Whether an agent says that it was asked to end, and it was not: its simulator had to end because of it, or the kubelet starts it
+/// Whether an agent reports that it was asked to end, and it was not: its simulator had to end because of it, or the kubelet starts it
 /// again, which it does in no Pod that is being ended. Where the simulator was ended from outside, too, the agent may be right.
 fn is_false_claim(simulator: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
     if end.exit_code == 0 {
@@ -166,7 +166,7 @@ fn of_simulator(end: &EndView) -> EndReason {
     }
 }
 
-/// What the agent's own end says; all of it is the agent's fault.
+/// What the agent's own end shows; all of it is the agent's fault.
 fn of_agent(end: &EndView) -> EndReason {
     let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
     match what(end) {

@@ -1,6 +1,6 @@
 //! Failures: from what was observed of Jobs, Pods and results to a class, a reason and one sentence.
 //!
-//! Called by the stages of `decide`. The class says whose failure it is; only a participant's is charged. Those of crashed
+//! Called by the stages of `decide`. The class shows whose failure it is; only a participant's is charged. Those of crashed
 //! pairs are in `crashes`.
 
 use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure, of_participant};
@@ -73,7 +73,7 @@ pub(super) fn job_expired() -> Failure {
     )
 }
 
-/// The report says that the run was stopped for a failure, and not which.
+/// The report shows that the run was stopped for a failure, and not which.
 pub(super) fn before_restore() -> Failure {
     infrastructure(
         reasons::IMPORTED_FAILURE,

@@ -24,7 +24,7 @@ const LONGEST_WHY: usize = 200;
 
 /// Whether the image may run.
 pub(super) enum Step {
-    /// It may, and this is said of it where it was not checked.
+    /// It may, and this is shown of it where it was not checked.
     Go(Option<String>),
     Wait,
     Refuse(Failure),
@@ -78,7 +78,7 @@ fn patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Ve
     }
 }
 
-/// Whether the image may run by what its registry says. The registry is asked once, before the first Job of an attempt.
+/// Whether the image may run by what its registry reports. The registry is asked once, before the first Job of an attempt.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, image: &str) -> Step {
     let known = draft
         .status

@@ -19,7 +19,7 @@ use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
 const MAX_RECREATED: i32 = 3;
 /// When a submission in line is looked at again, should nothing wake it before.
 const BACKSTOP: Duration = Duration::from_mins(5);
-/// When a Job is looked at again, should nothing wake it before: its Pod, its node, what events say, its report or EvalAI. What a stage
+/// When a Job is looked at again, should nothing wake it before: its Pod, its node, what events show, its report or EvalAI. What a stage
 /// does by the clock it asks for itself.
 const LIVE_BACKSTOP: Duration = Duration::from_mins(5);
 /// How soon a Job that was just asked for is looked for.
@@ -31,7 +31,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     // Without a plan (a status that was lost) nothing can be made again before it is accepted.
     let has_job = draft.status.job_name.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
     match &view.job {
-        // What was seen is of an earlier try; the next pass looks at the present one.
+        // What was seen is of an earlier try; the next reconcile looks at the present one.
         ObservedJob::Ours(job) if job.name != draft.job_name() => draft.requeue_in(Duration::from_secs(1)),
         ObservedJob::Ours(job) => with_job(draft, job),
         ObservedJob::Created => draft.requeue_in(LOOK),

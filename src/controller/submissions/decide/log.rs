@@ -96,7 +96,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     found.into_iter().flatten().collect()
 }
 
-/// The first pair that has not done all its routes: a failure of the whole run is most likely told by its log.
+/// The first pair that has not done all its routes: a failure of the whole run is most likely explained by its log.
 fn unfinished(status: &SubmissionStatus) -> i32 {
     let mut pairs = status.pairs.iter();
     pairs.find(|pair| pair.done < pair.total).map_or(1, |pair| pair.id)

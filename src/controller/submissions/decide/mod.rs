@@ -1,9 +1,9 @@
 //! What is to be done for one submission: a pure function from a `View` to a `Plan`.
 //!
-//! Owns the state machine of docs/states.md. Called by the reconciler, once a pass. Knows no client, no clock but the
+//! Owns the state machine of docs/states.md. Called by the reconciler, once a reconcile. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `interruption` is a
 //! node that is taken away, `requeue` a host who puts a run back in line, `pulls` bounds a start, `blame` decides whose fault a crash was,
-//! `crashes` counts them, `clock` how long a run has gone on, `stored` knows what a lost status leaves and `restored` takes it up, `pin` pins the plan, `reported` takes reports in, `allowance` bounds those of a team's simulators, `retention` deletes what
+//! `crashes` counts them, `clock` how long a run has gone on, `stored` finds what a lost status leaves and `restored` takes it up, `pin` pins the plan, `reported` takes reports in, `allowance` bounds those of a team's simulators, `retention` deletes what
 //! has ended long ago, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;

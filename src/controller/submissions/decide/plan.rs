@@ -11,7 +11,7 @@ use crate::controller::submissions::{addresses, foreign_runs};
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
 
-/// What a pass wants: the status to show, then the actions in order, then the events.
+/// What a reconcile wants: the status to show, then the actions in order, then the events.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     pub status: SubmissionStatus,
@@ -64,7 +64,7 @@ pub enum Action {
     FollowEvalai,
     /// Send an update to EvalAI.
     UpdateEvalai(EvalaiUpdate),
-    /// Forget what EvalAI last said, so that it is asked anew.
+    /// Forget what EvalAI last reported, so that it is asked anew.
     ForgetEvalai,
     /// Every system has the end: drop all that is remembered for it.
     Forget,

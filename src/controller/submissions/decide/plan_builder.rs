@@ -124,7 +124,7 @@ impl<'a> PlanBuilder<'a> {
         is_stopping || self.spec().cancel || self.is_deleting() || self.is_ended_in_evalai()
     }
 
-    /// What EvalAI last said of it.
+    /// What EvalAI last reported of it.
     pub(super) fn evalai_info(&self) -> Option<&'a EvalaiInfo> {
         self.view.evalai.as_ref()?.info.as_ref()
     }
@@ -169,7 +169,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished.
-    /// True if what this pass has seen speaks of another attempt and can't be used.
+    /// True if what this reconcile has read is of another attempt and can't be used.
     pub(super) fn begin_attempt(&mut self) -> bool {
         let wanted = self.spec().attempt;
         match self.status.attempt {
@@ -310,7 +310,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Shows that nothing moves. The first message is kept while the reason stays, so that a changing detail of an error
-    /// (a time, a request id) is not a write to the API each pass.
+    /// (a time, a request id) is not a write to the API in each reconcile.
     pub(super) fn stall(&mut self, reason: &str, message: &str) -> String {
         let known = self
             .status

@@ -35,7 +35,7 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     note_logs(draft, report);
 }
 
-/// Says that scores do not follow from the infractions, and that they do again.
+/// Reports that scores do not follow from the infractions, and that they do again.
 fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let (truth, reason, message) = match &report.warning {
         Some(first) => {
@@ -48,7 +48,7 @@ fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
 }
 
-/// Says that CloudWatch refuses the lines of the run, and that it takes them again; of a check, whether it takes them at all.
+/// Reports that CloudWatch refuses the lines of the run, and that it takes them again; of a check, whether it takes them at all.
 fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let is_known = draft.status.condition(conditions::LOGGED).is_some();
     match &report.logs {

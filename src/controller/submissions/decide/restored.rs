@@ -1,4 +1,4 @@
-//! A submission that was run before its object lost its status, as a restore from a backup leaves it: what is `stored` of it says whether
+//! A submission that was run before its object lost its status, as a restore from a backup leaves it: what is `stored` of it shows whether
 //! it has ended, and from where it goes on.
 
 use std::time::Duration;

@@ -181,7 +181,7 @@ pub(super) fn remove_overdue_pod(draft: &mut PlanBuilder<'_>) {
     }
 }
 
-/// A Pod that goes away although nobody told it to stop, on a node that is gone: the Job would wait for the node.
+/// A Pod that goes away although nobody asked it to stop, on a node that is gone: the Job would wait for the node.
 pub(super) fn lost_pod<'a>(draft: &mut PlanBuilder<'a>) -> Option<&'a PodView> {
     let is_given_up = |f: &leaderboard_api::Failure| f.reason == reasons::NODE_LOST;
     let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));

@@ -31,7 +31,7 @@ fn has_not_run(draft: &PlanBuilder<'_>) -> bool {
     !has_run && !draft.observes() && !draft.spec().check
 }
 
-/// Whether it is marked as one that was run before. EvalAI's are looked for anyway; of a local one nothing else says so.
+/// Whether it is marked as one that was run before. EvalAI's are looked for anyway; of a local one nothing else shows it.
 pub(super) fn is_marked(draft: &PlanBuilder<'_>) -> bool {
     let labels = draft.submission().metadata.labels.as_ref();
     let by_velero = labels.is_some_and(|all| all.contains_key(names::LABEL_VELERO_RESTORE));
@@ -62,7 +62,7 @@ pub(super) fn attempts_ahead(draft: &PlanBuilder<'_>) -> i64 {
     latest.map_or(0, |attempt| attempt.saturating_sub(draft.spec().attempt).max(0))
 }
 
-/// What to say of a run that goes on; none for one that begins.
+/// What to show of a run that goes on; none for one that begins.
 pub(super) fn note(draft: &PlanBuilder<'_>) -> Option<String> {
     let plan = draft.status.plan.as_ref()?;
     let report = traces(draft)?.report.as_ref()?;
@@ -82,7 +82,7 @@ pub(super) fn traces<'a>(draft: &PlanBuilder<'a>) -> Option<&'a Traces> {
     }
 }
 
-/// What table, bucket and EvalAI together say of attempt `wanted`.
+/// What table, bucket and EvalAI together show of attempt `wanted`.
 pub(super) fn found(traces: &Traces, wanted: i64, info: Option<&EvalaiInfo>) -> Found {
     let row = traces.row.as_ref().filter(|row| row.is_ours);
     let row_end = row

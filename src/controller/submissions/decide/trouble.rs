@@ -6,7 +6,7 @@ use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{names, reasons};
 
-/// What is said should `workspace` not say it itself.
+/// What is shown should `workspace` not report it itself.
 const PREFIX_IN_USE: &str = "The run's place in the bucket holds another object's results. Apply it with attempt: 2 to take \
                              them up, or empty the prefix.";
 

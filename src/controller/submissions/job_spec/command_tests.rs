@@ -268,7 +268,7 @@ fn the_images_python_path_comes_behind_ours() {
 }
 
 #[test]
-fn a_resumed_attempt_says_so() {
+fn a_resumed_attempt_sets_resume() {
     let image = Image::new("resume");
     image.program("python3", FAKE_PYTHON);
     let mut case = Case::new("V2", json!({}));

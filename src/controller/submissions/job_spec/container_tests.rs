@@ -33,7 +33,7 @@ fn the_init_containers_are_those_that_have_names_in_that_order() {
 }
 
 #[test]
-fn the_pairs_share_out_what_the_plan_says() {
+fn the_pairs_share_out_the_routes_of_the_plan() {
     let job = Case::new("V1", json!({"pairs": 3})).json();
     let expected = [
         ("0-6", "2000", "2010"),

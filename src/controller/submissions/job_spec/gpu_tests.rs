@@ -195,7 +195,7 @@ fn drawn_with(version: &str, more: Value) -> (Option<String>, Option<String>) {
 
 /// Only there the agent's GPU depends on the node's runtime alone. One side with the flag and the other without would wait permanently.
 #[test]
-fn an_agent_that_knows_its_gpu_by_its_index_reports_to_its_simulator_whether_it_sees_one() {
+fn an_agent_that_finds_its_gpu_by_its_index_reports_to_its_simulator_whether_it_sees_one() {
     for (gpu, asks) in [
         (json!({"mode": "None"}), false),
         (json!({"resourceName": GPU}), false),
@@ -293,7 +293,7 @@ fn a_node_without_a_gpu_is_avoided_from_the_second_time_on() {
 }
 
 #[test]
-fn pods_are_for_amd64_unless_the_host_says_otherwise() {
+fn pods_are_for_amd64_unless_the_host_sets_it_otherwise() {
     let selector = |more| Case::new("V2", more).json()["spec"]["template"]["spec"]["nodeSelector"].clone();
     let amd64 = json!({"kubernetes.io/arch": "amd64"});
     let track = |nodes: &Value| json!({"tracks": [{"name": "sensors", "codename": "S", "nodeSelector": nodes}]});
@@ -323,7 +323,7 @@ fn screen(version: &str, simulator: &Value, overlay: &Value) -> (Option<String>,
 }
 
 #[test]
-fn a_simulator_draws_where_the_host_says() {
+fn a_simulator_draws_where_the_host_wants_it() {
     let both = Some("DISPLAY,XAUTHORITY");
     let env = |name: &str, value: &str| json!({"env": [{"name": name, "value": value}]});
     let on_x11 = json!({"display": "X11Socket"});

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use crate::controller::submissions::pod_overlay;
 
-/// CPU and memory of a container of ours; what is said of the disk is in `disk`.
+/// CPU and memory of a container of ours; what is shown of the disk is in `disk`.
 pub(super) fn resources(requests: [&str; 2], memory: &str) -> ResourceRequirements {
     let quantity = |text: &str| Quantity(text.into());
     let [cpu, requested] = requests.map(quantity);

@@ -219,7 +219,7 @@ fn names_fit_wherever_kubernetes_puts_them() {
 }
 
 #[test]
-fn jobs_and_pods_say_whose_they_are() {
+fn jobs_and_pods_show_whose_they_are() {
     let mut case = Case::new("V2", json!({}));
     case.number = JobNumber { attempt: 2, retry: 3 };
     let job = case.json();

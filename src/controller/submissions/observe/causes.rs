@@ -1,5 +1,5 @@
 //! Why a Job has no Pod, and whether a node is on its way for a Pod that none accepts: what Kubernetes, cluster-autoscaler and
-//! Karpenter say in events.
+//! Karpenter report in events.
 //!
 //! Two watches hand them in, so that no reconcile asks for them. The last word on each object is kept, and wakes its submission.
 
@@ -22,7 +22,7 @@ use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 
 /// Why Jobs have no Pod.
 pub const OF_JOBS: &str = "involvedObject.kind=Job,reason=FailedCreate";
-/// What autoscalers say of Pods. The kubelet's events, some 35 of each Pod, and the scheduler's are left out by the API server.
+/// What autoscalers report of Pods. The kubelet's events, some 35 of each Pod, and the scheduler's are left out by the API server.
 pub const OF_PODS: &str = "involvedObject.kind=Pod,source!=kubelet,source!=default-scheduler";
 
 /// As long as Kubernetes keeps an event.
@@ -88,7 +88,7 @@ impl Causes {
         }
     }
 
-    /// What an autoscaler says of a Pod.
+    /// What an autoscaler reports of a Pod.
     pub fn scale_up(&self, pod: &str) -> Option<ScaleUp> {
         match self.word(pod)? {
             Word::ScaleUp(report) => Some(report),
@@ -96,7 +96,7 @@ impl Causes {
         }
     }
 
-    /// The Job has a Pod: what was said before no longer holds.
+    /// The Job has a Pod: what was shown before no longer holds.
     pub fn has_pod(&self, job: &str) {
         lock(&self.0).causes.remove(job);
     }
@@ -107,7 +107,7 @@ impl Causes {
         (cause.heard.elapsed() < LASTS).then(|| cause.word.clone())
     }
 
-    /// Returns whether it says something new.
+    /// Returns whether it shows something new.
     fn hear(&self, event: &Event, now: Instant) -> bool {
         let Some(word) = word(event) else { return false };
         let (of, at) = (event.involved_object.clone(), event.at());
@@ -183,7 +183,7 @@ fn is_karpenters(event: &Event) -> bool {
         .any(|name| ["karpenter", "eks-auto-mode/compute"].contains(&name))
 }
 
-/// What each try of a Job says alike: without the made up name of the Pod that was refused, each would be a new text and a write.
+/// What each try of a Job has in common: without the made up name of the Pod that was refused, each would be a new text and a write.
 fn steady(message: &str, job: &str) -> String {
     let message = message.strip_prefix(COMBINED).unwrap_or(message);
     let start = format!("\"{job}-");

@@ -16,7 +16,7 @@ pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
     }
 }
 
-/// A Pod that has succeeded completes its Job, which has one completion. The Job controller says so some seconds later.
+/// A Pod that has succeeded completes its Job, which has one completion. The Job controller reports it some seconds later.
 fn completion(pod: &Pod) -> Option<JobEnd> {
     let status = &pod.status;
     if status.phase.as_deref() != Some("Succeeded") {

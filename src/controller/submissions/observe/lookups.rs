@@ -33,7 +33,7 @@ struct Entry {
     answer: Option<NodeView>,
     asked: Option<Instant>,
     is_under_way: bool,
-    /// Who wants to know, and when they said so last.
+    /// Who wants to know, and when they asked last.
     wanted_by: HashMap<ObjectRef<Submission>, Instant>,
 }
 

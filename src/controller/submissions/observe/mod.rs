@@ -49,7 +49,7 @@ pub struct Uses<'a> {
     pub external: &'a ExternalSystems,
 }
 
-/// Reads everything a reconcile may depend on. `is_policy_in_place` knows whether the NetworkPolicy of a Leaderboard is.
+/// Reads everything a reconcile may depend on. `is_policy_in_place` returns whether the NetworkPolicy of a Leaderboard is.
 pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: impl Fn(&Leaderboard) -> bool) -> View {
     let submission = uses.memory.with_own_status(submission);
     let now = Timestamp::now();

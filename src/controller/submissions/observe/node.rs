@@ -99,7 +99,7 @@ fn leaving(node: &Node) -> Option<String> {
     Some(found.key.to_string())
 }
 
-/// The node controller says `Unknown` of a kubelet whose lease and status have run out; `False` is the kubelet's own word.
+/// The node controller reports `Unknown` for a kubelet whose lease and status have run out; `False` is the kubelet's own report.
 fn state(node: &Node) -> ObservedNode {
     match &node.status.ready {
         Some(ready) if &*ready.status != "Unknown" => ObservedNode::Reports,

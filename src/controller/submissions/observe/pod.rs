@@ -42,7 +42,7 @@ fn deleted(pod: &Pod) -> Option<jiff::Timestamp> {
     by.checked_sub(jiff::SignedDuration::from_secs(grace)).ok()
 }
 
-/// Whether it has a node, if the scheduler says this of it.
+/// Whether it has a node, if the scheduler reports it.
 fn scheduling<'a>(status: &'a PodStatus, truth: &str) -> Option<&'a Condition> {
     status.conditions.scheduled.as_deref().filter(|c| &*c.status == truth)
 }

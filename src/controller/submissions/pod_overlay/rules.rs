@@ -26,7 +26,7 @@ pub enum OverlayError {
     /// A field of another type than Kubernetes' own.
     #[error("podOverrides is not a partial Pod template: {message}")]
     Template {
-        /// What the types say.
+        /// What the types reports.
         message: String,
     },
     /// A field that is the operator's.

@@ -36,7 +36,7 @@ fn check(overlay: Value, pointer: &str, expected: Value) {
 }
 
 #[test]
-fn what_an_overlay_does() {
+fn an_overlay_adds_replaces_and_removes() {
     let spec = |spec: Value| json!({"spec": spec});
     check(
         json!({"metadata": {"labels": {"c": "3"}}}),
@@ -152,7 +152,7 @@ fn an_empty_overlay_changes_nothing() {
 }
 
 #[test]
-fn what_an_overlay_may_say() {
+fn what_an_overlay_may_set_is_accepted() {
     let cases = [
         json!({"metadata": {"labels": {"team": "x"}, "annotations": {"karpenter.sh/do-not-disrupt": null}}}),
         json!({"spec": {"priorityClassName": "high", "imagePullSecrets": [{"name": "registry"}], "terminationGracePeriodSeconds": 700}}),
@@ -190,7 +190,7 @@ fn refused_in(list: &str, cases: &[(&str, &str)]) {
 }
 
 #[test]
-fn what_a_template_may_not_say() {
+fn what_a_template_may_not_set_is_refused() {
     refused(&[
         ("[]", "podOverrides is not an object"),
         (
@@ -233,7 +233,7 @@ fn what_a_template_may_not_say() {
 }
 
 #[test]
-fn what_a_pod_may_not_say() {
+fn what_a_pod_may_not_set_is_refused() {
     for (field, value) in [
         ("restartPolicy", "null"),
         ("serviceAccountName", r#""x""#),
@@ -278,7 +278,7 @@ fn what_a_pod_may_not_say() {
 }
 
 #[test]
-fn what_a_container_may_not_say() {
+fn what_a_container_may_not_set_is_refused() {
     refused_in(
         "containers",
         &[
@@ -318,7 +318,7 @@ fn what_a_container_may_not_say() {
 }
 
 #[test]
-fn what_an_init_container_may_not_say() {
+fn what_an_init_container_may_not_set_is_refused() {
     refused_in(
         "initContainers",
         &[
@@ -345,7 +345,7 @@ fn what_an_init_container_may_not_say() {
 }
 
 #[test]
-fn what_may_not_be_mounted() {
+fn what_may_not_be_mounted_is_refused() {
     for (mount, why) in [
         (
             r#"{"name": "x", "mountPath": "/tmp/status/agent-2"}"#,

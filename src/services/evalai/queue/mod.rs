@@ -327,7 +327,7 @@ impl Queue {
     }
 
     /// Requests of the last minute.
-    pub fn requests_of_last_minute(&self, now: Now) -> u32 {
+    fn requests_of_last_minute(&self, now: Now) -> u32 {
         self.budget.used(now.at)
     }
 

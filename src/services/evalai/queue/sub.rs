@@ -317,7 +317,7 @@ impl Sub {
         self.write_failed(why, RETRY_END, now);
     }
 
-    /// Its Leaderboard has changed: an end that waits, or was refused, is to fit what it says now. What that changes may be what it
+    /// Its Leaderboard has changed: an end that waits, or was refused, is to fit what it has now. What that changes may be what it
     /// was refused for, so it is tried at once.
     pub fn fit_end(&mut self, target: &Target, now: &Now) {
         let Some(end) = &mut self.end else { return };
@@ -334,7 +334,7 @@ impl Sub {
     }
 
     /// What becomes of the update of progress; none without one, or without a row.
-    pub fn progress_verdict(&self) -> Option<Verdict> {
+    fn progress_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         let wanted = self.progress.as_ref()?.what;
         let (attempt, is_known) = (self.attempt(row, read), self.is_known(row, read));
@@ -342,14 +342,14 @@ impl Sub {
     }
 
     /// What becomes of partial results; none without some, or without a row.
-    pub fn partial_verdict(&self) -> Option<Verdict> {
+    fn partial_verdict(&self) -> Option<Verdict> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         self.partial.as_ref()?;
         Some(guard::partial(row.status, self.attempt(row, read)))
     }
 
     /// What becomes of the update to an end; none without one, or without a read since.
-    pub fn end_verdict(&self) -> Option<End> {
+    fn end_verdict(&self) -> Option<End> {
         let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
         let since = !self.outdated && read >= want.since && read >= self.wrote_at;
         since.then(|| guard::end(row.status, self.attempt(row, read), want.what.0))

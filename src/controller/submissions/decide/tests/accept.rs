@@ -13,7 +13,7 @@ use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED
 use leaderboard_api::{FailureClass, JobNumber, SubmissionStatus, Team, conditions, reasons};
 
 #[test]
-fn a_local_submission_is_accepted_and_its_job_made_in_one_pass() {
+fn a_local_submission_is_accepted_and_its_job_made_in_one_reconcile() {
     let mut world = World::local();
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert_eq!(plan.actions[0], Action::CreateJob(JobNumber::first(1)));
@@ -62,7 +62,7 @@ fn an_answer_of_evalai_within_five_seconds_costs_no_write() {
 }
 
 #[test]
-fn evalais_submission_takes_team_and_time_from_evalai_and_says_queued() {
+fn evalais_submission_takes_team_and_time_from_evalai_and_is_reported_as_queued() {
     let mut world = World::evalai();
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);

@@ -112,7 +112,7 @@ fn a_job_goes_early_only_by_the_hosts_choice_and_when_all_have_its_end() {
 }
 
 #[test]
-fn an_end_whose_result_cannot_be_read_says_why_it_waits() {
+fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
     let mut world = finished();
     world.view.report = ObservedReport::Unreadable("the bucket results did not answer in time".into());
     let told = |plan: &Plan, type_: &str| {
@@ -216,7 +216,7 @@ fn a_cancelled_one_that_evalai_ended_too_is_sent_once() {
 }
 
 #[test]
-fn a_refused_result_is_said_once_and_does_not_hold_up_the_row() {
+fn a_refused_result_is_shown_once_and_does_not_hold_up_the_row() {
     let mut world = finished();
     world.in_evalai().end = Some(EvalaiEnd::Refused {
         message: "metric x is unknown".into(),
@@ -408,7 +408,7 @@ fn a_row_that_was_read_before_the_rerun_is_asked_for_anew() {
     world.in_evalai().read_at = Some(at(532));
     assert!(world.pass().status.rerun_as.is_some());
 
-    // The row of the re-run was edited: EvalAI still says finished after it.
+    // The row of the re-run was edited: EvalAI still shows finished after it.
     unproven.go_to(600);
     unproven.in_evalai().read_at = Some(at(590));
     let plan = unproven.pass();
@@ -433,7 +433,7 @@ fn a_submission_remembers_which_one_it_reruns() {
 }
 
 #[test]
-fn an_end_says_until_when_it_waits_for_the_controller_before() {
+fn an_end_shows_until_when_it_waits_for_the_controller_before() {
     let mut world = finished();
     world.view.evalai_writes_from = world.view.now.checked_add(SignedDuration::from_secs(20)).ok();
     let plan = world.pass();
@@ -459,7 +459,7 @@ fn an_end_says_until_when_it_waits_for_the_controller_before() {
 }
 
 #[test]
-fn a_row_that_has_gone_to_another_team_is_said_with_its_end() {
+fn a_row_that_has_gone_to_another_team_is_shown_with_its_end() {
     let mut world = finished();
     world.in_evalai().team_id = Some("42".into());
     let mut same = world.clone();

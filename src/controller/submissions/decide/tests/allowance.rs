@@ -31,7 +31,7 @@ fn simulator_failed(history: TeamHistory, policy: OnRepeatedInfrastructure) -> W
 }
 
 #[test]
-fn a_repeated_failure_is_charged_only_where_the_host_says_so_and_only_to_the_likely_cause() {
+fn a_repeated_failure_is_charged_only_where_the_host_wants_it_and_only_to_the_likely_cause() {
     use OnRepeatedInfrastructure::{Charge, Forgive};
     let alone = TeamHistory {
         others: Others::default(),

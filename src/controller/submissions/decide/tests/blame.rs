@@ -72,7 +72,7 @@ fn check(rows: Vec<Row>) {
 }
 
 #[test]
-fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_says() {
+fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_reports() {
     use EndReason::{GraphicsDriverMissing, NoGPU, SimulatorCrashed, SimulatorNotReady, SimulatorSilent};
     check(vec![
         both("no GPU", "noGpu", "peerCrashed", NoGPU),
@@ -118,7 +118,7 @@ fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_says() {
 }
 
 #[test]
-fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_word() {
+fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_report() {
     use EndReason::{
         BlamesSimulator, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen,
     };

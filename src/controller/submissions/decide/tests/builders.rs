@@ -40,7 +40,7 @@ pub fn leaderboard(evalai: bool) -> Leaderboard {
         "leaderboardVersion": "V2",
         "contents": {"image": "contents:1"},
         "simulator": {"image": "simulator:1"},
-        // Any image; the tests of images say otherwise.
+        // Any image; the tests of images set it otherwise.
         "agent": {"images": []},
         "pairs": 2,
         "routes": 4,
@@ -94,7 +94,7 @@ pub fn looked(at: Timestamp, found: Result<Traces, Unread>) -> Looked {
     Looked { at, found }
 }
 
-/// A world, and what the last pass in it wanted.
+/// A world, and what the last reconcile in it wanted.
 #[derive(Clone, Debug)]
 pub struct World {
     pub view: View,
@@ -113,9 +113,9 @@ impl World {
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
                 is_policy_in_place: true,
                 image: ObservedImage::NotAsked,
-                // Nobody else runs it; the tests of foreign runs say otherwise.
+                // Nobody else runs it; the tests of foreign runs set it otherwise.
                 traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
-                // The results of another program; the tests of one that observes say otherwise.
+                // The results of another program; the tests of one that observes set it otherwise.
                 other_routes: ObservedRoutes::NotAsked,
                 addresses: ObservedAddresses::NotAsked,
                 turn: Turn::Go,
@@ -124,7 +124,7 @@ impl World {
                 node: ObservedNode::Unknown,
                 leaving: None,
                 report: ObservedReport::NotRead,
-                // Whatever is asked for is there already; the tests of waiting say otherwise.
+                // Whatever is asked for is there already; the tests of waiting set it otherwise.
                 report_stage: Some(Stage::JobEnded),
                 report_waited: std::time::Duration::ZERO,
                 texts: ObservedTexts::NotRead,
@@ -239,7 +239,7 @@ impl World {
         self.view.report = ObservedReport::Absent;
     }
 
-    /// Its report says this.
+    /// Its report shows this.
     pub fn report(&mut self, report: Report) {
         let digest = ReportDigest::from(&report);
         self.view.texts = ObservedTexts::Read(Arc::new(Texts {
@@ -313,7 +313,7 @@ impl World {
         }
     }
 
-    /// One pass: decides, checks the rules, and keeps the status.
+    /// One reconcile: decides, checks the rules, and keeps the status.
     pub fn pass(&mut self) -> Plan {
         let plan = decide(&self.view);
         rules::check(&self.view, &plan);
@@ -321,7 +321,7 @@ impl World {
         plan
     }
 
-    /// One pass that has to show this state with this reason.
+    /// One reconcile that has to show this state with this reason.
     #[track_caller]
     pub fn pass_to(&mut self, state: State, reason: &str) -> Plan {
         let plan = self.pass();

@@ -280,7 +280,7 @@ fn a_count_without_a_cause_waits_for_it() {
 }
 
 #[test]
-fn a_crash_that_only_the_simulator_has_told_of_waits_for_the_agents_own_word() {
+fn a_crash_that_only_the_simulator_has_reported_waits_for_the_agents_own_report() {
     let mut world = World::local().running();
     world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 100));
     let plan = world.pass_to(Running, reasons::RUNNING);

@@ -38,7 +38,7 @@ fn complete_results_that_count_finish() {
     assert_eq!(condition(&plan, RUNNING).0, "False");
 }
 
-/// The Pod's agents and simulators have ended well at this second; its Job knows nothing of it yet.
+/// The Pod's agents and simulators have ended well at this second; its Job shows nothing of it yet.
 fn run_ends(world: &mut World, second: i64) {
     world.go_to(second + 1);
     world.pod().run_ended = Some(at(second));
@@ -229,7 +229,7 @@ fn a_failed_job_is_blamed_on_its_worst_pair_or_on_nobody() {
     let mut unlimited = late.clone();
     fail(&mut late, "DeadlineExceeded");
     late.pass_to(Failed, reasons::TIME_LIMIT);
-    // The Pod's deadline was not ours: what its pair said counts.
+    // The Pod's deadline was not ours: what its pair reported counts.
     unlimited.leaderboard().deadlines.run_seconds = 0;
     fail(&mut unlimited, "DeadlineExceeded");
     unlimited.pass_to(Failed, reasons::IDLE);

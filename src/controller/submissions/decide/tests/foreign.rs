@@ -190,7 +190,7 @@ fn what_another_program_runs_waits_and_nothing_is_written_of_it() {
 }
 
 #[test]
-fn when_the_other_run_has_ended_evalai_says_what_follows() {
+fn when_the_other_run_has_ended_evalai_decides_what_follows() {
     let of = |status| ObservedTraces::Answered(Arc::new(looked(at(30), Ok(with_row(row(status))))));
     let held = || {
         let mut world = seen(with_row(row("RUNNING")));

@@ -74,7 +74,7 @@ fn an_image_of_another_team_or_of_the_host_fails_at_once_and_no_registry_is_aske
 }
 
 #[test]
-fn the_images_of_contents_and_simulator_are_nobodys_agent_whatever_the_patterns_say() {
+fn the_images_of_contents_and_simulator_are_nobodys_agent_whatever_the_patterns_allow() {
     for (image, patterns) in [
         ("contents:2", vec![]),
         ("docker.io/library/simulator:1", vec![]),
@@ -161,7 +161,7 @@ fn the_digest_stays_through_retries_and_attempts() {
 }
 
 #[test]
-fn what_a_registry_tells_ends_a_submission_before_a_job_is_made() {
+fn what_a_registry_reports_ends_a_submission_before_a_job_is_made() {
     use FailureClass::{Infrastructure, Participant};
     let huge = Facts {
         bytes: (60 << 30) + 1,

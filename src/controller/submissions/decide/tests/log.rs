@@ -149,7 +149,7 @@ fn a_preparation_that_fails_is_explained_by_its_container_before_the_job_is_dele
 }
 
 #[test]
-fn results_that_were_not_stored_are_told_by_logcopy() {
+fn results_that_were_not_stored_are_reported_by_logcopy() {
     let mut world = World::local().running();
     world.leaderboard().retries.infrastructure = 0;
     world.complete();
@@ -187,7 +187,7 @@ fn what_never_ran_has_no_log() {
 }
 
 #[test]
-fn a_log_is_requested_until_evalai_knows_the_end_and_not_after() {
+fn a_log_is_requested_until_evalai_has_the_end_and_not_after() {
     let mut world = World::evalai().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();

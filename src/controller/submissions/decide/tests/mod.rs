@@ -1,4 +1,4 @@
-//! Tables and properties of `decide`, by stage of life. Every pass of every table also obeys `rules`.
+//! Tables and properties of `decide`, by stage of life. Every reconcile of every table also obeys `rules`.
 
 mod accept;
 mod addresses;
@@ -33,3 +33,4 @@ mod run;
 mod start;
 mod stop;
 mod usage;
+mod waits;

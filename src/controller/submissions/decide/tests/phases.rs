@@ -13,7 +13,7 @@ use crate::observability::traces::{Kind, Span, Value};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
 use leaderboard_api::{names, reasons};
 
-/// What ends with the next pass: phase, and the seconds at which it began and ended.
+/// What ends with the next reconcile: phase, and the seconds at which it began and ended.
 type Lengths = Vec<(&'static str, i64, i64)>;
 
 fn pass(world: &mut World) -> (Plan, Lengths) {

@@ -16,7 +16,7 @@ use crate::controller::submissions::view::{
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 
-/// One change of the world, after which there is a pass.
+/// One change of the world, after which there is a reconcile.
 #[derive(Clone, Debug)]
 enum Change {
     Time(i64),

@@ -1,4 +1,4 @@
-//! Objects that have lost their status: what EvalAI, the table and the bucket hold says whether they have ended.
+//! Objects that have lost their status: what EvalAI, the table and the bucket hold shows whether they have ended.
 
 use std::sync::Arc;
 
@@ -70,7 +70,7 @@ fn refused() -> Report {
 }
 
 #[test]
-fn what_bucket_and_table_say_of_one_that_is_not_evalais() {
+fn one_that_is_not_evalais_ends_as_bucket_and_table_show() {
     let of = |row, report| found(&traces(row, report), 1, None);
     assert_eq!(of(None, None), Found::Nothing);
     assert_eq!(of(Some(row("RUNNING", 1)), None), Found::Nothing, "nothing was stored");
@@ -92,7 +92,7 @@ fn what_bucket_and_table_say_of_one_that_is_not_evalais() {
 }
 
 #[test]
-fn what_evalai_says_goes_before_what_is_stored() {
+fn what_evalai_shows_goes_before_what_is_stored() {
     let of = |standing, status: &str, row, report| found(&traces(row, report), 1, Some(&evalai(standing, status)));
     let running = || Some(row("RUNNING", 1));
     assert_eq!(of(Standing::Wanted, "submitted", None, None), Found::Nothing);

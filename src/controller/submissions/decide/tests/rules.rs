@@ -1,4 +1,4 @@
-//! What holds for every pass in every world.
+//! What holds for every reconcile in every world.
 
 use std::collections::HashSet;
 
@@ -8,10 +8,10 @@ use leaderboard_api::conditions::{self, FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::reasons::{self, Class};
 use leaderboard_api::{FailureClass, PolicySource, State, SubmissionStatus};
 
-/// Passes after which nothing may change any more in a world that stands still.
+/// Reconciles after which nothing may change any more in a world that stands still.
 const SETTLED_AFTER: usize = 5;
 
-/// Checks one pass, and that the world comes to rest after it.
+/// Checks one reconcile, and that the world comes to rest after it.
 pub fn check(view: &View, plan: &Plan) {
     if view.submission.awaits_import() {
         assert!(
@@ -277,7 +277,7 @@ fn a_wait_hears_evalai(view: &View, plan: &Plan) {
         || view.submission.metadata.deletion_timestamp.is_some()
         || status.failure.is_some()
         || status.times.stopping.is_some();
-    // The next pass looks at an attempt that has just begun.
+    // The next reconcile looks at an attempt that has just begun.
     let is_seen = plan.requeue != Some(std::time::Duration::ZERO);
     let is_asked = status.times.submitted.is_some();
     if may_run && is_asked && is_seen && !is_to_stop && !is_finished(status) {
@@ -306,7 +306,7 @@ fn comes_to_rest(view: &View, plan: &Plan) {
     std::sync::Arc::make_mut(&mut view.submission).status = Some(last.status.clone());
     let again = decide(&view);
     assert_eq!(again.status, last.status, "a write each pass");
-    // The pass that releases a deleted object is its last.
+    // The reconcile that releases a deleted object is its last.
     if !again.actions.contains(&Action::ReleaseFinalizer) {
         assert_eq!(again.events, Vec::new(), "an event each pass");
     }

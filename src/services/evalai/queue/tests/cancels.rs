@@ -42,7 +42,7 @@ fn a_cancellation_that_a_write_under_way_may_undo_is_sent_again() {
 }
 
 #[test]
-fn a_list_that_was_asked_for_before_a_write_may_tell_of_what_that_undid() {
+fn a_list_that_was_asked_for_before_a_write_may_show_what_that_undid() {
     let (mut bench, write) = partial_under_way();
     let list = next_list(&mut bench);
     bench.answer(&write, Reply::Written(Answer::Done(())));
@@ -164,7 +164,7 @@ fn a_cancellation_while_a_later_attempt_waits_ends_it() {
 }
 
 #[test]
-fn after_a_restart_the_job_name_tells_whose_cancellation_it_is() {
+fn after_a_restart_the_job_name_shows_whose_cancellation_it_is() {
     for (job, ended) in [("submission-7-1", None), ("submission-7-2", Some(Status::Cancelled))] {
         let mut bench = Bench::new();
         bench.live(7, 2);

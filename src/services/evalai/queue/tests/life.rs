@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn a_whole_life() {
+fn a_whole_life_is_written_step_by_step() {
     let mut bench = Bench::new();
     bench.running(7);
     assert_eq!(bench.view(7).progress, Some(Progress::Running));
@@ -77,7 +77,7 @@ fn queued_is_left_out_where_running_is_wanted_already() {
 }
 
 #[test]
-fn what_evalai_says_already_is_not_written_again() {
+fn what_evalai_shows_already_is_not_written_again() {
     let mut bench = Bench::new();
     bench.update(7, 1, DesiredUpdate::Running);
     bench.get(7, row(7, Status::Running));

@@ -4,7 +4,7 @@ use super::*;
 use crate::services::evalai::types::Swept;
 
 #[test]
-fn priorities() {
+fn the_most_urgent_request_goes_first() {
     let mut bench = Bench::new();
     bench.all_running(&[1, 2, 3]);
     bench.serve();

@@ -75,7 +75,7 @@ enum Event {
     Wake,
 }
 
-/// What the controller knows of a submission.
+/// What the controller has of a submission.
 #[derive(Clone, Debug, Default)]
 struct Actor {
     attempt: i64,

@@ -1,5 +1,5 @@
 //! A controller's surroundings without a cluster, for the tests of this module: caches that a test fills, an API server that takes
-//! everything, AWS wherever the test says.
+//! everything, AWS wherever the test puts it.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -50,6 +50,8 @@ use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatu
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";
+/// The version of a Leaderboard here, before its status is written and after it.
+const VERSION: &str = "2";
 /// The installation that drives every Leaderboard here.
 const OPERATOR: &str = "system/operator";
 
@@ -210,7 +212,7 @@ async fn serve(
 }
 
 /// A write of an object is answered with the object; nothing is ever refused, and nothing is listed.
-fn reply(method: &Method, path: &str, body: Value, known: &HashMap<String, Value>) -> Value {
+fn reply(method: &Method, path: &str, mut body: Value, known: &HashMap<String, Value>) -> Value {
     match *method {
         Method::GET => json!({"apiVersion": "v1", "kind": "List", "metadata": {}, "items": []}),
         Method::DELETE => json!({"apiVersion": "v1", "kind": "Status", "metadata": {}, "status": "Success"}),
@@ -220,6 +222,9 @@ fn reply(method: &Method, path: &str, body: Value, known: &HashMap<String, Value
                 .nth(1)
                 .and_then(|rest| rest.split('/').next());
             let Some(mut object) = name.and_then(|name| known.get(name)).cloned() else {
+                if path.ends_with("/status") {
+                    body["metadata"]["resourceVersion"] = json!(VERSION);
+                }
                 return body;
             };
             if let Some(status) = body.get("status") {
@@ -241,11 +246,12 @@ pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
     let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some(NAMESPACE.into());
     object.metadata.uid = Some(format!("uid-of-{name}"));
+    object.metadata.resource_version = Some(VERSION.into());
     object.status.get_or_insert_default().operator = Some(OPERATOR.into());
     object
 }
 
-/// A submission whose Job was made, and that Job. Nothing says yet that it was scheduled.
+/// A submission whose Job was made, and that Job. Nothing shows yet that it was scheduled.
 pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     let board_name = board.name_any();
     let spec = json!({"leaderboardName": board_name, "image": "agent:1", "track": "sensors", "team": {"id": "t1"}});

@@ -304,7 +304,7 @@ fn a_pause_or_a_lower_limit_takes_back_what_was_not_used() {
 }
 
 #[test]
-fn the_line_knows_who_was_served_and_how_long_runs_take() {
+fn the_line_remembers_who_was_served_and_how_long_runs_take() {
     let running = json!({"attempt": 1, "jobName": "j", "times": {"scheduled": time(2000)}});
     let all = [
         submission("x-old", "x", 1, ended(1)),

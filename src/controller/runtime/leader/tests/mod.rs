@@ -1,5 +1,8 @@
 //! Whole elections on tokio's paused clock against one Lease on a mock of the API server, with faults.
 
+pub(crate) mod fake_server;
+mod simulation;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -8,9 +11,9 @@ use serde_json::json;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
-use super::fake_server::{FakeServer, Fault};
 use super::*;
 use crate::observability::shutdown::Stop;
+use fake_server::{FakeServer, Fault};
 
 /// Longer than anything an election may take.
 const LIMIT: Duration = Duration::from_mins(5);
@@ -130,7 +133,7 @@ async fn a_standby_takes_over_fifteen_seconds_after_the_last_sign_and_waits_for_
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_live_leader_is_left_alone_whatever_its_clock_says() {
+async fn a_live_leader_is_left_alone_whatever_its_clock_shows() {
     let server = FakeServer::default();
     server.with(|state| state.put(Some("alive"), 3, &json!({})));
     let candidate = Candidate::start(&server, someone());

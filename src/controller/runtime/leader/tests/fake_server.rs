@@ -21,7 +21,7 @@ pub enum Fault {
     Silence,
     /// It is done, and answered 4 s later.
     Late,
-    /// Somebody else touches the Lease right before it arrives.
+    /// Somebody else changes the Lease right before it arrives.
     Meddled,
     /// Refused, 403.
     Forbidden,

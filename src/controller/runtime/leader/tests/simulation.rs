@@ -7,9 +7,9 @@ use std::time::Duration;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 
-use super::Timing;
-use super::decide::{Decision, Leading, Seen, decide};
-use super::record::{Identity, Record};
+use crate::controller::runtime::leader::Timing;
+use crate::controller::runtime::leader::decide::{Decision, Leading, Seen, decide};
+use crate::controller::runtime::leader::record::{Identity, Record};
 
 #[derive(Clone, Debug)]
 enum Step {
