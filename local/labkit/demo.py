@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import aws, build, cluster, demo_check, evalai_server, image, packages, pythonenv, tools
+from . import aws, build, cluster, demo_check, evalai_server, image, packages, pki, pythonenv, tools
 from .console import say, seconds
 from .demo_check import Findings
 from .errors import LabError
@@ -124,7 +124,7 @@ def install(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
     for name in ("namespaces.yaml", "secrets.yaml"):
         apply(settings, kube, name, pinned)
     # The commands that README and the demo's last lines name are then short.
-    kube.run("kubectl", "config", "set-context", "--current", f"--namespace={NAMESPACE}")
+    pki.choose_namespace(settings.kubeconfig, NAMESPACE)
     unblock(kube)
     values = manifest(settings, "values.yaml", {})
     digest = pinned[OPERATOR].partition("@")[2]
