@@ -38,7 +38,7 @@ measure-intake: ## Measure the intake of 10,000 messages while controller and br
 	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
 		ten_thousand_messages
 
-measure-failover: ## Measure how long the other replica takes to go on, ten ends of each kind (10 min; no root, no node)
+measure-failover: ## Measure how long the other replica takes to go on, ten ends of each kind (3 min; no root, no node)
 	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
 	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
 	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \

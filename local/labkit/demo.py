@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import aws, build, cluster, demo_check, evalai_server, image, packages, pythonenv, tools
+from . import aws, build, cluster, demo_check, evalai_server, image, packages, pki, pythonenv, tools
 from .console import say, seconds
 from .demo_check import Findings
 from .errors import LabError
@@ -123,6 +123,8 @@ def install(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
     step(7, f"the operator, by its Helm chart, in the namespace {SYSTEM}", "10 s")
     for name in ("namespaces.yaml", "secrets.yaml"):
         apply(settings, kube, name, pinned)
+    # The commands that README and the demo's last lines name are then short.
+    pki.choose_namespace(settings.kubeconfig, NAMESPACE)
     unblock(kube)
     values = manifest(settings, "values.yaml", {})
     digest = pinned[OPERATOR].partition("@")[2]
@@ -308,11 +310,12 @@ def next_steps(settings: Settings, found: Findings) -> str:
     at = "" if settings.ports["evalai"] == PORTS["evalai"] else f" --server {settings.evalai_endpoint}"
     return f"""
 What to try next:
-  eval "$(local/lab env)"                                   # kubectl, helm and AWS's variables for this shell
-  kubectl -n {NAMESPACE} describe submission {name}
+  eval "$(local/lab env)"                                   # kubectl with the plugin and this namespace, helm, AWS's variables
+  kubectl describe submission {name}
+  kubectl leaderboard dashboard                             # in a browser
   {stand_in} submit {agents}:crash-once --phase 2{at}
   {stand_in} submit {agents}:print-routes{at}
-  kubectl -n {NAMESPACE} get submissions --watch
+  kubectl get submissions --watch
   {stand_in} show {key}{at}
   http://127.0.0.1:{settings.ports["evalai"]}/                                    # EvalAI's submissions and leaderboards
   make demo                                                 # once more: a new submission

@@ -64,11 +64,10 @@ NOT_TYPED = {
 }
 # Answers to a line that is right, of a server without nodes and without the object.
 ANSWERS = re.compile(
-    r"\(NotFound\): (?:pods|services) |\(AlreadyExists\)|already exists|timed out waiting|Metrics API not available"
-    r"|no endpoints available|release: not found"
+    r"\(NotFound\): pods |\(AlreadyExists\)|already exists|timed out waiting|Metrics API not available"
+    r"|release: not found"
 )
 MAY_MISS = {"create", "exec", "get --raw", "logs", "top", "uninstall", "wait"}
-SERVICE = re.compile(r"/namespaces/([\w-]+)/services/([\w-]+):(\d+)/proxy/")
 # What stands for what the reader puts in.
 PLACEHOLDERS = {
     "<name>": "sample",
@@ -112,7 +111,7 @@ def check(settings: Settings, kube: Kube) -> str:
         docanswers.running(settings, Path(folder)) as more,
     ):
         notes, said = typed(settings.repository, Kube(kube.tools, {**kube.env, **more}), Path(folder), found)
-    faults += [*said, *judged(notes), *services(kube, notes), *of_words(settings, notes)]
+    faults += [*said, *judged(notes), *of_words(settings, notes)]
     if faults:
         raise LabError("; ".join(faults[:12]))
     counts = Counter(how(note) for note in notes)
@@ -229,15 +228,6 @@ def judged(notes: Sequence[Note]) -> Iterator[str]:
         is_answer = verb in MAY_MISS and ANSWERS.search(note.error)
         if note.code and not is_answer:
             yield f"{note}: {note.error.strip()[-200:]}"
-
-
-def services(kube: Kube, notes: Sequence[Note]) -> Iterator[str]:
-    """Services that a line asks through the API server, which answers the same for one without Pods and of one that is not there."""
-    for note in notes:
-        for namespace, name, port in SERVICE.findall(" ".join(note.words)):
-            argv = ["get", "service", name, f"--namespace={namespace}", "--output=jsonpath={.spec.ports[*].port}"]
-            if kube.attempt("kubectl", *argv).stdout.split().count(port) != 1:
-                yield f"{note}: there is no Service {name} in {namespace} with the port {port}"
 
 
 def of_words(settings: Settings, notes: Sequence[Note]) -> Iterator[str]:

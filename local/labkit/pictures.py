@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from . import browser, build, evalai_server, image, pagetest, terminal, tools
 from .browser import Tab
-from .demo import CHALLENGE, LEADERBOARD, NAMESPACE, RELEASE, SYSTEM
+from .demo import CHALLENGE, LEADERBOARD, NAMESPACE
 from .errors import LabError
 from .kube import Kube, of_lab
 from .settings import Settings
@@ -43,7 +43,6 @@ def run(settings: Settings) -> None:
     with of_person(settings) as kube, browser.tab() as tab:
         if kube.attempt("kubectl", "get", "leaderboard", LEADERBOARD).returncode != 0:
             raise LabError("the pictures are of the demo's cluster, which is not there: run `make demo` first")
-        serve_page(settings, kube)
         with changed_back(kube):
             shown = submissions(settings, kube)
             for name, data in [*terminals(kube, tab, shown), *pages(kube, tab)]:
@@ -61,13 +60,6 @@ def of_person(settings: Settings) -> Iterator[Kube]:
         kube = Kube(lab.tools, {**lab.env, "PATH": path, "KUBECONFIG": config, "TERM": "xterm"})
         kube.run("kubectl", "config", "set-context", "--current", f"--namespace={NAMESPACE}")
         yield kube
-
-
-def serve_page(settings: Settings, kube: Kube) -> None:
-    """As docs/page.md turns it on."""
-    chart = str(settings.repository / "charts" / RELEASE)
-    argv = ["upgrade", RELEASE, chart, f"--namespace={SYSTEM}", "--reuse-values", "--set=controller.page.enabled=true"]
-    kube.run("helm", *argv, "--wait", "--timeout=180s", action="helm upgrade")
 
 
 @contextmanager

@@ -138,6 +138,13 @@ def write_kubeconfig(settings: Settings, name: str, file: Path) -> None:
     write_whole(file, text)
 
 
+def choose_namespace(file: Path, namespace: str) -> None:
+    """Makes it the one that kubectl takes unasked; the file keeps its owner. `kubectl config` writes YAML, and tests read JSON."""
+    content = json.loads(file.read_text())
+    content["contexts"][0]["context"]["namespace"] = namespace
+    file.write_text(json.dumps(content, indent=2) + "\n")
+
+
 def authority_data(settings: Settings) -> str:
     """The authority's certificate as kubeconfigs hold it (base64)."""
     return base64.b64encode((settings.pki / "ca.crt").read_bytes()).decode()

@@ -7,7 +7,7 @@ import unittest
 from pathlib import Path
 from typing import Any
 
-from labkit import demo_check, evalai_server, follow
+from labkit import demo_check, evalai_server, follow, pki
 from labkit.demo_check import Findings
 
 LOCAL = Path(__file__).resolve().parent.parent
@@ -102,6 +102,16 @@ class Comparison(unittest.TestCase):
 def texts(found: Findings, key: str, value: Any) -> None:
     merged = json.loads(found.texts["agent/agent_results.json"])
     found.texts["agent/agent_results.json"] = json.dumps(merged | {key: value})
+
+
+class Namespace(unittest.TestCase):
+    def test_kubectl_takes_that_of_the_demo_and_the_file_stays_json(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "kubeconfig"
+            file.write_text('{"contexts": [{"name": "a", "context": {"cluster": "b", "user": "c"}}]}')
+            pki.choose_namespace(file, "leaderboard")
+            (context,) = json.loads(file.read_text())["contexts"]
+            self.assertEqual(context["context"], {"cluster": "b", "user": "c", "namespace": "leaderboard"})
 
 
 class Following(unittest.TestCase):

@@ -140,7 +140,7 @@ mod tests {
         let address = server.address();
         let why = unready(&http, address).await.unwrap();
         assert!(
-            why.contains("/readyz answers 503") && why.contains("not all checks are registered"),
+            why.contains("/readyz answers 500") && why.contains("not all checks are registered"),
             "{why}"
         );
         telemetry.readiness.registered();

@@ -106,7 +106,8 @@ fn page(problems: &[String]) -> Response {
     if problems.is_empty() {
         return "ok\n".into_response();
     }
-    (StatusCode::SERVICE_UNAVAILABLE, problems.join("\n") + "\n").into_response()
+    // As on the API server's own pages: of a 503 `kubectl get --raw` shows no text.
+    (StatusCode::INTERNAL_SERVER_ERROR, problems.join("\n") + "\n").into_response()
 }
 
 #[cfg(test)]
@@ -140,7 +141,7 @@ mod tests {
         let (code, answer) = get(server.address(), "/readyz").await;
         assert_eq!(
             (code, body(&answer)),
-            (503, "process: starting; not all checks are registered\n")
+            (500, "process: starting; not all checks are registered\n")
         );
         telemetry
             .readiness
@@ -149,14 +150,14 @@ mod tests {
         let (code, answer) = get(server.address(), "/readyz").await;
         assert_eq!(
             (code, body(&answer)),
-            (503, "submissions synced: the list has not come yet\n")
+            (500, "submissions synced: the list has not come yet\n")
         );
         telemetry.readiness.set("submissions synced", Ok(()));
         let (code, answer) = get(server.address(), "/readyz").await;
         assert_eq!((code, body(&answer)), (200, "ok\n"));
         sender.send(true).unwrap();
         let (code, answer) = get(server.address(), "/readyz").await;
-        assert_eq!((code, body(&answer)), (503, "running: the process is stopping\n"));
+        assert_eq!((code, body(&answer)), (500, "running: the process is stopping\n"));
         let (code, _) = get(server.address(), "/livez").await;
         assert_eq!(code, 200, "a process that drains is not to be killed for it");
         server.close().await;
