@@ -10,7 +10,7 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 
 use crate::controller::leaderboards::operator;
-use crate::controller::submissions::act::awaits_publication;
+use crate::controller::submissions::decide::awaits_publication;
 use crate::kubernetes::Store;
 use crate::lock::lock;
 use crate::observability::Observability;

@@ -33,3 +33,4 @@ mod run;
 mod start;
 mod stop;
 mod usage;
+mod writes;
