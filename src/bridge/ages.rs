@@ -13,10 +13,10 @@ const MOST: usize = 10_000;
 
 /// The messages of one queue.
 #[derive(Debug, Default)]
-pub struct Ages(HashMap<String, Seen>);
+pub struct Ages(HashMap<String, KnownMessage>);
 
 #[derive(Debug)]
-struct Seen {
+struct KnownMessage {
     sent_ms: i64,
     /// By then it has come back, if it is still there.
     until: Instant,
@@ -28,7 +28,7 @@ impl Ages {
         if let Some(seen) = self.0.get_mut(id) {
             seen.until = until;
         } else if self.0.len() < MOST {
-            self.0.insert(id.to_owned(), Seen { sent_ms, until });
+            self.0.insert(id.to_owned(), KnownMessage { sent_ms, until });
         }
     }
 

@@ -227,7 +227,7 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
         ("stdout.txt", files.stdout_txt.as_str()),
     ];
     texts.extend(files.metadata_json.as_deref().map(|text| ("metadata.json", text)));
-    let places: Vec<Place> = texts.iter().map(|(name, _)| Place::of(out, name)).collect();
+    let places: Vec<OutputFile> = texts.iter().map(|(name, _)| OutputFile::of(out, name)).collect();
     // Side by side, as each waits for the disk.
     let staged = thread::scope(|scope| {
         let mut writers = Vec::with_capacity(places.len());
@@ -239,7 +239,7 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
             .map(|writer| writer.join().unwrap_or_else(|panic| resume_unwind(panic)));
         ended.fold(Ok(()), Result::and)
     });
-    let done = staged.and_then(|()| places.iter().try_for_each(Place::take));
+    let done = staged.and_then(|()| places.iter().try_for_each(OutputFile::take));
     if done.is_err() {
         for place in &places {
             // What is left of the attempt; most of it may not be there.
@@ -250,12 +250,12 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
 }
 
 /// Where a file goes, and where it waits until the others are ready.
-struct Place {
+struct OutputFile {
     target: PathBuf,
     staged: PathBuf,
 }
 
-impl Place {
+impl OutputFile {
     fn of(out: &Path, name: &str) -> Self {
         Self {
             target: out.join(name),

@@ -30,7 +30,7 @@ use crate::observability::Observability;
 use connections::Bounded;
 use hub::{Hub, Source};
 use leaderboard_api::{Leaderboard, Submission};
-use model::{Replica, View};
+use model::{PageView, Replica};
 
 /// Why there is no page.
 #[derive(Debug, thiserror::Error)]
@@ -119,7 +119,7 @@ impl Source for Caches {
             is_complete: boards.is_complete() && submissions.is_complete(),
         };
         let (leaderboards, submissions) = (boards.store.state(), submissions.store.state());
-        let view = View::of(replica, &leaderboards, &submissions, Timestamp::now());
+        let view = PageView::of(replica, &leaderboards, &submissions, Timestamp::now());
         // Names as keys and plain values: serde_json has no error for them.
         serde_json::to_vec(&view).unwrap_or_default()
     }

@@ -37,7 +37,7 @@ pub(super) struct Replica<'a> {
 
 /// Everything that is shown.
 #[derive(Serialize, Debug)]
-pub(super) struct View<'a> {
+pub(super) struct PageView<'a> {
     replica: Replica<'a>,
     version: &'static str,
     leaderboards: List<Board>,
@@ -129,7 +129,7 @@ struct Tally {
     last_runs: Vec<Phases>,
 }
 
-impl<'a> View<'a> {
+impl<'a> PageView<'a> {
     pub(super) fn of(
         replica: Replica<'a>,
         leaderboards: &[Arc<Leaderboard>],

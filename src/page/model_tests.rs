@@ -9,7 +9,7 @@ fn view(leaderboards: &[Arc<Leaderboard>], submissions: &[Arc<Submission>]) -> V
         leads: true,
         is_complete: true,
     };
-    serde_json::to_value(View::of(replica, leaderboards, submissions, now())).unwrap()
+    serde_json::to_value(PageView::of(replica, leaderboards, submissions, now())).unwrap()
 }
 
 fn names(list: &Value) -> Vec<&str> {

@@ -1,7 +1,7 @@
 //! Which versions of the documents between the controller and its Pods are read: a run lasts days, and an upgrade of the operator
 //! does not wait for it.
 //!
-//! `report`, `run` and the owner's mark carry a number each. A field that an older reader can do without changes no number;
+//! `report`, `run`, the verdict of `workspace` and the owner's mark carry a number each. A field that an older reader can do without changes no number;
 //! anything else does, and `golden/` keeps one file of each version that is read.
 
 /// Whether a document of version `found` is read by a program that writes `own`: its own and the one before.
@@ -17,9 +17,12 @@ mod tests {
     use super::*;
     use crate::pod::report::{OWNER_SCHEMA, Owner, Report, ReportError, SCHEMA as REPORT_SCHEMA};
     use crate::pod::run::{Run, SCHEMA as RUN_SCHEMA};
+    use crate::pod::workspace::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
 
     const REPORT_1: &str = include_str!("golden/report-1.json");
     const RUN_1: &str = include_str!("golden/run-1.json");
+    const WORKSPACE_0: &str = include_str!("golden/workspace-0.json");
+    const WORKSPACE_1: &str = include_str!("golden/workspace-1.json");
     const OWNER_0: &str = include_str!("golden/owner-0");
     const OWNER_1: &str = include_str!("golden/owner-1.json");
 
@@ -56,6 +59,24 @@ mod tests {
         let unnumbered = RUN_1.replacen("\"schema\": 1,", "", 1);
         let unnumbered: Run = serde_json::from_str(&unnumbered).unwrap();
         assert_eq!(unnumbered, Run { schema: 0, ..run });
+    }
+
+    #[test]
+    fn each_version_of_the_verdict_of_workspace_is_read() {
+        assert_eq!(VERDICT_SCHEMA, 1, "a new version needs a golden file of its own");
+        let verdict = WorkspaceVerdict::parse(WORKSPACE_1).unwrap();
+        assert_eq!(verdict.reason, WorkspaceReason::NotEnforced);
+        assert_round_trip(WORKSPACE_1, &verdict);
+        let old = WorkspaceVerdict::parse(WORKSPACE_0);
+        assert_eq!(old, Ok(WorkspaceVerdict { schema: 0, ..verdict }));
+        let newer = WORKSPACE_1.replacen("\"schema\": 1", "\"schema\": 2", 1);
+        let newer = newer.replacen("NotEnforced", "OfTomorrow", 1);
+        let error = WorkspaceVerdict::parse(&newer).unwrap_err();
+        assert_eq!(error, NotAVerdict::Schema(2));
+        assert_eq!(
+            error.to_string(),
+            "the verdict of `workspace` has schema 2, and 1 and the one before are read"
+        );
     }
 
     #[test]

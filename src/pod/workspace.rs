@@ -23,6 +23,7 @@ use super::name_files;
 use super::places::{Places, Setting};
 use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, ReportPair, SCHEMA};
 use super::run::{Run, STATUS_FOLDER};
+use super::schema::is_read;
 use super::tree::{Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError};
 use leaderboard_api::names::FAILURE_LOG_KEY;
@@ -34,6 +35,8 @@ const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
 const PREPARED: &str = "logcopy/.prepared";
 /// Tries while S3 does not answer, before the kubelet is left to start this again.
 const TRIES: u32 = 6;
+/// Version of the verdict.
+pub const VERDICT_SCHEMA: u32 = 1;
 /// Most bytes of a verdict: eleven containers share 12 KiB.
 const VERDICT_BYTES: usize = 1000;
 
@@ -63,13 +66,39 @@ pub enum WorkspaceReason {
 /// The container's termination message.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
 pub struct WorkspaceVerdict {
+    /// [`VERDICT_SCHEMA`]; what had no number yet is version 0.
+    #[serde(default)]
+    pub schema: u32,
     /// For the controller.
     pub reason: WorkspaceReason,
     /// For people, with the next step.
     pub message: String,
 }
 
+/// Why a termination message is no verdict.
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
+pub enum NotAVerdict {
+    /// Longer than any version writes.
+    #[error("the termination message has {0} bytes, more than the {VERDICT_BYTES} of a verdict of `workspace`")]
+    TooLong(usize),
+    /// Of a version that is not read.
+    #[error("the verdict of `workspace` has schema {0}, and {VERDICT_SCHEMA} and the one before are read")]
+    Schema(u32),
+    /// Not the JSON of a verdict.
+    #[error("the termination message is no verdict of `workspace`: {0}")]
+    Malformed(String),
+}
+
 impl WorkspaceVerdict {
+    /// A verdict of this version.
+    pub fn new(reason: WorkspaceReason, message: String) -> Self {
+        Self {
+            schema: VERDICT_SCHEMA,
+            reason,
+            message,
+        }
+    }
+
     /// Its JSON, cut to what a termination message may have.
     pub fn to_json(&self) -> String {
         let mut verdict = self.clone();
@@ -86,19 +115,31 @@ impl WorkspaceVerdict {
 
     /// What a Pod that goes on reports of its isolation.
     fn of(finding: &Finding) -> Self {
-        Self {
-            reason: match finding {
-                Finding::Enforced(..) => WorkspaceReason::Enforced,
-                Finding::Open(_) => WorkspaceReason::NotEnforced,
-                Finding::Unmeasured(_) => WorkspaceReason::NotMeasured,
-            },
-            message: finding.to_string(),
-        }
+        let reason = match finding {
+            Finding::Enforced(..) => WorkspaceReason::Enforced,
+            Finding::Open(_) => WorkspaceReason::NotEnforced,
+            Finding::Unmeasured(_) => WorkspaceReason::NotMeasured,
+        };
+        Self::new(reason, finding.to_string())
     }
 
-    /// Reads a container's termination message; `None` if it is not one of these.
-    pub fn parse(message: &str) -> Option<Self> {
-        (message.len() <= VERDICT_BYTES).then(|| serde_json::from_str(message).ok())?
+    /// Reads a container's termination message.
+    pub fn parse(message: &str) -> Result<Self, NotAVerdict> {
+        #[derive(Deserialize)]
+        struct Numbered {
+            #[serde(default)]
+            schema: u32,
+        }
+        if message.len() > VERDICT_BYTES {
+            return Err(NotAVerdict::TooLong(message.len()));
+        }
+        let malformed = |error: serde_json::Error| NotAVerdict::Malformed(error.to_string());
+        // Another version may know other reasons.
+        let Numbered { schema } = serde_json::from_str(message).map_err(malformed)?;
+        if !is_read(schema, VERDICT_SCHEMA) {
+            return Err(NotAVerdict::Schema(schema));
+        }
+        serde_json::from_str(message).map_err(malformed)
     }
 }
 
@@ -157,10 +198,7 @@ impl WorkspaceError {
             Self::Storage(_) => WorkspaceReason::StorageFailed,
             Self::Volume { .. } | Self::NameFile { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
         };
-        WorkspaceVerdict {
-            reason,
-            message: self.to_string(),
-        }
+        WorkspaceVerdict::new(reason, self.to_string())
     }
 }
 
@@ -403,7 +441,7 @@ mod tests {
         ] {
             let verdict = WorkspaceVerdict::of(&finding);
             assert_eq!(verdict.reason, reason);
-            assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
+            assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Ok(verdict));
             let verdict = WorkspaceError::NotIsolated(finding).verdict();
             assert_eq!(verdict.reason, required);
             assert!(
@@ -418,10 +456,13 @@ mod tests {
     fn verdicts_are_short_and_read_back() {
         let verdict = WorkspaceError::PrefixInUse("bucket/77/".to_owned()).verdict();
         assert_eq!(verdict.reason, WorkspaceReason::PrefixInUse);
-        assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Some(verdict));
+        assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Ok(verdict));
         let long = WorkspaceError::PrefixInUse("é\"".repeat(3000)).verdict();
         assert!(long.to_json().len() <= VERDICT_BYTES);
-        assert!(WorkspaceVerdict::parse(&long.to_json()).is_some());
-        assert_eq!(WorkspaceVerdict::parse("Error"), None);
+        assert!(WorkspaceVerdict::parse(&long.to_json()).is_ok());
+        assert!(matches!(
+            WorkspaceVerdict::parse("Error"),
+            Err(NotAVerdict::Malformed(_))
+        ));
     }
 }

@@ -13,7 +13,7 @@ use sts_endpoint::ResolveEndpoint as _;
 
 /// Where a service is.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct ServiceAddress {
     /// The service, for people.
     pub service: &'static str,
     /// A name in small letters, or an address.
@@ -38,7 +38,7 @@ macro_rules! endpoint {
 }
 
 /// Where the bucket is, for a program in this region.
-pub async fn s3(storage: &Storage, region: Option<&str>) -> Result<Place, String> {
+pub async fn s3(storage: &Storage, region: Option<&str>) -> Result<ServiceAddress, String> {
     let params = s3_endpoint::Params::builder()
         .bucket(&storage.bucket)
         .region(storage.region.as_deref().or(region).unwrap_or(USUAL_REGION))
@@ -48,26 +48,26 @@ pub async fn s3(storage: &Storage, region: Option<&str>) -> Result<Place, String
 }
 
 /// Where STS is.
-pub async fn sts(storage: &Storage, region: Option<&str>) -> Result<Place, String> {
+pub async fn sts(storage: &Storage, region: Option<&str>) -> Result<ServiceAddress, String> {
     let region = storage.region.as_deref().or(region).unwrap_or(USUAL_REGION);
     let params = sts_endpoint::Params::builder().region(region);
     place("STS", endpoint!(sts_endpoint, params))
 }
 
 /// Where CloudWatch Logs is.
-pub async fn logs(group: &LogGroup, region: Option<&str>) -> Result<Place, String> {
+pub async fn logs(group: &LogGroup, region: Option<&str>) -> Result<ServiceAddress, String> {
     let params = logs_endpoint::Params::builder()
         .region(group.region.as_deref().or(region).unwrap_or(USUAL_REGION))
         .set_endpoint(group.endpoint.clone());
     place("CloudWatch Logs", endpoint!(logs_endpoint, params))
 }
 
-fn place(service: &'static str, endpoint: Result<String, String>) -> Result<Place, String> {
+fn place(service: &'static str, endpoint: Result<String, String>) -> Result<ServiceAddress, String> {
     let endpoint = endpoint.map_err(|why| format!("the endpoint of {service} is not known: {why}"))?;
     let unusable = || format!("the endpoint of {service} is no address of a server");
     let url = Url::parse(&endpoint).map_err(|_| unusable())?;
     let host = url.host_str().ok_or_else(unusable)?;
-    Ok(Place {
+    Ok(ServiceAddress {
         service,
         host: host.trim_matches(['[', ']']).to_lowercase(),
         port: url.port_or_known_default().ok_or_else(unusable)?,
@@ -133,7 +133,7 @@ mod tests {
     #[tokio::test]
     async fn tokens_and_logs_have_their_own_places() {
         let at = |region: &str| storage(&json!({"region": region}));
-        let host = |place: Result<Place, String>| place.unwrap().host;
+        let host = |place: Result<ServiceAddress, String>| place.unwrap().host;
         assert_eq!(
             host(sts(&at("eu-west-1"), Some("us-west-2")).await),
             "sts.eu-west-1.amazonaws.com"

@@ -8,18 +8,18 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 /// What a text takes up; dropped, it is free again.
-pub type Place = Arc<dyn Any + Send + Sync>;
+pub type HeldMemory = Arc<dyn Any + Send + Sync>;
 
 /// A shared text, with its place if it has one. Compared and shown by its content.
 #[derive(Clone, Default)]
 pub struct HeldText {
     text: Arc<str>,
-    place: Option<Place>,
+    place: Option<HeldMemory>,
 }
 
 impl HeldText {
     /// A text that holds its place.
-    pub fn new(text: String, place: Place) -> Self {
+    pub fn new(text: String, place: HeldMemory) -> Self {
         Self {
             text: text.into(),
             place: Some(place),
@@ -72,7 +72,7 @@ mod tests {
     #[test]
     fn a_place_is_free_again_with_the_last_copy_of_its_text() {
         let place: Arc<()> = Arc::new(());
-        let one = HeldText::new("text".to_owned(), Arc::clone(&place) as Place);
+        let one = HeldText::new("text".to_owned(), Arc::clone(&place) as HeldMemory);
         let other = one.clone();
         assert_eq!((&one, one.len()), (&HeldText::from("text"), 4));
         assert_eq!(format!("{one:?}"), "4 bytes, held");

@@ -1,6 +1,6 @@
 //! A check of a Leaderboard: one route with one pair and an image of the host's own, of which no other system keeps anything.
 //!
-//! A check is a Submission with `spec.check`, which `kubectl leaderboard check` creates. Its plan is cut to one route here; the
+//! A check is a Submission with `spec.check`, which `kubectl leaderboard check` creates. The
 //! Leaderboard remembers how the last one ended. Pure.
 
 use jiff::Timestamp;
@@ -8,9 +8,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::route_slice::RouteSlice;
-use super::submission_status::{RunPlan, State};
-use super::{Leaderboard, Submission, conditions, reasons};
+use super::submission_status::State;
+use super::{Submission, conditions, reasons};
 
 /// What the name of a check begins with: its prefix in the bucket can never be a team's.
 pub const NAME_PREFIX: &str = "check-";
@@ -107,25 +106,6 @@ impl CheckEnd {
     }
 }
 
-/// The plan of a check: the first route, once, with one pair.
-pub fn first_route(plan: RunPlan) -> RunPlan {
-    let first = plan.slices.first().map_or(0, |slice| slice.first);
-    RunPlan {
-        slices: vec![RouteSlice { first, last: first }],
-        routes: 1,
-        repetitions: 1,
-        ..plan
-    }
-}
-
-/// The Leaderboard as a check takes it: the first crash and the first fault of the infrastructure end it, since they are what it is
-/// to show.
-pub fn without_retries(leaderboard: &Leaderboard) -> Leaderboard {
-    let mut strict = leaderboard.clone();
-    (strict.spec.retries.per_pair, strict.spec.retries.infrastructure) = (0, 0);
-    strict
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -212,15 +192,5 @@ mod tests {
             ..end
         };
         assert_eq!(noted(&unaccepted, fault), (CheckResult::Failed, "ImagePull".into(), 5));
-    }
-
-    #[test]
-    fn a_check_drives_the_first_route_once() {
-        let plan = json!({"runId": "check-lb-1", "leaderboardVersion": "V1", "track": "sensors", "codename": "SENSORS",
-                          "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}], "routes": 12, "repetitions": 5,
-                          "storage": {"bucket": "b"}, "image": "a:1", "contentsImage": "c:1", "simulatorImage": "s:1"});
-        let plan = first_route(serde_json::from_value(plan).unwrap());
-        assert_eq!(plan.slices, [RouteSlice { first: 4, last: 4 }]);
-        assert_eq!((plan.routes, plan.repetitions), (1, 1));
     }
 }

@@ -19,6 +19,26 @@ const NO_DEAD_LETTERS: &str = "queue.deadLetterURL: a queue for messages that ca
 pub(super) const FLUENTD: &str = "logGroup: does the original's FluentD run on these nodes? Then each line is stored twice: leave logGroup out, or take \
                        the namespace out of FluentD's source (docs/migrate.md, Logs twice)";
 
+/// What no entry holds, and the fields that answer it.
+const ALWAYS: [(&[&str], &str); 4] = [
+    (
+        &["tracks[].nodeSelector"],
+        "tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?",
+    ),
+    (
+        &["concurrency"],
+        "concurrency: how many submissions may run at once, in all and of one team",
+    ),
+    (
+        &["simulator.resources", "agent.resources"],
+        "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else",
+    ),
+    (
+        &["deadlines.runSeconds"],
+        "deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original",
+    ),
+];
+
 /// Before the name of a field of each track.
 const OF_TRACKS: &str = "tracks[].";
 
@@ -70,25 +90,8 @@ fn all(entries: &Entries, options: &Options, now: Timestamp) -> Vec<Question> {
     ask(true, challenge(options));
     ask(options.role_arn.is_none(), Question::new("podIdentity", NO_ROLE));
     ask(options.egress.is_empty(), Question::new("network.egress", NO_EGRESS));
-    for (fields, text) in [
-        (
-            vec!["tracks[].nodeSelector"],
-            "tracks[].nodeSelector: is g5.12xlarge still the instance type of the GPU nodes?",
-        ),
-        (
-            vec!["concurrency"],
-            "concurrency: how many submissions may run at once, in all and of one team",
-        ),
-        (
-            vec!["simulator.resources", "agent.resources"],
-            "resources: CPU, memory and disk of simulators and agents; the original requested one GPU and nothing else",
-        ),
-        (
-            vec!["deadlines.runSeconds"],
-            "deadlines.runSeconds: how long a run may take; 0 is no limit, as in the original",
-        ),
-    ] {
-        let text = text.to_owned();
+    for (fields, text) in ALWAYS {
+        let (fields, text) = (fields.to_vec(), text.to_owned());
         ask(true, Question { fields, text });
     }
     let has_group = entries.boards.iter().any(|board| board.log_group.is_some());

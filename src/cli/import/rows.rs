@@ -95,14 +95,14 @@ fn decide(row: &StoredRow, boards: &[Leaderboard], table: &str) -> Result<Outcom
 }
 
 /// Where a row belongs.
-struct Place<'a> {
+struct Destination<'a> {
     board: &'a Leaderboard,
     track: &'a Track,
     /// Challenge and phase of EvalAI; none for a local Leaderboard.
     evalai: Option<(i64, i64)>,
 }
 
-fn place<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Result<Place<'a>, Undecided> {
+fn place<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Result<Destination<'a>, Undecided> {
     let Some(text) = row.text("track_id") else {
         return local(row, boards).ok_or(Undecided::NoPhase);
     };
@@ -114,7 +114,7 @@ fn place<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Result<Place<'a>, Un
             .tracks
             .iter()
             .find(|track| track.phase.is_some() && track.phase == phase)?;
-        Some(Place {
+        Some(Destination {
             board,
             track,
             evalai: Some((evalai.challenge, phase?)),
@@ -124,19 +124,19 @@ fn place<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Result<Place<'a>, Un
 }
 
 /// A local submission's row has no phase; its track is known by its codename.
-fn local<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Option<Place<'a>> {
+fn local<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Option<Destination<'a>> {
     let codename = row.text("track_name")?;
     let locals = boards.iter().filter(|board| board.spec.evalai.is_none());
     let mut found = locals.flat_map(|board| board.spec.tracks.iter().map(move |track| (board, track)));
     let (board, track) = found.find(|(_, track)| track.codename == codename)?;
-    Some(Place {
+    Some(Destination {
         board,
         track,
         evalai: None,
     })
 }
 
-fn submission(row: &StoredRow, place: &Place<'_>, attempt: i64) -> Result<Submission, Undecided> {
+fn submission(row: &StoredRow, place: &Destination<'_>, attempt: i64) -> Result<Submission, Undecided> {
     let board = place.board.name_any();
     let mut labels = BTreeMap::from([(names::LABEL_LEADERBOARD.to_owned(), board.clone())]);
     let image = row

@@ -20,7 +20,7 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Pod;
 use crate::kubernetes::{WatchEvents, call};
-use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
+use crate::pod::workspace::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, names, reasons};
@@ -263,7 +263,14 @@ fn is_pod_of(pod: &Pod, leaderboard: &Leaderboard) -> bool {
 fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
     let mut containers = pod.status.init_container_statuses.iter();
     let end = containers.find(|c| &*c.name == names::CONTAINER_WORKSPACE)?.ended()?;
-    let verdict = WorkspaceVerdict::parse(end.message.as_deref()?)?;
+    let verdict = match WorkspaceVerdict::parse(end.message.as_deref()?) {
+        Ok(verdict) => verdict,
+        Err(error @ NotAVerdict::Schema(_)) => {
+            tracing::warn!(pod = &*pod.metadata.name, %error, "what a Pod has found of its isolation is not used");
+            return None;
+        }
+        Err(_) => return None,
+    };
     let is_finding = matches!(
         verdict.reason,
         WorkspaceReason::Enforced
@@ -317,8 +324,7 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
         reasons::NOT_ENFORCED => WorkspaceReason::NotEnforced,
         _ => return None,
     };
-    let message = known.message.clone();
-    Some(WorkspaceVerdict { reason, message })
+    Some(WorkspaceVerdict::new(reason, known.message.clone()))
 }
 
 fn shown(found: WorkspaceReason) -> (Truth, &'static str) {

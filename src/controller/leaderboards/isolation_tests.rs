@@ -19,10 +19,7 @@ fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
 }
 
 fn verdict(reason: WorkspaceReason) -> WorkspaceVerdict {
-    WorkspaceVerdict {
-        reason,
-        message: "It was tried.".into(),
-    }
+    WorkspaceVerdict::new(reason, "It was tried.".into())
 }
 
 /// A Leaderboard whose condition shows this of this generation.

@@ -8,7 +8,7 @@ use std::time::Duration;
 use futures::future::{BoxFuture, FutureExt, join_all};
 use jiff::Timestamp;
 
-use super::reach::{Finding, Place, Reach};
+use super::reach::{AwsResource, Finding, Reach};
 use crate::controller::objects::key_of;
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
@@ -36,10 +36,10 @@ pub(super) fn due(
     reach: &Reach,
     is_queue_due: bool,
     now: Timestamp,
-) -> Vec<(Place, String)> {
+) -> Vec<(AwsResource, String)> {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
-    let is_due = |(place, address): &(Place, String)| {
-        let is_in_question = *place == Place::Queue && is_queue_due;
+    let is_due = |(place, address): &(AwsResource, String)| {
+        let is_in_question = *place == AwsResource::Queue && is_queue_due;
         is_in_question || reach.is_due(*place, address, generation, now)
     };
     named(leaderboard).into_iter().filter(is_due).collect()
@@ -50,11 +50,11 @@ pub(super) async fn look(
     aws: &Aws,
     leaderboard: &Leaderboard,
     reach: &mut Reach,
-    due: Vec<(Place, String)>,
+    due: Vec<(AwsResource, String)>,
     now: Timestamp,
 ) -> Readings {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
-    let places: Vec<Place> = named(leaderboard).iter().map(|(place, _)| *place).collect();
+    let places: Vec<AwsResource> = named(leaderboard).iter().map(|(place, _)| *place).collect();
     reach.retain(&places);
     let asked = due.into_iter().map(|(place, address)| {
         let question = ask(aws, leaderboard, place);
@@ -68,9 +68,9 @@ pub(super) async fn look(
     let mut readings = Readings::default();
     for (place, address, found, read) in join_all(asked).await {
         match place {
-            Place::Queue => readings.queue = read,
-            Place::DeadLetterQueue => readings.dead_letters = read,
-            Place::Bucket | Place::Table | Place::LogGroup => {}
+            AwsResource::Queue => readings.queue = read,
+            AwsResource::DeadLetterQueue => readings.dead_letters = read,
+            AwsResource::Bucket | AwsResource::Table | AwsResource::LogGroup => {}
         }
         if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
             tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table, queue or log group cannot be reached");
@@ -81,7 +81,7 @@ pub(super) async fn look(
 }
 
 /// What a Leaderboard names, each with its address in words.
-fn named(leaderboard: &Leaderboard) -> Vec<(Place, String)> {
+fn named(leaderboard: &Leaderboard) -> Vec<(AwsResource, String)> {
     let spec = &leaderboard.spec;
     let at = |region: &Option<String>, endpoint: &Option<String>| {
         let place = endpoint.as_ref().or(region.as_ref());
@@ -89,41 +89,49 @@ fn named(leaderboard: &Leaderboard) -> Vec<(Place, String)> {
     };
     let (region, endpoint) = (&spec.storage.region, &spec.storage.endpoint);
     let bucket = format!("the bucket {}{}", spec.storage.bucket, at(region, endpoint));
-    let mut places = vec![(Place::Bucket, bucket)];
+    let mut places = vec![(AwsResource::Bucket, bucket)];
     if let Some(table) = &spec.table {
         let keys = table.partition_key.as_deref().zip(table.sort_key.as_deref());
         let keys = keys.map(|(team, submission)| format!(" by {team} and {submission}"));
         let (keys, at) = (keys.unwrap_or_default(), at(&table.region, &table.endpoint));
-        places.push((Place::Table, format!("the table {}{keys}{at}", table.name)));
+        places.push((AwsResource::Table, format!("the table {}{keys}{at}", table.name)));
     }
     if let Some(queue) = &spec.queue {
         let at = at(&queue.region, &queue.endpoint);
-        places.push((Place::Queue, format!("the queue {}{at}", queue.url)));
+        places.push((AwsResource::Queue, format!("the queue {}{at}", queue.url)));
         let dead = queue.dead_letter_url.as_ref();
-        places.extend(dead.map(|url| (Place::DeadLetterQueue, format!("the dead-letter queue {url}{at}"))));
+        places.extend(dead.map(|url| (AwsResource::DeadLetterQueue, format!("the dead-letter queue {url}{at}"))));
     }
     if let Some(group) = spec.log_group.as_ref().filter(|group| group.retention_days.is_some()) {
         let at = at(&group.region, &group.endpoint);
-        places.push((Place::LogGroup, format!("the log group {}{at}", group.name)));
+        places.push((AwsResource::LogGroup, format!("the log group {}{at}", group.name)));
     }
     places
 }
 
-fn ask<'a>(aws: &'a Aws, leaderboard: &'a Leaderboard, place: Place) -> BoxFuture<'a, (Finding, Option<Reading>)> {
+fn ask<'a>(
+    aws: &'a Aws,
+    leaderboard: &'a Leaderboard,
+    place: AwsResource,
+) -> BoxFuture<'a, (Finding, Option<Reading>)> {
     let spec = &leaderboard.spec;
-    if let (Place::LogGroup, Some(group)) = (place, &spec.log_group) {
+    if let (AwsResource::LogGroup, Some(group)) = (place, &spec.log_group) {
         let days = group.retention_days.unwrap_or_default();
         return async move { (of_log_group(log_groups::keep(aws, group, days).await), None) }.boxed();
     }
     match (place, &spec.table, &spec.queue) {
-        (Place::Bucket, ..) => {
+        (AwsResource::Bucket, ..) => {
             let prefix = format!("{}{NO_RUN}", spec.storage.prefix.as_deref().unwrap_or_default());
             let archive = Archive::of_storage(aws, &spec.storage).at_prefix(prefix);
             async move { (of_bucket(archive.prefix_is_empty().await), None) }.boxed()
         }
-        (Place::Table, Some(table), _) => async move { (of_table(Table::describe(aws, table).await), None) }.boxed(),
-        (Place::Queue, _, Some(queue)) => async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed(),
-        (Place::DeadLetterQueue, _, Some(queue)) => {
+        (AwsResource::Table, Some(table), _) => {
+            async move { (of_table(Table::describe(aws, table).await), None) }.boxed()
+        }
+        (AwsResource::Queue, _, Some(queue)) => {
+            async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed()
+        }
+        (AwsResource::DeadLetterQueue, _, Some(queue)) => {
             let url = queue.dead_letter_url.as_deref().unwrap_or_default();
             async move { of_queue(queue::check(aws, queue, url).await) }.boxed()
         }

@@ -30,7 +30,7 @@ pub(super) struct Problems {
 
 /// How a class was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Seen {
+enum ObservedClass {
     Unreadable,
     Missing,
     Preempts,
@@ -58,29 +58,29 @@ pub(super) async fn look(client: &Client, asked: &BTreeMap<String, Asked>) -> Pr
     let mut problems = Problems::default();
     for (class, asked) in asked {
         let seen = match call("reading the PriorityClass", class, api.get(class)).await {
-            Ok(found) if found.preemption_policy.as_deref() == Some("Never") => Seen::Waits,
-            Ok(_) => Seen::Preempts,
-            Err(error) if error.is_gone() => Seen::Missing,
-            Err(_) => Seen::Unreadable,
+            Ok(found) if found.preemption_policy.as_deref() == Some("Never") => ObservedClass::Waits,
+            Ok(_) => ObservedClass::Preempts,
+            Err(error) if error.is_gone() => ObservedClass::Missing,
+            Err(_) => ObservedClass::Unreadable,
         };
         judge(class, asked, seen, &mut problems);
     }
     problems
 }
 
-fn judge(class: &str, asked: &Asked, seen: Seen, problems: &mut Problems) {
+fn judge(class: &str, asked: &Asked, seen: ObservedClass, problems: &mut Problems) {
     let named = if asked.tracks.len() == 1 { "track" } else { "tracks" };
     let tracks = asked.tracks.join(", ");
     let what = format!("PriorityClass {class} of the {named} {tracks}");
     let text = match seen {
-        Seen::Unreadable | Seen::Waits => return,
-        Seen::Missing => format!("{what} does not exist. Create it, or correct its name."),
-        Seen::Preempts => format!(
+        ObservedClass::Unreadable | ObservedClass::Waits => return,
+        ObservedClass::Missing => format!("{what} does not exist. Create it, or correct its name."),
+        ObservedClass::Preempts => format!(
             "{what} preempts: one run would end another, which then repeats a route of each pair. Set preemptionPolicy: Never \
              in the class."
         ),
     };
-    if seen == Seen::Missing || asked.is_of_track {
+    if seen == ObservedClass::Missing || asked.is_of_track {
         problems.refused.get_or_insert(text);
     } else {
         problems.notes.push(text);
@@ -122,12 +122,12 @@ mod tests {
     #[test]
     fn a_class_that_preempts_is_refused_where_a_track_names_it_and_noted_where_the_overrides_do() {
         for (is_of_track, seen, is_refused, has_note) in [
-            (true, Seen::Waits, false, false),
-            (true, Seen::Unreadable, false, false),
-            (true, Seen::Preempts, true, false),
-            (false, Seen::Preempts, false, true),
-            (true, Seen::Missing, true, false),
-            (false, Seen::Missing, true, false),
+            (true, ObservedClass::Waits, false, false),
+            (true, ObservedClass::Unreadable, false, false),
+            (true, ObservedClass::Preempts, true, false),
+            (false, ObservedClass::Preempts, false, true),
+            (true, ObservedClass::Missing, true, false),
+            (false, ObservedClass::Missing, true, false),
         ] {
             let asked = Asked {
                 tracks: vec!["a".into(), "b".into()],

@@ -14,7 +14,7 @@ use super::claims::{self, Claims};
 use super::places::{self, Readings};
 use super::priority;
 use super::queue_readers;
-use super::reach::{Place, Reach};
+use super::reach::{AwsResource, Reach};
 use super::shared_queue::SharedQueue;
 use super::tried_pods::{TriedPods, try_pods};
 use crate::controller::objects::key_of;
@@ -76,7 +76,7 @@ pub struct Due {
     priority: bool,
     claims: bool,
     token: bool,
-    places: Vec<(Place, String)>,
+    places: Vec<(AwsResource, String)>,
 }
 
 impl Due {
@@ -129,7 +129,7 @@ impl Probe {
                 tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
             }
         }
-        let is_queue_due = due.places.iter().any(|(place, _)| *place == Place::Queue);
+        let is_queue_due = due.places.iter().any(|(place, _)| *place == AwsResource::Queue);
         if let Some(queue) = self.queue.as_mut().filter(|_| is_queue_due) {
             queue.asked(now);
         }

@@ -23,7 +23,7 @@ const PATIENCE: SignedDuration = SignedDuration::from_mins(2);
 
 /// What a Leaderboard names in AWS, the gravest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Place {
+pub enum AwsResource {
     Bucket,
     Table,
     Queue,
@@ -31,7 +31,7 @@ pub enum Place {
     LogGroup,
 }
 
-impl Place {
+impl AwsResource {
     /// The reason of a Leaderboard that cannot do without it.
     fn reason(self) -> Option<&'static str> {
         match self {
@@ -70,7 +70,7 @@ pub struct Unreachable {
 
 /// What is known of all places of one Leaderboard.
 #[derive(Clone, Debug, Default)]
-pub struct Reach(BTreeMap<Place, Known>);
+pub struct Reach(BTreeMap<AwsResource, Known>);
 
 #[derive(Clone, Debug)]
 struct Known {
@@ -87,12 +87,12 @@ struct Known {
 
 impl Reach {
     /// Forgets places that the Leaderboard no longer names.
-    pub fn retain(&mut self, named: &[Place]) {
+    pub fn retain(&mut self, named: &[AwsResource]) {
         self.0.retain(|place, _| named.contains(place));
     }
 
     /// Whether a place has to be asked now: it is new, it was edited, or its time has come.
-    pub fn is_due(&self, place: Place, address: &str, generation: i64, now: Timestamp) -> bool {
+    pub fn is_due(&self, place: AwsResource, address: &str, generation: i64, now: Timestamp) -> bool {
         self.0.get(&place).is_none_or(|known| {
             // A clock that was set back makes it due as well.
             let edited = known.address != address || known.generation != generation;
@@ -101,7 +101,7 @@ impl Reach {
     }
 
     /// Takes in what a look has found.
-    pub fn take(&mut self, place: Place, address: &str, generation: i64, found: Finding, now: Timestamp) {
+    pub fn take(&mut self, place: AwsResource, address: &str, generation: i64, found: Finding, now: Timestamp) {
         let before = self.0.remove(&place).filter(|known| known.address == address);
         let mut known = before.unwrap_or_else(|| Known {
             address: address.to_owned(),
@@ -206,12 +206,12 @@ mod tests {
     #[test]
     fn a_log_group_that_cannot_be_made_is_a_note_and_holds_nothing_up() {
         let mut reach = Reach::default();
-        reach.take(Place::LogGroup, "the log group logs", 1, bad(), at(0));
+        reach.take(AwsResource::LogGroup, "the log group logs", 1, bad(), at(0));
         assert_eq!(reach.unreachable(at(0)), None);
         assert_eq!(reach.notes(at(0)), ["It does not exist; create it."]);
-        reach.take(Place::Table, "the table rows", 1, bad(), at(0));
+        reach.take(AwsResource::Table, "the table rows", 1, bad(), at(0));
         assert_eq!(reach.unreachable(at(0)).unwrap().reason, reasons::TABLE_UNREACHABLE);
-        reach.take(Place::LogGroup, "the log group logs", 1, Finding::Good, at(5));
+        reach.take(AwsResource::LogGroup, "the log group logs", 1, Finding::Good, at(5));
         assert_eq!(reach.notes(at(5)), Vec::<String>::new());
     }
 
@@ -284,7 +284,7 @@ mod tests {
             for (second, truth) in expected {
                 let mut reach = Reach::default();
                 for (look, found) in looks.iter().filter(|(look, _)| *look <= second) {
-                    reach.take(Place::Table, "table", 1, found.clone(), at(*look));
+                    reach.take(AwsResource::Table, "table", 1, found.clone(), at(*look));
                 }
                 assert_eq!(said(&reach, second), truth, "{name} at {second}");
             }
@@ -294,19 +294,22 @@ mod tests {
     #[test]
     fn what_fails_is_asked_sooner_then_ever_later() {
         let mut reach = Reach::default();
-        assert!(reach.is_due(Place::Bucket, "bucket", 1, at(0)) && reach.next(at(0)).is_none());
+        assert!(reach.is_due(AwsResource::Bucket, "bucket", 1, at(0)) && reach.next(at(0)).is_none());
         let mut now = 0;
         for wait in [5, 10, 20, 40, 80, 160, 300, 300] {
-            reach.take(Place::Bucket, "bucket", 1, bad(), at(now));
-            assert!(!reach.is_due(Place::Bucket, "bucket", 1, at(now + wait - 1)), "{wait}");
-            assert!(reach.is_due(Place::Bucket, "bucket", 1, at(now + wait)), "{wait}");
+            reach.take(AwsResource::Bucket, "bucket", 1, bad(), at(now));
+            assert!(
+                !reach.is_due(AwsResource::Bucket, "bucket", 1, at(now + wait - 1)),
+                "{wait}"
+            );
+            assert!(reach.is_due(AwsResource::Bucket, "bucket", 1, at(now + wait)), "{wait}");
             assert_eq!(reach.next(at(now)), Some(at(now + wait)));
             now += wait;
         }
-        reach.take(Place::Bucket, "bucket", 1, Finding::Good, at(now));
+        reach.take(AwsResource::Bucket, "bucket", 1, Finding::Good, at(now));
         assert_eq!(reach.next(at(now)), Some(at(now + 300)));
         assert!(
-            reach.is_due(Place::Bucket, "bucket", 1, at(now - 1)),
+            reach.is_due(AwsResource::Bucket, "bucket", 1, at(now - 1)),
             "a clock that was set back"
         );
     }
@@ -315,27 +318,27 @@ mod tests {
     fn an_edit_asks_at_once_and_another_address_has_nothing_of_the_old_one() {
         let mut reach = Reach::default();
         for second in [0, 5, 15] {
-            reach.take(Place::Queue, "one", 1, bad(), at(second));
+            reach.take(AwsResource::Queue, "one", 1, bad(), at(second));
         }
-        assert!(reach.is_due(Place::Queue, "one", 2, at(16)));
-        reach.take(Place::Queue, "one", 2, silent(), at(16));
+        assert!(reach.is_due(AwsResource::Queue, "one", 2, at(16)));
+        reach.take(AwsResource::Queue, "one", 2, silent(), at(16));
         assert_eq!(
             (said(&reach, 16), reach.next(at(16))),
             (Some(Truth::False), Some(at(21)))
         );
-        assert!(reach.is_due(Place::Queue, "two", 2, at(17)));
-        reach.take(Place::Queue, "two", 2, silent(), at(17));
+        assert!(reach.is_due(AwsResource::Queue, "two", 2, at(17)));
+        reach.take(AwsResource::Queue, "two", 2, silent(), at(17));
         assert_eq!(said(&reach, 17), Some(Truth::Unknown));
-        reach.retain(&[Place::Bucket]);
+        reach.retain(&[AwsResource::Bucket]);
         assert_eq!((said(&reach, 17), reach.next(at(17))), (None, None));
     }
 
     #[test]
     fn the_end_of_patience_is_a_moment_to_look() {
         let mut reach = Reach::default();
-        reach.take(Place::Bucket, "bucket", 1, Finding::Good, at(0));
+        reach.take(AwsResource::Bucket, "bucket", 1, Finding::Good, at(0));
         for second in [300, 305, 315, 335, 375] {
-            reach.take(Place::Bucket, "bucket", 1, silent(), at(second));
+            reach.take(AwsResource::Bucket, "bucket", 1, silent(), at(second));
         }
         assert_eq!(
             reach.next(at(375)),
@@ -347,9 +350,9 @@ mod tests {
     #[test]
     fn what_is_surely_wrong_comes_first_and_all_is_shown() {
         let mut reach = Reach::default();
-        reach.take(Place::Bucket, "bucket", 1, silent(), at(0));
-        reach.take(Place::Table, "table", 1, Finding::Good, at(0));
-        reach.take(Place::Queue, "queue", 1, bad(), at(0));
+        reach.take(AwsResource::Bucket, "bucket", 1, silent(), at(0));
+        reach.take(AwsResource::Table, "table", 1, Finding::Good, at(0));
+        reach.take(AwsResource::Queue, "queue", 1, bad(), at(0));
         let found = reach.unreachable(at(0)).unwrap();
         assert_eq!((found.truth, found.reason), (Truth::False, reasons::QUEUE_UNREACHABLE));
         assert_eq!(

@@ -94,7 +94,6 @@ mod tests {
         let labels = |problems| Labels {
             at: Timestamp::UNIX_EPOCH,
             problems,
-            partial: vec![],
         };
         let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
         assert_eq!(note(&labels(vec![]), None), None);

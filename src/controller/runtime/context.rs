@@ -87,6 +87,7 @@ impl Context {
             memory: &self.memory,
             slots: &self.slots,
             archive: &self.archive,
+            lookups: &self.lookups,
             images: &self.images,
             foreign_runs: &self.foreign_runs,
             other_results: &self.other_results,

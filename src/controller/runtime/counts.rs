@@ -11,7 +11,7 @@ use kube::ResourceExt;
 
 use super::gpu_holders::{Holder, Holders};
 use crate::controller::leaderboards::operator;
-use crate::controller::submissions::act::awaits_publication;
+use crate::controller::submissions::decide::awaits_publication;
 use crate::kubernetes::Store;
 use crate::lock::lock;
 use crate::observability::Observability;

@@ -4,27 +4,27 @@
 
 use std::time::Duration;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{DeleteParams, Patch, PostParams, Preconditions};
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
+use tokio::time::Instant;
 
 use super::addresses::{self, Addresses};
 use super::archive::ArchiveWorkers;
-use super::decide::{Action, Event, Plan, pinned};
+use super::decide::{Action, Event, Plan, StatusWrite, pinned};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
 use super::foreign_runs::ForeignRuns;
 use super::images::Images;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
+use super::observe::lookups::Lookups;
 use super::other_results::OtherResults;
 use super::phases::{self, Ended, Phase};
-use super::significance::{Change, change, patience};
 use super::spans;
-use super::view::{LogPlace, ObservedTexts, View};
+use super::view::{LogPlace, View};
 use crate::controller::objects::{key_of, uid};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
@@ -36,7 +36,7 @@ use crate::observability::metrics::{FailedAttempt, Metrics};
 use crate::observability::traces::Traces;
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, names, reasons};
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
@@ -51,6 +51,7 @@ pub struct Uses<'a> {
     pub memory: &'a Memory,
     pub slots: &'a SlotAllocator,
     pub archive: &'a ArchiveWorkers,
+    pub lookups: &'a Lookups,
     pub images: &'a Images,
     pub foreign_runs: &'a ForeignRuns,
     pub other_results: &'a OtherResults,
@@ -84,7 +85,7 @@ impl ActError {
 
 /// Carries out a plan for what `view` shows.
 ///
-/// Returns when to look again if a status of mere progress was held back.
+/// Returns when to look again if the status has to wait for its turn.
 pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Duration>, ActError> {
     let actor = Actor {
         uses,
@@ -94,7 +95,7 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     if plan.actions.contains(&Action::AddFinalizer) {
         actor.set_finalizer(true).await?;
     }
-    let held_back = actor.write_status(&plan.status).await?;
+    let turn_in = actor.write_status(&plan.status, plan.write).await?;
     for event in &plan.events {
         actor.publish(event).await;
     }
@@ -103,18 +104,7 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for action in plan.actions {
         actor.carry_out(action, &plan.status).await?;
     }
-    if view.texts != ObservedTexts::NotRead && !awaits_publication(&plan.status) {
-        uses.archive.drop_texts(&view.submission, &plan.status);
-    }
-    Ok(held_back)
-}
-
-/// Whether an end is still to be sent to EvalAI, with the texts that were read. Those of a live run are with EvalAI's side already.
-pub fn awaits_publication(status: &SubmissionStatus) -> bool {
-    let published = status.condition(conditions::PUBLISHED);
-    let is_open =
-        |c: &Condition| c.status == "False" && ![reasons::NOT_REQUIRED, reasons::REFUSED].contains(&c.reason.as_str());
-    status.has_ended() && published.is_some_and(is_open)
+    Ok(turn_in)
 }
 
 struct Actor<'a> {
@@ -162,6 +152,8 @@ impl Actor<'_> {
             Action::TakeOwnership => uses.archive.want_fence(submission, status),
             Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => uses.archive.want_texts(submission, status, of),
+            Action::DropTexts => uses.archive.drop_texts(submission, status),
+            Action::LookUpNode(name) => uses.lookups.want(submission, &name),
             Action::AskEvalai => {
                 uses.memory.asks_evalai(submission);
                 uses.external.ask(self.view);
@@ -180,7 +172,7 @@ impl Actor<'_> {
                 uses.foreign_runs.forget(uid);
                 uses.addresses.forget(uid);
             }
-            Action::Record { end } => uses.external.record(self.view, status, end),
+            Action::Record(update) => uses.external.record(self.view, status, update),
         }
         Ok(())
     }
@@ -190,28 +182,18 @@ impl Actor<'_> {
         Ok(set.await?)
     }
 
-    async fn write_status(&self, status: &SubmissionStatus) -> Result<Option<Duration>, ActError> {
+    /// Returns how long it waits for its turn.
+    async fn write_status(&self, status: &SubmissionStatus, write: StatusWrite) -> Result<Option<Duration>, ActError> {
+        let waits = match write {
+            StatusWrite::NotNow => return Ok(None),
+            StatusWrite::InTurn => self.uses.memory.place_waits(self.submission(), Instant::now()),
+            StatusWrite::Now => None,
+        };
+        if waits.is_some() {
+            return Ok(waits);
+        }
         let nothing = SubmissionStatus::default();
         let old = self.submission().status.as_ref().unwrap_or(&nothing);
-        match change(old, status) {
-            Change::Nothing => return Ok(None),
-            Change::Place => {
-                let position = status.waiting.as_ref().map_or(0, |w| w.position);
-                let now = tokio::time::Instant::now();
-                let waits = self.uses.memory.place_waits(self.submission(), position, now);
-                if waits.is_some() {
-                    return Ok(waits);
-                }
-            }
-            Change::Progress => {
-                let patience = patience(self.view.leaderboard.as_ref().map(|l| &l.spec));
-                let since = self.uses.memory.since_write(self.submission());
-                if let Some(left) = since.and_then(|since| patience.checked_sub(since)) {
-                    return Ok(Some(left));
-                }
-            }
-            Change::Real => {}
-        }
         let version = apply_status(self.uses.client, self.submission(), status).await?;
         let shown = self
             .uses

@@ -7,7 +7,7 @@ use tracing::Instrument;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::objects::span_of;
-use crate::controller::submissions::decide::Plan;
+use crate::controller::submissions::decide::{Plan, StatusWrite};
 use crate::controller::submissions::observe::observe;
 use crate::observability::logging::tests::Lines;
 
@@ -30,6 +30,7 @@ async fn bench() -> (Surroundings, View) {
 async fn write(around: &Surroundings, view: &View, status: SubmissionStatus) {
     let plan = Plan {
         status,
+        write: StatusWrite::Now,
         actions: Vec::new(),
         events: Vec::new(),
         report: None,

@@ -10,7 +10,7 @@ use jiff::{SignedDuration, Timestamp};
 use super::questions::{self, Observed, Questions};
 use crate::controller::objects::Wake;
 use crate::observability::tasks::Tasks;
-use crate::services::endpoints::{self, Place};
+use crate::services::endpoints::{self, ServiceAddress};
 use crate::services::names::{self, Answer, GOOD_FOR, Names};
 use leaderboard_api::ranges::{self, Range, is_no_service, is_public};
 use leaderboard_api::text::one_line;
@@ -34,7 +34,7 @@ pub struct Question {
 /// One service, and what was found of its name.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
-    pub place: Place,
+    pub place: ServiceAddress,
     pub addresses: Answer,
 }
 
@@ -135,7 +135,7 @@ pub fn of_pod(observed: &ObservedAddresses, network: &Network) -> Option<names::
 }
 
 fn of_place(network: &Network, found: &Found) -> Result<Vec<IpAddr>, String> {
-    let Place { service, host, port } = &found.place;
+    let ServiceAddress { service, host, port } = &found.place;
     let all = found.addresses.as_ref().map_err(|why| {
         format!(
             "The address of {host} ({service}) is not known: {}. The operator's own Pod looks it up: correct the name, or let that Pod \
@@ -173,8 +173,8 @@ fn allows(network: &Network, address: IpAddr, port: u16) -> bool {
 }
 
 /// Public addresses change from look-up to look-up, and each change would be a write.
-fn not_allowed(place: &Place, addresses: &[IpAddr]) -> String {
-    let Place { service, host, port } = place;
+fn not_allowed(place: &ServiceAddress, addresses: &[IpAddr]) -> String {
+    let ServiceAddress { service, host, port } = place;
     let private = addresses.iter().find(|address| !is_public(**address));
     match private.and_then(|address| Range::alone(*address)) {
         Some(range) => format!(

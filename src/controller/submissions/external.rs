@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 
 use super::archive::ArchiveWorkers;
-use super::decide::EvalaiUpdate;
+use super::decide::{EvalaiUpdate, TableUpdate};
 use super::memory::Memory;
 use super::reruns;
 use super::result_texts;
@@ -79,7 +79,11 @@ impl ExternalSystems {
         let row = seen.row.as_ref().filter(|_| may_note);
         let rerun_of = row.and_then(|row| reruns::original(row, submission, others));
         let observes = leaderboard.is_some_and(|board| board.spec.observes());
-        Some(map_view(&as_observed(seen, observes), submission, rerun_of))
+        let phase = submission.spec.evalai.map_or(0, |evalai| evalai.phase);
+        Some(EvalaiView {
+            shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), phase)),
+            ..map_view(&as_observed(seen, observes), submission, rerun_of)
+        })
     }
 
     /// What is known of a submission's row. None without a table.
@@ -104,7 +108,7 @@ impl ExternalSystems {
         log_refused(asked);
     }
 
-    /// Looks for a submission's end in EvalAI from now on, also while it waits before anything of it runs.
+    /// Looks for a submission's end in EvalAI from now on.
     pub fn follow(&self, view: &View, status: &SubmissionStatus) {
         let Some(subject) = self.subject(view) else { return };
         let since = status.times.submitted.as_ref().map_or(view.now, |t| t.0);
@@ -122,9 +126,6 @@ impl ExternalSystems {
         update: EvalaiUpdate,
     ) {
         let Some(subject) = self.subject(view) else { return };
-        if matches!(update, EvalaiUpdate::Queued | EvalaiUpdate::Running) {
-            self.follow(view, status);
-        }
         let Some(publisher) = Publisher::of(subject) else {
             return;
         };
@@ -132,7 +133,7 @@ impl ExternalSystems {
         let desired = match update {
             EvalaiUpdate::Queued => Some(DesiredUpdate::Queued),
             EvalaiUpdate::Running => Some(DesiredUpdate::Running),
-            EvalaiUpdate::Partial => self.partial(memory, view),
+            EvalaiUpdate::Partial { is_shown } => partial_update(memory, view, is_shown),
             EvalaiUpdate::Finished => with_end(Outcome::Finished),
             EvalaiUpdate::Failed => with_end(Outcome::Failed),
             EvalaiUpdate::Cancelled => with_end(Outcome::Cancelled),
@@ -142,30 +143,19 @@ impl ExternalSystems {
         }
     }
 
-    fn partial(&self, memory: &Memory, view: &View) -> Option<DesiredUpdate> {
-        let report = view.report.ours()?;
-        let leaderboard = key_of(view.leaderboard.as_deref()?);
-        let is_shown = self.hub.shows_partial(&leaderboard, result_texts::phase(view));
-        let payload = result_texts::partial_payload(view, is_shown)?;
-        let attempt = view.submission.present_attempt();
-        memory.sent_partial(&view.submission, attempt, report.done);
-        Some(DesiredUpdate::Partial(Arc::new(payload)))
-    }
-
     /// Writes the row, or lets the next write carry it.
-    pub fn record(&self, view: &View, status: &SubmissionStatus, end: bool) {
+    pub fn record(&self, view: &View, status: &SubmissionStatus, update: TableUpdate) {
         let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
         let Some(table) = table else { return };
         let submission = view.submission.as_ref();
-        let row = if submission.spec.check {
-            // Before its end there is nothing to learn.
-            end.then(|| result_texts::trial(status))
-        } else {
-            result_texts::row(view.report.ours().map(Arc::as_ref), status)
+        let row = match update {
+            TableUpdate::Trial => Some(result_texts::trial(status)),
+            TableUpdate::Progress | TableUpdate::End => result_texts::row(view.report.ours().map(Arc::as_ref), status),
         };
         if let Some(row) = row {
+            let is_end = update != TableUpdate::Progress;
             self.recorder
-                .record(table, &key_of(submission), row, end, log_span_of(submission));
+                .record(table, &key_of(submission), row, is_end, log_span_of(submission));
         }
     }
 
@@ -199,6 +189,13 @@ fn run_of(submission: &Submission) -> Run {
         ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
         log: log_span_of(submission),
     }
+}
+
+fn partial_update(memory: &Memory, view: &View, is_shown: bool) -> Option<DesiredUpdate> {
+    let report = view.report.ours()?;
+    let payload = result_texts::partial_payload(view, is_shown)?;
+    memory.sent_partial(&view.submission, view.submission.present_attempt(), report.done);
+    Some(DesiredUpdate::Partial(Arc::new(payload)))
 }
 
 fn final_update(archive: &ArchiveWorkers, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
@@ -264,27 +261,25 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
         read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
-        end: seen
-            .end
-            .as_ref()
-            .filter(|_| present)
-            .map(|end| map_end(end, seen.read_at)),
+        end: seen.end.as_ref().filter(|_| present).map(|end| map_end(end, seen)),
+        shows_partial: false,
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }
 
-fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
+fn map_end(end: &Ended, seen: &SubmissionState) -> EvalaiEnd {
     match end {
         Ended::Published { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Agreed(_) => EvalaiEnd::Published {
-            at: read_at.unwrap_or_else(Timestamp::now),
+            at: seen.read_at.unwrap_or_else(Timestamp::now),
         },
         Ended::Otherwise(status) => EvalaiEnd::Ended {
             status: status.as_str().to_owned(),
         },
         Ended::Refused(message) => EvalaiEnd::Refused {
             message: message.clone(),
+            is_due: seen.needs_texts,
         },
     }
 }

@@ -102,8 +102,10 @@ async fn bench(state: State) -> Bench {
         turn: Turn::Go,
         job: ObservedJob::Absent,
         evalai_waited: std::time::Duration::ZERO,
+        written_ago: None,
         pod: None,
         leaving: None,
+        is_node_watched: true,
         node: ObservedNode::Unknown,
         report: ObservedReport::NotRead,
         report_stage: None,
@@ -128,7 +130,10 @@ async fn bench(state: State) -> Bench {
 
 impl Bench {
     fn records_the_end(&self) {
-        self.around.context.external.record(&self.view, &self.status, true);
+        self.around
+            .context
+            .external
+            .record(&self.view, &self.status, TableUpdate::End);
     }
 
     async fn row(&mut self) -> Item {

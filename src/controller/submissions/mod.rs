@@ -24,7 +24,6 @@ pub mod questions;
 pub mod report_digest;
 pub mod reruns;
 mod result_texts;
-pub mod significance;
 pub mod spans;
 pub mod team_history;
 pub mod view;

@@ -41,8 +41,7 @@ pub(super) fn partial_payload(view: &View, is_shown: bool) -> Option<Payload> {
     })
 }
 
-/// The metrics over the routes so far where people see them, else the original's zeros: EvalAI keeps them, and would show them as
-/// final of a row that its participant calls finished.
+/// The metrics over the routes so far where people see them, else the original's zeros.
 fn partial_results(texts: &Texts, is_shown: bool) -> &str {
     let so_far = texts.partial.as_ref().filter(|_| is_shown);
     so_far.unwrap_or(&texts.result)

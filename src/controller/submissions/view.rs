@@ -40,6 +40,8 @@ pub struct View {
     pub node: ObservedNode,
     /// The taint that announces that the node is about to be taken away.
     pub leaving: Option<String>,
+    /// Whether a watch shows the nodes; else each has to be asked for.
+    pub is_node_watched: bool,
     pub report: ObservedReport,
     /// What was known of the run when the answer in `report` was asked for; None: nothing was read for this Job.
     pub report_stage: Option<Stage>,
@@ -52,6 +54,8 @@ pub struct View {
     pub evalai: Option<EvalaiView>,
     /// How long EvalAI has been asked whether the present attempt is to run.
     pub evalai_waited: Duration,
+    /// How long ago this process wrote the status; None: it has not.
+    pub written_ago: Option<Duration>,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
     /// Routes in the last partial result that was sent to EvalAI, in this attempt.
@@ -156,6 +160,13 @@ pub struct PodView {
     /// Who takes it away: the reason of its condition `DisruptionTarget`.
     pub disruption: Option<String>,
     pub stop: Option<Stop>,
+}
+
+impl PodView {
+    /// Whether it has not ended, so that its node matters.
+    pub fn needs_node(&self) -> bool {
+        self.delete_by.is_some() || self.run_ended.is_none()
+    }
 }
 
 /// The Pod's node, which is read while the Pod runs or is being deleted.
@@ -375,6 +386,8 @@ pub struct EvalaiView {
     pub overtaken: bool,
     /// What became of the final result of this attempt.
     pub end: Option<EvalaiEnd>,
+    /// Whether the leaderboards of its phase show partial results; no as long as that is not known.
+    pub shows_partial: bool,
     /// Team of its row, as last read.
     pub team_id: Option<String>,
     /// Why the last request failed.
@@ -420,8 +433,8 @@ pub enum EvalaiEnd {
     Published { at: Timestamp },
     /// EvalAI had ended it before: cancelled, archived, ignored, or it is gone.
     Ended { status: String },
-    /// EvalAI will never take it, and why.
-    Refused { message: String },
+    /// EvalAI does not take it, and why. `is_due`: it is to be sent again, with its texts.
+    Refused { message: String, is_due: bool },
 }
 
 /// What is known of the row in DynamoDB.

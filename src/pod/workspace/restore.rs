@@ -65,14 +65,7 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
         // Not known as stored: it gets a pair's key with the first upload.
         download(archive, tree, object, &path).await?;
     }
-    let stored: Vec<Option<(String, Stored)>> = futures::stream::iter(chosen.objects)
-        .map(|object| async move {
-            let key = object.key.clone();
-            download(archive, tree, object, &key).await
-        })
-        .buffer_unordered(AT_ONCE)
-        .try_collect()
-        .await?;
+    let stored = download_all(archive, tree, chosen.objects).await?;
     let mut memory = Memory {
         stored: stored.into_iter().flatten().collect(),
         sent: Daily::default(),
@@ -197,6 +190,18 @@ fn shadowed(objects: &[Listed]) -> BTreeSet<String> {
 fn is_foreign_agent(key: &str, pairs: usize) -> bool {
     let number = key.strip_prefix("agent/agent").and_then(|rest| rest.split_once('/'));
     number.is_some_and(|(number, _)| !(1..=pairs).any(|pair| pair.to_string() == number))
+}
+
+async fn download_all(
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    objects: Vec<Listed>,
+) -> Result<Vec<Option<(String, Stored)>>, WorkspaceError> {
+    let downloads = futures::stream::iter(objects).map(|object| async move {
+        let key = object.key.clone();
+        download(archive, tree, object, &key).await
+    });
+    downloads.buffer_unordered(AT_ONCE).try_collect().await
 }
 
 async fn download(

@@ -205,8 +205,8 @@ impl Hub {
 
     /// Whether partial results are on the leaderboards of a phase; no as long as that is not known.
     pub fn shows_partial(&self, leaderboard: &Key, phase: i64) -> bool {
-        let (labels, _) = self.labels(leaderboard);
-        labels.is_some_and(|labels| labels.partial.contains(&phase))
+        self.place(leaderboard)
+            .is_some_and(|shared| shared.queue().shows_partial(leaderboard, phase))
     }
 
     /// How the requests of a Leaderboard's token are used.

@@ -29,8 +29,6 @@ pub struct Labels {
     pub at: Timestamp,
     /// What does not fit.
     pub problems: Vec<Misfit>,
-    /// The phases whose leaderboards show partial results.
-    pub partial: Vec<i64>,
 }
 
 impl Labels {
@@ -72,12 +70,6 @@ pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
             .phases
             .iter()
             .flat_map(|phase| compare_phase(target, catalog, *phase))
-            .collect(),
-        partial: catalog
-            .phases
-            .iter()
-            .filter(|phase| phase.shows_partial)
-            .map(|phase| phase.id)
             .collect(),
     }
 }
@@ -178,7 +170,6 @@ mod tests {
         };
         let found = of(&[1, 2], &["A", "B"], Some("leaderboard"));
         assert!(found.ok() && found.problems == [unsent], "{found:?}");
-        assert_eq!(found.partial, [2]);
         for (phases, labels, codename, text) in [
             (
                 &[3][..],

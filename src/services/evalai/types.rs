@@ -130,6 +130,23 @@ pub struct Payload {
     pub environment_log: String,
 }
 
+impl Payload {
+    /// The same without the texts that take up much memory.
+    pub fn without_texts(&self) -> Self {
+        Self {
+            phase: self.phase,
+            result: self.result.clone(),
+            stderr: self.stderr.clone(),
+            environment_log: self.environment_log.clone(),
+            ..Self::default()
+        }
+    }
+
+    pub fn has_texts(&self) -> bool {
+        !self.stdout.is_empty() || !self.metadata.is_empty()
+    }
+}
+
 /// What is known of a submission in EvalAI. Memory only.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SubmissionState {
@@ -152,6 +169,8 @@ pub struct SubmissionState {
     pub overtaken: bool,
     /// What became of the update to an end.
     pub end: Option<Ended>,
+    /// The end that EvalAI refused is due again, and is to be sent with its texts: they were not kept meanwhile.
+    pub needs_texts: bool,
     /// When partial results were last taken.
     pub partial_at: Option<Timestamp>,
     /// The last error; none after the next success.
@@ -180,7 +199,7 @@ pub enum Ended {
     Agreed(Status),
     /// EvalAI has ended the run itself: the outcome becomes Cancelled, nothing was written.
     Otherwise(Status),
-    /// EvalAI refuses it, or would file it wrongly. It is retried from time to time, and at once with other texts; a cancel
+    /// EvalAI refuses it, or would file it wrongly. It is retried from time to time, and at once with other results; a cancel
     /// that such a try finds makes it `Otherwise`.
     Refused(String),
 }

@@ -30,13 +30,13 @@ const CONTENT: &str = "application/x-amz-json-1.1";
 
 /// The region of a registry of Amazon, and the end of its names there.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Place<'a> {
+struct AmazonRegistry<'a> {
     region: &'a str,
     domain: &'a str,
 }
 
 /// `123456789012.dkr.ecr.us-east-1.amazonaws.com` is in us-east-1.
-fn place(registry: &str) -> Option<Place<'_>> {
+fn place(registry: &str) -> Option<AmazonRegistry<'_>> {
     let (account, rest) = registry.split_once(".dkr.ecr.")?;
     let (region, domain) = rest.split_once('.')?;
     let is_account = account.len() == 12 && account.bytes().all(|b| b.is_ascii_digit());
@@ -44,7 +44,7 @@ fn place(registry: &str) -> Option<Place<'_>> {
         .bytes()
         .all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
     let is_amazons = matches!(domain, "amazonaws.com" | "amazonaws.com.cn");
-    (is_account && is_region && is_amazons).then_some(Place { region, domain })
+    (is_account && is_region && is_amazons).then_some(AmazonRegistry { region, domain })
 }
 
 /// A password, from when on it is known, and until when it is used.
@@ -61,7 +61,7 @@ pub(super) struct Ecr {
     http: reqwest::Client,
     kept: Mutex<HashMap<String, Kept>>,
     /// Which registries are Amazon's, and where.
-    place: for<'a> fn(&'a str) -> Option<Place<'a>>,
+    place: for<'a> fn(&'a str) -> Option<AmazonRegistry<'a>>,
 }
 
 impl Ecr {
@@ -115,14 +115,14 @@ impl Ecr {
         Some(known.credentials.clone())
     }
 
-    async fn ask(&self, place: &Place<'_>) -> Result<Kept, String> {
+    async fn ask(&self, place: &AmazonRegistry<'_>) -> Result<Kept, String> {
         let running = self.aws.meter().begin("ecr", "GetAuthorizationToken");
         let answer = self.send(place).await;
         running.end(if answer.is_ok() { "ok" } else { "refused" });
         answer
     }
 
-    async fn send(&self, place: &Place<'_>) -> Result<Kept, String> {
+    async fn send(&self, place: &AmazonRegistry<'_>) -> Result<Kept, String> {
         let config = self.aws.config(Some(place.region));
         let usual = || format!("https://api.ecr.{}.{}/", place.region, place.domain);
         let url = config.endpoint_url().map_or_else(usual, ToOwned::to_owned);

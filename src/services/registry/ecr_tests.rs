@@ -29,8 +29,8 @@ struct Amazon {
 }
 
 /// What is on loopback is Amazon's here.
-fn here(registry: &str) -> Option<Place<'_>> {
-    let place = Place {
+fn here(registry: &str) -> Option<AmazonRegistry<'_>> {
+    let place = AmazonRegistry {
         region: "eu-west-1",
         domain: "amazonaws.com",
     };

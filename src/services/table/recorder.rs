@@ -22,6 +22,8 @@ use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api as api;
 
+/// A worker that nobody gives a row ends after this long.
+const LINGERS: Duration = Duration::from_mins(1);
 /// Time between the starts of two writes to one table: the stock table has one write unit.
 const SPACING: Duration = Duration::from_secs(2);
 /// Pauses after failures in a row, half of which is no less than the spacing.
@@ -103,7 +105,7 @@ impl Recorder {
                 id,
                 notify: notify.clone(),
             };
-            self.shared.tasks.stay(format!("table {}", table.name), worker.run());
+            self.shared.tasks.may_end(format!("table {}", table.name), worker.run());
             notify
         });
         notify.notify_one();
@@ -153,15 +155,29 @@ impl Worker {
             };
             let wait = async {
                 match pause {
-                    Some(until) => tokio::time::sleep_until(until).await,
-                    None => self.notify.notified().await,
+                    Some(until) => {
+                        tokio::time::sleep_until(until).await;
+                        false
+                    }
+                    // For a long time nobody has written a row.
+                    None => tokio::time::timeout(LINGERS, self.notify.notified()).await.is_err() && self.leaves(),
                 }
             };
             tokio::select! {
                 () = stop.wait() => {}
-                () = wait => {}
+                is_over = wait => if is_over { return },
             }
         }
+    }
+
+    /// Takes the worker away, unless somebody has handed a row in meanwhile.
+    fn leaves(&self) -> bool {
+        let mut tables = lock(&self.shared.tables);
+        let is_idle = self.shared.ledger().next(&self.id).is_none();
+        if is_idle {
+            tables.remove(&self.id);
+        }
+        is_idle
     }
 
     /// Writes one row. True if the table could not be written.

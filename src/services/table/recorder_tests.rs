@@ -211,5 +211,20 @@ async fn nothing_is_remembered_of_a_thousand_rows_that_are_written_and_forgotten
         bench.recorder.forget(&key);
     }
     assert_eq!(lock(&bench.recorder.shared.ledger).len(), 0);
-    assert_eq!(lock(&bench.recorder.shared.tables).len(), 1, "the task of the table");
+    tokio::time::sleep(2 * LINGERS).await;
+    assert_eq!(lock(&bench.recorder.shared.tables).len(), 0, "the task of the table");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_table_that_was_quiet_for_long_is_written_again() {
+    let mut bench = bench(vec![]);
+    for progress in ["1/2", "2/2"] {
+        bench
+            .recorder
+            .record(&table("t"), &key("a"), row(progress), true, LogSpan::default());
+        bench.wake.recv().await.unwrap();
+        tokio::time::sleep(2 * LINGERS).await;
+        assert!(lock(&bench.recorder.shared.tables).is_empty());
+    }
+    assert_eq!(bench.written().len(), 2);
 }

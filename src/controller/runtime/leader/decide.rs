@@ -10,7 +10,7 @@ use super::record::{FIRST_TERM, Identity, Record};
 
 /// What a candidate has seen of the Lease.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Seen {
+pub struct ObservedLease {
     /// None: there is no Lease.
     pub record: Option<Record>,
     /// Highest term ever seen; outlives the deletion of the Lease.
@@ -19,7 +19,7 @@ pub struct Seen {
     pub changed_at: Duration,
 }
 
-impl Seen {
+impl ObservedLease {
     /// Notes what a look has shown.
     pub fn note(&mut self, record: Option<Record>, now: Duration) {
         if let Some(record) = &record {
@@ -75,14 +75,20 @@ pub fn is_overdue(leading: &Leading, timing: &Timing, now: Duration) -> Option<L
 }
 
 /// See the module's text. `leading`: set from the first write that succeeded on.
-pub fn decide(seen: &Seen, me: &Identity, leading: Option<&Leading>, timing: &Timing, now: Duration) -> Decision {
+pub fn decide(
+    seen: &ObservedLease,
+    me: &Identity,
+    leading: Option<&Leading>,
+    timing: &Timing,
+    now: Duration,
+) -> Decision {
     match leading {
         Some(leading) => lead(seen, me, leading, timing, now),
         None => stand(seen, me, timing, now),
     }
 }
 
-fn lead(seen: &Seen, me: &Identity, leading: &Leading, timing: &Timing, now: Duration) -> Decision {
+fn lead(seen: &ObservedLease, me: &Identity, leading: &Leading, timing: &Timing, now: Duration) -> Decision {
     if let Some(loss) = is_overdue(leading, timing, now) {
         return Decision::Lost(loss);
     }
@@ -98,7 +104,7 @@ fn lead(seen: &Seen, me: &Identity, leading: &Leading, timing: &Timing, now: Dur
     }
 }
 
-fn stand(seen: &Seen, me: &Identity, timing: &Timing, now: Duration) -> Decision {
+fn stand(seen: &ObservedLease, me: &Identity, timing: &Timing, now: Duration) -> Decision {
     let acquire = Decision::Acquire { term: seen.next_term() };
     let patience = match &seen.record {
         None if seen.last_term.is_none() => return acquire,
@@ -147,8 +153,8 @@ mod tests {
         }
     }
 
-    fn seen(record: Option<Record>, last_term: Option<i32>) -> Seen {
-        Seen {
+    fn seen(record: Option<Record>, last_term: Option<i32>) -> ObservedLease {
+        ObservedLease {
             record,
             last_term,
             changed_at: secs(100),
@@ -256,7 +262,7 @@ mod tests {
 
     #[test]
     fn only_a_change_of_the_record_counts_as_one() {
-        let mut seen = Seen::default();
+        let mut seen = ObservedLease::default();
         seen.note(Some(record(Some("other"), 3)), secs(5));
         seen.note(Some(record(Some("other"), 3)), secs(9));
         assert_eq!((seen.changed_at, seen.last_term), (secs(5), Some(3)));
@@ -289,7 +295,7 @@ mod tests {
                 holder: r.holder.map(|h| if h == "me" { me.as_str().to_owned() } else { h }),
                 ..r
             });
-            let mut seen = Seen::default();
+            let mut seen = ObservedLease::default();
             seen.note(record.clone(), secs(changed));
             let now = secs(changed + later);
             let leading = renewed.map(|ago| Leading { term: 2, renewed_at: now.saturating_sub(secs(ago)) });

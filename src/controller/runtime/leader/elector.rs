@@ -13,7 +13,7 @@ use kube::{Api, Client};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant, sleep};
 
-use super::decide::{Decision, Leading, Loss, Seen, decide, is_overdue};
+use super::decide::{Decision, Leading, Loss, ObservedLease, decide, is_overdue};
 use super::record::{Record, held, released};
 use super::{Fence, Leadership, Settings};
 use crate::backoff::jittered;
@@ -38,7 +38,7 @@ pub(super) struct Elector {
     outlets: Outlets,
     metrics: Arc<Metrics>,
     liveness: Liveness,
-    seen: Seen,
+    seen: ObservedLease,
     /// The Lease as the server last answered it. None: there is none, if `is_fresh`.
     lease: Option<Lease>,
     /// The last look or write was answered, and nothing has been sent since.
@@ -60,7 +60,7 @@ impl Elector {
             outlets,
             metrics: telemetry.metrics.clone(),
             liveness: telemetry.liveness.clone(),
-            seen: Seen::default(),
+            seen: ObservedLease::default(),
             lease: None,
             is_fresh: false,
             leading: None,

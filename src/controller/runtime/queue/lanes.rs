@@ -36,8 +36,8 @@ impl Class {
 }
 
 /// A moment, and a number that no other place has.
-pub(super) type Place = (Instant, u64);
-type Lane = BTreeMap<Place, Key>;
+pub(super) type DueKey = (Instant, u64);
+type Lane = BTreeMap<DueKey, Key>;
 
 /// A lower class waits so long before it ages: half of the usual `syncPeriodSeconds`.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -55,7 +55,7 @@ pub(super) struct Lanes {
 }
 
 impl Lanes {
-    pub(super) fn insert(&mut self, class: Class, place: Place, key: Key) {
+    pub(super) fn insert(&mut self, class: Class, place: DueKey, key: Key) {
         match class {
             Class::Urgent => self.urgent.insert(place, key),
             Class::New => self
@@ -67,7 +67,7 @@ impl Lanes {
         };
     }
 
-    pub(super) fn remove(&mut self, class: Class, place: Place, key: &Key) {
+    pub(super) fn remove(&mut self, class: Class, place: DueKey, key: &Key) {
         match class {
             Class::Urgent => self.urgent.remove(&place),
             Class::New => self.remove_new(place, &key.namespace),
@@ -75,7 +75,7 @@ impl Lanes {
         };
     }
 
-    fn remove_new(&mut self, place: Place, namespace: &Arc<str>) -> Option<Key> {
+    fn remove_new(&mut self, place: DueKey, namespace: &Arc<str>) -> Option<Key> {
         let lane = self.new.get_mut(namespace)?;
         let key = lane.remove(&place);
         if lane.is_empty() {
@@ -99,11 +99,11 @@ impl Lanes {
         now: Instant,
         may_begin: impl Fn(Class) -> bool,
         has_permit: impl Fn(&str) -> bool,
-    ) -> Option<(Class, Place, Key)> {
+    ) -> Option<(Class, DueKey, Key)> {
         let heads = Class::ALL.map(|class| self.head(class, &has_permit).filter(|_| may_begin(class)));
         let first = heads.iter().position(Option::is_some)?;
         let is_aged =
-            |head: &Option<(Place, Key)>| head.as_ref().is_some_and(|((since, _), _)| *since + PATIENCE <= now);
+            |head: &Option<(DueKey, Key)>| head.as_ref().is_some_and(|((since, _), _)| *since + PATIENCE <= now);
         for (class, head) in heads.iter().enumerate() {
             let waits = class > first && is_aged(head);
             self.passed_over[class] = if waits { self.passed_over[class] + 1 } else { 0 };
@@ -119,7 +119,7 @@ impl Lanes {
         Some((class, place, key))
     }
 
-    fn head(&self, class: Class, has_permit: impl Fn(&str) -> bool) -> Option<(Place, Key)> {
+    fn head(&self, class: Class, has_permit: impl Fn(&str) -> bool) -> Option<(DueKey, Key)> {
         let first = |lane: &Lane| lane.first_key_value().map(|(place, key)| (*place, key.clone()));
         match class {
             Class::Urgent => first(&self.urgent),

@@ -10,7 +10,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::Key;
-use super::lanes::{Class, Lanes, Place};
+use super::lanes::{Class, DueKey, Lanes};
 
 /// How much may run at once.
 #[derive(Clone, Copy, Debug)]
@@ -48,7 +48,7 @@ pub struct State {
     limits: Limits,
     objects: HashMap<Key, Object>,
     lanes: Lanes,
-    timers: BTreeMap<Place, Key>,
+    timers: BTreeMap<DueKey, Key>,
     permits: Permits,
     running: usize,
     /// Of these, those that are not urgent.
@@ -65,8 +65,8 @@ struct Object {
 
 #[derive(Debug)]
 enum Stage {
-    Ready(Class, Place),
-    Waits(Place),
+    Ready(Class, DueKey),
+    Waits(DueKey),
     Runs(Run),
 }
 

@@ -1,6 +1,7 @@
 use serde_json::{Value, json};
 
 use super::*;
+use crate::controller::submissions::decide::StatusWrite;
 use crate::controller::submissions::view::ReportDemand;
 use leaderboard_api::JobNumber;
 
@@ -161,6 +162,7 @@ fn what_follows_is_urgent_while_the_report_of_an_end_is_awaited() {
         });
         let plan = Plan {
             status: status.clone(),
+            write: StatusWrite::Now,
             actions: Vec::new(),
             events: Vec::new(),
             report,

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, TryAcquireError};
 
-use crate::services::held_text::Place;
+use crate::services::held_text::HeldMemory;
 
 /// Largest text that is passed on to EvalAI, in bytes.
 pub(super) const MAX_TEXT: u64 = 4 << 20;
@@ -56,7 +56,7 @@ impl TextBudget {
     }
 
     /// A place for texts of so many bytes. That of an end waits; a live run's has another text soon, and leaves half to the ends.
-    pub(super) async fn place(&self, bytes: u64, is_end: bool) -> Result<Place, NoPlace> {
+    pub(super) async fn place(&self, bytes: u64, is_end: bool) -> Result<HeldMemory, NoPlace> {
         let units = permits(bytes * COPIES).max(1);
         let found = if is_end {
             let wait = self.wait(units);
@@ -64,7 +64,7 @@ impl TextBudget {
         } else {
             self.now(units)
         };
-        found.map(|permits| Arc::new(permits) as Place)
+        found.map(|permits| Arc::new(permits) as HeldMemory)
     }
 
     async fn wait(&self, units: u32) -> Result<[OwnedSemaphorePermit; 2], NoPlace> {

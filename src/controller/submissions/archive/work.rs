@@ -13,7 +13,7 @@ use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
 use crate::controller::submissions::view::{TextProblem, Texts};
 use crate::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, StoredFile};
 use crate::services::archive::{Archive, ArchiveError, Fetched};
-use crate::services::held_text::{HeldText, Place};
+use crate::services::held_text::{HeldMemory, HeldText};
 
 /// Time that reading a report, or writing the fence, may take.
 const LIMIT: Duration = Duration::from_secs(10);
@@ -139,7 +139,7 @@ async fn text(
     archive: &Archive,
     key: &'static str,
     expected: Option<&StoredFile>,
-    place: Place,
+    place: HeldMemory,
 ) -> Result<HeldText, TextProblem> {
     let Some(expected) = expected else {
         return Ok(HeldText::default());

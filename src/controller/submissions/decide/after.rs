@@ -5,7 +5,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, EvalaiUpdate};
+use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
 use super::{accept, log, observe, retention, stop};
@@ -195,7 +195,7 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
 fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
     let is_recorded = draft.status.is_true(conditions::RECORDED);
     if is_recorded {
-        draft.act(Action::Record { end: true });
+        record_end(draft);
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
     }
     is_recorded
@@ -230,8 +230,12 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     match view.end {
         Some(EvalaiEnd::Published { at }) => Delivery::Answered(at),
         Some(EvalaiEnd::Ended { status }) => amend(draft, &status),
-        Some(EvalaiEnd::Refused { message }) => {
+        Some(EvalaiEnd::Refused { message, is_due }) => {
             refused(draft, &message);
+            if is_due {
+                // Why it cannot be read is not what its end waits for.
+                let _ = send_result(draft, log_left);
+            }
             Delivery::Refused
         }
         None => {
@@ -241,11 +245,10 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     }
 }
 
-/// Sends the end with all that belongs to it, once that is there.
-fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
-    let mut unread = None;
+/// Sends the end with all that belongs to it, once that is there. Returns why it cannot be read.
+fn send_result(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Option<String> {
     match reading::result_of_end(draft) {
-        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why)),
+        Reading::Waits(why) => return why,
         Reading::Done if log_left.is_some() => {}
         Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {
             State::Finished => EvalaiUpdate::Finished,
@@ -253,6 +256,13 @@ fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bo
             _ => EvalaiUpdate::Failed,
         })),
     }
+    None
+}
+
+/// Sends the end, and shows that EvalAI does not have it yet.
+fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
+    let why = send_result(draft, log_left);
+    let unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why));
     let failed = error.map(|e| format!("The last request failed: {}", sentence(&e)));
     let failed = failed.or(unread);
     let (reason, message) = if is_overtaken {
@@ -360,7 +370,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
         return Delivery::Done;
     }
     draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
-    draft.act(Action::Record { end: true });
+    record_end(draft);
     Delivery::Waiting
 }
 
@@ -394,7 +404,7 @@ fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
     let mut unread = None;
     match row_of_end(draft) {
         Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
-        Reading::Done => draft.act(Action::Record { end: true }),
+        Reading::Done => record_end(draft),
     }
     let (reason, message) = match view.error {
         Some(error) => (
@@ -408,6 +418,16 @@ fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
     };
     draft.condition(conditions::RECORDED, Truth::False, reason, &message);
     Delivery::Waiting
+}
+
+/// A check only learns whether the table would take its row.
+fn record_end(draft: &mut PlanBuilder<'_>) {
+    let is_check = draft.spec().check;
+    draft.act(Action::Record(if is_check {
+        TableUpdate::Trial
+    } else {
+        TableUpdate::End
+    }));
 }
 
 /// Whether all that the row shows is there: only that of a finished submission has metrics.

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, EvalaiUpdate};
+use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
     accept, addresses, clock, crashes, end, failure, interruption, isolation, line, reading, reported, requeue, start,
@@ -42,17 +42,17 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     follow(draft);
 }
 
-/// Looks for its end in EvalAI also while it waits and nothing is sent to EvalAI, whatever it waits for.
+/// Looks for its end in EvalAI, also while it waits and nothing is sent to EvalAI, whatever it waits for.
 fn follow(draft: &mut PlanBuilder<'_>) {
     // The time of its submission is taken with EvalAI's answer; without it nothing would be found.
     let is_known = draft.status.times.submitted.is_some();
     let may_run = is_known && draft.evalai_info().is_some_and(|info| info.standing != Standing::Ended);
-    if may_run && !draft.is_finished() && !draft.is_to_stop() && !draft.does(is_progress) {
+    if draft.does(is_progress) || (may_run && !draft.is_finished() && !draft.is_to_stop()) {
         draft.act(Action::FollowEvalai);
     }
 }
 
-/// An update with which EvalAI's side looks for the end by itself.
+/// EvalAI learns that it is in line or runs.
 fn is_progress(action: &Action) -> bool {
     matches!(
         action,
@@ -331,12 +331,14 @@ fn update_evalai(draft: &mut PlanBuilder<'_>) {
     let Some(report) = draft.view.report.ours() else { return };
     let is_new = report.done > 0 && Some(report.done) != draft.view.partial_sent;
     if is_new && reading::has_texts(draft, report) {
-        draft.act(Action::UpdateEvalai(EvalaiUpdate::Partial));
+        // EvalAI keeps a partial result, and would show it as final of a row that its participant calls finished.
+        let is_shown = draft.view.evalai.as_ref().is_some_and(|evalai| evalai.shows_partial);
+        draft.act(Action::UpdateEvalai(EvalaiUpdate::Partial { is_shown }));
     }
 }
 
 fn record(draft: &mut PlanBuilder<'_>) {
     if draft.view.record.is_some() && !draft.spec().check {
-        draft.act(Action::Record { end: false });
+        draft.act(Action::Record(TableUpdate::Progress));
     }
 }

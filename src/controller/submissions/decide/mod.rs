@@ -4,7 +4,7 @@
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `interruption` is a
 //! node that is taken away, `requeue` a host who puts a run back in line, `pulls` bounds a start, `blame` decides whose fault a crash was,
 //! `crashes` counts them, `clock` how long a run has gone on, `stored` finds what a lost status leaves and `restored` takes it up, `pin` pins the plan, `reported` takes reports in, `allowance` bounds those of a team's simulators, `retention` deletes what
-//! has ended long ago, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
+//! has ended long ago, `significance` decides when a changed status is worth a write, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait.
 
 mod accept;
 mod addresses;
@@ -33,6 +33,7 @@ mod reported;
 mod requeue;
 mod restored;
 mod retention;
+mod significance;
 mod start;
 mod stop;
 mod stored;
@@ -45,8 +46,9 @@ use std::time::Duration;
 use super::view::View;
 pub use after::previous_controller;
 pub(super) use image::pinned;
-pub use plan::{Action, EvalaiUpdate, Event, Plan, job_name};
+pub use plan::{Action, EvalaiUpdate, Event, Plan, StatusWrite, TableUpdate, job_name};
 use plan_builder::PlanBuilder;
+pub use reading::awaits_publication;
 
 /// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
@@ -66,6 +68,8 @@ pub fn decide(view: &View) -> Plan {
             draft.act_first(Action::AddFinalizer);
         }
     }
+    look_up_node(&mut draft);
+    reading::drop_texts(&mut draft);
     let report = reading::demand(&draft);
     draft.into_plan(report)
 }
@@ -79,12 +83,25 @@ fn decide_stage(draft: &mut PlanBuilder<'_>) {
     }
 }
 
+/// Where nodes are not watched, that of a Pod is asked for once it runs or is being deleted.
+fn look_up_node(draft: &mut PlanBuilder<'_>) {
+    let pod = draft
+        .view
+        .pod
+        .as_ref()
+        .filter(|pod| !draft.view.is_node_watched && pod.needs_node());
+    let node = pod.filter(|pod| pod.delete_by.is_some() || pod.agent_started.is_some());
+    if let Some(name) = node.and_then(|pod| pod.node.clone()) {
+        draft.act(Action::LookUpNode(name));
+    }
+}
+
 /// A deletion waits only for another system that has heard of the submission, or will, and not of its end.
 fn needs_finalizer(draft: &PlanBuilder<'_>) -> bool {
     let is_recorded = draft.view.record.is_some() && !draft.spec().check;
     let is_owed = draft.spec().evalai.is_some() || is_recorded;
     let has_begun = draft.status.job_name.is_some() || draft.status.retry > 0;
-    let is_requested = draft.does(|action| matches!(action, Action::UpdateEvalai(_) | Action::Record { .. }));
+    let is_requested = draft.does(|action| matches!(action, Action::UpdateEvalai(_) | Action::Record(_)));
     let is_settled = draft.does(|action| *action == Action::Forget);
     is_owed && (has_begun || is_requested) && !is_settled && !draft.has_finalizer() && !draft.is_deleting()
 }

@@ -3,8 +3,7 @@
 use super::plan_builder::{PlanBuilder, Terms};
 use super::stored;
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
-use leaderboard_api::check::first_route;
-use leaderboard_api::{RunPlan, effective};
+use leaderboard_api::{RouteSlice, RunPlan, effective};
 
 pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) {
     let Terms {
@@ -51,4 +50,31 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
 fn earlier_attempts(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
     let resumed = info.filter(|info| info.standing == Standing::Resumed);
     resumed.map_or(0, |info| (info.last_attempt + 1 - draft.spec().attempt).max(0))
+}
+
+/// The plan of a check: the first route, once, with one pair.
+fn first_route(plan: RunPlan) -> RunPlan {
+    let first = plan.slices.first().map_or(0, |slice| slice.first);
+    RunPlan {
+        slices: vec![RouteSlice { first, last: first }],
+        routes: 1,
+        repetitions: 1,
+        ..plan
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn a_check_drives_the_first_route_once() {
+        let plan = json!({"runId": "check-lb-1", "leaderboardVersion": "V1", "track": "sensors", "codename": "SENSORS",
+                          "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}], "routes": 12, "repetitions": 5,
+                          "storage": {"bucket": "b"}, "image": "a:1", "contentsImage": "c:1", "simulatorImage": "s:1"});
+        let plan = first_route(serde_json::from_value(plan).unwrap());
+        assert_eq!(plan.slices, [RouteSlice { first: 4, last: 4 }]);
+        assert_eq!((plan.routes, plan.repetitions), (1, 1));
+    }
 }

@@ -15,12 +15,23 @@ use leaderboard_api::{JobNumber, SubmissionStatus, names};
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     pub status: SubmissionStatus,
+    pub write: StatusWrite,
     pub actions: Vec<Action>,
     pub events: Vec<Event>,
     /// The report that the next decision needs; None: none.
     pub report: Option<ReportDemand>,
     /// When to look again without any other cause.
     pub requeue: Option<Duration>,
+}
+
+/// When the status is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StatusWrite {
+    /// Nothing is new, or what is new may wait.
+    NotNow,
+    Now,
+    /// In its turn among all whose place in line has moved.
+    InTurn,
 }
 
 /// One thing to do. All are safe to repeat.
@@ -58,9 +69,13 @@ pub enum Action {
     KeepLog { places: Vec<LogPlace> },
     /// Read the texts of this report, so that they can be published.
     ReadTexts { of: ReportId },
+    /// Give the memory of the texts that were read back.
+    DropTexts,
+    /// Ask the API server for this node.
+    LookUpNode(String),
     /// Ask EvalAI for the submission.
     AskEvalai,
-    /// Look for its end in EvalAI from now on, although nothing was sent to EvalAI yet.
+    /// Look for its end in EvalAI from now on.
     FollowEvalai,
     /// Send an update to EvalAI.
     UpdateEvalai(EvalaiUpdate),
@@ -69,7 +84,7 @@ pub enum Action {
     /// Every system has the end: drop all that is remembered for it.
     Forget,
     /// Write the row.
-    Record { end: bool },
+    Record(TableUpdate),
     /// Delete the object, if it is still the one that was decided on.
     DeleteSubmission { uid: String, resource_version: String },
 }
@@ -79,10 +94,23 @@ pub enum Action {
 pub enum EvalaiUpdate {
     Queued,
     Running,
-    Partial,
+    /// A partial result; `is_shown`: with the metrics over the routes so far, else with the original's zeros.
+    Partial {
+        is_shown: bool,
+    },
     Finished,
     Failed,
     Cancelled,
+}
+
+/// What is written to the table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TableUpdate {
+    /// How a run stands, with the next write of its row.
+    Progress,
+    End,
+    /// For a check: whether the table would take a row. None is written.
+    Trial,
 }
 
 /// An event of Kubernetes, published after the status was written.

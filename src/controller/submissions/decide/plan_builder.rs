@@ -5,7 +5,8 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, Event, Plan, job_name};
+use super::plan::{Action, Event, Plan, StatusWrite, job_name};
+use super::significance::{self, Change};
 use crate::controller::submissions::view::{EvalaiInfo, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
@@ -96,8 +97,17 @@ impl<'a> PlanBuilder<'a> {
         self.leaderboard().map(of).unwrap_or_default()
     }
 
+    /// The first crash and the first fault of the infrastructure end a check, since they are what it is to show.
     pub(super) fn retries(&self) -> Retries {
-        self.leaderboard().map(|l| l.retries).unwrap_or_default()
+        let retries = self.leaderboard().map(|l| l.retries).unwrap_or_default();
+        if !self.spec().check {
+            return retries;
+        }
+        Retries {
+            per_pair: 0,
+            infrastructure: 0,
+            ..retries
+        }
     }
 
     pub(super) fn now(&self) -> Timestamp {
@@ -384,10 +394,30 @@ impl<'a> PlanBuilder<'a> {
         self.status.fit();
         Plan {
             report,
+            write: self.status_write(),
             status: self.status,
             actions: self.actions,
             events: self.events,
             requeue: self.requeue,
+        }
+    }
+
+    /// API writes are what a submission costs its cluster: what may wait is written with what comes next.
+    fn status_write(&mut self) -> StatusWrite {
+        let nothing = SubmissionStatus::default();
+        let old = self.submission().status.as_ref().unwrap_or(&nothing);
+        match significance::change(old, &self.status) {
+            Change::Nothing => StatusWrite::NotNow,
+            Change::Place(position) if position > significance::FIRST_PLACES => StatusWrite::InTurn,
+            Change::Progress => {
+                let patience = significance::patience(self.period());
+                let left = self.view.written_ago.and_then(|ago| patience.checked_sub(ago));
+                if let Some(left) = left {
+                    self.requeue_in(left);
+                }
+                left.map_or(StatusWrite::Now, |_| StatusWrite::NotNow)
+            }
+            Change::Place(_) | Change::Real => StatusWrite::Now,
         }
     }
 

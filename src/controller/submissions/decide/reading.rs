@@ -6,6 +6,7 @@
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, left_of};
@@ -13,7 +14,7 @@ use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
 };
-use leaderboard_api::conditions;
+use leaderboard_api::{SubmissionStatus, conditions, reasons};
 
 /// How long an answer is waited for before the status shows that.
 const ANSWER: Duration = Duration::from_secs(15);
@@ -161,6 +162,22 @@ pub(super) fn has_texts(draft: &mut PlanBuilder<'_>, report: &ReportDigest) -> b
             false
         }
     }
+}
+
+/// Texts that are with EvalAI's side, or that nobody needs, give their memory back before others are asked for.
+pub(super) fn drop_texts(draft: &mut PlanBuilder<'_>) {
+    let is_forgotten = draft.does(|action| *action == Action::Forget);
+    if draft.view.texts != ObservedTexts::NotRead && !is_forgotten && !awaits_publication(&draft.status) {
+        draft.act_first(Action::DropTexts);
+    }
+}
+
+/// Whether an end is still to be sent to EvalAI, with the texts that were read.
+pub fn awaits_publication(status: &SubmissionStatus) -> bool {
+    let published = status.condition(conditions::PUBLISHED);
+    let is_open =
+        |c: &Condition| c.status == "False" && ![reasons::NOT_REQUIRED, reasons::REFUSED].contains(&c.reason.as_str());
+    status.has_ended() && published.is_some_and(is_open)
 }
 
 /// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.

@@ -56,21 +56,29 @@ impl Lookups {
         Self(shared)
     }
 
+    /// Asks for a node, and goes on asking for as long as this is called again.
+    pub fn want(&self, submission: &Submission, node: &str) {
+        self.0.want(node, ObjectRef::from_obj(submission));
+    }
+
     /// How a node is, as far as it was read.
-    pub fn node(&self, name: &str, by: ObjectRef<Submission>) -> NodeView {
-        self.0.want(name, by).unwrap_or_default()
+    pub fn node(&self, name: &str) -> NodeView {
+        self.0.answer(name).unwrap_or_default()
     }
 }
 
 impl Shared {
-    fn want(&self, node: &str, by: ObjectRef<Submission>) -> Option<NodeView> {
+    fn answer(&self, node: &str) -> Option<NodeView> {
+        lock(&self.entries).get(node)?.answer.clone()
+    }
+
+    fn want(&self, node: &str, by: ObjectRef<Submission>) {
         let mut entries = lock(&self.entries);
         let entry = entries.entry(node.to_owned()).or_default();
         entry.wanted_by.insert(by, Instant::now());
         if entry.asked.is_none() {
             self.notify.notify_one();
         }
-        entry.answer.clone()
     }
 
     /// The next node that is due.
@@ -154,8 +162,9 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_node_is_asked_for_once_for_all_and_again_when_its_answer_is_old() {
         let shared = Shared::default();
-        assert_eq!(shared.want("a", by("1")), None);
-        assert_eq!(shared.want("a", by("2")), None);
+        shared.want("a", by("1"));
+        shared.want("a", by("2"));
+        assert_eq!(shared.answer("a"), None);
         assert_eq!(shared.next(Instant::now()).as_deref(), Some("a"));
         assert_eq!(shared.next(Instant::now()), None, "it is under way");
         assert!(shared.done("a", node::healthy()).is_empty(), "nothing to decide on");
@@ -166,7 +175,7 @@ mod tests {
         let mut woken = shared.done("a", gone());
         woken.sort_by(|one, other| one.name.cmp(&other.name));
         assert_eq!(woken, [by("1"), by("2")]);
-        assert_eq!(shared.want("a", by("2")), Some(gone()));
+        assert_eq!(shared.answer("a"), Some(gone()));
     }
 
     #[tokio::test(start_paused = true)]

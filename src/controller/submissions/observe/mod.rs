@@ -27,7 +27,6 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
 use causes::Causes;
-use leaderboard_api::check::without_retries;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use lookups::Lookups;
 
@@ -54,15 +53,12 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let submission = uses.memory.with_own_status(submission);
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
-    let mut leaderboard = uses.stores.leaderboard_for(&submission);
-    if submission.spec.check {
-        leaderboard = leaderboard.map(|found| Arc::new(without_retries(&found)));
-    }
+    let leaderboard = uses.stores.leaderboard_for(&submission);
     let (job, pod) = children(uses, &submission);
     let status = submission.status.as_ref();
     let is_over = status.is_some_and(SubmissionStatus::has_ended);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
-    let node = node(uses, &submission, pod.as_ref());
+    let node = node(uses, pod.as_ref());
     let archive = uses.archive.observe(&submission, pod_uid, is_over);
     let others = || uses.stores.submissions_of(&namespace);
     View {
@@ -76,6 +72,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,
         leaving: node.leaving,
+        is_node_watched: node::is_watched(uses.stores),
         report: archive.report.report,
         report_stage: archive.report.stage,
         report_waited: archive.report.waited,
@@ -87,6 +84,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
             .as_deref()
             .and_then(|board| uses.external.record_view(board, &submission)),
         evalai_waited: uses.memory.evalai_waited(&submission),
+        written_ago: uses.memory.since_write(&submission),
         partial_sent: uses.memory.partial_sent(&submission),
         rerun_as: uses.reruns.of(&submission),
         team: team_of(uses.teams, &submission, &job, now),
@@ -137,19 +135,11 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
     (ObservedJob::Ours(job), Some(pod))
 }
 
-/// The node of a Pod that has not ended. Where nodes are not watched, only that of one that runs or is being deleted is asked for.
-fn node(uses: Uses<'_>, submission: &Submission, pod: Option<&PodView>) -> NodeView {
-    let is_there = |pod: &&PodView| pod.delete_by.is_some() || pod.run_ended.is_none();
-    let Some((pod, name)) = pod.filter(is_there).and_then(|pod| Some((pod, pod.node.as_ref()?))) else {
-        return NodeView::default();
-    };
-    if let Some(seen) = node::watched(uses.stores, name) {
-        return seen;
-    }
-    if pod.delete_by.is_none() && pod.agent_started.is_none() {
-        return NodeView::default();
-    }
-    uses.lookups.node(name, ObjectRef::from_obj(submission))
+/// The node of a Pod that has not ended, as its watch shows it, or as it was last asked for.
+fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
+    let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
+    let known = |name| node::watched(uses.stores, name).unwrap_or_else(|| uses.lookups.node(name));
+    name.map(known).unwrap_or_default()
 }
 
 /// How its team's attempts ended. Read only if this may be the reconcile that ends it.

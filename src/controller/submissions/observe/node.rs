@@ -25,9 +25,14 @@ const LEAVING: [&str; 3] = [
 /// What those of the AWS Node Termination Handler begin with: `spot-itn`, `scheduled-maintenance`, and others.
 const TERMINATION_HANDLER: &str = "aws-node-termination-handler/";
 
+/// Whether there is a watch that can be relied on.
+pub(super) fn is_watched(stores: &Stores) -> bool {
+    stores.nodes.as_ref().is_some_and(|nodes| nodes.synced.is_true())
+}
+
 /// What a watch shows of a node; None without a watch that can be relied on.
 pub(super) fn watched(stores: &Stores, name: &str) -> Option<NodeView> {
-    let nodes = stores.nodes.as_ref().filter(|nodes| nodes.synced.is_true())?;
+    let nodes = stores.nodes.as_ref().filter(|_| is_watched(stores))?;
     let found = nodes.store.get(&ObjectRef::new(name));
     Some(found.map_or_else(gone, |node| of(&node)))
 }

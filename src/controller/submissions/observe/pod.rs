@@ -6,7 +6,7 @@ use leaderboard_runner::verdict::Verdict;
 use crate::controller::submissions::view::{ContainerView, EndView, PodView};
 use crate::kubernetes::objects::{Condition, ContainerStatus, Ended, Pod, PodStatus};
 use crate::pod::run::Stop;
-use crate::pod::workspace::{WorkspaceReason, WorkspaceVerdict};
+use crate::pod::workspace::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_api::{names, reasons};
 
@@ -149,18 +149,24 @@ fn end(container: &str, terminated: &Ended) -> EndView {
     }
 }
 
-/// `workspace` leaves `{"reason": …, "message": …}`.
+/// `workspace` leaves `{"schema": …, "reason": …, "message": …}`.
 fn foreign_word(message: &str) -> Option<String> {
     let value: serde_json::Value = serde_json::from_str(message).ok()?;
-    let verdict = WorkspaceVerdict::parse(message);
-    if verdict.is_some_and(|verdict| verdict.reason == WorkspaceReason::NotKnownIsolated) {
+    match WorkspaceVerdict::parse(message) {
         // For the run it is the same; the Leaderboard's condition distinguishes them.
-        return Some(reasons::NOT_ISOLATED.to_owned());
+        Ok(verdict) if verdict.reason == WorkspaceReason::NotKnownIsolated => {
+            return Some(reasons::NOT_ISOLATED.to_owned());
+        }
+        Err(NotAVerdict::Schema(_)) => return None,
+        _ => {}
     }
     value.get("reason")?.as_str().map(short)
 }
 
 fn foreign_why(message: &str) -> Option<String> {
+    if let Err(error @ NotAVerdict::Schema(_)) = WorkspaceVerdict::parse(message) {
+        return Some(error.to_string());
+    }
     let parsed: Option<serde_json::Value> = serde_json::from_str(message).ok();
     let told = parsed
         .as_ref()
@@ -285,6 +291,14 @@ mod tests {
         let seen = view(&pod.unwrap());
         assert_eq!(seen.deleted.unwrap().to_string(), "2026-01-01T00:00:00Z");
         assert_eq!(seen.delete_by.unwrap().to_string(), "2026-01-01T00:10:00Z");
+    }
+
+    #[test]
+    fn a_verdict_of_a_newer_workspace_is_not_guessed_at() {
+        let newer = json!({"schema": 2, "reason": "OfTomorrow", "message": "Something."}).to_string();
+        let end = seen("workspace", "Error", &newer);
+        let why = "the verdict of `workspace` has schema 2, and 1 and the one before are read";
+        assert_eq!((end.own_reason, end.why.as_deref()), (None, Some(why)));
     }
 
     #[test]

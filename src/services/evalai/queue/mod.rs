@@ -314,6 +314,21 @@ impl Queue {
         self.subs.get(key).map(|sub| sub.view.clone())
     }
 
+    /// Whether partial results are on the leaderboards of a phase.
+    pub fn shows_partial(&self, leaderboard: &Key, phase: i64) -> bool {
+        let check = self
+            .served
+            .get(leaderboard)
+            .and_then(|target| self.challenges.get(&target.challenge));
+        let catalog = check.and_then(|challenge| challenge.check.catalog.as_ref());
+        catalog.is_some_and(|catalog| {
+            catalog
+                .phases
+                .iter()
+                .any(|known| known.id == phase && known.shows_partial)
+        })
+    }
+
     /// How a Leaderboard fits its challenge; none before the first check. The error is why there was no newer check.
     pub fn labels(&self, leaderboard: &Key) -> (Option<Labels>, Option<String>) {
         let Some(target) = self.served.get(leaderboard) else {
@@ -448,14 +463,19 @@ fn request_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Pa
         .as_ref()
         .is_some_and(|end| !matches!(end, Ended::Refused(_)));
     let want = (outcome, for_split(payload, &target.split));
-    if closed || sub.end.as_ref().is_some_and(|end| end.what == want) {
+    let is_again = sub.is_refused(&want);
+    let is_known = is_again && !sub.view.needs_texts;
+    if closed || is_known || sub.end.as_ref().is_some_and(|end| end.what == want) {
         return false;
     }
     sub.misfit = sub::misfit(&want, target);
     let since = now.at;
     sub.end = Some(Pending { what: want, since });
     sub.run.ended.get_or_insert(now.wall);
-    (sub.progress, sub.partial, sub.view.end) = (None, None, None);
+    (sub.progress, sub.partial) = (None, None);
+    // The refusal stands until EvalAI has answered again.
+    sub.view.end = sub.view.end.take().filter(|_| is_again);
+    (sub.lacks_texts, sub.view.needs_texts) = (false, false);
     sub.retry_at = sub.retry_at.min(now.at);
     true
 }

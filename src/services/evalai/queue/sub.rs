@@ -59,6 +59,8 @@ pub(super) struct Sub {
     pub partial_sent: Option<u64>,
     /// Why the end's results are not sent, whatever EvalAI shows.
     pub misfit: Option<String>,
+    /// The texts of a refused end were given back: others need their memory.
+    pub lacks_texts: bool,
     /// Request of the last read of the row.
     pub read: Option<Duration>,
     /// The row is known to be outdated.
@@ -98,6 +100,7 @@ impl Sub {
             end: None,
             partial_sent: None,
             misfit: None,
+            lacks_texts: false,
             read: None,
             outdated: false,
             known_at: None,
@@ -181,7 +184,7 @@ impl Sub {
     /// The end to write: `cancelled` for a submission that was deleted before its end, whatever it was here.
     pub fn outcome(&self) -> Option<Outcome> {
         match self.end_verdict()? {
-            End::Put if self.problem().is_none() => Some(self.end.as_ref()?.what.0),
+            End::Put if self.problem().is_none() && !self.lacks_texts => Some(self.end.as_ref()?.what.0),
             End::Cancel => Some(Outcome::Cancelled),
             _ => None,
         }
@@ -296,6 +299,9 @@ impl Sub {
             Some(End::Put) if self.retry_at <= now.at => {
                 if let Some(why) = self.problem() {
                     self.refuse_end(why, now);
+                } else if self.lacks_texts {
+                    self.view.needs_texts = true;
+                    self.retry_at = now.at + RETRY_END;
                 }
             }
             Some(End::Put | End::Cancel) | None => {}
@@ -306,7 +312,14 @@ impl Sub {
     pub fn close(&mut self, end: Ended) {
         self.view.end = Some(end);
         self.view.last_error = None;
+        (self.lacks_texts, self.view.needs_texts) = (false, false);
         (self.end, self.live, self.progress, self.partial) = (None, None, None, None);
+    }
+
+    /// Whether an end is the refused one, whose texts were given back.
+    pub fn is_refused(&self, (outcome, payload): &(Outcome, Arc<Payload>)) -> bool {
+        let known = self.end.as_ref().filter(|_| self.lacks_texts);
+        known.is_some_and(|end| end.what.0 == *outcome && *end.what.1 == payload.without_texts())
     }
 
     /// The end can't be written now. It is retried from time to time, after a read that finds a later cancel too: so no list
@@ -314,6 +327,10 @@ impl Sub {
     pub fn refuse_end(&mut self, why: String, now: &Now) {
         self.view.end = Some(Ended::Refused(why.clone()));
         self.live = None;
+        if let Some(end) = self.end.as_mut().filter(|end| end.what.1.has_texts()) {
+            end.what.1 = Arc::new(end.what.1.without_texts());
+            self.lacks_texts = true;
+        }
         self.write_failed(why, RETRY_END, now);
     }
 

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 
 use crate::controller::runtime::leader::Timing;
-use crate::controller::runtime::leader::decide::{Decision, Leading, Seen, decide};
+use crate::controller::runtime::leader::decide::{Decision, Leading, ObservedLease, decide};
 use crate::controller::runtime::leader::record::{Identity, Record};
 
 #[derive(Clone, Debug)]
@@ -44,7 +44,7 @@ struct Candidate {
     identity: Identity,
     /// Its clock is ahead by so much.
     ahead: Duration,
-    seen: Seen,
+    seen: ObservedLease,
     leading: Option<Leading>,
     is_lost: bool,
     writes: Vec<Write>,
@@ -65,7 +65,7 @@ impl World {
         let candidate = |n: u64| Candidate {
             identity: Identity::random("host"),
             ahead: Duration::from_secs(n * 1_000_000),
-            seen: Seen::default(),
+            seen: ObservedLease::default(),
             leading: None,
             is_lost: false,
             writes: Vec::new(),

@@ -6,7 +6,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
 use crate::controller::submissions::view::{Standing, Turn};
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
@@ -231,7 +231,11 @@ fn an_image_that_can_never_be_pulled_fails_at_once_without_a_job() {
                 world.view.evalai = None;
             }
             let plan = world.pass();
-            assert!(has(&plan, |a| *a == Action::Record { end: true }), "{:?}", plan.actions);
+            assert!(
+                has(&plan, |a| *a == Action::Record(TableUpdate::End)),
+                "{:?}",
+                plan.actions
+            );
             world.recorded();
             assert!(has(&world.pass(), |a| *a == Action::Forget));
         }

@@ -9,7 +9,7 @@ use super::builders::*;
 use crate::controller::submissions::addresses::{Found, Looked, Question, of_pod};
 use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::ObservedAddresses;
-use crate::services::endpoints::Place;
+use crate::services::endpoints::ServiceAddress;
 use leaderboard_api::State::{Pending, Running};
 use leaderboard_api::conditions::{ACCEPTED, STALLED};
 use leaderboard_api::reasons;
@@ -32,7 +32,7 @@ fn asked(plan: &Plan) -> Option<Question> {
 /// An answer of this moment.
 fn answer(world: &mut World, question: Question, address: &str) {
     let found = Found {
-        place: Place {
+        place: ServiceAddress {
             service: "S3",
             host: "results.s3.example".into(),
             port: 443,

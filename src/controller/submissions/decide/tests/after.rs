@@ -6,7 +6,7 @@ use jiff::SignedDuration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiInfo, ObservedReport, Standing};
 use leaderboard_api::State::{Cancelled, Failed, Finished};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
@@ -43,7 +43,7 @@ fn evalai_first_then_the_table_then_rest() {
         world.published();
         let plan = world.pass();
         assert_eq!(plan.status, before, "both answers are one write");
-        assert_eq!(plan.actions, [Action::Record { end: true }]);
+        assert_eq!(plan.actions, [Action::Record(TableUpdate::End)]);
         world.recorded();
         let plan = world.pass();
         assert_eq!(condition(&plan, PUBLISHED).0, "True");
@@ -220,11 +220,12 @@ fn a_refused_result_is_shown_once_and_does_not_hold_up_the_row() {
     let mut world = finished();
     world.in_evalai().end = Some(EvalaiEnd::Refused {
         message: "metric x is unknown".into(),
+        is_due: false,
     });
     let plan = world.pass();
     assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::REFUSED.into()));
     assert_eq!(events(&plan), [reasons::REFUSED]);
-    assert!(has(&plan, |a| *a == Action::Record { end: true }));
+    assert!(has(&plan, |a| *a == Action::Record(TableUpdate::End)));
     assert!(world.pass().events.is_empty());
     world.recorded();
     let plan = world.pass();
@@ -237,6 +238,7 @@ fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
         let mut world = finished();
         world.in_evalai().end = Some(EvalaiEnd::Refused {
             message: "it belongs to another phase".into(),
+            is_due: false,
         });
         world.pass();
         world.recorded();
@@ -248,14 +250,14 @@ fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
         });
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert!(
-            has(&plan, |a| *a == Action::Record { end: true }),
+            has(&plan, |a| *a == Action::Record(TableUpdate::End)),
             "the row said FINISHED"
         );
         assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
         assert!(!has(&plan, |a| *a == Action::Forget));
         // The row that was handed in is not the written one.
         world.view.record.as_mut().unwrap().end_written = false;
-        assert!(has(&world.pass(), |a| *a == Action::Record { end: true }));
+        assert!(has(&world.pass(), |a| *a == Action::Record(TableUpdate::End)));
         world.recorded();
         let plan = world.pass();
         assert_eq!(condition(&plan, RECORDED).0, "True");
@@ -366,12 +368,12 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
         let published = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
         assert_eq!((published.status.as_str(), published.message.as_str()), ("True", text));
         assert_eq!(events(&plan), [reasons::RERUN_IN_EVALAI]);
-        assert_eq!(plan.actions, [Action::Record { end: true }], "the row names it too");
+        assert_eq!(plan.actions, [Action::Record(TableUpdate::End)], "the row names it too");
         assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
 
         world.view.record.as_mut().unwrap().end_written = false;
         let waits = world.pass();
-        assert_eq!(waits.actions, [Action::Record { end: true }], "until it is written");
+        assert_eq!(waits.actions, [Action::Record(TableUpdate::End)], "until it is written");
         world.recorded();
         world.view.evalai = None;
         let again = world.pass();

@@ -123,6 +123,7 @@ impl World {
                 pod: None,
                 node: ObservedNode::Unknown,
                 leaving: None,
+                is_node_watched: true,
                 report: ObservedReport::NotRead,
                 // Whatever is asked for is there already; the tests of waiting set it otherwise.
                 report_stage: Some(Stage::JobEnded),
@@ -133,6 +134,7 @@ impl World {
                 evalai: evalai.then_some(known),
                 // Long enough that silence is shown.
                 evalai_waited: std::time::Duration::from_secs(5),
+                written_ago: None,
                 record: Some(RecordView::default()),
                 partial_sent: None,
                 rerun_as: None,
@@ -318,6 +320,9 @@ impl World {
         let plan = decide(&self.view);
         rules::check(&self.view, &plan);
         self.submission().status = Some(plan.status.clone());
+        if plan.actions.contains(&Action::Forget) {
+            self.view.texts = ObservedTexts::NotRead;
+        }
         plan
     }
 

@@ -169,10 +169,7 @@ fn what_another_program_runs_waits_and_nothing_is_written_of_it() {
     world.submission().spec.image = Some("contents:1".into());
     let plan = world.pass_to(Pending, reasons::FOREIGN);
     assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
-    assert!(!has(&plan, |a| matches!(
-        a,
-        Action::Record { .. } | Action::AddFinalizer
-    )));
+    assert!(!has(&plan, |a| matches!(a, Action::Record(_) | Action::AddFinalizer)));
     assert!(
         has(&plan, |a| matches!(a, Action::LookForForeignRun(_))),
         "it is looked for again"

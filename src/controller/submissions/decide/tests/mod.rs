@@ -34,3 +34,4 @@ mod start;
 mod stop;
 mod usage;
 mod waits;
+mod writes;

@@ -270,7 +270,14 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         Some(EvalaiEnd::Ended {
             status: "cancelled".into(),
         }),
-        Some(EvalaiEnd::Refused { message: "no".into() }),
+        Some(EvalaiEnd::Refused {
+            message: "no".into(),
+            is_due: false,
+        }),
+        Some(EvalaiEnd::Refused {
+            message: "no".into(),
+            is_due: true,
+        }),
     ];
     let error = select(vec![None, Some("away".to_owned())]);
     let cancels = select(
@@ -280,6 +287,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
             .collect::<Vec<_>>(),
     );
     (select(infos), cancels, select(ends), error).prop_map(|(info, (cancelled, overtaken), end, error)| EvalaiView {
+        shows_partial: false,
         team_id: None,
         info,
         read_at: None,

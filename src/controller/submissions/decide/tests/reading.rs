@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::controller::submissions::view::{
     ObservedFence, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Stage, TextProblem, Texts,
 };
@@ -349,7 +349,7 @@ fn the_end_of_a_deleted_one_does_not_wait_until_the_finalizer_gives_up() {
 
 #[test]
 fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
-    let records = |plan: &Plan| has(plan, |a| *a == Action::Record { end: true });
+    let records = |plan: &Plan| has(plan, |a| *a == Action::Record(TableUpdate::End));
     let mut world = World::local().running();
     world.complete();
     world.report(final_report());
@@ -386,7 +386,10 @@ fn a_partial_result_is_sent_when_its_texts_are_there_and_left_out_when_they_are_
     let plan = world.pass();
     assert_eq!(
         (reads_texts(&plan), evalai_updates(&plan)),
-        (false, vec![EvalaiUpdate::Running, EvalaiUpdate::Partial])
+        (
+            false,
+            vec![EvalaiUpdate::Running, EvalaiUpdate::Partial { is_shown: false }]
+        )
     );
     with_problem(&mut world, TextProblem::Unread("away".into()));
     let plan = world.pass();

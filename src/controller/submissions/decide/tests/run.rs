@@ -16,7 +16,10 @@ fn progress_is_no_transition_and_is_sent_once() {
     world.report(report(1));
     let plan = world.pass_to(Running, reasons::RUNNING);
     assert!(plan.events.is_empty());
-    assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Running, EvalaiUpdate::Partial]);
+    assert_eq!(
+        evalai_updates(&plan),
+        [EvalaiUpdate::Running, EvalaiUpdate::Partial { is_shown: false }]
+    );
     assert_eq!(plan.status.progress.as_ref().unwrap().text, "1/4");
     assert_eq!(
         plan.status.score.as_ref().map(|score| score.text.as_str()),
@@ -29,7 +32,7 @@ fn progress_is_no_transition_and_is_sent_once() {
     world.report(report(2));
     assert_eq!(
         evalai_updates(&world.pass()),
-        [EvalaiUpdate::Running, EvalaiUpdate::Partial]
+        [EvalaiUpdate::Running, EvalaiUpdate::Partial { is_shown: false }]
     );
 }
 

@@ -1,7 +1,7 @@
 //! Cancels and deletions at every stage, and stops that nobody obeys.
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
@@ -229,7 +229,7 @@ fn a_cancel_that_comes_after_the_last_route_loses() {
         status: "cancelled".into(),
     });
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
-    assert!(has(&plan, |a| *a == Action::Record { end: true }));
+    assert!(has(&plan, |a| *a == Action::Record(TableUpdate::End)));
 }
 
 #[test]
@@ -340,7 +340,7 @@ fn a_deleted_one_is_released_when_all_know_its_end() {
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Cancelled]);
     assert!(!has(&plan, |a| *a == Action::ReleaseFinalizer));
     world.published();
-    assert!(has(&world.pass(), |a| *a == Action::Record { end: true }));
+    assert!(has(&world.pass(), |a| *a == Action::Record(TableUpdate::End)));
     world.recorded();
     assert!(has(&world.pass(), |a| *a == Action::ReleaseFinalizer));
 }

@@ -5,8 +5,10 @@
 use std::time::Duration;
 
 use leaderboard_api::conditions::STALLED;
-use leaderboard_api::{LeaderboardSpec, PairState, SubmissionStatus};
+use leaderboard_api::{PairState, SubmissionStatus};
 
+/// Places in line that are written without waiting for their turn.
+pub(super) const FIRST_PLACES: i32 = 20;
 /// Longest wait of progress.
 const LONGEST: Duration = Duration::from_secs(30);
 /// Periods that progress waits for, where that is shorter.
@@ -14,21 +16,21 @@ const PERIODS: u32 = 3;
 
 /// What separates two statuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Change {
+pub(super) enum Change {
     Nothing,
-    /// Only its place in line, which moves for many at once.
-    Place,
+    /// Only its place in line, which moves for many at once; the new one.
+    Place(i32),
     /// Only how far it is, and the text for it.
     Progress,
     Real,
 }
 
 /// Compares the status that is stored with the one that is wanted.
-pub fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
+pub(super) fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
     if old == new {
         Change::Nothing
-    } else if is_place_alone(old, new) {
-        Change::Place
+    } else if let Some(position) = place_alone(old, new) {
+        Change::Place(position)
     } else if steady(old) == steady(new) {
         Change::Progress
     } else {
@@ -36,21 +38,19 @@ pub fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
     }
 }
 
-fn is_place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> bool {
-    if old.waiting.is_none() || new.waiting.is_none() {
-        return false;
-    }
+/// The new place in line, where nothing else has changed.
+fn place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> Option<i32> {
+    let (_, waiting) = old.waiting.as_ref().zip(new.waiting.as_ref())?;
     let moved = SubmissionStatus {
         waiting: new.waiting.clone(),
         ..old.clone()
     };
-    moved == *new
+    (moved == *new).then_some(waiting.position)
 }
 
-/// How long progress may wait since the last write.
-pub fn patience(leaderboard: Option<&LeaderboardSpec>) -> Duration {
-    let period = leaderboard.map_or(10, |l| l.sync_period_seconds).unsigned_abs();
-    LONGEST.min(Duration::from_secs(period) * PERIODS)
+/// How long progress may wait since the last write, with reports of this period.
+pub(super) fn patience(period: Duration) -> Duration {
+    LONGEST.min(period * PERIODS)
 }
 
 /// A status without what moves while a submission waits, starts or runs.
@@ -138,7 +138,7 @@ mod tests {
             waiting: Some(leaderboard_api::Waiting::new(position, None)),
             ..SubmissionStatus::default()
         };
-        assert_eq!(change(&waiting(3), &waiting(2)), Change::Place);
+        assert_eq!(change(&waiting(3), &waiting(2)), Change::Place(2));
         assert_eq!(change(&waiting(3), &waiting(3)), Change::Nothing);
         assert_eq!(change(&SubmissionStatus::default(), &waiting(3)), Change::Progress);
         let started = SubmissionStatus {
@@ -167,6 +167,8 @@ mod tests {
 
     #[test]
     fn progress_waits_no_longer_than_three_periods() {
-        assert_eq!(patience(None), Duration::from_secs(30));
+        for (period, expected) in [(5, 15), (10, 30), (60, 30)] {
+            assert_eq!(patience(Duration::from_secs(period)), Duration::from_secs(expected));
+        }
     }
 }

@@ -1,0 +1,152 @@
+//! When a changed status is written, and what memory and nodes a plan asks for.
+
+use std::time::Duration;
+
+use super::builders::*;
+use crate::controller::slots::turns::Turn;
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, StatusWrite, TableUpdate};
+use crate::controller::submissions::view::{EvalaiEnd, ObservedTexts};
+use leaderboard_api::State::Finished;
+use leaderboard_api::conditions::PUBLISHED;
+use leaderboard_api::reasons;
+
+#[test]
+fn progress_waits_since_the_last_write_and_what_matters_does_not() {
+    let running = || {
+        let mut world = World::local().running();
+        world.report(report(1));
+        world.pass();
+        world.report(report(2));
+        world
+    };
+    for (written_ago, expected) in [
+        (None, StatusWrite::Now),
+        (Some(5), StatusWrite::NotNow),
+        (Some(29), StatusWrite::NotNow),
+        (Some(31), StatusWrite::Now),
+    ] {
+        let mut world = running();
+        world.view.written_ago = written_ago.map(Duration::from_secs);
+        let plan = world.pass();
+        assert_eq!(plan.write, expected, "{written_ago:?}");
+        if expected == StatusWrite::NotNow {
+            let left = Duration::from_secs(30 - written_ago.unwrap());
+            assert!(plan.requeue.is_some_and(|at| at <= left), "{:?}", plan.requeue);
+        }
+        assert_eq!(world.pass().write, StatusWrite::NotNow, "nothing is new");
+    }
+    let mut world = running();
+    world.view.written_ago = Some(Duration::from_secs(1));
+    world.submission().spec.cancel = true;
+    assert_eq!(world.pass().write, StatusWrite::Now);
+}
+
+#[test]
+fn a_place_far_back_is_written_in_its_turn() {
+    for (position, expected) in [(20, StatusWrite::Now), (21, StatusWrite::InTurn)] {
+        let mut world = World::local();
+        let at = |position| Turn::Wait { position, eta: None };
+        world.view.turn = at(position + 100);
+        assert_eq!(world.pass().write, StatusWrite::Now, "its first place");
+        world.view.turn = at(position);
+        assert_eq!(world.pass().write, expected, "{position}");
+    }
+}
+
+#[test]
+fn texts_are_kept_until_evalai_has_the_end_and_no_longer() {
+    let drops = |world: &mut World| has(&world.pass(), |a| matches!(a, Action::DropTexts | Action::Forget));
+    let mut world = World::evalai().running();
+    assert!(!drops(&mut world), "none were read");
+    world.report(report(1));
+    let plan = world.pass();
+    let partial = EvalaiUpdate::Partial { is_shown: false };
+    assert!(evalai_updates(&plan).contains(&partial) && has(&plan, |a| *a == Action::DropTexts));
+    world.complete();
+    world.report(final_report());
+    assert!(!drops(&mut world), "the end is to be sent with them");
+    world.published();
+    world.view.record.as_mut().unwrap().end_written = true;
+    assert!(drops(&mut world));
+}
+
+#[test]
+fn a_partial_result_has_metrics_where_its_phase_shows_them() {
+    for is_shown in [false, true] {
+        let mut world = World::evalai().running();
+        world.in_evalai().shows_partial = is_shown;
+        world.report(report(1));
+        assert!(evalai_updates(&world.pass()).contains(&EvalaiUpdate::Partial { is_shown }));
+    }
+}
+
+#[test]
+fn an_end_is_a_row_and_that_of_a_check_a_trial() {
+    for is_check in [false, true] {
+        let mut world = World::local();
+        world.submission().spec.check = is_check;
+        world.submission().spec.team.take_if(|_| is_check);
+        let mut world = world.running();
+        let updates = |world: &mut World| -> Vec<TableUpdate> {
+            let actions = world.pass().actions.into_iter();
+            let of = |action| match action {
+                Action::Record(update) => Some(update),
+                _ => None,
+            };
+            actions.filter_map(of).collect()
+        };
+        let live: &[_] = if is_check { &[] } else { &[TableUpdate::Progress] };
+        assert_eq!(updates(&mut world), live);
+        world.submission().spec.cancel = true;
+        world.pass();
+        world.complete();
+        let end = if is_check { TableUpdate::Trial } else { TableUpdate::End };
+        assert_eq!(updates(&mut world), [end]);
+    }
+}
+
+#[test]
+fn a_node_is_asked_for_where_none_are_watched_and_only_for_a_pod_that_runs_or_goes() {
+    let asks = |world: &mut World| has(&world.pass(), |a| *a == Action::LookUpNode("node-a".into()));
+    let mut world = World::local().with_pod();
+    world.view.is_node_watched = false;
+    assert!(!asks(&mut world), "it does not run yet");
+    let mut going = world.clone();
+    going.pod().delete_by = Some(at(700));
+    assert!(asks(&mut going));
+    let mut world = World::local().running();
+    assert!(!asks(&mut world), "a watch shows it");
+    world.view.is_node_watched = false;
+    assert!(asks(&mut world));
+    world.pod().run_ended = Some(at(20));
+    assert!(!asks(&mut world), "it has ended");
+}
+
+#[test]
+fn a_refused_result_that_is_due_again_is_sent_with_texts_that_were_read_anew() {
+    let mut world = World::evalai().running();
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    let texts = std::mem::replace(&mut world.view.texts, ObservedTexts::NotRead);
+    let drops = |plan: &Plan| has(plan, |a| *a == Action::DropTexts);
+    for (is_due, texts, sends) in [
+        (false, texts.clone(), false),
+        (false, ObservedTexts::NotRead, false),
+        (true, ObservedTexts::NotRead, false),
+        (true, texts, true),
+    ] {
+        world.view.texts = texts;
+        world.in_evalai().end = Some(EvalaiEnd::Refused {
+            message: "no".into(),
+            is_due,
+        });
+        let plan = world.pass();
+        assert_eq!(condition(&plan, PUBLISHED).1, reasons::REFUSED, "until EvalAI takes it");
+        let expected: &[_] = if sends { &[EvalaiUpdate::Finished] } else { &[] };
+        assert_eq!(evalai_updates(&plan), expected);
+        let reads = has(&plan, |a| matches!(a, Action::ReadTexts { .. }));
+        assert_eq!(reads, is_due && !sends);
+        assert_eq!(drops(&plan), world.view.texts != ObservedTexts::NotRead);
+    }
+}
