@@ -1,5 +1,6 @@
 //! A submission that has not come to its end: in line, with its Job, without it.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
@@ -11,6 +12,7 @@ use super::{
     stop,
 };
 use crate::controller::submissions::job_spec;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
@@ -172,7 +174,8 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         return draft.requeue_in(left);
     }
     // A report from before this Job was seen is its predecessor's.
-    let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| r.is_verdict());
+    let says = |report: &Arc<ReportDigest>| report.is_verdict() && reported::is_of_present_job(draft, report);
+    let is_verdict = is_read && draft.view.report.ours().is_some_and(says);
     if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
         return end::decide(draft, None);
     }
