@@ -171,6 +171,7 @@ impl ExternalSystems {
 
     /// Drops everything of an object that is gone, or whose end both systems have.
     pub fn gone(&self, key: &ObjectKey) {
+        lock(&self.targets).remove(&key.uid);
         self.hub.forget(key);
         self.recorder.forget(key);
     }
