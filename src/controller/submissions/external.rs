@@ -4,7 +4,6 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
-use jiff::Timestamp;
 use kube::ResourceExt;
 
 use super::archive::ArchiveWorkers;
@@ -265,22 +264,15 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
         read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
-        end: seen
-            .end
-            .as_ref()
-            .filter(|_| present)
-            .map(|end| map_end(end, seen.read_at)),
+        end: seen.end.as_ref().filter(|_| present).map(map_end),
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }
 
-fn map_end(end: &Ended, read_at: Option<Timestamp>) -> EvalaiEnd {
+fn map_end(end: &Ended) -> EvalaiEnd {
     match end {
-        Ended::Published { at, .. } => EvalaiEnd::Published { at: *at },
-        Ended::Agreed(_) => EvalaiEnd::Published {
-            at: read_at.unwrap_or_else(Timestamp::now),
-        },
+        Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Otherwise(status) => EvalaiEnd::Ended {
             status: status.as_str().to_owned(),
         },
