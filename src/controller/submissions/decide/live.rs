@@ -131,17 +131,21 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
 }
 
 fn start_job(draft: &mut PlanBuilder<'_>) {
+    let view = draft.view;
     let name = draft.job_name();
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
     draft.status.job_name = Some(name);
     note_gpus(draft);
     draft.act(Action::CreateJob(draft.status.job_number()));
-    draft.waits(reasons::PREPARING);
-    if draft.is_running() {
+    if let Some(words) = &view.job_refused {
+        start::job_refused(draft, words);
+    } else if draft.is_running() {
+        draft.waits(reasons::PREPARING);
         let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
         start::replacing(draft, message);
     } else {
+        draft.waits(reasons::PREPARING);
         draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
         draft.show(reasons::PREPARING, start::PREPARED);
     }

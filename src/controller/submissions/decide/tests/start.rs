@@ -407,6 +407,31 @@ fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
 }
 
 #[test]
+fn a_job_that_the_api_server_refuses_is_shown_and_tried_again() {
+    let cases = [
+        (
+            "exceeded quota: q, requested: count/jobs.batch=1",
+            reasons::QUOTA_EXCEEDED,
+        ),
+        ("denied by a policy", reasons::POD_REFUSED),
+    ];
+    for (words, reason) in cases {
+        let mut world = World::evalai();
+        world.pass_to(Pending, reasons::PREPARING);
+        world.view.job_refused = Some(words.into());
+        let plan = world.pass_to(Pending, reason);
+        assert!(creates(&plan));
+        assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
+        assert_eq!(condition(&plan, STALLED), ("True".to_owned(), reason.to_owned()));
+        assert!(plan.status.message.unwrap().contains(words));
+        world.view.job_refused = None;
+        world.see_job();
+        world.view.pod = Some(pod(0));
+        world.pass_to(Pending, reasons::PREPARING);
+    }
+}
+
+#[test]
 fn a_job_without_a_pod_is_shown_when_it_lasts() {
     let mut world = World::local().with_job();
     world.go_to(44);
