@@ -38,6 +38,13 @@ impl CallError {
         }
     }
 
+    /// What the API server has answered, if that is no and stays no until somebody changes something: no right, a quota, or a webhook
+    /// or a policy of admission. Not a conflict, and not too many requests.
+    pub fn refusal(&self) -> Option<&Status> {
+        let is_refusal = |code: u16| (400..500).contains(&code) && ![408, 409, 429].contains(&code);
+        self.status().filter(|status| is_refusal(status.code))
+    }
+
     /// Why it failed, without what it was about.
     pub fn cause(&self) -> String {
         match self {
@@ -117,6 +124,23 @@ fn no_answer(limit: &Duration) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn what_a_person_has_to_change_is_a_refusal() {
+        for (code, expected) in [
+            (400, true),
+            (403, true),
+            (422, true),
+            (409, false),
+            (429, false),
+            (500, false),
+        ] {
+            let status = Status::failure("No.", "Reason").with_code(code).boxed();
+            let refused = async { Err::<(), _>(kube::Error::Api(status)) };
+            let error = call("the status", "one", refused).await.unwrap_err();
+            assert_eq!(error.refusal().is_some(), expected, "{code}");
+        }
+    }
 
     #[tokio::test(start_paused = true)]
     async fn a_failure_shows_what_was_called_and_why() {

@@ -180,7 +180,7 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
             "The API server has changed the NetworkPolicy {name} while it was applied. Look for an admission webhook that \
              does so."
         )),
-        Err(error) => match error.status().filter(|status| is_refusal(status.code)) {
+        Err(error) => match error.refusal() {
             Some(status) => Policy::Refused(format!(
                 "The API server refuses the NetworkPolicy {name}: {} Give the operator's role create and patch of \
                  networkpolicies in this namespace, or correct what the admission webhook says; where the cluster has policies \
@@ -193,11 +193,6 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
             )),
         },
     }
-}
-
-/// No right, or a webhook or a policy of admission that refuses; not a conflict, and not too many requests.
-fn is_refusal(code: u16) -> bool {
-    (400..500).contains(&code) && ![408, 409, 429].contains(&code)
 }
 
 /// What was measured last of this generation: by a Pod, as this process has seen it, else by one that is gone, as the condition shows;

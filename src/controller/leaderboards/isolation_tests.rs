@@ -188,20 +188,6 @@ fn a_finding_is_read_from_workspace_alone() {
 }
 
 #[test]
-fn what_a_person_has_to_change_is_a_refusal() {
-    for (code, expected) in [
-        (400, true),
-        (403, true),
-        (422, true),
-        (409, false),
-        (429, false),
-        (500, false),
-    ] {
-        assert_eq!(is_refusal(code), expected, "{code}");
-    }
-}
-
-#[test]
 fn what_the_cache_shows_decides_with_the_answer() {
     let (refused, failed) = (Policy::Refused("no".into()), Policy::NotApplied("no".into()));
     let cases = [

@@ -101,7 +101,12 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     }
     uses.archive
         .demand(&view.submission, &plan.status, view.ended_at(), plan.report);
-    for action in plan.actions {
+    // Last comes what the API server may refuse for as long as a quota is used up: it keeps nothing else from being done.
+    let (creates, others): (Vec<_>, Vec<_>) = plan
+        .actions
+        .into_iter()
+        .partition(|a| matches!(a, Action::CreateJob(_)));
+    for action in others.into_iter().chain(creates) {
         actor.carry_out(action, &plan.status).await?;
     }
     Ok(turn_in)
@@ -301,10 +306,17 @@ impl Actor<'_> {
         match call_within(CREATE_LIMIT, "creating the Job", &name, create).await {
             // Its name is ours alone; whose it is, the next reconcile sees.
             Err(error) if error.is_conflict() => Ok(()),
-            other => {
-                other?;
+            Ok(_) => {
                 self.uses.memory.created_job(self.submission(), name);
                 Ok(())
+            }
+            Err(error) => {
+                // The next reconcile shows it.
+                if let Some(status) = error.refusal() {
+                    let why = one_line(&status.message, LONGEST_NOTE);
+                    self.uses.memory.refused_job(self.submission(), name, why);
+                }
+                Err(error.into())
             }
         }
     }

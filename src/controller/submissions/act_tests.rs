@@ -51,6 +51,36 @@ async fn metrics_after(around: &Surroundings, view: &mut View, status: Submissio
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_job_that_is_refused_keeps_nothing_else_from_being_done_and_is_known_to_the_next_reconcile() {
+    let board = leaderboard("board", "http://127.0.0.1:9");
+    let (submission, _) = with_job("first", &board);
+    let cluster = Cluster {
+        leaderboards: vec![board],
+        submissions: vec![submission.clone()],
+        no_jobs: Some("exceeded quota: q"),
+        ..Cluster::default()
+    };
+    let around = surroundings(cluster, "http://127.0.0.1:9").await;
+    let uses = || around.context.for_observe();
+    let view = observe(uses(), Arc::new(submission.clone()), |_| true);
+    assert_eq!(view.job_refused, None);
+    let status = submission.status.clone().unwrap();
+    let plan = Plan {
+        actions: vec![Action::CreateJob(status.job_number()), Action::AskEvalai],
+        status,
+        events: Vec::new(),
+        report: None,
+        requeue: None,
+    };
+    let failed = act(around.context.for_act(), &view, plan).await;
+    assert!(failed.is_err(), "it is tried again");
+    tokio::time::advance(Duration::from_secs(1)).await;
+    let seen = observe(uses(), Arc::new(submission), |_| true);
+    assert_eq!(seen.job_refused.as_deref(), Some("exceeded quota: q"));
+    assert!(seen.evalai_waited >= Duration::from_secs(1), "it was asked");
+}
+
+#[tokio::test(start_paused = true)]
 async fn each_transition_is_one_line_with_all_that_identifies_it() {
     let (around, view) = bench().await;
     let old = view.submission.status.clone().unwrap();

@@ -4,7 +4,6 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
-use jiff::Timestamp;
 use kube::ResourceExt;
 
 use super::archive::ArchiveWorkers;
@@ -161,6 +160,7 @@ impl ExternalSystems {
 
     /// Drops everything of an object that is gone, or whose end both systems have.
     pub fn gone(&self, key: &ObjectKey) {
+        lock(&self.targets).remove(&key.uid);
         self.hub.forget(key);
         self.recorder.forget(key);
     }
@@ -261,19 +261,16 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
         read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
-        end: seen.end.as_ref().filter(|_| present).map(|end| map_end(end, seen)),
+        end: seen.end.as_ref().filter(|_| present).map(map_end),
         shows_partial: false,
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }
 
-fn map_end(end: &Ended, seen: &SubmissionState) -> EvalaiEnd {
+fn map_end(end: &Ended) -> EvalaiEnd {
     match end {
-        Ended::Published { at, .. } => EvalaiEnd::Published { at: *at },
-        Ended::Agreed(_) => EvalaiEnd::Published {
-            at: seen.read_at.unwrap_or_else(Timestamp::now),
-        },
+        Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Otherwise(status) => EvalaiEnd::Ended {
             status: status.as_str().to_owned(),
         },

@@ -6,6 +6,7 @@ use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
+use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
@@ -101,6 +102,7 @@ async fn bench(state: State) -> Bench {
         addresses: ObservedAddresses::NotAsked,
         turn: Turn::Go,
         job: ObservedJob::Absent,
+        job_refused: None,
         evalai_waited: std::time::Duration::ZERO,
         written_ago: None,
         pod: None,
@@ -223,4 +225,25 @@ fn an_attempt_that_is_asked_for_early_is_not_the_one_that_runs() {
     assert!(map_view(&ended_in_evalai, &submission, None).cancelled);
     submission.status = None;
     assert_eq!(run_of(&submission).attempt, 2);
+}
+
+#[test]
+fn an_end_that_evalai_showed_already_is_published_at_one_moment_whatever_is_read_later() {
+    let (submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    let at = Timestamp::UNIX_EPOCH;
+    let end_after = |seconds: i64| {
+        let seen = SubmissionState {
+            attempt: 1,
+            end: Some(Ended::Agreed {
+                status: Status::Cancelled,
+                at,
+            }),
+            read_at: Timestamp::from_second(seconds).ok(),
+            ..SubmissionState::default()
+        };
+        map_view(&seen, &submission, None).end
+    };
+    for seconds in [0, 10] {
+        assert_eq!(end_after(seconds), Some(EvalaiEnd::Published { at }));
+    }
 }

@@ -30,6 +30,8 @@ struct Entry {
     partial: Option<(i64, u32)>,
     /// The Job that was created last, and when.
     job: Option<(String, Instant)>,
+    /// The Job that the API server refuses to make, and why.
+    refused: Option<Box<(String, String)>>,
     /// Of which attempt EvalAI has been asked whether it is to run, and since when.
     asked: Option<(i64, Instant)>,
     /// When its place may be written, until its status is.
@@ -126,7 +128,22 @@ impl Memory {
 
     /// Remembers a Job that was created.
     pub fn created_job(&self, submission: &Submission, name: String) {
-        lock(&self.entries).entry(uid(submission).into()).or_default().job = Some((name, Instant::now()));
+        let mut entries = lock(&self.entries);
+        let entry = entries.entry(uid(submission).into()).or_default();
+        (entry.job, entry.refused) = (Some((name, Instant::now())), None);
+    }
+
+    /// Remembers why the API server refuses a Job.
+    pub fn refused_job(&self, submission: &Submission, name: String, why: String) {
+        let mut entries = lock(&self.entries);
+        entries.entry(uid(submission).into()).or_default().refused = Some(Box::new((name, why)));
+    }
+
+    /// Why the API server refuses the Job of this name, if it did last.
+    pub fn refusal(&self, submission: &Submission, name: &str) -> Option<String> {
+        let entries = lock(&self.entries);
+        let refused = entries.get(uid(submission))?.refused.as_deref();
+        refused.filter(|(known, _)| known == name).map(|(_, why)| why.clone())
     }
 
     /// Forgets the Job that was created: the cache shows it, or it is being deleted.
@@ -224,6 +241,16 @@ mod tests {
         memory.created_job(&object, "s-1".into());
         memory.forget_job(&object);
         assert!(!memory.awaits_job(&object, "s-1"));
+    }
+
+    #[test]
+    fn a_refusal_is_remembered_until_the_job_is_made() {
+        let (memory, object) = (Memory::default(), object("1", "Preparing"));
+        memory.refused_job(&object, "s-1".into(), "exceeded quota".into());
+        assert_eq!(memory.refusal(&object, "s-1").as_deref(), Some("exceeded quota"));
+        assert_eq!(memory.refusal(&object, "s-2"), None, "another attempt's is another Job");
+        memory.created_job(&object, "s-1".into());
+        assert_eq!(memory.refusal(&object, "s-1"), None);
     }
 
     #[tokio::test(start_paused = true)]

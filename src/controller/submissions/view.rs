@@ -36,6 +36,8 @@ pub struct View {
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
+    /// Why the API server has refused that Job, if it did.
+    pub job_refused: Option<String>,
     pub pod: Option<PodView>,
     pub node: ObservedNode,
     /// The taint that announces that the node is about to be taken away.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use aws_config::{BehaviorVersion, Region};
 use aws_credential_types::Credentials;
-use http::{Method, Request, Response};
+use http::{Method, Request, Response, StatusCode};
 use jiff::Timestamp;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
@@ -63,6 +63,8 @@ pub struct Cluster {
     pub jobs: Vec<Job>,
     pub pods: Vec<Pod>,
     pub policies: Vec<NetworkPolicy>,
+    /// Why the API server makes no Job.
+    pub no_jobs: Option<&'static str>,
 }
 
 /// A request that the API server got.
@@ -106,7 +108,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let (arrived, requests) = mpsc::unbounded_channel();
     let (service, handle) = pair::<Request<Body>, Response<Body>>();
     let known = cluster.submissions.iter().map(|s| (s.name_any(), json!(s))).collect();
-    tokio::spawn(serve(handle, known, arrived));
+    tokio::spawn(serve(handle, known, cluster.no_jobs, arrived));
     let client = Client::new(service, NAMESPACE);
     let (stop, stopped) = Stop::new();
     let tasks = Tasks::new(stopped);
@@ -198,20 +200,32 @@ fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
 async fn serve(
     mut handle: Handle<Request<Body>, Response<Body>>,
     known: HashMap<String, Value>,
+    no_jobs: Option<&'static str>,
     arrived: mpsc::UnboundedSender<Arrived>,
 ) {
     while let Some((request, answer)) = handle.next_request().await {
         let (method, path) = (request.method().clone(), request.uri().path().to_owned());
         let body = request.into_body().collect_bytes().await.unwrap();
         let body: Value = serde_json::from_slice(&body).unwrap_or_default();
-        let reply = reply(&method, &path, body.clone(), &known);
+        let refusal = no_jobs.filter(|_| method == Method::POST && path.ends_with("/jobs"));
+        let (status, reply) = match refusal {
+            Some(why) => (StatusCode::FORBIDDEN, refused(why)),
+            None => (StatusCode::OK, reply(&method, &path, body.clone(), &known)),
+        };
         let at = Instant::now();
         let _ = arrived.send(Arrived { at, method, path, body });
-        answer.send_response(Response::new(Body::from(reply.to_string().into_bytes())));
+        let mut response = Response::new(Body::from(reply.to_string().into_bytes()));
+        *response.status_mut() = status;
+        answer.send_response(response);
     }
 }
 
-/// A write of an object is answered with the object; nothing is ever refused, and nothing is listed.
+fn refused(why: &str) -> Value {
+    let code = StatusCode::FORBIDDEN.as_u16();
+    json!({"apiVersion": "v1", "kind": "Status", "status": "Failure", "message": why, "reason": "Forbidden", "code": code})
+}
+
+/// A write of an object is answered with the object, and nothing is listed.
 fn reply(method: &Method, path: &str, mut body: Value, known: &HashMap<String, Value>) -> Value {
     match *method {
         Method::GET => json!({"apiVersion": "v1", "kind": "List", "metadata": {}, "items": []}),

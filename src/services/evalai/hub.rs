@@ -187,9 +187,13 @@ impl Hub {
         self.with_subject(subject, |queue, now| queue.update(subject, update, now))
     }
 
-    /// The object is gone, or needs no further update. What is on its way is still waited for.
+    /// The object is gone, or needs no further update. What is on its way is still waited for. A Leaderboard may have gone without
+    /// [`Hub::retire`]: somebody took its finalizer away.
     pub fn forget(&self, key: &Key) {
-        self.leave(key, |queue, now| queue.forget(key, now));
+        self.leave(key, |queue, now| {
+            queue.retire(key, now);
+            queue.forget(key, now);
+        });
     }
 
     /// What is known of a submission.

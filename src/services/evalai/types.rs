@@ -195,8 +195,8 @@ pub enum ImageAnswer {
 pub enum Ended {
     /// EvalAI has taken it.
     Published { outcome: Outcome, at: Timestamp },
-    /// EvalAI showed it already; nothing was written.
-    Agreed(Status),
+    /// EvalAI showed it already, when that was first read; nothing was written.
+    Agreed { status: Status, at: Timestamp },
     /// EvalAI has ended the run itself: the outcome becomes Cancelled, nothing was written.
     Otherwise(Status),
     /// EvalAI refuses it, or would file it wrongly. It is retried from time to time, and at once with other results; a cancel

@@ -119,9 +119,10 @@ impl Ledger {
         first.map(|(key, entry)| (key.clone(), entry.newest.clone()))
     }
 
-    /// Takes in what became of a write. True if the view of the object has changed.
+    /// Takes in what became of a write to a table. True if the view of the object has changed.
     pub fn report(
         &mut self,
+        table: &TableId,
         key: &ObjectKey,
         update: &RowUpdate,
         result: Result<Written, TableError>,
@@ -129,7 +130,8 @@ impl Ledger {
     ) -> bool {
         let before = self.view(key);
         self.turns += 1;
-        let Some(entry) = self.entries.get_mut(key) else {
+        // A Leaderboard may have got another table meanwhile, which has nothing of this write.
+        let Some(entry) = self.entries.get_mut(key).filter(|entry| entry.table == *table) else {
             return false;
         };
         let is_newest = entry.newest == *update;
@@ -269,13 +271,13 @@ mod tests {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
         ledger.record(table("t"), &a, update(1, "9/9", true), now);
         assert_eq!(ledger.view(&a), Some(view(1, false, None)));
-        assert!(ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stored), now));
+        assert!(ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stored), now));
         assert_eq!(ledger.view(&a), Some(view(1, true, None)));
         assert_eq!(ledger.next(&table("t")), None);
         assert!(!ledger.record(table("t"), &a, update(1, "9/9", true), now));
         ledger.forget(&a);
         assert_eq!(ledger.view(&a), None);
-        assert!(!ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stored), now));
+        assert!(!ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stored), now));
     }
 
     #[test]
@@ -284,8 +286,20 @@ mod tests {
         ledger.record(table("t"), &a, update(1, "1/9", false), now);
         let (_, first) = ledger.next(&table("t")).unwrap();
         ledger.record(table("t"), &a, update(1, "2/9", false), now);
-        assert!(!ledger.report(&a, &first, Ok(Written::Stored), now));
+        assert!(!ledger.report(&table("t"), &a, &first, Ok(Written::Stored), now));
         assert_eq!(ledger.next(&table("t")).unwrap().1, update(1, "2/9", false));
+    }
+
+    #[test]
+    fn what_a_table_has_taken_is_not_in_the_one_that_the_leaderboard_has_now() {
+        let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
+        ledger.record(table("t"), &a, update(1, "9/9", true), now);
+        let (_, first) = ledger.next(&table("t")).unwrap();
+        assert!(ledger.record(table("u"), &a, update(1, "9/9", true), now));
+        assert!(!ledger.report(&table("t"), &a, &first, Ok(Written::Stored), now));
+        assert_eq!(ledger.view(&a), Some(view(1, false, None)));
+        assert!(!ledger.report(&table("t"), &a, &first, Err(throttled()), now));
+        assert_eq!(ledger.next(&table("u")).unwrap().1, first);
     }
 
     #[test]
@@ -298,7 +312,7 @@ mod tests {
         ledger.record(table("t"), &key("a"), update(1, "2/9", false), now);
         let mut order = Vec::new();
         while let Some((key, update)) = ledger.next(&table("t")) {
-            ledger.report(&key, &update, Ok(Written::Stored), now);
+            ledger.report(&table("t"), &key, &update, Ok(Written::Stored), now);
             order.push(key.name);
         }
         assert_eq!(order, ["c", "a", "b"]);
@@ -309,7 +323,7 @@ mod tests {
         let (mut ledger, now) = (Ledger::default(), Instant::now());
         ledger.record(table("t"), &key("a"), update(1, "1/9", false), now);
         ledger.record(table("t"), &key("b"), update(1, "1/9", false), now);
-        assert!(ledger.report(&key("a"), &update(1, "1/9", false), Err(throttled()), now));
+        assert!(ledger.report(&table("t"), &key("a"), &update(1, "1/9", false), Err(throttled()), now));
         assert_eq!(
             ledger.view(&key("a")),
             Some(view(
@@ -319,9 +333,21 @@ mod tests {
             ))
         );
         assert_eq!(ledger.next(&table("t")).unwrap().0, key("b"));
-        ledger.report(&key("b"), &update(1, "1/9", false), Ok(Written::Stored), now);
+        ledger.report(
+            &table("t"),
+            &key("b"),
+            &update(1, "1/9", false),
+            Ok(Written::Stored),
+            now,
+        );
         assert_eq!(ledger.next(&table("t")).unwrap().0, key("a"));
-        assert!(ledger.report(&key("a"), &update(1, "1/9", false), Ok(Written::Stored), now));
+        assert!(ledger.report(
+            &table("t"),
+            &key("a"),
+            &update(1, "1/9", false),
+            Ok(Written::Stored),
+            now
+        ));
         assert_eq!(ledger.view(&key("a")), Some(view(1, false, None)));
     }
 
@@ -334,13 +360,13 @@ mod tests {
             problem: "is empty: the team is not known".into(),
         };
         ledger.record(table("t"), &a, update(1, "1/9", true), now);
-        ledger.report(&a, &update(1, "1/9", true), Err(refused()), now);
+        ledger.report(&table("t"), &a, &update(1, "1/9", true), Err(refused()), now);
         let error = Some("table t: key team_id is empty: the team is not known");
         assert_eq!(ledger.view(&a), Some(view(1, false, error)));
         assert_eq!(ledger.next(&table("t")), None);
         assert!(!ledger.record(table("t"), &a, update(1, "1/9", true), now));
         assert!(ledger.record(table("t"), &a, update(1, "2/9", true), now));
-        ledger.report(&a, &update(1, "2/9", true), Err(refused()), now);
+        ledger.report(&table("t"), &a, &update(1, "2/9", true), Err(refused()), now);
         assert!(ledger.record(table("t"), &a, update(1, "2/9", true), now + REFUSED));
     }
 
@@ -348,9 +374,9 @@ mod tests {
     fn a_stale_end_is_an_error_and_a_stale_partial_row_is_not() {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
         ledger.record(table("t"), &a, update(1, "1/9", false), now);
-        assert!(!ledger.report(&a, &update(1, "1/9", false), Ok(Written::Stale), now));
+        assert!(!ledger.report(&table("t"), &a, &update(1, "1/9", false), Ok(Written::Stale), now));
         ledger.record(table("t"), &a, update(1, "9/9", true), now);
-        ledger.report(&a, &update(1, "9/9", true), Ok(Written::Stale), now);
+        ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stale), now);
         let error = "table t already holds a later attempt or another end of submission 7; the row is left as it is";
         assert_eq!(ledger.view(&a), Some(view(1, false, Some(error))));
     }

@@ -188,7 +188,11 @@ impl Worker {
             let span = update.log.span();
             span.in_scope(|| tracing::warn!(%error, "the row is not in the table"));
         }
-        if self.shared.ledger().report(&key, &update, result, Instant::now()) {
+        let is_news = self
+            .shared
+            .ledger()
+            .report(&self.id, &key, &update, result, Instant::now());
+        if is_news {
             // Nobody listens any more once the controller has ended.
             let _ = self.shared.wake.send(key);
         }

@@ -61,10 +61,10 @@ reasons! {
              Karpenter says of it.",
             "Add a node, or lower the requests. Without `deadlines.scheduleSeconds` the submission waits without a limit.";
         QUOTA_EXCEEDED = "QuotaExceeded",
-            "The namespace's quota does not allow the Pod.",
-            "Raise the quota, or wait until other Pods end.";
+            "The namespace's quota does not allow the Job or its Pod.",
+            "Raise the quota, or wait until others end.";
         POD_REFUSED = "PodRefused",
-            "The API server refuses the Pod: a LimitRange, Pod Security, or a webhook.",
+            "The API server refuses the Job or its Pod: a LimitRange, Pod Security, or a webhook.",
             "Fix what the message names, in the Leaderboard or in the namespace.";
         IMAGE_PULL = "ImagePull",
             "An image cannot be pulled. The submission fails after `deadlines.startSeconds`: as a participant failure if it is the \

@@ -59,14 +59,19 @@ struct Bucket {
 }
 
 impl Bucket {
+    /// Two Leaderboards that keep their objects there differently have a worker each: what it stores for a run is kept as that run's
+    /// Leaderboard says.
     fn is_of(&self, storage: &Storage) -> bool {
         let Storage {
             bucket,
             region,
             endpoint,
+            kms_key_arn,
+            storage_class,
             ..
         } = &self.storage;
-        (bucket, region, endpoint) == (&storage.bucket, &storage.region, &storage.endpoint)
+        let place = (bucket, region, endpoint) == (&storage.bucket, &storage.region, &storage.endpoint);
+        place && (kms_key_arn, storage_class) == (&storage.kms_key_arn, &storage.storage_class)
     }
 }
 

@@ -198,6 +198,24 @@ async fn a_text_that_is_too_large_is_left_out_at_once_and_reported() {
     assert_eq!(bench.seen().texts, ObservedTexts::NotRead);
 }
 
+#[tokio::test]
+async fn leaderboards_that_keep_their_objects_differently_share_a_bucket_and_no_worker() {
+    let bench = bench().await;
+    let mut other = bench.status();
+    let key = "arn:aws:kms:eu-west-1:123456789012:key/1".to_owned();
+    other.plan.as_mut().unwrap().storage.kms_key_arn = Some(key.clone());
+    let workers = bench.workers();
+    for status in [&bench.status(), &other, &other] {
+        workers.want_fence(&bench.submission, status);
+    }
+    let buckets = lock(&workers.0.buckets);
+    let keys: Vec<_> = buckets
+        .iter()
+        .map(|bucket| bucket.storage.kms_key_arn.clone())
+        .collect();
+    assert_eq!(keys, [None, Some(key)]);
+}
+
 #[tokio::test(start_paused = true)]
 async fn a_worker_ends_when_nobody_uses_its_bucket_and_begins_anew_with_the_next() {
     let around = surroundings(Cluster::default(), "http://127.0.0.1:9").await;

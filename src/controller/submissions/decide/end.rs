@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, clock, crashes, failure, interruption, reading, requeue};
+use super::{allowance, clock, crashes, failure, interruption, reading, reported, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -50,6 +50,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     if let Some(report) = report.filter(|r| r.is_complete() && r.eligible) {
         return finished(draft, report);
     }
+    let report = report.filter(|r| reported::is_of_present_job(draft, r));
     if draft.is_cancelled() {
         let reason = cancel_reason(draft);
         let message = if reason == reasons::ENDED_IN_EVALAI {

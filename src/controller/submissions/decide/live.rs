@@ -1,5 +1,6 @@
 //! A submission that has not come to its end: in line, with its Job, without it.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
@@ -11,6 +12,7 @@ use super::{
     stop,
 };
 use crate::controller::submissions::job_spec;
+use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobView, ObservedJob, PodView, Stage, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
@@ -129,17 +131,21 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
 }
 
 fn start_job(draft: &mut PlanBuilder<'_>) {
+    let view = draft.view;
     let name = draft.job_name();
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
     draft.status.job_name = Some(name);
     note_gpus(draft);
     draft.act(Action::CreateJob(draft.status.job_number()));
-    draft.waits(reasons::PREPARING);
-    if draft.is_running() {
+    if let Some(words) = &view.job_refused {
+        start::job_refused(draft, words);
+    } else if draft.is_running() {
+        draft.waits(reasons::PREPARING);
         let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
         start::replacing(draft, message);
     } else {
+        draft.waits(reasons::PREPARING);
         draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
         draft.show(reasons::PREPARING, start::PREPARED);
     }
@@ -172,7 +178,8 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         return draft.requeue_in(left);
     }
     // A report from before this Job was seen is its predecessor's.
-    let is_verdict = is_read && draft.view.report.ours().is_some_and(|r| r.is_verdict());
+    let says = |report: &Arc<ReportDigest>| report.is_verdict() && reported::is_of_present_job(draft, report);
+    let is_verdict = is_read && draft.view.report.ours().is_some_and(says);
     if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
         return end::decide(draft, None);
     }

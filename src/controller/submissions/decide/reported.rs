@@ -35,6 +35,16 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     note_logs(draft, report);
 }
 
+/// Whether a report can be of the present Job, rather than of one before it whose end is settled: it stays where it is until the present
+/// Job's first round. The Pod decides. Without one, what was stopped is the present Job's only if that is being ended too.
+pub(super) fn is_of_present_job(draft: &PlanBuilder<'_>, report: &ReportDigest) -> bool {
+    draft.is_first_job()
+        || match &draft.view.pod {
+            Some(pod) => pod.uid == report.pod_uid,
+            None => report.stopped.is_none() || draft.is_to_stop(),
+        }
+}
+
 /// Reports that scores do not follow from the infractions, and that they do again.
 fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let (truth, reason, message) = match &report.warning {

@@ -195,13 +195,7 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
         if settles(draft, job) {
             return;
         }
-        let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
-        let (reason, what) = if is_quota {
-            (reasons::QUOTA_EXCEEDED, "The namespace's quota does not allow the Pod")
-        } else {
-            (reasons::POD_REFUSED, "The API server refuses the Pod")
-        };
-        let message = sentence(&format!("{what}: {words}"));
+        let (reason, message) = refused("Pod", words);
         if !is_late(draft, job, reason, &message) {
             draft.stall_with(reason, &message);
             show_wait(draft, reason, &message);
@@ -217,6 +211,30 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
         draft.stall_with(reasons::PREPARING, message);
         show_wait(draft, reasons::PREPARING, message);
     }
+}
+
+/// Shows why the API server does not make the Job; each next try asks it again.
+pub(super) fn job_refused(draft: &mut PlanBuilder<'_>, words: &str) {
+    let (reason, message) = refused("Job", words);
+    draft.stall_with(reason, &message);
+    if draft.is_running() {
+        replacing(draft, &message);
+    } else {
+        draft.condition(conditions::RUNNING, Truth::False, reason, "");
+        draft.show(reason, message);
+    }
+}
+
+/// A reason and what to show of an object that the API server refuses.
+fn refused(what: &str, words: &str) -> (&'static str, String) {
+    let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
+    let (reason, what) = if is_quota {
+        let what = format!("The namespace's quota does not allow the {what}");
+        (reasons::QUOTA_EXCEEDED, what)
+    } else {
+        (reasons::POD_REFUSED, format!("The API server refuses the {what}"))
+    };
+    (reason, sentence(&format!("{what}: {words}")))
 }
 
 /// Shows nothing yet of a Job that is new.

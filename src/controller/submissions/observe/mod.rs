@@ -69,6 +69,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         traces: uses.foreign_runs.observe(&submission),
         other_routes: uses.other_results.observe(&submission),
         addresses: uses.addresses.observe(&submission),
+        job_refused: refusal(uses, &submission, &job),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,
         leaving: node.leaving,
@@ -99,6 +100,13 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
 /// Whether a Job may be made now.
 fn may_create(job: &ObservedJob) -> bool {
     matches!(job, ObservedJob::Absent | ObservedJob::Foreign)
+}
+
+/// Why the API server has refused the Job that is not there.
+fn refusal(uses: Uses<'_>, submission: &Submission, job: &ObservedJob) -> Option<String> {
+    let status = submission.status.as_ref().filter(|_| *job == ObservedJob::Absent)?;
+    uses.memory
+        .refusal(submission, &job_name(&submission.name_any(), status))
 }
 
 /// The Job that the present attempt should have, and its newest Pod.

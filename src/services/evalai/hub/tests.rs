@@ -78,6 +78,22 @@ fn only_a_leaderboard_that_publishes_has_a_publisher() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_leaderboard_that_is_forgotten_is_served_no_more() {
+    let (_stop, signal) = Stop::new();
+    let hub = hub(&Tasks::new(signal), || true);
+    let slow = Target {
+        requests_per_minute: 10,
+        ..target("x")
+    };
+    hub.serve(&key("one"), &slow).unwrap();
+    hub.serve(&key("two"), &target("x")).unwrap();
+    let limit = || hub.usage(&key("two")).unwrap().limit;
+    assert_eq!(limit(), 10, "the lower one of a token's Leaderboards");
+    hub.forget(&key("one"));
+    assert_eq!(limit(), 54);
+}
+
+#[tokio::test(start_paused = true)]
 async fn nothing_is_remembered_of_a_thousand_submissions_that_are_forgotten() {
     let (_stop, signal) = Stop::new();
     let hub = hub(&Tasks::new(signal), || true);

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::poll::Challenge;
+use super::poll::{Challenge, Poll};
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
 use crate::services::evalai::request::{Purpose, Request, SubmissionRef};
@@ -167,6 +167,7 @@ impl Queue {
                 let terms = Terms {
                     may_write,
                     asked_by_list: asked.contains_key(&sub.challenge),
+                    list_fails: self.fails_to_list(sub.challenge),
                     live_by_list: list_of_live(sub).is_some_and(is_listed) || self.is_swept(sub),
                 };
                 self.offer_of(key, sub, now, terms)
@@ -212,6 +213,14 @@ impl Queue {
         }
         counts.retain(|_, (count, _)| *count > ASKED_ONE_BY_ONE);
         counts.into_iter().map(|(id, (_, since))| (id, since)).collect()
+    }
+
+    /// Whether the list of those that wait for acceptance has failed too often to wait for it.
+    fn fails_to_list(&self, challenge: i64) -> bool {
+        let known = self.challenges.get(&challenge);
+        known
+            .and_then(|known| known.lists.get(&Purpose::Accept))
+            .is_some_and(Poll::fails_for_long)
     }
 
     /// Lists of live submissions that hold so many that one request is made for all.
@@ -260,8 +269,14 @@ impl Queue {
             return write;
         }
         if let Some(asked) = &sub.asked {
-            let alone = asked.listed || !terms.asked_by_list;
-            return alone.then(|| (acceptance(asked.since, now), asked.since, false, Step::Get));
+            let priority = if asked.listed || !terms.asked_by_list {
+                Some(acceptance(asked.since, now))
+            } else {
+                // One row that EvalAI breaks down over must not keep all others from being asked for. Ends go first: EvalAI may as
+                // well be away.
+                terms.list_fails.then_some(Priority::Acceptance)
+            };
+            return priority.map(|priority| (priority, asked.since, false, Step::Get));
         }
         let refresh = self.refresh_of(sub, now, terms);
         // A file that is not there must not keep its submission from being read.
@@ -404,6 +419,8 @@ struct Terms {
     may_write: bool,
     /// A list is asked whether it may run.
     asked_by_list: bool,
+    /// That list fails, and goes on failing.
+    list_fails: bool,
     /// A list is asked whether it was ended in a way that changes no status.
     live_by_list: bool,
 }

@@ -292,7 +292,7 @@ impl Sub {
             self.progress = None;
         }
         match self.end_verdict() {
-            Some(End::Done(status)) => self.close(Ended::Agreed(status)),
+            Some(End::Done(status)) => self.close(Ended::Agreed { status, at: now.wall }),
             Some(End::Amend(status)) => self.close(Ended::Otherwise(status)),
             Some(End::Wait) => self.retry_at = now.at + UNCLEAR_PAUSE,
             // A list that brings the row meanwhile does not put the next try off.

@@ -120,6 +120,7 @@ impl World {
                 addresses: ObservedAddresses::NotAsked,
                 turn: Turn::Go,
                 job: ObservedJob::Absent,
+                job_refused: None,
                 pod: None,
                 node: ObservedNode::Unknown,
                 leaving: None,

@@ -202,7 +202,7 @@ fn a_cancel_and_a_complete_result_come_before_an_interruption() {
 
 /// A Job that follows this run, which is stopped and has stored a refused checkpoint; its Pod has a node and has stored nothing yet.
 fn followed(mut world: World, stop: Stop) -> World {
-    world.leaderboard().retries.infrastructure = 1;
+    world.leaderboard().retries.infrastructure = 2;
     world.pass();
     world.wait(20);
     world.complete();
@@ -215,6 +215,8 @@ fn followed(mut world: World, stop: Stop) -> World {
     world.pass_to(Pending, reasons::REPLACING);
     world.view.leaving = None;
     world.job_gone();
+    // One that has failed waits before it is tried again.
+    world.wait(20);
     assert!(creates(&world.pass()));
     world.see_job();
     world.view.pod = Some(PodView {
@@ -229,7 +231,13 @@ fn followed(mut world: World, stop: Stop) -> World {
 fn what_a_stopped_run_has_stored_is_no_verdict_on_the_job_that_follows() {
     let mut requeued = World::evalai().running();
     requeued.requeue(None);
-    for (world, stop) in [(leaving(), Stop::Interruption), (requeued, Stop::Cancel)] {
+    let mut crashed = World::evalai().running();
+    crashed.see_alone(ended("simulator-1", 3, "exited", 1, 100));
+    for (world, stop) in [
+        (leaving(), Stop::Interruption),
+        (requeued, Stop::Cancel),
+        (crashed, Stop::Retries),
+    ] {
         let mut deleted = followed(world, stop);
         let mut ended = deleted.clone();
         deleted.job_gone();

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::builders::*;
+use crate::controller::submissions::decide::EvalaiUpdate;
 use crate::controller::submissions::view::{ScaleUp, Turn};
 use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Failed, Pending};
@@ -143,6 +144,31 @@ fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
         world.pass_to(Pending, reason);
         world.job().failed_create = None;
         world.view.pod = Some(pod(1_000_000));
+        world.pass_to(Pending, reasons::PREPARING);
+    }
+}
+
+#[test]
+fn a_job_that_the_api_server_refuses_is_shown_and_tried_again() {
+    let cases = [
+        (
+            "exceeded quota: q, requested: count/jobs.batch=1",
+            reasons::QUOTA_EXCEEDED,
+        ),
+        ("denied by a policy", reasons::POD_REFUSED),
+    ];
+    for (words, reason) in cases {
+        let mut world = World::evalai();
+        world.pass_to(Pending, reasons::PREPARING);
+        world.view.job_refused = Some(words.into());
+        let plan = world.pass_to(Pending, reason);
+        assert!(creates(&plan));
+        assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
+        assert_eq!(condition(&plan, STALLED), ("True".to_owned(), reason.to_owned()));
+        assert!(plan.status.message.unwrap().contains(words));
+        world.view.job_refused = None;
+        world.see_job();
+        world.view.pod = Some(pod(0));
         world.pass_to(Pending, reasons::PREPARING);
     }
 }

@@ -18,7 +18,21 @@ fn a_cancellation_is_found_by_the_next_list() {
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Cancelled, results(41.0)));
     bench.get(7, row(7, Status::Cancelled));
     bench.expect_nothing();
-    assert_eq!(bench.view(7).end, Some(Ended::Agreed(Status::Cancelled)));
+    let agreed = bench.view(7).end;
+    assert!(matches!(
+        agreed,
+        Some(Ended::Agreed {
+            status: Status::Cancelled,
+            ..
+        })
+    ));
+    // Another's list brings the row again: it is published since the first time.
+    bench.live(8, 1);
+    bench.wait(20.0);
+    let read_at = bench.view(7).read_at;
+    bench.list("list of cancelled", vec![row(7, Status::Cancelled)]);
+    assert!(bench.view(7).read_at > read_at);
+    assert_eq!(bench.view(7).end, agreed);
 }
 
 #[test]
