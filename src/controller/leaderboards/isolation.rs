@@ -317,7 +317,7 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
         reasons::NOT_ENFORCED => WorkspaceReason::NotEnforced,
         _ => return None,
     };
-    let message = known.message.clone();
+    let message = known.message.to_string();
     Some(WorkspaceVerdict { reason, message })
 }
 

@@ -31,9 +31,9 @@ impl Patience {
     /// Takes in what the check shows.
     pub fn observe(&mut self, submission: &Submission, now: Timestamp) {
         let status = submission.status.as_ref();
-        let reason = status.and_then(|status| status.reason.clone());
-        if reason != self.reason {
-            (self.reason, self.since) = (reason, now);
+        let reason = status.and_then(|status| status.reason.as_deref());
+        if reason != self.reason.as_deref() {
+            (self.reason, self.since) = (reason.map(str::to_owned), now);
         }
     }
 
