@@ -1,10 +1,10 @@
 //! The whole table of what an incoming submission means, and races on a mock API server.
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::Value;
 
 use super::*;
-use leaderboard_api::conditions;
+use leaderboard_api::conditions::{self, Condition};
 
 const BOARD: &str = "leaderboard-20";
 
@@ -48,7 +48,7 @@ fn with_state(mut made: Submission, state: State) -> Submission {
         type_: type_.into(),
         status: if is_true { "True" } else { "False" }.into(),
         reason: state.as_str().into(),
-        message: String::new(),
+        message: "".into(),
         observed_generation: None,
         last_transition_time: Time(jiff::Timestamp::UNIX_EPOCH),
     };

@@ -113,6 +113,9 @@ pub trait Parts: Lookup<DynamicType = ()> + Clone + fmt::Debug + Send + Sync + '
     type Status: DeserializeOwned;
 
     fn of(metadata: ObjectMeta, spec: Self::Spec, status: Self::Status) -> Self;
+
+    /// Stores texts once that many objects have.
+    fn share_texts(&mut self, _texts: &mut Texts) {}
 }
 
 impl Parts for Submission {
@@ -130,6 +133,13 @@ impl Parts for Submission {
             }
         }
         submission
+    }
+
+    fn share_texts(&mut self, texts: &mut Texts) {
+        let status = self.status.iter_mut();
+        status
+            .flat_map(SubmissionStatus::shared_texts)
+            .for_each(|text| texts.share(text));
     }
 }
 
@@ -156,6 +166,10 @@ impl<K: Parts> Watchable for K {
 
     fn read<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Result<Self, Malformed>, D::Error> {
         in_parts(deserializer)
+    }
+
+    fn share(&mut self, texts: &mut Texts) {
+        self.share_texts(texts);
     }
 }
 

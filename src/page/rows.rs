@@ -160,7 +160,7 @@ impl Waits {
             // The attempt begins with this condition.
             let began = status.condition(conditions::FINISHED);
             let since = began.map(|c| c.last_transition_time.0).or(created);
-            let waiting = status.waiting.as_ref();
+            let waiting = status.waiting.as_deref();
             let meaning = status.reason.as_deref().and_then(reasons::of);
             let meaning = meaning.map(|reason| reasons::plain(reason.meaning));
             let own = status.message.as_deref().unwrap_or_default();

@@ -39,7 +39,7 @@ async fn until_says(world: &World, reason: &str, part: &str) -> String {
             world.api::<Leaderboard>().get("lb").await
         );
     };
-    condition(found.unwrap().as_ref()).unwrap().message
+    condition(found.unwrap().as_ref()).unwrap().message.into()
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -93,7 +93,7 @@ impl World {
             found.is_some_and(|found| ready(found).is_some())
         });
         let found = timeout(LIMIT, Box::pin(is_so)).await.expect("it is not ready");
-        ready(&found.unwrap().unwrap()).unwrap()
+        ready(&found.unwrap().unwrap()).unwrap().into()
     }
 }
 

@@ -10,11 +10,10 @@ use std::sync::{Arc, Mutex};
 
 use axum::http::{Request, StatusCode};
 use evalai_stand_in::Config;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::Client;
 use kube::api::{Api, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Leaderboard, Submission, conditions};
+use leaderboard_api::{Condition, Leaderboard, Submission, conditions};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};

@@ -105,7 +105,10 @@ impl World {
         };
         let holds = |found: Option<&Leaderboard>| of(found).is_some_and(|c| c.status == status && c.reason == reason);
         let found = timeout(LIMIT, Box::pin(await_condition(self.api(), "lb", holds))).await;
-        of(found.expect("Ready says so").unwrap().as_ref()).unwrap().message
+        of(found.expect("Ready says so").unwrap().as_ref())
+            .unwrap()
+            .message
+            .into()
     }
 }
 

@@ -7,11 +7,10 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::api::rbac::v1::{Role, RoleBinding};
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
+use leaderboard_api::{Condition, Leaderboard, Submission, conditions, reasons};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;
@@ -127,7 +126,7 @@ impl World {
             status.and_then(|s| s.reason.as_deref()) == Some(reasons::NOT_ISOLATED)
         };
         let found = self.until(name, "it waits for the policy", holds).await;
-        found.status.unwrap().message.unwrap()
+        found.status.unwrap().message.unwrap().into()
     }
 
     /// A Pod of this Job whose `workspace` has ended with this message.

@@ -92,7 +92,7 @@ impl World {
         conditions::get(&status.conditions, conditions::READY)
             .unwrap()
             .message
-            .clone()
+            .to_string()
     }
 }
 

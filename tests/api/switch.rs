@@ -213,7 +213,7 @@ async fn read_again(world: &World, round: usize) -> (String, String) {
     let board = taken.expect("it is reconciled").unwrap().unwrap();
     let status = board.status.unwrap();
     let ready = conditions::get(&status.conditions, conditions::READY).unwrap();
-    (ready.reason.clone(), ready.message.clone())
+    (ready.reason.to_string(), ready.message.to_string())
 }
 
 /// Edits until `Ready` shows this reason. Readings count only if they lie further apart than a message stays invisible, which is a

@@ -1,4 +1,4 @@
-//! Many that run on: memory and rest with 1,000 and with 5,000 of them, how fast they are taken in, and a restart with all.
+//! Many that run on: memory and rest with so many of them, how fast they are taken in, and a restart with all.
 
 use std::time::{Duration, Instant};
 
@@ -13,8 +13,6 @@ use crate::player::Pods;
 use crate::record::Figures;
 use crate::world::{Setup, World};
 
-const SIZES: [usize; 2] = [1_000, 5_000];
-const QUICK_SIZES: [usize; 2] = [300, 1_000];
 /// Objects of a page, as in the operator's own lists.
 const PAGE: u32 = 100;
 /// Taken in at once while the number grows.
@@ -25,7 +23,8 @@ const SETTLE: Duration = Duration::from_secs(15);
 const REST: Duration = Duration::from_secs(30);
 const ALL_CAP: Duration = Duration::from_mins(3);
 
-pub async fn measure(bench: &Bench) -> Outcome<Figures> {
+/// Measures with each of these numbers of submissions, the smallest first.
+pub async fn measure(bench: &Bench, sizes: &[usize]) -> Outcome<Figures> {
     let mut figures = Figures::default();
     // Nobody else makes Pods: the Job controller would only share the cores.
     let setup = Setup {
@@ -36,8 +35,8 @@ pub async fn measure(bench: &Bench) -> Outcome<Figures> {
     let mut world = World::start(bench, &setup).await?;
     rest(bench, &world, &mut figures, 0).await?;
     let mut live = 0;
-    for size in if bench.quick { QUICK_SIZES } else { SIZES } {
-        let size = bench.count(size);
+    for size in sizes {
+        let size = bench.count(*size);
         while live < size {
             let next = (live + BLOCK).min(size);
             if !block(&world, &mut figures, live, next).await? {

@@ -38,6 +38,9 @@ pub enum Case {
     BurstRestart,
     /// 1,000 and 5,000 live ones: memory, rest, restart.
     Live,
+    /// 10,000 live ones, which the chart's limit of memory is to hold. Only where it is named, since it takes long.
+    #[value(name = "live-10000")]
+    Live10000,
     /// Whole lives next to many that have ended.
     Ended,
     /// `leaderboard-operator results`.
@@ -50,10 +53,14 @@ pub enum Case {
     StormNodes,
 }
 
-/// All of them, or those that were named.
+/// Those that were named; without a name all but the longest.
 pub fn chosen(named: &[Case]) -> Vec<Case> {
     let all = Case::value_variants().iter().copied();
-    all.filter(|case| named.is_empty() || named.contains(case)).collect()
+    let is_chosen = |case: &Case| match named {
+        [] => *case != Case::Live10000,
+        named => named.contains(case),
+    };
+    all.filter(is_chosen).collect()
 }
 
 impl Case {
@@ -67,6 +74,7 @@ impl Case {
             Self::Burst => "burst",
             Self::BurstRestart => "burst-restart",
             Self::Live => "live",
+            Self::Live10000 => "live-10000",
             Self::Ended => "ended",
             Self::Results => "results",
             Self::StormQuota => "storm-quota",
@@ -84,7 +92,9 @@ impl Case {
             Self::Latency => latency::measure(bench, bodies).await,
             Self::Burst => burst::measure(bench, bodies, false).await,
             Self::BurstRestart => burst::measure(bench, bodies, true).await,
-            Self::Live => live::measure(bench).await,
+            Self::Live if bench.quick => live::measure(bench, &[300, 1_000]).await,
+            Self::Live => live::measure(bench, &[1_000, 5_000]).await,
+            Self::Live10000 => live::measure(bench, &[10_000]).await,
             Self::Ended => ended::measure(bench, bodies).await,
             Self::Results => results::measure(bench),
             Self::StormQuota => storms::measure(bench, storms::Storm::Quota).await,

@@ -126,6 +126,13 @@ const AIMS: &[Aim] = &[
         AtMost(80.0),
     ),
     Aim(
+        "RSS, 10,000 live: the chart's limit",
+        "live-10000",
+        "RSS, MB, 10000 live",
+        "MB",
+        AtMost(134.0),
+    ),
+    Aim(
         "CPU at rest, 5,000 live",
         "live",
         "CPU at rest, % of a core, 5000 live",

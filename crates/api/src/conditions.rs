@@ -2,9 +2,12 @@
 //!
 //! Called by the controller. Pure: the time is handed in.
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::{self, Time};
 use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
+
+use super::SharedText;
 
 /// The submission has a Leaderboard, a track, an image and a place in EvalAI.
 pub const ACCEPTED: &str = "Accepted";
@@ -37,6 +40,31 @@ pub const TERMINATING: &str = "Terminating";
 
 /// Characters of a condition's message, which may hold a stranger's text.
 pub const MAX_MESSAGE: usize = 32_768;
+
+/// A condition as Kubernetes has it. Of thousands of submissions most conditions have the same texts, which are in memory once.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct Condition {
+    pub last_transition_time: Time,
+    #[serde(default)]
+    pub message: SharedText,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub observed_generation: Option<i64>,
+    #[serde(default)]
+    pub reason: SharedText,
+    /// One of `Truth`.
+    #[serde(default)]
+    pub status: SharedText,
+    #[serde(default, rename = "type")]
+    pub type_: SharedText,
+}
+
+impl Condition {
+    /// All its texts.
+    pub fn shared_texts(&mut self) -> [&mut SharedText; 4] {
+        [&mut self.type_, &mut self.status, &mut self.reason, &mut self.message]
+    }
+}
 
 /// The truth of a condition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,29 +101,33 @@ pub fn set(
     generation: Option<i64>,
     now: &Time,
 ) -> bool {
-    let fresh = Condition {
-        type_: type_.into(),
-        status: truth.as_str().into(),
-        reason: reason.into(),
-        message: fitting(message).into(),
-        observed_generation: generation,
-        last_transition_time: now.clone(),
-    };
+    let (status, message) = (truth.as_str(), fitting(message));
     let Some(old) = conditions.iter_mut().find(|c| c.type_ == type_) else {
-        conditions.push(fresh);
+        conditions.push(Condition {
+            type_: type_.into(),
+            status: status.into(),
+            reason: reason.into(),
+            message: message.into(),
+            observed_generation: generation,
+            last_transition_time: now.clone(),
+        });
         return true;
     };
-    let kept = if old.status == fresh.status {
-        old.last_transition_time.clone()
-    } else {
-        now.clone()
-    };
-    let fresh = Condition {
-        last_transition_time: kept,
-        ..fresh
-    };
-    let changed = *old != fresh;
-    *old = fresh;
+    let mut changed = old.observed_generation != generation;
+    old.observed_generation = generation;
+    if old.status != status {
+        old.last_transition_time = now.clone();
+    }
+    for (old, new) in [
+        (&mut old.status, status),
+        (&mut old.reason, reason),
+        (&mut old.message, message),
+    ] {
+        if *old != *new {
+            *old = new.into();
+            changed = true;
+        }
+    }
     changed
 }
 
@@ -125,7 +157,7 @@ pub fn is_true(conditions: &[Condition], type_: &str) -> bool {
 
 /// A list of conditions, one of each type. Kubernetes bounds none of its texts, and a rule may walk only what is bounded.
 pub(super) fn schema(generator: &mut SchemaGenerator) -> Schema {
-    let mut item = Condition::json_schema(generator);
+    let mut item = v1::Condition::json_schema(generator);
     for (field, longest) in [("message", MAX_MESSAGE), ("reason", 64), ("status", 7), ("type", 64)] {
         if let Some(Value::Object(text)) = item.pointer_mut(&format!("/properties/{field}")) {
             text.insert("maxLength".to_owned(), longest.into());
@@ -146,6 +178,23 @@ mod tests {
 
     fn at(second: i64) -> Time {
         Time(jiff::Timestamp::from_second(second).unwrap())
+    }
+
+    #[test]
+    fn a_condition_reads_and_writes_as_kubernetes_own() {
+        for generation in [None, Some(3)] {
+            let theirs = v1::Condition {
+                type_: READY.into(),
+                status: "True".into(),
+                reason: "A".into(),
+                message: "All is well.".into(),
+                observed_generation: generation,
+                last_transition_time: at(7),
+            };
+            let text = serde_json::to_string(&theirs).unwrap();
+            let ours: Condition = serde_json::from_str(&text).unwrap();
+            assert_eq!(serde_json::to_string(&ours).unwrap(), text);
+        }
     }
 
     #[test]

@@ -64,14 +64,14 @@ impl SubmissionStatus {
         let mut status = Self {
             observed_generation: Some(generation),
             attempt: Some(spec.attempt),
-            reason: Some(reason.to_owned()),
-            message: Some(what.to_owned()),
+            reason: Some(reason.into()),
+            message: Some(what.into()),
             team: spec.team.clone().map(TeamStatus::from),
             track: Some(end.track),
             progress: end.progress,
             score: end.score,
             results_url: end.results_url,
-            failure,
+            failure: failure.map(Box::new),
             ..Self::default()
         };
         let ended = end.times.finished.clone().unwrap_or_else(|| now.clone());

@@ -4,14 +4,14 @@
 //! What depends on another field has no schema default: `api::effective` computes it.
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::CustomResource;
 use kube::KubeSchema;
 use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
 use super::check::{CheckImage, LastCheck};
-use super::conditions;
+use super::conditions::{self, Condition};
 use super::evalai_mode::EvalaiMode;
 use super::infrastructure_failures::{MAX_TEAMS, TeamFailures};
 use super::leaderboard_parts::{

@@ -79,7 +79,7 @@ impl LogCollector {
     fn of(set: &DaemonSet) -> Option<Self> {
         let pod = set.spec.as_ref()?.template.spec.as_ref()?;
         let images = pod.containers.iter().filter_map(|container| container.image.as_deref());
-        let product = images.filter_map(Product::of_image).next()?;
+        let product = images.find_map(Product::of_image)?;
         let volumes = pod.volumes.iter().flatten();
         let maps = volumes.filter_map(|volume| Some(volume.config_map.as_ref()?.name.clone()));
         let variables = pod

@@ -38,7 +38,7 @@ pub struct PairStatus {
     pub state: PairState,
     /// How its last container ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub last: Option<LastEnd>,
+    pub last: Option<Box<LastEnd>>,
 }
 
 /// What ended a round of a pair.

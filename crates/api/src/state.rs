@@ -3,9 +3,7 @@
 //!
 //! Called by everyone who reads a status. Pure.
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
-
-use crate::conditions::{self, FINISHED, RUNNING};
+use crate::conditions::{self, Condition, FINISHED, RUNNING};
 use crate::{State, SubmissionStatus, reasons};
 
 impl SubmissionStatus {

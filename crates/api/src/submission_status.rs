@@ -2,11 +2,12 @@
 //!
 //! `state` is for people: it is computed from the conditions and never read back.
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{Condition, Time};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::conditions::Condition;
 use super::gpu::{MAX_NODES_WITHOUT_GPU, NodeWithoutGpu};
 use super::infrastructure_failures::InfrastructureFailures;
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
@@ -15,6 +16,7 @@ use super::progress::{Progress, Score};
 use super::requeue::Requeued;
 use super::route_slice::RouteSlice;
 use super::run_id::RunId;
+use super::shared_text::SharedText;
 use super::submission_use::{Interruptions, Use};
 use super::team::TeamStatus;
 use super::waiting::Waiting;
@@ -71,10 +73,10 @@ pub struct SubmissionStatus {
     pub retry: i32,
     /// Those of them whose node was taken away, which use up no retry.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub interruptions: Option<Interruptions>,
+    pub interruptions: Option<Box<Interruptions>>,
     /// The last request of `spec.requeue` that was carried out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub requeued: Option<Requeued>,
+    pub requeued: Option<Box<Requeued>>,
     /// Times the Job of this attempt had to be created again after somebody deleted it.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub recreated: i32,
@@ -88,14 +90,14 @@ pub struct SubmissionStatus {
     /// Why it stands there, one of `api::reasons`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 64))]
-    pub reason: Option<String>,
+    pub reason: Option<SharedText>,
     /// The same as a sentence.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
-    pub message: Option<String>,
+    pub message: Option<SharedText>,
     /// What holds the submission up at present, and since when.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub blocked_since: Option<BlockedSince>,
+    pub blocked_since: Option<Box<BlockedSince>>,
     /// Who submitted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub team: Option<TeamStatus>,
@@ -125,7 +127,7 @@ pub struct SubmissionStatus {
     pub score: Option<Score>,
     /// Place in line.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub waiting: Option<Waiting>,
+    pub waiting: Option<Box<Waiting>>,
     /// When what happened.
     #[serde(default, skip_serializing_if = "Times::is_empty")]
     pub times: Times,
@@ -148,21 +150,21 @@ pub struct SubmissionStatus {
     pub nodes_without_gpu: Vec<NodeWithoutGpu>,
     /// The submission that this one re-runs: EvalAI made a new row for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rerun_of: Option<Rerun>,
+    pub rerun_of: Option<Box<Rerun>>,
     /// The submission that re-runs this one: EvalAI has cancelled this one's result. State, score and the table's row stay.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rerun_as: Option<Rerun>,
+    pub rerun_as: Option<Box<Rerun>>,
     /// Where the results are, `s3://bucket/prefix/id`.
     #[serde(rename = "resultsURL", default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 2048))]
     pub results_url: Option<String>,
     /// What went wrong.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub failure: Option<Failure>,
+    pub failure: Option<Box<Failure>>,
     /// Attempts, since one last finished, that ended because of the infrastructure in ways that an agent can cause as well. A resume
     /// keeps them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub infrastructure_failures: Option<InfrastructureFailures>,
+    pub infrastructure_failures: Option<Box<InfrastructureFailures>>,
     /// What its Jobs have used. A resume keeps it.
     #[serde(rename = "use", default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Use>,
@@ -181,17 +183,38 @@ impl SubmissionStatus {
             let others = [failure.next_step.as_mut(), failure.participant_message.as_mut()];
             others.into_iter().flatten().chain([&mut failure.message])
         });
+        of_failure.for_each(|text| {
+            if let Some(end) = end(text) {
+                text.truncate(end);
+            }
+        });
         let of_conditions = self.conditions.iter_mut().map(|condition| &mut condition.message);
-        for text in self.message.iter_mut().chain(of_failure).chain(of_conditions) {
-            cut(text, MAX_MESSAGE);
+        for text in self.message.iter_mut().chain(of_conditions) {
+            if let Some(end) = end(text) {
+                *text = text[..end].into();
+            }
         }
+    }
+
+    /// All texts that other submissions are likely to have as well.
+    pub fn shared_texts(&mut self) -> impl Iterator<Item = &mut SharedText> {
+        let of_plan = self.plan.iter_mut().flat_map(|plan| {
+            [
+                &mut plan.track,
+                &mut plan.codename,
+                &mut plan.contents_image,
+                &mut plan.simulator_image,
+            ]
+        });
+        let of_conditions = self.conditions.iter_mut().flat_map(Condition::shared_texts);
+        let own = [self.reason.as_mut(), self.message.as_mut()];
+        own.into_iter().flatten().chain(of_plan).chain(of_conditions)
     }
 }
 
-fn cut(text: &mut String, longest: usize) {
-    if let Some((end, _)) = text.char_indices().nth(longest) {
-        text.truncate(end);
-    }
+/// Where a text ends that is too long.
+fn end(text: &str) -> Option<usize> {
+    text.char_indices().nth(MAX_MESSAGE).map(|(end, _)| end)
 }
 
 /// What a run consists of, pinned when the submission is first accepted, so that an edited Leaderboard leaves it alone.
@@ -205,10 +228,10 @@ pub struct RunPlan {
     pub leaderboard_version: LeaderboardVersion,
     /// Name of the track.
     #[schemars(length(max = 32))]
-    pub track: String,
+    pub track: SharedText,
     /// CHALLENGE_TRACK_CODENAME.
     #[schemars(length(max = 64))]
-    pub codename: String,
+    pub codename: SharedText,
     /// EvalAI phase.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<i64>,
@@ -226,10 +249,10 @@ pub struct RunPlan {
     pub image: String,
     /// Image of the contents, renewed by each attempt.
     #[schemars(length(max = 512))]
-    pub contents_image: String,
+    pub contents_image: SharedText,
     /// Image of the simulator, renewed by each attempt.
     #[schemars(length(max = 512))]
-    pub simulator_image: String,
+    pub simulator_image: SharedText,
     /// True if the stored results of an earlier run are taken up.
     #[serde(default)]
     pub resume: bool,
@@ -366,7 +389,7 @@ mod tests {
     fn texts_of_strangers_are_cut_to_what_the_definition_allows() {
         let long = "é".repeat(MAX_MESSAGE + 1);
         let mut status = SubmissionStatus {
-            message: Some(long.clone()),
+            message: Some(long.as_str().into()),
             ..SubmissionStatus::default()
         };
         status.fit();

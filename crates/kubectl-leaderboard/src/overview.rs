@@ -5,7 +5,6 @@
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::ResourceExt;
 use serde_json::Value;
 
@@ -14,7 +13,7 @@ use super::facts;
 use super::table::table;
 use super::text::{Frame, clean, join, span, wrap};
 use super::why;
-use leaderboard_api::conditions;
+use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 
 /// How long an end may wait for another system before that is a problem.

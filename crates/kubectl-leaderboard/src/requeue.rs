@@ -212,7 +212,10 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
         one.name_any(),
         facts::team(one).unwrap_or_default(),
         status.and_then(facts::state).map_or("", State::as_str).to_owned(),
-        status.and_then(|status| status.reason.clone()).unwrap_or_default(),
+        status
+            .and_then(|status| status.reason.as_deref())
+            .unwrap_or_default()
+            .to_owned(),
         charged.to_owned(),
         since.unwrap_or_default(),
         status.and_then(|status| status.node_name.clone()).unwrap_or_default(),

@@ -57,7 +57,7 @@ impl Waiting {
         let state = status.state_of_conditions();
         let is_over = conditions::is_true(&status.conditions, conditions::FINISHED);
         let end = is_over.then_some(state);
-        let reason = status.reason.clone().unwrap_or_default();
+        let reason = status.reason.as_deref().unwrap_or_default().to_owned();
         if self.last.as_ref() == Some(&(state, reason.clone())) {
             return Update { end, ..nothing };
         }

@@ -69,7 +69,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
 
 fn reason(plan: &LeaderboardPlan) -> (String, String) {
     let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
-    (condition.status.clone(), condition.reason.clone())
+    (condition.status.to_string(), condition.reason.to_string())
 }
 
 #[test]

@@ -319,7 +319,7 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
         reasons::NOT_ENFORCED => WorkspaceReason::NotEnforced,
         _ => return None,
     };
-    Some(WorkspaceVerdict::new(reason, known.message.clone()))
+    Some(WorkspaceVerdict::new(reason, known.message.to_string()))
 }
 
 fn shown(found: WorkspaceReason) -> (Truth, &'static str) {

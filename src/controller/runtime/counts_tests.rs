@@ -108,7 +108,7 @@ fn in_state(state: State, reason: Option<&str>, class: Option<&str>) -> Submissi
     let status = one.status.as_mut().unwrap();
     // What is for people is read by nobody.
     status.state = Some(State::Resumed);
-    status.reason = reason.map(str::to_owned);
+    status.reason = reason.map(Into::into);
     status.failure = serde_json::from_value(json!(failure)).unwrap();
     one
 }

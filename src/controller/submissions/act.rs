@@ -35,6 +35,7 @@ use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use crate::observability::metrics::{FailedAttempt, Metrics};
 use crate::observability::traces::Traces;
 use crate::pod::run::Stop;
+use leaderboard_api::conditions::Condition;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, names, reasons};
 
@@ -228,7 +229,7 @@ impl Actor<'_> {
             attempt = new.attempt,
             from = old.map_or("none", |status| status.state_of_conditions().as_str()),
             to = new.state_of_conditions().as_str(),
-            reason = new.reason,
+            reason = new.reason.as_deref(),
             "{}",
             new.message.as_deref().unwrap_or("the submission's state has changed")
         );

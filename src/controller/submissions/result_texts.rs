@@ -109,7 +109,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         team_name: team.name.clone().unwrap_or_default(),
         submission_status: table_status(status.state_of_conditions()).to_owned(),
         track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
-        track_name: plan.codename.clone(),
+        track_name: plan.codename.to_string(),
         submitted_image_uri: plan.image.clone(),
         submitted_time: text(status.times.submitted.as_ref()),
         start_time: text(status.times.started.as_ref()),

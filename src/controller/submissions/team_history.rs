@@ -313,7 +313,7 @@ fn gpu_seconds(submission: &Submission) -> i64 {
 }
 
 fn failures(submission: &Submission) -> Option<&InfrastructureFailures> {
-    submission.status.as_ref()?.infrastructure_failures.as_ref()
+    submission.status.as_ref()?.infrastructure_failures.as_deref()
 }
 
 fn number(failures: &InfrastructureFailures) -> usize {

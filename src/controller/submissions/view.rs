@@ -15,7 +15,7 @@ use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
-use leaderboard_api::{JobNumber, Leaderboard, Rerun, Submission, names};
+use leaderboard_api::{JobNumber, Leaderboard, Rerun, SharedText, Submission, names};
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]
@@ -205,7 +205,7 @@ pub enum ScaleUp {
 /// One container of the Pod.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ContainerView {
-    pub name: String,
+    pub name: SharedText,
     pub restarts: i32,
     pub running: bool,
     /// When its present life began, while it runs.
@@ -262,7 +262,7 @@ pub enum Stage {
 pub struct ReportDemand {
     pub job: JobNumber,
     /// UID of the Pod.
-    pub pod: Option<String>,
+    pub pod: Option<SharedText>,
     pub stage: Stage,
     /// How often the report of a live run is read.
     pub period: Duration,

@@ -150,6 +150,16 @@ fn an_object_takes_little_in_a_cache() {
     assert!(submission < 6_000, "a Submission takes {submission} bytes");
 }
 
+#[test]
+fn submissions_have_one_copy_of_the_texts_of_their_conditions() {
+    let read = page::<Submission>(&mut Texts::default(), &text(submission));
+    let conditions = |submission: &Submission| submission.status.clone().unwrap().conditions;
+    for (mut one, mut other) in conditions(&read[0]).into_iter().zip(conditions(&read[1])) {
+        let texts = one.shared_texts().into_iter().zip(other.shared_texts());
+        assert!(texts.into_iter().all(|(one, other)| one.is_copy_of(other)));
+    }
+}
+
 /// `cargo test --release -- --ignored --nocapture what_5000` prints the memory of the process.
 #[test]
 #[ignore = "prints figures of this machine"]

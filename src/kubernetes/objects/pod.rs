@@ -75,12 +75,23 @@ pub struct ContainerStatus {
     pub last_ended: Option<Box<Ended>>,
 }
 
+/// What a container does: one of the three that Kubernetes has.
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(from = "States")]
+pub enum ContainerState {
+    #[default]
+    Unknown,
+    Running(Running),
+    Waiting(Box<Waiting>),
+    Ended(Box<Ended>),
+}
+
+#[derive(Deserialize, Default)]
 #[serde(default)]
-pub struct ContainerState {
-    pub running: Option<Running>,
-    pub waiting: Option<Box<Waiting>>,
-    pub terminated: Option<Box<Ended>>,
+struct States {
+    running: Option<Running>,
+    waiting: Option<Box<Waiting>>,
+    terminated: Option<Box<Ended>>,
 }
 
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
@@ -132,7 +143,39 @@ pub(super) fn of_type<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
 }
 
 fn ended<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<Ended>>, D::Error> {
-    ContainerState::deserialize(deserializer).map(|state| state.terminated)
+    States::deserialize(deserializer).map(|states| states.terminated)
+}
+
+impl From<States> for ContainerState {
+    fn from(states: States) -> Self {
+        let ended = states.terminated.map(Self::Ended);
+        let running = || states.running.map(Self::Running);
+        let waiting = || states.waiting.map(Self::Waiting);
+        ended.or_else(running).or_else(waiting).unwrap_or_default()
+    }
+}
+
+impl ContainerState {
+    pub fn running(&self) -> Option<&Running> {
+        match self {
+            Self::Running(running) => Some(running),
+            _ => None,
+        }
+    }
+
+    pub fn waiting(&self) -> Option<&Waiting> {
+        match self {
+            Self::Waiting(waiting) => Some(waiting),
+            _ => None,
+        }
+    }
+
+    pub fn ended(&self) -> Option<&Ended> {
+        match self {
+            Self::Ended(ended) => Some(ended),
+            _ => None,
+        }
+    }
 }
 
 impl PodStatus {
@@ -145,7 +188,7 @@ impl PodStatus {
 impl ContainerStatus {
     /// How it ended last.
     pub fn ended(&self) -> Option<&Ended> {
-        self.state.terminated.as_deref().or(self.last_ended.as_deref())
+        self.state.ended().or(self.last_ended.as_deref())
     }
 }
 
@@ -170,15 +213,13 @@ impl Pod {
         let all = [&mut status.init_container_statuses, &mut status.container_statuses];
         for container in all.into_iter().flat_map(|containers| containers.iter_mut()) {
             shared.push(&mut container.name);
-            shared.extend(
-                container
-                    .state
-                    .waiting
-                    .iter_mut()
-                    .filter_map(|waiting| waiting.reason.as_mut()),
-            );
-            let ends = [&mut container.state.terminated, &mut container.last_ended];
-            shared.extend(ends.into_iter().flatten().filter_map(|ended| ended.reason.as_mut()));
+            shared.extend(match &mut container.state {
+                ContainerState::Waiting(waiting) => waiting.reason.as_mut(),
+                ContainerState::Ended(ended) => ended.reason.as_mut(),
+                _ => None,
+            });
+            let last = container.last_ended.iter_mut();
+            shared.extend(last.filter_map(|ended| ended.reason.as_mut()));
         }
         for text in shared {
             texts.share(text);

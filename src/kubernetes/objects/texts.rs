@@ -2,63 +2,14 @@
 
 use std::collections::HashSet;
 use std::fmt;
-use std::ops::Deref;
-use std::sync::Arc;
 
-use serde::de::{Deserialize, Deserializer, Error, Visitor};
+pub use leaderboard_api::SharedText as Text;
+use serde::de::{Deserializer, Error, Visitor};
 
 /// Texts that are kept at least, whether or not an object still has them.
 const KEPT: usize = 256;
 /// Bytes that are kept of a free text: more than any verdict of ours has, and than anybody is shown.
 const LONGEST_TEXT: usize = 1024;
-
-/// A text that may be shared.
-#[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Text(Arc<str>);
-
-impl Deref for Text {
-    type Target = str;
-
-    fn deref(&self) -> &str {
-        &self.0
-    }
-}
-
-impl Default for Text {
-    fn default() -> Self {
-        Self::from("")
-    }
-}
-
-impl From<&str> for Text {
-    fn from(text: &str) -> Self {
-        Self(text.into())
-    }
-}
-
-impl fmt::Debug for Text {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        fmt::Debug::fmt(&*self.0, f)
-    }
-}
-
-impl<'de> Deserialize<'de> for Text {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct OfText;
-        impl Visitor<'_> for OfText {
-            type Value = Text;
-
-            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("a text")
-            }
-
-            fn visit_str<E: Error>(self, text: &str) -> Result<Text, E> {
-                Ok(text.into())
-            }
-        }
-        deserializer.deserialize_str(OfText)
-    }
-}
 
 /// The texts of one cache, each once.
 #[derive(Debug)]
@@ -85,7 +36,7 @@ impl Texts {
             return;
         }
         if self.known.len() >= self.limit {
-            self.known.retain(|known| Arc::strong_count(&known.0) > 1);
+            self.known.retain(Text::has_copies);
             self.limit = KEPT.max(self.known.len().saturating_mul(2));
         }
         self.known.insert(text.clone());
@@ -131,14 +82,14 @@ mod tests {
         let (mut one, mut two) = (Text::from("node-1"), Text::from("node-1"));
         texts.share(&mut one);
         texts.share(&mut two);
-        assert!(Arc::ptr_eq(&one.0, &two.0));
+        assert!(one.is_copy_of(&two));
         for number in 0..10_000 {
             texts.share(&mut Text::from(format!("node-{number}").as_str()));
         }
         assert!(texts.known.len() <= KEPT, "{}", texts.known.len());
         let mut again = Text::from("node-1");
         texts.share(&mut again);
-        assert!(Arc::ptr_eq(&one.0, &again.0), "still in use");
+        assert!(one.is_copy_of(&again), "still in use");
     }
 
     #[test]

@@ -83,7 +83,7 @@ impl Amazon {
         let mut registries = Registries::new(&aws);
         let mut clients = Clients::new(&aws).unwrap();
         clients.ecr.place = here;
-        registries.clients = Ok(clients);
+        registries.clients = Ok(clients).into();
         let registry = ImageRegistry::start().await;
         registry.push("one", &config(), 1);
         let amazon = Self {
@@ -121,7 +121,7 @@ impl Amazon {
 
     /// The password has been known for so long.
     fn age(&self, age: Duration) {
-        let clients = self.registries.clients.as_ref().unwrap_or_else(|why| panic!("{why}"));
+        let clients = self.registries.clients.get().unwrap().as_ref().unwrap();
         let mut kept = clients.ecr.kept();
         kept.values_mut().for_each(|kept| kept.since -= age);
     }

@@ -10,7 +10,7 @@ mod ecr;
 mod manifest;
 
 use std::collections::HashMap;
-use std::sync::Mutex;
+use std::sync::{Mutex, OnceLock};
 use std::time::Duration;
 
 use reqwest::header::{ACCEPT, AUTHORIZATION, LOCATION, WWW_AUTHENTICATE};
@@ -101,7 +101,8 @@ impl Fault {
 
 /// The way to all registries.
 pub struct Registries {
-    clients: Result<Clients, String>,
+    /// Made for the first image: each has a copy of the machine's certificates.
+    clients: OnceLock<Result<Clients, String>>,
     aws: Aws,
     left_alone: Mutex<HashMap<String, (Instant, String)>>,
 }
@@ -115,7 +116,7 @@ struct Clients {
 impl Registries {
     pub fn new(aws: &Aws) -> Self {
         Self {
-            clients: Clients::new(aws).map_err(|error| format!("no HTTP client could be made: {error}")),
+            clients: OnceLock::new(),
             aws: aws.clone(),
             left_alone: Mutex::default(),
         }
@@ -154,7 +155,9 @@ impl Registries {
     }
 
     async fn ask(&self, image: &Image, credentials: Option<Credentials>) -> Result<Facts, Fault> {
-        let clients = self.clients.as_ref().map_err(|why| Fault::Unreachable(why.clone()))?;
+        let make = || Clients::new(&self.aws).map_err(|error| format!("no HTTP client could be made: {error}"));
+        let clients = self.clients.get_or_init(make).as_ref();
+        let clients = clients.map_err(|why| Fault::Unreachable(why.clone()))?;
         let is_ecrs = credentials.is_none() && clients.ecr.is_ecr(&image.registry);
         let answer = Session::new(clients, image, credentials).await?.facts().await;
         // A password may end early, with the role that fetched it for example.

@@ -39,9 +39,9 @@ impl Patience {
     /// Takes in what the check shows.
     pub fn observe(&mut self, submission: &Submission, now: Timestamp) {
         let status = submission.status.as_ref();
-        let reason = status.and_then(|status| status.reason.clone());
-        if reason != self.reason {
-            (self.reason, self.since) = (reason, now);
+        let reason = status.and_then(|status| status.reason.as_deref());
+        if reason != self.reason.as_deref() {
+            (self.reason, self.since) = (reason.map(str::to_owned), now);
         }
         let has_ended = status.is_some_and(SubmissionStatus::has_ended);
         self.ended = has_ended.then(|| self.ended.unwrap_or(now));

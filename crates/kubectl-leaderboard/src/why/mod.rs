@@ -6,7 +6,6 @@
 mod next;
 
 use jiff::Timestamp;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 use kube::ResourceExt;
 use serde_json::{Value, json};
 
@@ -15,7 +14,7 @@ use super::board::{self, Observed};
 use super::bucket;
 use super::facts::{class, command, has_ended, headline, is_attempt_requested, state, track};
 use super::text::{Frame, Page, join, span, when};
-use leaderboard_api::conditions;
+use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{EndReason, LastEnd, PairStatus, Rerun, Submission, SubmissionStatus, reasons};
@@ -329,7 +328,7 @@ fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
         count => format!(", crashed {count} times"),
     };
     let is_known = |last: &&LastEnd| ![EndReason::Unseen, EndReason::Unknown].contains(&last.reason);
-    let known = pair.last.as_ref().filter(is_known);
+    let known = pair.last.as_deref().filter(is_known);
     let last = known.map(|last| {
         let code = last.exit_code.map(|code| format!(" (exit code {code})"));
         let ago = last.time.as_ref().map(|time| {

@@ -26,7 +26,7 @@ pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, lea
     reasons.extend(problems.iter().filter_map(|problem| problem.reason.as_deref()));
     let pair = status.failure.as_ref().and_then(|failure| failure.pair);
     let mut steps: Vec<String> = Vec::new();
-    let next = |reason| next_step(status.failure.as_ref(), reason);
+    let next = |reason| next_step(status.failure.as_deref(), reason);
     for next in reasons.into_iter().filter_map(next).map(|next| of_pair(next, pair)) {
         if !steps.contains(&next) {
             steps.push(next);
@@ -56,7 +56,7 @@ pub(super) fn verb(submission: &Submission, status: &SubmissionStatus) -> Option
     let reason = status.reason.as_deref().unwrap_or_default();
     if has_ended(submission) {
         let is_infrastructure = |f: &Failure| f.class == FailureClass::Infrastructure;
-        let is_resumable = status.failure.as_ref().is_some_and(is_infrastructure);
+        let is_resumable = status.failure.as_deref().is_some_and(is_infrastructure);
         return (is_resumable || reason == reasons::CANCELLED).then_some("resume");
     }
     [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]

@@ -43,7 +43,7 @@ pub fn of_pod(pod: &Pod, is_gone: bool) -> Class {
     let phase = pod.status.phase.as_deref();
     let is_over = phase.is_some_and(|phase| ["Succeeded", "Failed"].contains(&phase));
     let containers = &pod.status.container_statuses;
-    let has_ended = |c: &ContainerStatus| c.state.terminated.is_some();
+    let has_ended = |c: &ContainerStatus| c.state.ended().is_some();
     let all_ended = !containers.is_empty() && containers.iter().all(has_ended);
     let is_deleting = pod.metadata.deletion_timestamp.is_some();
     urgent_or(is_gone || is_over || all_ended || is_deleting, Class::Refresh)

@@ -25,7 +25,7 @@ use tracing::Instrument;
 use super::failure_log::{LogDemand, Tail};
 use super::report_digest::ReportId;
 use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
-use crate::controller::objects::{Wake, log_span_of, uid, uid_of};
+use crate::controller::objects::{Wake, uid};
 use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
@@ -207,25 +207,29 @@ impl ArchiveWorkers {
             .known(uid(submission))
             .filter(|(_, target)| is_same(target))
             .unwrap_or_else(|| {
-                let target = target(submission, plan, ended, now);
-                (uid(submission).into(), Arc::new(target))
+                let uid = Uid::from(uid(submission));
+                let target = target(submission, &uid, plan, ended, now);
+                (uid, Arc::new(target))
             });
         change(&mut state, &uid, &target, now);
         bucket.notify.notify_one();
     }
 }
 
-fn target(submission: &Submission, plan: &RunPlan, ended: Option<Timestamp>, now: Instant) -> Target {
+fn target(submission: &Submission, uid: &Uid, plan: &RunPlan, ended: Option<Timestamp>, now: Instant) -> Target {
     let age = ended.map(|at| Timestamp::now().duration_since(at));
     let age = age.map(|age| Duration::try_from(age).unwrap_or_default());
     Target {
-        namespace: submission.namespace().unwrap_or_default(),
-        name: submission.name_any(),
-        prefix: effective::key_prefix(&plan.storage, &plan.run_id),
-        submission_uid: plan.submission_uid.clone().unwrap_or_else(|| uid_of(submission)),
+        namespace: submission.namespace().unwrap_or_default().into(),
+        name: submission.name_any().into(),
+        leaderboard: submission.spec.leaderboard_name.as_str().into(),
+        prefix: effective::key_prefix(&plan.storage, &plan.run_id).into(),
+        submission_uid: match plan.submission_uid.as_deref() {
+            Some(other) if *other != **uid => other.into(),
+            _ => Arc::clone(uid),
+        },
         attempt: submission.present_attempt(),
         ended: age.map(|age| now.checked_sub(age).unwrap_or(now)),
-        log: log_span_of(submission),
     }
 }
 
@@ -291,9 +295,9 @@ impl ArchiveWorker {
     }
 
     async fn done(&self, work: Work) -> (Work, Done) {
-        let archive = self.archive.at_prefix(work.target.prefix.as_str());
+        let archive = self.archive.at_prefix(&*work.target.prefix);
         let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work);
-        let done = done.instrument(work.target.log.span()).await;
+        let done = done.instrument(work.span()).await;
         (work, done)
     }
 

@@ -1,17 +1,16 @@
 //! In which order ends are read.
 
 use super::*;
-use crate::observability::about::LogSpan;
 
 fn ended(before: Duration, now: Instant) -> Arc<Target> {
     Arc::new(Target {
         namespace: "one".into(),
         name: "sub".into(),
+        leaderboard: "carla".into(),
         prefix: "7/".into(),
         submission_uid: "u".into(),
         attempt: 1,
         ended: now.checked_sub(before),
-        log: LogSpan::default(),
     })
 }
 

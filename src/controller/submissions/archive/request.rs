@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::Instant;
+use tracing::Span;
 
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
-use crate::observability::about::LogSpan;
+use crate::observability::about;
 use leaderboard_api::JobNumber;
 
 pub(super) type Uid = Arc<str>;
@@ -30,17 +31,16 @@ pub(super) const LIMITS: [usize; 5] = [16, 32, 8, 4, 32];
 /// Where a run's files are, and which object they belong to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Target {
-    pub namespace: String,
-    pub name: String,
+    pub namespace: Box<str>,
+    pub name: Box<str>,
+    pub leaderboard: Box<str>,
     /// Key prefix of the run in the bucket, with the final slash.
-    pub prefix: String,
+    pub prefix: Box<str>,
     /// UID that its reports name.
-    pub submission_uid: String,
+    pub submission_uid: Uid,
     pub attempt: i64,
     /// When its run ended: of several that have, the oldest end is read first. None: it goes on.
     pub ended: Option<Instant>,
-    /// For the log.
-    pub log: LogSpan,
 }
 
 impl Target {
@@ -77,6 +77,20 @@ pub(super) enum What {
         demand: LogDemand,
         tail: Option<Tail>,
     },
+}
+
+impl Work {
+    /// What its log lines are written in.
+    pub(super) fn span(&self) -> Span {
+        let Target {
+            namespace,
+            name,
+            leaderboard,
+            attempt,
+            ..
+        } = &*self.target;
+        about::submission(format_args!("{namespace}/{name}"), leaderboard, *attempt, &self.uid)
+    }
 }
 
 /// What was known when a read was sent.

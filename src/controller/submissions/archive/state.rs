@@ -81,7 +81,9 @@ impl State {
         if known.of.as_ref().is_some_and(|of| of.stage > demand.stage) {
             known.of = None;
         }
-        known.wanted = demand;
+        if known.wanted != demand {
+            known.wanted = demand;
+        }
         if !known.is_under_way {
             self.plan_read(uid, now);
         }

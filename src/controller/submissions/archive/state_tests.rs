@@ -4,7 +4,6 @@ use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{LogAt, LogPlace, Texts};
-use crate::observability::about::LogSpan;
 
 struct Bench {
     state: State,
@@ -50,11 +49,11 @@ impl Bench {
             target: Arc::new(Target {
                 namespace: "one".into(),
                 name: "sub".into(),
+                leaderboard: "carla".into(),
                 prefix: "7/".into(),
                 submission_uid: "u".into(),
                 attempt: 1,
                 ended: None,
-                log: LogSpan::default(),
             }),
         }
     }

@@ -87,7 +87,7 @@ fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
     let known = draft.status.condition(conditions::ACCEPTED);
     let known = known
         .filter(|c| c.reason == reasons::RESTORED)
-        .map(|c| c.message.clone());
+        .map(|c| c.message.to_string());
     let (reason, note) = match (unpinned, known.or_else(|| stored::note(draft))) {
         (Some(note), _) => (reasons::IMAGE_NOT_PINNED, note),
         (None, Some(note)) => (reasons::RESTORED, note),

@@ -181,13 +181,13 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
         rerun.submission_name
     );
     let ended = draft.status.message.take().unwrap_or_default();
-    draft.status.message = Some(format!("{ended} {message}").trim_start().to_owned());
+    draft.status.message = Some(format!("{ended} {message}").trim_start().into());
     if let Some(published) = draft.status.condition(conditions::PUBLISHED).cloned() {
         let truth = Truth::from(published.status == "True");
         draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
     }
     draft.event(false, reasons::RERUN_IN_EVALAI, message);
-    draft.status.rerun_as = Some(rerun);
+    draft.status.rerun_as = Some(Box::new(rerun));
     record_again(draft)
 }
 
@@ -323,7 +323,7 @@ pub fn previous_controller(until: Timestamp) -> String {
 /// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
 fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     const BEGINS: &str = "The stored result cannot be read:";
-    let known = draft.status.condition(type_).map(|c| c.message.clone());
+    let known = draft.status.condition(type_).map(|c| c.message.to_string());
     let known = known.filter(|message| message.starts_with(BEGINS));
     known.unwrap_or_else(|| {
         format!(

@@ -70,15 +70,16 @@ fn is_charged(draft: &PlanBuilder<'_>) -> bool {
 fn note(draft: &mut PlanBuilder<'_>) {
     let now = Time(draft.now());
     let node = draft.status.node_name.clone();
+    let none = || InfrastructureFailures {
+        number: 0,
+        first_time: now.clone(),
+        last_time: now.clone(),
+        nodes: Vec::new(),
+    };
     let known = draft
         .status
         .infrastructure_failures
-        .get_or_insert_with(|| InfrastructureFailures {
-            number: 0,
-            first_time: now.clone(),
-            last_time: now.clone(),
-            nodes: Vec::new(),
-        });
+        .get_or_insert_with(|| Box::new(none()));
     known.number = known.number.saturating_add(1);
     known.last_time = now;
     let is_new = |node: &String| !known.nodes.contains(node);

@@ -28,11 +28,11 @@ pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp)
     }
     for pair in &mut status.pairs {
         if let Some(crash) = last_crash(pod, pair.id, now) {
-            pair.last = Some(LastEnd {
+            pair.last = Some(Box::new(LastEnd {
                 reason: crash.cause,
                 exit_code: Some(crash.exit_code),
                 time: crash.at.map(Time),
-            });
+            }));
         }
     }
 }

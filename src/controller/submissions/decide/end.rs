@@ -67,7 +67,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     }
     let recorded = draft.status.failure.clone();
     let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
-    let found = recorded.unwrap_or_else(|| cause(draft, report, job_end));
+    let found = recorded.map_or_else(|| cause(draft, report, job_end), |found| *found);
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
     }
@@ -259,7 +259,7 @@ fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
 pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
     let found = failure::at_the_end(found);
     let (reason, message) = (found.reason.clone(), found.message.clone());
-    draft.status.failure = Some(found);
+    draft.status.failure = Some(Box::new(found));
     close(draft, &reason, &message);
 }
 

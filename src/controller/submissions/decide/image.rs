@@ -85,7 +85,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec,
         .condition(conditions::ACCEPTED)
         .filter(|c| c.status == "True");
     if let Some(known) = known {
-        let note = (known.reason == reasons::IMAGE_NOT_PINNED).then(|| known.message.clone());
+        let note = (known.reason == reasons::IMAGE_NOT_PINNED).then(|| known.message.to_string());
         return Step::Go(note);
     }
     let has_run = draft.status.image.is_some() || draft.status.job_name.is_some() || draft.status.retry > 0;

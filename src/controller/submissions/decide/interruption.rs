@@ -66,11 +66,12 @@ pub(super) fn other_failures(status: &SubmissionStatus) -> i32 {
 pub(super) fn note(draft: &mut PlanBuilder<'_>) {
     let now = Time(draft.now());
     let node = draft.status.node_name.clone();
-    let known = draft.status.interruptions.get_or_insert_with(|| Interruptions {
+    let none = || Interruptions {
         number: 0,
         last_time: now.clone(),
         nodes: Vec::new(),
-    });
+    };
+    let known = draft.status.interruptions.get_or_insert_with(|| Box::new(none()));
     known.number = known.number.saturating_add(1);
     known.last_time = now;
     let Some(node) = node else { return };

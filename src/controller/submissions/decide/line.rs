@@ -41,7 +41,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> Step {
             "The Leaderboard is paused; it starts again with paused: false.",
         ),
     };
-    draft.status.waiting = Some(Waiting::new(position, eta));
+    draft.status.waiting = Some(Box::new(Waiting::new(position, eta)));
     draft.waits(reason);
     draft.show(reason, message);
     // Its priority may have been edited since.
@@ -69,6 +69,10 @@ fn join(draft: &mut PlanBuilder<'_>) {
 
 /// The wait that is shown of this place. One that is only estimated anew is not worth a write; it follows the place.
 fn known_eta(draft: &PlanBuilder<'_>, position: i32) -> Option<Eta> {
-    let known = draft.status.waiting.as_ref().filter(|known| known.position == position);
+    let known = draft
+        .status
+        .waiting
+        .as_deref()
+        .filter(|known| known.position == position);
     known.and_then(Waiting::eta)
 }

@@ -109,7 +109,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
 /// Remembers which submission this one re-runs, so that the other learns of it.
 fn note_original(draft: &mut PlanBuilder<'_>) {
     if draft.status.rerun_of.is_none() {
-        draft.status.rerun_of = draft.evalai_info().and_then(|info| info.rerun_of.clone());
+        draft.status.rerun_of = draft.evalai_info().and_then(|info| info.rerun_of.clone()).map(Box::new);
     }
 }
 

@@ -18,8 +18,8 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
         Some(pinned) if draft.status.retry == 0 && draft.status.job_name.is_none() => RunPlan {
             // The same, unless an earlier attempt had none.
             image,
-            contents_image: leaderboard.contents.image.clone(),
-            simulator_image: leaderboard.simulator.image.clone(),
+            contents_image: leaderboard.contents.image.as_str().into(),
+            simulator_image: leaderboard.simulator.image.as_str().into(),
             ..pinned
         },
         Some(pinned) => pinned,

@@ -10,8 +10,8 @@ use super::significance::{self, Change};
 use crate::controller::submissions::view::{EvalaiInfo, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Requeued, Retries, Score, State, Submission,
-    SubmissionSpec, SubmissionStatus, Track, effective, names, reasons,
+    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
+    SubmissionStatus, Track, effective, names, reasons,
 };
 
 /// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
@@ -219,7 +219,10 @@ impl<'a> PlanBuilder<'a> {
             rerun_of: old.rerun_of,
             infrastructure_failures: old.infrastructure_failures,
             // Retries are counted anew.
-            requeued: old.requeued.map(|requeued| Requeued { retries: 0, ..requeued }),
+            requeued: old.requeued.map(|mut requeued| {
+                requeued.retries = 0;
+                requeued
+            }),
             usage: old.usage,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,
@@ -304,10 +307,11 @@ impl<'a> PlanBuilder<'a> {
         // A later time is that of a clock that was set back since: what is counted from it would not end.
         let known = self.blocked_since(reason).filter(|since| *since <= now);
         known.unwrap_or_else(|| {
-            self.status.blocked_since = Some(BlockedSince {
+            let since = BlockedSince {
                 reason: reason.to_owned(),
                 time: self.time(),
-            });
+            };
+            self.status.blocked_since = Some(Box::new(since));
             now
         })
     }
@@ -315,8 +319,8 @@ impl<'a> PlanBuilder<'a> {
     /// Shows why the submission is in its state.
     pub(super) fn show(&mut self, reason: &str, message: impl Into<String>) {
         let message = message.into();
-        self.status.reason = Some(reason.to_owned());
-        self.status.message = (!message.is_empty()).then_some(message);
+        self.status.reason = Some(reason.into());
+        self.status.message = (!message.is_empty()).then(|| message.into());
     }
 
     /// Shows that nothing moves. The first message is kept while the reason stays, so that a changing detail of an error
@@ -326,7 +330,7 @@ impl<'a> PlanBuilder<'a> {
             .status
             .condition(conditions::STALLED)
             .filter(|c| c.status == "True" && c.reason == reason)
-            .map(|c| c.message.clone());
+            .map(|c| c.message.to_string());
         let message = known.unwrap_or_else(|| message.to_owned());
         self.stall_with(reason, &message);
         message
@@ -381,7 +385,7 @@ impl<'a> PlanBuilder<'a> {
     /// Marks a failure that ends the attempt; the first one stands.
     pub(super) fn fail(&mut self, failure: Failure) {
         if self.status.failure.is_none() {
-            self.status.failure = Some(failure);
+            self.status.failure = Some(Box::new(failure));
         }
     }
 
@@ -433,7 +437,7 @@ impl<'a> PlanBuilder<'a> {
             return;
         }
         let message = self.status.message.clone();
-        let message = message.unwrap_or_else(|| state.as_str().to_owned());
+        let message = message.unwrap_or_else(|| state.as_str().into());
         self.event(state == State::Failed, &reason, message);
     }
 }

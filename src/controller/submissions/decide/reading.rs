@@ -46,7 +46,7 @@ pub(super) fn demand(draft: &PlanBuilder<'_>) -> Option<ReportDemand> {
     };
     Some(ReportDemand {
         job: status.job_number(),
-        pod: draft.view.pod.as_ref().map(|pod| pod.uid.clone()),
+        pod: draft.view.pod.as_ref().map(|pod| pod.uid.as_str().into()),
         stage,
         period: draft.period(),
     })

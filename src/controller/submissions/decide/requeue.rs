@@ -53,11 +53,12 @@ pub(super) fn is_one(found: &Failure) -> bool {
 /// Remembers that the request is carried out, with `jobs` that end by it, and forgives what was before.
 pub(super) fn note(draft: &mut PlanBuilder<'_>, jobs: i32) {
     let interruptions = draft.status.interruptions.as_ref().map_or(0, |past| past.number);
-    draft.status.requeued = Some(Requeued {
+    let requeued = Requeued {
         number: wanted(draft),
         time: draft.time(),
         retries: draft.status.retry.saturating_sub(interruptions).saturating_add(jobs),
-    });
+    };
+    draft.status.requeued = Some(Box::new(requeued));
     draft.status.infrastructure_failures = None;
 }
 

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use leaderboard_api::conditions::STALLED;
-use leaderboard_api::{PairState, SubmissionStatus};
+use leaderboard_api::{PairState, SharedText, SubmissionStatus};
 
 /// Places in line that are written without waiting for their turn.
 pub(super) const FIRST_PLACES: i32 = 20;
@@ -73,9 +73,9 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
     for condition in &mut steady.conditions {
         // Why nothing is stalled is no news.
         if condition.type_ == STALLED && condition.status != "True" {
-            condition.reason = String::new();
+            condition.reason = SharedText::default();
         }
-        condition.message = String::new();
+        condition.message = SharedText::default();
         condition.observed_generation = None;
     }
     steady
@@ -94,7 +94,7 @@ mod tests {
         SubmissionStatus {
             state: Some(State::Running),
             progress: Some(Progress::new(done, 20)),
-            message: Some(format!("{done}/20 routes done.")),
+            message: Some(format!("{done}/20 routes done.").into()),
             ..SubmissionStatus::default()
         }
     }
@@ -135,7 +135,7 @@ mod tests {
     #[test]
     fn a_step_forward_is_a_place_and_the_first_place_is_not() {
         let waiting = |position| SubmissionStatus {
-            waiting: Some(leaderboard_api::Waiting::new(position, None)),
+            waiting: Some(Box::new(leaderboard_api::Waiting::new(position, None))),
             ..SubmissionStatus::default()
         };
         assert_eq!(change(&waiting(3), &waiting(2)), Change::Place(2));

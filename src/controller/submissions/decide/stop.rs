@@ -76,7 +76,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
 
 /// Whether the Job ends because its node is about to go.
 fn is_leaving(draft: &PlanBuilder<'_>) -> bool {
-    !draft.is_cancelled() && draft.status.failure.as_ref().is_some_and(interruption::is_one)
+    !draft.is_cancelled() && draft.status.failure.as_deref().is_some_and(interruption::is_one)
 }
 
 /// Deletes a Job, once the log that goes with its Pod is kept or was waited for long enough.
@@ -97,7 +97,7 @@ fn stopping_since(draft: &mut PlanBuilder<'_>) -> Timestamp {
 }
 
 fn show(draft: &mut PlanBuilder<'_>) {
-    let failure = draft.status.failure.as_ref().filter(|_| !draft.is_cancelled());
+    let failure = draft.status.failure.as_deref().filter(|_| !draft.is_cancelled());
     let message = match failure {
         Some(failure) if failure.reason == reasons::NODE_LOST => {
             let what = failure.message.clone();
@@ -126,7 +126,7 @@ fn annotate(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     let stop = if draft.is_cancelled() {
         Stop::Cancel
     } else {
-        failure::stop_of(draft.status.failure.as_ref())
+        failure::stop_of(draft.status.failure.as_deref())
     };
     draft.act(Action::AnnotateStop {
         pod: pod.name.clone(),
@@ -184,7 +184,7 @@ pub(super) fn remove_overdue_pod(draft: &mut PlanBuilder<'_>) {
 /// A Pod that goes away although nobody asked it to stop, on a node that is gone: the Job would wait for the node.
 pub(super) fn lost_pod<'a>(draft: &mut PlanBuilder<'a>) -> Option<&'a PodView> {
     let is_given_up = |f: &leaderboard_api::Failure| f.reason == reasons::NODE_LOST;
-    let other_end = draft.is_cancelled() || draft.status.failure.as_ref().is_some_and(|f| !is_given_up(f));
+    let other_end = draft.is_cancelled() || draft.status.failure.as_deref().is_some_and(|f| !is_given_up(f));
     let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
     let at = given_up_at(draft.view.node, pod)?;
     if draft.now() >= at {

@@ -27,7 +27,7 @@ pub(super) fn contents(input: &JobInput<'_>) -> Container {
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     Container {
         name: names::CONTAINER_CONTENTS.into(),
-        image: Some(input.plan.contents_image.clone()),
+        image: Some(input.plan.contents_image.to_string()),
         command: Some(kept(host.unwrap_or_else(commands::contents))),
         env: Some(contents_env(input)),
         resources: spec.resources.clone(),

@@ -51,7 +51,7 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
         .chain(gpu::variables(gpus, Side::Simulator, pair));
     let resources = effective::resources(own, spec.resources.as_ref());
     Container {
-        image: Some(input.plan.simulator_image.clone()),
+        image: Some(input.plan.simulator_image.to_string()),
         command: Some(behind_runner(Side::Simulator, pair, flags, words)),
         env: Some(merged(env.collect(), &spec.env)),
         resources: gpu::resources(gpus, Side::Simulator, pair, resources),

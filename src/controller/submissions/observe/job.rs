@@ -24,7 +24,7 @@ fn completion(pod: &Pod) -> Option<JobEnd> {
     }
     let ends = status
         .all_containers()
-        .filter_map(|container| container.state.terminated.as_ref()?.finished_at.as_ref());
+        .filter_map(|container| container.state.ended()?.finished_at.as_ref());
     Some(JobEnd::Complete {
         at: ends.map(|time| time.0).max(),
     })

@@ -71,7 +71,7 @@ fn run_ended(pod: &Pod) -> Option<jiff::Timestamp> {
     let ends: Option<Vec<jiff::Timestamp>> = of_pairs
         .map(|wanted| {
             let mut statuses = pod.status.container_statuses.iter();
-            let end = statuses.find(|s| s.name == wanted.name)?.state.terminated.as_ref()?;
+            let end = statuses.find(|s| s.name == wanted.name)?.state.ended()?;
             end.finished_at.as_ref().filter(|_| end.exit_code == 0).map(|at| at.0)
         })
         .collect();
@@ -79,12 +79,10 @@ fn run_ended(pod: &Pod) -> Option<jiff::Timestamp> {
 }
 
 fn started_times(status: &ContainerStatus) -> impl Iterator<Item = jiff::Timestamp> {
-    let running = status
-        .state
-        .running
-        .as_ref()
-        .and_then(|running| running.started_at.as_ref());
-    let ends = [&status.state.terminated, &status.last_ended].into_iter().flatten();
+    let running = status.state.running().and_then(|running| running.started_at.as_ref());
+    let ends = [status.state.ended(), status.last_ended.as_deref()]
+        .into_iter()
+        .flatten();
     // A container that could not be started has no start of its own.
     let ended = ends.filter(|end| end.reason.as_deref() != Some("StartError"));
     running
@@ -101,15 +99,14 @@ fn ended_by_node(status: &PodStatus) -> Option<(String, String)> {
 fn container(status: &ContainerStatus) -> ContainerView {
     let state = &status.state;
     ContainerView {
-        name: status.name.to_string(),
+        name: status.name.clone(),
         restarts: status.restart_count,
-        running: state.running.is_some(),
+        running: state.running().is_some(),
         began: state
-            .running
-            .as_ref()
+            .running()
             .and_then(|running| running.started_at.as_ref())
             .map(|t| t.0),
-        waiting: state.waiting.as_ref().map(|w| {
+        waiting: state.waiting().map(|w| {
             (
                 w.reason.as_deref().unwrap_or_default().to_owned(),
                 short(w.message.as_deref().unwrap_or_default()),

@@ -117,7 +117,7 @@ fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
     world.view.report = ObservedReport::Unreadable("the bucket results did not answer in time".into());
     let told = |plan: &Plan, type_: &str| {
         let condition = conditions::get(&plan.status.conditions, type_).unwrap();
-        (condition.reason.clone(), condition.message.clone())
+        (condition.reason.to_string(), condition.message.to_string())
     };
     let waits = (
         reasons::WAITING.to_owned(),
@@ -359,12 +359,13 @@ fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
         says(&mut world, "cancelled");
         let plan = world.pass();
         let text = "A host re-ran this submission in EvalAI as submission-99; EvalAI cancelled this one's result. Its state and score stay, in the table too.";
-        assert_eq!(plan.status.rerun_as, Some(rerun));
+        assert_eq!(plan.status.rerun_as.as_deref(), Some(&rerun));
         assert_eq!(
             (plan.status.state, plan.status.score.clone(), plan.status.reason.clone()),
             (Some(state), before.score, before.reason)
         );
-        assert_eq!(plan.status.message, Some(format!("{} {text}", before.message.unwrap())));
+        let message = format!("{} {text}", before.message.unwrap());
+        assert_eq!(plan.status.message.as_deref(), Some(message.as_str()));
         let published = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
         assert_eq!((published.status.as_str(), published.message.as_str()), ("True", text));
         assert_eq!(events(&plan), [reasons::RERUN_IN_EVALAI]);
@@ -429,9 +430,9 @@ fn a_submission_remembers_which_one_it_reruns() {
     };
     let known = world.in_evalai().info.as_mut().unwrap();
     known.rerun_of = Some(of.clone());
-    assert_eq!(world.pass().status.rerun_of, Some(of.clone()));
+    assert_eq!(world.pass().status.rerun_of.as_deref(), Some(&of));
     world.in_evalai().info.as_mut().unwrap().rerun_of = None;
-    assert_eq!(world.pass().status.rerun_of, Some(of));
+    assert_eq!(world.pass().status.rerun_of.as_deref(), Some(&of));
 }
 
 #[test]

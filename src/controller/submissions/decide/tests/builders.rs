@@ -469,7 +469,7 @@ pub fn creates(plan: &Plan) -> bool {
 /// Status and reason of a condition.
 pub fn condition(plan: &Plan, type_: &str) -> (String, String) {
     let found = conditions::get(&plan.status.conditions, type_);
-    found.map_or_else(Default::default, |c| (c.status.clone(), c.reason.clone()))
+    found.map_or_else(Default::default, |c| (c.status.to_string(), c.reason.to_string()))
 }
 
 pub fn events(plan: &Plan) -> Vec<&str> {

@@ -24,7 +24,7 @@ fn used_up(agent: &str, simulator: &str) -> Failure {
         plan.status.pairs[0].crashes, 4,
         "{agent} {simulator}: the end that is not restarted yet counts"
     );
-    plan.status.failure.unwrap()
+    *plan.status.failure.unwrap()
 }
 
 #[test]

@@ -129,7 +129,7 @@ fn completes_with(report: Option<Report>, reason: &str) -> Failure {
     }
     let plan = world.pass_to(Failed, reason);
     assert!(plan.events.last().unwrap().warning, "{reason}");
-    plan.status.failure.unwrap()
+    *plan.status.failure.unwrap()
 }
 
 #[test]

@@ -44,7 +44,7 @@ fn failure_of(what: &str, reason: &str) -> Failure {
         reason.clone_into(&mut last.reason);
     }
     world.see(end);
-    world.pass().status.failure.unwrap()
+    *world.pass().status.failure.unwrap()
 }
 
 #[test]

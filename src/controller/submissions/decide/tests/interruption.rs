@@ -39,7 +39,11 @@ fn ends(world: &mut World) -> Option<Interruptions> {
     world.pass_to(Running, reasons::REPLACING);
     world.wait(20);
     world.complete();
-    world.pass_to(Pending, reasons::REPLACING).status.interruptions
+    world
+        .pass_to(Pending, reasons::REPLACING)
+        .status
+        .interruptions
+        .map(|known| *known)
 }
 
 #[test]

@@ -13,7 +13,7 @@ fn who_waits_sees_place_and_time() {
     let eta = Some(Eta::between(20 * 60, 35 * 60));
     world.view.turn = Turn::Wait { position: 3, eta };
     let plan = world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
-    assert_eq!(plan.status.waiting, Some(Waiting::new(3, eta)));
+    assert_eq!(plan.status.waiting.as_deref(), Some(&Waiting::new(3, eta)));
     assert!(!creates(&plan));
 
     let before = world.status();
@@ -26,14 +26,18 @@ fn who_waits_sees_place_and_time() {
     let eta = Some(Eta::between(15 * 60, 25 * 60));
     world.view.turn = Turn::Wait { position: 2, eta };
     let plan = world.pass();
-    assert_eq!(plan.status.waiting, Some(Waiting::new(2, eta)));
+    assert_eq!(plan.status.waiting.as_deref(), Some(&Waiting::new(2, eta)));
     assert!(plan.events.is_empty(), "a step forward is no transition");
 
     world.view.turn = Turn::Paused { position: 2 };
     let plan = world.pass_to(Pending, reasons::PAUSED);
     assert_eq!(events(&plan), [reasons::PAUSED]);
-    let place = Some(Waiting::new(2, None));
-    assert_eq!(plan.status.waiting, place, "nobody knows for how long");
+    let place = Waiting::new(2, None);
+    assert_eq!(
+        plan.status.waiting.as_deref(),
+        Some(&place),
+        "nobody knows for how long"
+    );
 
     world.view.turn = Turn::Go;
     let plan = world.pass_to(Pending, reasons::PREPARING);

@@ -264,7 +264,10 @@ fn finished() -> World {
 }
 
 fn waits_with(plan: &Plan, type_: &str) -> String {
-    conditions::get(&plan.status.conditions, type_).unwrap().message.clone()
+    conditions::get(&plan.status.conditions, type_)
+        .unwrap()
+        .message
+        .to_string()
 }
 
 #[test]

@@ -235,9 +235,9 @@ fn status_is_whole(plan: &Plan) {
 /// Each reason has a meaning and a next step, and that of a failure has its class.
 fn reasons_are_of_the_table(plan: &Plan) {
     let status = &plan.status;
-    let conditions = status.conditions.iter().map(|condition| &condition.reason);
-    let events = plan.events.iter().map(|event| &event.reason);
-    for reason in status.reason.iter().chain(conditions).chain(events) {
+    let conditions = status.conditions.iter().map(|condition| condition.reason.as_str());
+    let events = plan.events.iter().map(|event| event.reason.as_str());
+    for reason in status.reason.as_deref().into_iter().chain(conditions).chain(events) {
         assert!(reasons::of(reason).is_some(), "{reason} is not in the table of reasons");
     }
     if let Some(failure) = &status.failure {
