@@ -78,7 +78,7 @@ pub struct LogCollector {
 impl LogCollector {
     fn of(set: &DaemonSet) -> Option<Self> {
         let pod = set.spec.as_ref()?.template.spec.as_ref()?;
-        let images = pod.containers.iter().filter_map(|container| container.image.as_deref());
+        let mut images = pod.containers.iter().filter_map(|container| container.image.as_deref());
         let product = images.find_map(Product::of_image)?;
         let volumes = pod.volumes.iter().flatten();
         let maps = volumes.filter_map(|volume| Some(volume.config_map.as_ref()?.name.clone()));

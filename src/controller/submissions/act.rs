@@ -35,7 +35,6 @@ use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
 use crate::observability::metrics::{FailedAttempt, Metrics};
 use crate::observability::traces::Traces;
 use crate::pod::run::Stop;
-use leaderboard_api::conditions::Condition;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, names, reasons};
 

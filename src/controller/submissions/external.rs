@@ -261,14 +261,14 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
         read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
-        end: seen.end.as_ref().filter(|_| present).map(map_end),
+        end: seen.end.as_ref().filter(|_| present).map(|end| map_end(end, seen.needs_texts)),
         shows_partial: false,
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }
 
-fn map_end(end: &Ended) -> EvalaiEnd {
+fn map_end(end: &Ended, is_due: bool) -> EvalaiEnd {
     match end {
         Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Otherwise(status) => EvalaiEnd::Ended {
@@ -276,7 +276,7 @@ fn map_end(end: &Ended) -> EvalaiEnd {
         },
         Ended::Refused(message) => EvalaiEnd::Refused {
             message: message.clone(),
-            is_due: seen.needs_texts,
+            is_due,
         },
     }
 }

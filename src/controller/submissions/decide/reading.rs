@@ -6,7 +6,6 @@
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Condition;
 
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, left_of};
@@ -14,7 +13,8 @@ use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
 };
-use leaderboard_api::{SubmissionStatus, conditions, reasons};
+use leaderboard_api::conditions::{self, Condition};
+use leaderboard_api::{SubmissionStatus, reasons};
 
 /// How long an answer is waited for before the status shows that.
 const ANSWER: Duration = Duration::from_secs(15);

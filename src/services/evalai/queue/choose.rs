@@ -166,8 +166,11 @@ impl Queue {
                 let is_listed = |list| live.contains_key(&(sub.challenge, list));
                 let terms = Terms {
                     may_write,
-                    asked_by_list: asked.contains_key(&sub.challenge),
-                    list_fails: self.fails_to_list(sub.challenge),
+                    acceptance: match asked.contains_key(&sub.challenge) {
+                        true if self.fails_to_list(sub.challenge) => AskedBy::FailingList,
+                        true => AskedBy::List,
+                        false => AskedBy::Itself,
+                    },
                     live_by_list: list_of_live(sub).is_some_and(is_listed) || self.is_swept(sub),
                 };
                 self.offer_of(key, sub, now, terms)
@@ -269,12 +272,12 @@ impl Queue {
             return write;
         }
         if let Some(asked) = &sub.asked {
-            let priority = if asked.listed || !terms.asked_by_list {
-                Some(acceptance(asked.since, now))
-            } else {
+            let priority = match terms.acceptance {
+                AskedBy::List if !asked.listed => None,
                 // One row that EvalAI breaks down over must not keep all others from being asked for. Ends go first: EvalAI may as
                 // well be away.
-                terms.list_fails.then_some(Priority::Acceptance)
+                AskedBy::FailingList if !asked.listed => Some(Priority::Acceptance),
+                _ => Some(acceptance(asked.since, now)),
             };
             return priority.map(|priority| (priority, asked.since, false, Step::Get));
         }
@@ -412,15 +415,23 @@ impl Queue {
     }
 }
 
+/// How EvalAI is asked whether a submission may run.
+#[derive(Clone, Copy)]
+enum AskedBy {
+    /// By a request of its own.
+    Itself,
+    /// With all others of its challenge.
+    List,
+    /// The same, but that list fails, and goes on failing.
+    FailingList,
+}
+
 /// What holds for the next request of a submission.
 #[derive(Clone, Copy)]
 struct Terms {
     /// Writes are allowed.
     may_write: bool,
-    /// A list is asked whether it may run.
-    asked_by_list: bool,
-    /// That list fails, and goes on failing.
-    list_fails: bool,
+    acceptance: AskedBy,
     /// A list is asked whether it was ended in a way that changes no status.
     live_by_list: bool,
 }
