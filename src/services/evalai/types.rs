@@ -132,6 +132,7 @@ pub struct Payload {
 
 impl Payload {
     /// The same without the texts that take up much memory.
+    #[must_use]
     pub fn without_texts(&self) -> Self {
         Self {
             phase: self.phase,
