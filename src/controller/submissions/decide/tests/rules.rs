@@ -43,8 +43,13 @@ fn the_state_is_for_people(view: &View, plan: &Plan) {
     }
     // What is stored is written over.
     let decided = decide(&view);
-    let write = plan.write;
-    assert_eq!(Plan { write, ..decided }, *plan);
+    let (write, requeue) = (plan.write, plan.requeue);
+    let decided = Plan {
+        write,
+        requeue,
+        ..decided
+    };
+    assert_eq!(decided, *plan);
 }
 
 fn is_finished(status: &SubmissionStatus) -> bool {
