@@ -68,6 +68,7 @@ async fn a_job_that_is_refused_keeps_nothing_else_from_being_done_and_is_known_t
     let plan = Plan {
         actions: vec![Action::CreateJob(status.job_number()), Action::AskEvalai],
         status,
+        write: StatusWrite::Now,
         events: Vec::new(),
         report: None,
         requeue: None,

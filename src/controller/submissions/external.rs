@@ -261,7 +261,11 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
         read_at: seen.read_at,
         cancelled: ended.is_some(),
         overtaken: ended.is_some() && seen.overtaken,
-        end: seen.end.as_ref().filter(|_| present).map(|end| map_end(end, seen.needs_texts)),
+        end: seen
+            .end
+            .as_ref()
+            .filter(|_| present)
+            .map(|end| map_end(end, seen.needs_texts)),
         shows_partial: false,
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),

@@ -97,7 +97,7 @@ async fn a_write_that_was_done_without_an_answer_is_settled_by_a_read() {
         world.fail("PUT", "/api/jobs/", answer, When::After);
         world.update(pk, DesiredUpdate::Final(Outcome::Failed, results(&world.target, 0.0)));
         world.until(pk, |view| view.unanswered_until.is_some()).await;
-        assert_eq!(world.ended(pk).await, Ended::Agreed(Status::Failed));
+        assert_eq!(Kept::of(&world.ended(pk).await), Some(Kept::Agreed(Status::Failed)));
         assert_eq!(world.sent("PUT").len(), 1);
     };
     join_all([Failure::Close, Failure::Status(502), Failure::Status(504)].map(settle)).await;

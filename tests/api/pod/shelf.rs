@@ -94,16 +94,16 @@ impl Shelf {
         let if_none_match = header("if-none-match");
         let mut response = None;
         self.state
-            .send_modify(|state| response = Some(state.answer(&head.method, &key, &query, if_none_match, body)));
+            .send_modify(|state| response = Some(state.answer(&head.method, &key, &query, if_none_match.as_deref(), body)));
         response.unwrap()
     }
 }
 
 impl State {
-    fn answer(&mut self, method: &Method, key: &str, query: &str, known: Option<String>, body: Vec<u8>) -> Response {
+    fn answer(&mut self, method: &Method, key: &str, query: &str, known: Option<&str>, body: Vec<u8>) -> Response {
         match *method {
             Method::GET if query.contains("list-type=2") => self.list(query),
-            Method::GET => self.get(key, known.as_deref()),
+            Method::GET => self.get(key, known),
             Method::PUT if query.contains("partNumber=") => {
                 self.parts += 1;
                 ([("etag", format!("\"part-{}\"", self.parts))], "").into_response()
