@@ -145,9 +145,9 @@ fn an_object_takes_little_in_a_cache() {
     let (submission_text, submission) = kept::<Submission>(submission, |_| None);
     println!("Job: {job_text} -> {job}; Pod: {pod_text} -> {pod}; Submission: {submission_text} -> {submission} bytes");
     assert!(job_text > 15_000 && pod_text > 15_000, "{job_text} {pod_text}");
-    assert!(job < 1_000, "a Job takes {job} bytes");
-    assert!(pod < 3_000, "a Pod takes {pod} bytes");
-    assert!(submission < 6_000, "a Submission takes {submission} bytes");
+    assert!(job < 500, "a Job takes {job} bytes");
+    assert!(pod < 1_700, "a Pod takes {pod} bytes");
+    assert!(submission < 3_000, "a Submission takes {submission} bytes");
 }
 
 #[test]
