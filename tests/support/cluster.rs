@@ -39,7 +39,7 @@ mod waits;
 /// Every wait of a test ends; this one ends what was forgotten.
 const TEST_LIMIT: Duration = Duration::from_mins(20);
 /// How many tests run at once, however many threads there are: more would only wait for the processors.
-static SLOTS: Semaphore = Semaphore::const_new(4);
+static SLOTS: Semaphore = Semaphore::const_new(6);
 /// Names the tests' own requests in the API server's audit log.
 pub const USER_AGENT: &str = "leaderboard-tests";
 /// Marks the tests' namespaces, where no service account may write.

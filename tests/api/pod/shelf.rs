@@ -93,8 +93,9 @@ impl Shelf {
         let body = to_bytes(body, usize::MAX).await.unwrap().to_vec();
         let if_none_match = header("if-none-match");
         let mut response = None;
-        self.state
-            .send_modify(|state| response = Some(state.answer(&head.method, &key, &query, if_none_match.as_deref(), body)));
+        self.state.send_modify(|state| {
+            response = Some(state.answer(&head.method, &key, &query, if_none_match.as_deref(), body));
+        });
         response.unwrap()
     }
 }
