@@ -42,6 +42,7 @@ mod cluster {
     mod expected;
     mod failures;
     mod gpus;
+    mod helm;
     mod import;
     mod isolation;
     mod losses;

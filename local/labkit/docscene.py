@@ -35,6 +35,26 @@ LEASE: dict[str, Any] = {"apiVersion": "coordination.k8s.io/v1", "kind": "Lease"
 CONTAINER = {"name": "agent", "image": "registry.example/agent:1"}
 TEMPLATE = {"spec": {"restartPolicy": "Never", "containers": [CONTAINER]}}
 JOB: dict[str, Any] = {"apiVersion": "batch/v1", "kind": "Job", "spec": {"template": TEMPLATE}}
+# What the pipeline before this one has on its nodes, as docs/migrate.md finds it.
+FLUENTD: tuple[dict[str, Any], ...] = (
+    {
+        "apiVersion": "apps/v1",
+        "kind": "DaemonSet",
+        "metadata": {"name": "fluentd", "namespace": "kube-system"},
+        "spec": {
+            "selector": {"matchLabels": {"app": "fluentd"}},
+            "template": {
+                "metadata": {"labels": {"app": "fluentd"}},
+                "spec": {"containers": [{"name": "fluentd", "image": "registry.example/fluentd:1"}]},
+            },
+        },
+    },
+    {
+        "apiVersion": "v1",
+        "kind": "ConfigMap",
+        "metadata": {"name": "fluentd-config", "namespace": "kube-system"},
+    },
+)
 APPLY = ("apply", "--server-side", "--force-conflicts", "--dry-run=server", "--validate=strict", "--filename=-")
 
 
@@ -46,7 +66,7 @@ def prepare(repository: Path, kube: Kube) -> None:
     kube.run("kubectl", "wait", "--for=condition=Established", *definitions, "--timeout=60s")
     board = example(repository, kube, {})
     items = [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}} for name in NAMESPACES]
-    items += [named(LEASE, RELEASE, SYSTEM), named(JOB, "sample", "default")]
+    items += [named(LEASE, RELEASE, SYSTEM), named(JOB, "sample", "default"), *FLUENTD]
     items.append(named(submission(), "submission-1", "leaderboard-demo"))
     for namespace in FURNISHED:
         items += [named(board, name, namespace) for name in LEADERBOARDS]

@@ -1,11 +1,9 @@
 //! The matrix: a part of the cluster dies while a submission runs, and comes back: the run does not notice. In `interruption` the
-//! node is about to go, and comes back; in `release` the operator itself is changed, taken away and installed again; in the mode
-//! NodeIndex a submission wants the node to itself.
+//! node is about to go, and comes back; in the mode NodeIndex a submission wants the node to itself.
 //!
 //! All other tests would. So these run alone and only when they are named, as `make test` does after the others.
 
 mod interruption;
-mod release;
 
 use std::path::Path;
 use std::process::Stdio;

@@ -13,11 +13,11 @@ use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt as _;
 use tokio::process::Command;
 
-use super::super::expected::assert_finished;
+use super::expected::assert_finished;
 use crate::scene::{LABEL, Scene, done, names, say, scenario};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
-const MANIFEST: &str = include_str!("../../../examples/quickstart.yaml");
+const MANIFEST: &str = include_str!("../../examples/quickstart.yaml");
 /// Where a release publishes its images.
 const PUBLISHED: &str = "ghcr.io/OWNER/";
 /// As in the tests of rights: the Lease has this name.
@@ -28,7 +28,6 @@ const SLOW: &str = "8000";
 const LIMIT: Duration = Duration::from_mins(4);
 
 #[tokio::test]
-#[ignore = "it disturbs all other tests: make test runs it after them"]
 async fn the_quickstart_gives_a_score_and_no_step_of_a_release_loses_a_submission() {
     scenario("release", async |scene: &Scene| {
         let quickstart = Quickstart::install(scene).await;
