@@ -147,6 +147,7 @@ def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) ->
             "HOME": str(home / "home"),
             "MANPATH": str(home / "home" / ".local" / "share" / "man"),
             "MANPAGER": "cat",
+            "KUBE_EDITOR": "/bin/true",
             "PYTHONPATH": str(repository / "local"),
             "PYTHONDONTWRITEBYTECODE": "1",
             "DOCUMENTS_FOLDER": str(folder),
