@@ -38,7 +38,7 @@ Reason:      WaitingForSlot: All slots that concurrency.total and concurrency.pe
              use. status.waiting has the position in the line and an estimate.
 Message:     All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set
              their number.
-In line:     position 3; starts in about 20-35 min. 2 running, 4 waiting, concurrency.total is 2.
+In line:     position 3; starts in about 20-35 min. concurrency.total is 2.
 Attempt:     1.
 
 Next:        Wait, or raise the limits."

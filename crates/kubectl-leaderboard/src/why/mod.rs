@@ -203,12 +203,10 @@ impl Explanation<'_> {
         };
         let mut text = format!("position {}; {eta}.", waiting.position);
         if let Some(leaderboard) = self.leaderboard.leaderboard() {
-            let counts = leaderboard.status.as_ref().and_then(|s| s.counts);
             let limits = leaderboard.spec.concurrency;
-            let now = counts.map(|c| format!("{} running, {} waiting", c.running, c.pending));
             let total = limits.total.map(|n| format!("concurrency.total is {n}"));
             let team = limits.per_team.map(|n| format!("concurrency.perTeam is {n}"));
-            let facts: Vec<String> = [now, total, team].into_iter().flatten().collect();
+            let facts: Vec<String> = [total, team].into_iter().flatten().collect();
             text = join(&[&text, &sentence(&facts.join(", "))]);
         }
         self.page.row("In line", &text);
