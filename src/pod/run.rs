@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 
 use crate::services::names::Addresses;
-use leaderboard_api::{Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
+use leaderboard_api::{Attempt, Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
 use leaderboard_results::Format;
 
 /// Environment variable with the JSON of [`Run`].
@@ -70,8 +70,7 @@ pub struct Run {
     pub submission: String,
     /// UID of the Submission: a report of another one does not count.
     pub uid: String,
-    /// Attempt.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// Routes, slices, format and storage.
     pub plan: RunPlan,
     /// What is done with scores that do not follow from their infractions.

@@ -225,7 +225,7 @@ impl Actor<'_> {
             return;
         }
         tracing::info!(
-            attempt = new.attempt,
+            attempt = new.attempt.map(|attempt| attempt.0),
             from = old.map_or("none", |status| status.state_of_conditions().as_str()),
             to = new.state_of_conditions().as_str(),
             reason = new.reason.as_deref(),
@@ -415,7 +415,7 @@ fn log_delivery(new: &SubmissionStatus, ended: &Ended) {
         Phase::Publish => "EvalAI has the end",
         _ => return,
     };
-    tracing::info!(attempt = new.attempt, "{by}");
+    tracing::info!(attempt = new.attempt.map(|attempt| attempt.0), "{by}");
 }
 
 /// The object of this UID alone.

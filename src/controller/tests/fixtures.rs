@@ -46,7 +46,7 @@ use crate::observability::traces::Traces;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options};
 use crate::services::table::Recorder;
-use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";
@@ -280,10 +280,10 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     submission.metadata.finalizers = Some(vec![names::FINALIZER_SUBMISSION.into()]);
     let (track, image) = (&board.spec.tracks[0], "agent:1".to_owned());
     let plan = effective::plan(&board.spec, track, name.parse().unwrap(), image, false);
-    let job_name = names::job(name, JobNumber::first(1));
+    let job_name = names::job(name, JobNumber::first(Attempt(1)));
     submission.status = Some(SubmissionStatus {
         state: Some(State::Pending),
-        attempt: Some(1),
+        attempt: Some(Attempt(1)),
         team: submission.spec.team.clone().map(Into::into),
         plan: Some(plan),
         job_name: Some(job_name.clone()),

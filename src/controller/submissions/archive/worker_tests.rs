@@ -12,6 +12,7 @@ use tokio::time::timeout;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{ObservedReport, Stage, TextProblem};
+use leaderboard_api::{Attempt, JobNumber};
 
 /// Longer than a read takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -77,7 +78,7 @@ impl Bench {
 
     fn demand(&self, stage: Stage) {
         let demand = ReportDemand {
-            job: JobNumber::first(1),
+            job: JobNumber::first(Attempt(1)),
             pod: None,
             stage,
             period: std::time::Duration::from_secs(10),

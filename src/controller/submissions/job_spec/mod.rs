@@ -44,8 +44,8 @@ use crate::pod::run::{Isolation, Run, SCHEMA};
 use crate::services::names::Addresses;
 pub use gpu_count::gpus;
 use leaderboard_api::{
-    Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan, Submission,
-    Track, conditions, effective, names, reasons,
+    Attempt, Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan,
+    Submission, Track, conditions, effective, names, reasons,
 };
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
@@ -353,7 +353,7 @@ fn variable(name: &str, value: &str) -> EnvVar {
 
 /// `RESUME` of a run: the evaluator takes any text for a yes.
 fn resume(input: &JobInput<'_>) -> &'static str {
-    if input.plan.resume || input.number.attempt > 1 {
+    if input.plan.resume || input.number.attempt > Attempt::FIRST {
         "1"
     } else {
         ""
