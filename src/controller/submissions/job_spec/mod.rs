@@ -47,6 +47,7 @@ use leaderboard_api::{
     Attempt, Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan,
     Submission, Track, conditions, effective, names, reasons,
 };
+use leaderboard_runner::protocol::Pair;
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;
@@ -259,7 +260,7 @@ fn generation(input: &JobInput<'_>) -> i64 {
 }
 
 fn pod(input: &JobInput<'_>) -> PodSpec {
-    let pairs = 1..=input.pairs();
+    let pairs = Pair::first(input.pairs());
     let identity = input.spec().pod_identity.as_ref();
     PodSpec {
         restart_policy: Some("OnFailure".into()),
