@@ -26,15 +26,10 @@ use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
 use crate::controller::settings::Settings;
 use crate::controller::stores::{Stores, owner_uid};
-use crate::controller::submissions::addresses::Addresses;
-use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::foreign_runs::ForeignRuns;
-use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
-use crate::controller::submissions::observe::lookups::Lookups;
-use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history::Teams;
 use crate::kubernetes::Namespaces;
@@ -123,14 +118,9 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         settings: settings(),
         stores: stores(cluster),
         memory: Memory::default(),
-        archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), noting(&answering)),
-        lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
+        workers: Workers::start(&aws, &client, &tasks, None, || noting(&answering)),
         causes: Causes::default(),
         teams,
-        images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
-        foreign_runs: ForeignRuns::start(&aws, &tasks, noting(&answering)),
-        other_results: OtherResults::start(&aws, &tasks, noting(&answering)),
-        addresses: Addresses::start(aws.names(), None, &tasks, noting(&answering)),
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),
