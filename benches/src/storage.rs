@@ -10,7 +10,7 @@ use axum::Router;
 use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use leaderboard_api::PairState;
+use leaderboard_api::{Attempt, PairState};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA, StoredFile};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
@@ -169,7 +169,7 @@ fn report(is_final: bool) -> Report {
     Report {
         schema: SCHEMA,
         submission_uid: SUBMISSION.into(),
-        attempt: 1,
+        attempt: Attempt(1),
         pod_uid: POD.into(),
         round: ROUND,
         done: done * PAIRS,
@@ -203,7 +203,7 @@ mod tests {
         for is_final in [false, true] {
             let (_, text) = storage.shelf.report("run-1").unwrap();
             let report = Report::parse(text.as_bytes()).unwrap();
-            assert!(report.belongs_to("the-submission", 1));
+            assert!(report.belongs_to("the-submission", Attempt(1)));
             assert_eq!(
                 (report.pod_uid.as_str(), report.is_final, report.round),
                 ("the-pod", is_final, 1)

@@ -19,7 +19,7 @@ use crate::observability::about;
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
 use leaderboard_api::{
-    EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, names,
+    Attempt, EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, names,
 };
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
@@ -98,9 +98,9 @@ pub enum Ingest {
     /// There is none yet: create this one.
     Create(Box<Submission>),
     /// It has ended and is wanted again: raise its attempt, if it still is at this resourceVersion.
-    Bump { attempt: i64, resource_version: String },
+    Bump { attempt: Attempt, resource_version: String },
     /// It has ended, and EvalAI's row asks for an attempt that no message has announced: note that, so that people see it.
-    Refuse { attempt: i64, resource_version: String },
+    Refuse { attempt: Attempt, resource_version: String },
     /// It is known already.
     Repeat,
     /// There is none, and EvalAI's row was run before: no message has announced that it is to be run again.
@@ -117,7 +117,7 @@ pub enum Outcome {
     /// A Submission was created.
     Created,
     /// Its attempt was raised to this number.
-    Bumped(i64),
+    Bumped(Attempt),
     /// No message has announced the attempt that EvalAI's row asks for, and none begins.
     Refused,
     /// EvalAI's row was run before, and no message has announced that it is to be run again: none is made.
@@ -180,7 +180,7 @@ fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &In
         return Ingest::Repeat;
     }
     let record = Ingested::of(existing).unwrap_or_default();
-    let attempt = spec.attempt + 1;
+    let attempt = spec.attempt.next();
     match incoming.source {
         Source::Message(_) => Ingest::Bump {
             attempt,
@@ -256,7 +256,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
     Submission {
         metadata: ObjectMeta {
             name: Some(names::submission(incoming.submission)),
-            annotations: Some(BTreeMap::from([annotation(&record(None, incoming, 1))])),
+            annotations: Some(BTreeMap::from([annotation(&record(None, incoming, Attempt::FIRST))])),
             labels: Some(BTreeMap::from([
                 (names::LABEL_LEADERBOARD.to_owned(), leaderboard.to_owned()),
                 (names::LABEL_PHASE.to_owned(), incoming.phase.to_string()),
@@ -272,7 +272,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
             check: false,
             team: None,
             priority: 0,
-            attempt: 1,
+            attempt: Attempt::FIRST,
             cancel: false,
             requeue: None,
         },
@@ -281,7 +281,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
 }
 
 /// What is noted of an attempt that this begins. A message begins the count anew; a first run needs none to be granted.
-fn record(existing: Option<&Submission>, incoming: &Incoming, attempt: i64) -> Ingested {
+fn record(existing: Option<&Submission>, incoming: &Incoming, attempt: Attempt) -> Ingested {
     let mut without_message = match incoming.source {
         Source::Message(_) => Vec::new(),
         Source::Sweep(_) => existing.and_then(Ingested::of).unwrap_or_default().without_message,
@@ -379,7 +379,7 @@ async fn rounds(
 }
 
 /// What is noted of an attempt that does not begin.
-fn refusal(existing: Option<&Submission>, incoming: &Incoming, attempt: i64) -> Ingested {
+fn refusal(existing: Option<&Submission>, incoming: &Incoming, attempt: Attempt) -> Ingested {
     let at = incoming.sent_ms;
     Ingested {
         refused: Some(RefusedAttempt { attempt, at }),

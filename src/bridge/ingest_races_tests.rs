@@ -95,7 +95,7 @@ async fn lines_about_what_comes_in_have_its_attempt_and_its_trace_once_its_objec
     let mut failed = with_state(made_by(&message("a", 100_000)), State::Failed);
     failed.metadata.uid = Some("uid".into());
     let mut resumed = failed.clone();
-    resumed.spec.attempt = 2;
+    resumed.spec.attempt = Attempt(2);
     let exists = || refusal(409, "AlreadyExists");
     for (script, attempt) in [
         (vec![refusal(403, "Forbidden")], None),

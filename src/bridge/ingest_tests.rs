@@ -67,7 +67,7 @@ fn with_state(mut made: Submission, state: State) -> Submission {
 
 /// The object after a bump was carried out and the controller has not read it yet.
 fn bumped(mut made: Submission, by: &Incoming) -> Submission {
-    made.spec.attempt += 1;
+    made.spec.attempt = made.spec.attempt.next();
     let (key, text) = annotation(&record(Some(&made), by, made.spec.attempt));
     made.metadata.annotations.get_or_insert_default().insert(key, text);
     made.metadata.resource_version = Some("11".into());
@@ -76,7 +76,7 @@ fn bumped(mut made: Submission, by: &Incoming) -> Submission {
 
 fn bump_to(attempt: i64) -> Ingest {
     Ingest::Bump {
-        attempt,
+        attempt: Attempt(attempt),
         resource_version: "10".into(),
     }
 }
@@ -98,7 +98,7 @@ fn the_first_message_makes_the_object_with_everything_it_needs() {
     assert!(!spec.check, "no message makes a check");
     assert_eq!(
         (spec.leaderboard_name.as_str(), spec.attempt, spec.cancel),
-        (BOARD, 1, false)
+        (BOARD, Attempt(1), false)
     );
     assert_eq!(spec.image.as_deref(), Some("r.example/a:1"));
     assert_eq!(
@@ -218,7 +218,7 @@ fn the_sweep_and_the_message_that_it_stood_in_for_count_once() {
 
 fn refuse(attempt: i64, version: &str) -> Ingest {
     Ingest::Refuse {
-        attempt,
+        attempt: Attempt(attempt),
         resource_version: version.into(),
     }
 }
@@ -227,7 +227,7 @@ fn refuse(attempt: i64, version: &str) -> Ingest {
 fn refused(mut made: Submission, sent_ms: i64) -> Submission {
     let record = Ingested {
         refused: Some(RefusedAttempt {
-            attempt: made.spec.attempt + 1,
+            attempt: made.spec.attempt.next(),
             at: sent_ms,
         }),
         ..Ingested::of(&made).unwrap_or_default()
@@ -247,7 +247,7 @@ fn a_row_that_was_edited_to_submitted_begins_no_other_attempt() {
     check("a message", &noted, &message("b", 350_000), &bump_to(2));
     // A person has raised the attempt.
     let mut raised = noted;
-    raised.spec.attempt = 2;
+    raised.spec.attempt = Attempt(2);
     let raised = with_state(raised, State::Failed);
     check("after another attempt", &raised, &sweep(500_000), &refuse(3, "10"));
 }
@@ -258,15 +258,15 @@ fn one_attempt_begins_without_a_message_until_the_next_message_comes() {
     let lost = swept_resume(300_000);
     check("a resume whose message was lost", &failed, &lost, &bump_to(2));
     let second = with_state(bumped(failed, &lost), State::Failed);
-    assert_eq!(Ingested::of(&second).unwrap().without_message, [2]);
+    assert_eq!(Ingested::of(&second).unwrap().without_message, [Attempt(2)]);
     check("another one", &second, &swept_resume(600_000), &refuse(3, "11"));
     let noted = refused(second, 600_000);
     check("and another one", &noted, &swept_resume(900_000), &REPEAT);
     let resume = message("b", 950_000);
     let third = with_state(bumped(noted, &resume), State::Failed);
-    assert_eq!(Ingested::of(&third).unwrap().without_message, [0_i64; 0]);
+    assert!(Ingested::of(&third).unwrap().without_message.is_empty());
     let want = Ingest::Bump {
-        attempt: 4,
+        attempt: Attempt(4),
         resource_version: "11".into(),
     };
     check("after a message", &third, &swept_resume(1_300_000), &want);
@@ -310,7 +310,7 @@ fn a_row_that_was_run_before_makes_no_object_without_a_message() {
     ));
     // Its participant can have edited the row of a re-run: that is shown, and counts.
     let rerun = with_state(made_by(&swept(Swept::Rerun)), State::Failed);
-    assert_eq!(Ingested::of(&rerun).unwrap().without_message, [1]);
+    assert_eq!(Ingested::of(&rerun).unwrap().without_message, [Attempt(1)]);
     check("its resume", &rerun, &swept_resume(600_000), &refuse(2, "10"));
     let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
     check("of one that is there", &failed, &swept(Swept::Edited), &refuse(2, "10"));
@@ -326,7 +326,7 @@ fn a_resume_of_a_resume_goes_on_counting() {
         State::Cancelled,
     );
     let want = Ingest::Bump {
-        attempt: 3,
+        attempt: Attempt(3),
         resource_version: "11".into(),
     };
     assert_eq!(decide_ingest(BOARD, Some(&resumed), &message("c", 300)), want);
@@ -464,7 +464,7 @@ async fn a_bump_is_one_patch_bound_to_what_was_read() {
     let failed = with_state(made_by(&message("a", 100)), State::Failed);
     let script = vec![refusal(409, "AlreadyExists"), object(&failed), object(&failed)];
     let (outcome, asked) = against(script, message("b", 200)).await;
-    assert_eq!(outcome.unwrap(), Outcome::Bumped(2));
+    assert_eq!(outcome.unwrap(), Outcome::Bumped(Attempt(2)));
     assert_eq!(asked[2].0, format!("PATCH {ONE}"));
     let record = json!({"message": "b", "sent": 200, "attempt": 2}).to_string();
     let want = json!({

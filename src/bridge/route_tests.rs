@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::*;
 use crate::kubernetes::CallError;
+use leaderboard_api::Attempt;
 
 /// A Leaderboard of challenge 1 with phases 2 and 3, created at this second.
 pub(in crate::bridge) fn board(name: &str, second: i64) -> Leaderboard {
@@ -257,7 +258,7 @@ fn each_outcome_of_ingest_settles_its_message() {
     };
     let cases: Vec<(Result<Outcome, IngestError>, i64, MessageOutcome)> = vec![
         (Ok(Outcome::Created), 0, MessageOutcome::Delete(Done::Created)),
-        (Ok(Outcome::Bumped(2)), 0, MessageOutcome::Delete(Done::Bumped)),
+        (Ok(Outcome::Bumped(Attempt(2))), 0, MessageOutcome::Delete(Done::Bumped)),
         (Ok(Outcome::Repeat), 0, MessageOutcome::Delete(Done::Repeat)),
         (Ok(Outcome::Deleting), 90_000, wait(30, Later::Deleting)),
         (

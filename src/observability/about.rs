@@ -10,16 +10,17 @@ use tracing::Span;
 use tracing::field::Empty;
 
 use super::trace_id::TraceId;
+use leaderboard_api::Attempt;
 
 /// The span of a submission that has an object. `submission` is `namespace/name`.
 ///
 /// Of the level ERROR: a filter that lets an error through lets its fields through as well.
-pub fn submission(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Span {
+pub fn submission(submission: impl fmt::Display, leaderboard: &str, attempt: Attempt, uid: &str) -> Span {
     tracing::error_span!(
         "submission",
         %submission,
         leaderboard,
-        attempt,
+        attempt = attempt.0,
         trace_id = %TraceId::of(uid)
     )
 }
@@ -30,10 +31,10 @@ pub fn incoming(submission: impl fmt::Display, leaderboard: &str) -> Span {
 }
 
 /// Adds what the object shows to the span of [`incoming`] that is current.
-pub fn identify(attempt: i64, uid: &str) {
+pub fn identify(attempt: Attempt, uid: &str) {
     let span = Span::current();
     if !span.is_disabled() {
-        span.record("attempt", attempt);
+        span.record("attempt", attempt.0);
         span.record("trace_id", tracing::field::display(TraceId::of(uid)));
     }
 }
@@ -47,13 +48,13 @@ pub struct LogSpan(Option<Arc<Fields>>);
 struct Fields {
     submission: Box<str>,
     leaderboard: Box<str>,
-    attempt: i64,
+    attempt: Attempt,
     uid: Box<str>,
 }
 
 impl LogSpan {
     /// That of [`submission`].
-    pub fn of(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Self {
+    pub fn of(submission: impl fmt::Display, leaderboard: &str, attempt: Attempt, uid: &str) -> Self {
         Self(Some(Arc::new(Fields {
             submission: submission.to_string().into(),
             leaderboard: leaderboard.into(),
@@ -99,7 +100,7 @@ mod tests {
     fn work_of_another_task_logs_with_the_fields_of_who_asked_for_it() {
         let lines = Lines::default();
         let _guard = lines.collect();
-        let log = LogSpan::of("ns/one", "carla", 2, "uid");
+        let log = LogSpan::of("ns/one", "carla", Attempt(2), "uid");
         tracing::warn!("nothing is known");
         log.span().in_scope(|| tracing::warn!(why = "slow", "late"));
         let found = lines.take_json();
@@ -117,7 +118,7 @@ mod tests {
         let _guard = lines.collect();
         incoming("ns/one", "carla").in_scope(|| {
             tracing::info!("before");
-            identify(3, "uid");
+            identify(Attempt(3), "uid");
             tracing::info!("after");
         });
         let found = lines.take_json();

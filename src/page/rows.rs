@@ -6,7 +6,8 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::{one_line, sentence};
 use leaderboard_api::{
-    EndReason, Failure, PairState, PairStatus, State, Submission, SubmissionStatus, TeamStatus, conditions, reasons,
+    Attempt, EndReason, Failure, PairState, PairStatus, State, Submission, SubmissionStatus, TeamStatus, conditions,
+    reasons,
 };
 use serde::Serialize;
 
@@ -50,7 +51,7 @@ pub(super) struct Runs {
     #[serde(flatten)]
     pub who: Who,
     pub reason: Option<String>,
-    pub attempt: Option<i64>,
+    pub attempt: Option<Attempt>,
     pub node: Option<String>,
     pub done: i32,
     pub total: i32,

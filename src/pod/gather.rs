@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness};
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Progress, Side};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Pair, Progress};
 
 use super::keys::{EVALAI, MERGED, checkpoint_path};
 use super::report::{ReportPair, StoredFile};
@@ -52,8 +52,8 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
 }
 
 /// Its last whole copy, which the agent's runner keeps.
-fn kept_path(pair: usize) -> String {
-    format!("{STATUS_FOLDER}/{}-{pair}/{KEPT_CHECKPOINT}", Side::Agent)
+fn kept_path(pair: Pair) -> String {
+    format!("{STATUS_FOLDER}/{}/{KEPT_CHECKPOINT}", pair.agent())
 }
 
 /// One pair, as its status files show it.
@@ -66,12 +66,10 @@ pub struct PairSeen {
 }
 
 impl PairSeen {
-    fn read(status: &std::path::Path, number: usize) -> Self {
-        let pair = u16::try_from(number).ok().and_then(Pair::new);
-        let of = |side| pair.map_or_else(Progress::default, |pair| Progress::read(status, Member { side, pair }));
+    fn read(status: &std::path::Path, pair: Pair) -> Self {
         Self {
-            agent: of(Side::Agent),
-            simulator: of(Side::Simulator),
+            agent: Progress::read(status, pair.agent()),
+            simulator: Progress::read(status, pair.simulator()),
         }
     }
 
@@ -217,15 +215,14 @@ impl Gatherer {
     /// Reads everything once. Blocks: not for an asynchronous thread.
     pub fn round(&mut self) -> Gathered {
         // The status files are read before the results: an agent that is done has written everything.
-        let seen: Vec<PairSeen> = (1..=self.workers.len())
-            .map(|number| PairSeen::read(&self.status, number))
-            .collect();
+        let pairs = Pair::first(self.workers.len());
+        let seen: Vec<PairSeen> = pairs.clone().map(|pair| PairSeen::read(&self.status, pair)).collect();
         let mut changed = false;
-        for index in 0..self.workers.len() {
-            changed |= match self.read(index) {
+        for pair in pairs {
+            changed |= match self.read(pair) {
                 ReadOutcome::New => true,
                 ReadOutcome::Same => false,
-                ReadOutcome::Unusable => self.read_kept(index),
+                ReadOutcome::Unusable => self.read_kept(pair),
             };
         }
         if changed {
@@ -244,8 +241,8 @@ impl Gatherer {
     }
 
     /// Reads one worker's checkpoint, if it is not the one of the last round.
-    fn read(&mut self, index: usize) -> ReadOutcome {
-        let path = checkpoint_path(index.saturating_add(1));
+    fn read(&mut self, pair: Pair) -> ReadOutcome {
+        let (path, index) = (checkpoint_path(pair), pair.index());
         let limit = self.plan.limits_of(index).bytes as u64;
         let Some(worker) = self.workers.get_mut(index) else {
             return ReadOutcome::Unusable;
@@ -253,7 +250,7 @@ impl Gatherer {
         let (file, stamp) = match self.tree.file(&path) {
             Ok(Some(found)) => found,
             Ok(None) => return ReadOutcome::Unusable,
-            Err(error) => return worker.refuse(index, &error),
+            Err(error) => return worker.refuse(pair, &error),
         };
         if worker.seen == Some(stamp) {
             return ReadOutcome::Same;
@@ -263,7 +260,7 @@ impl Gatherer {
             Ok(Some(read)) => read,
             // The next round finds it whole.
             Ok(None) | Err(TreeError::Changed) => return ReadOutcome::Unusable,
-            Err(error) => return worker.refuse(index, &error),
+            Err(error) => return worker.refuse(pair, &error),
         };
         match leaderboard_results::read_worker(&self.plan, index, &bytes) {
             Ok(None) => ReadOutcome::Unusable,
@@ -272,10 +269,7 @@ impl Gatherer {
                 worker.good = Some(checkpoint);
                 self.objects.insert(path, Object::new(bytes));
                 if let Some(why) = worker.refused.take() {
-                    tracing::info!(
-                        pair = index.saturating_add(1),
-                        "the checkpoint is good again; before: {why}"
-                    );
+                    tracing::info!(pair = pair.get(), "the checkpoint is good again; before: {why}");
                 }
                 ReadOutcome::New
             }
@@ -288,8 +282,8 @@ impl Gatherer {
 
     /// Reads what the agent's runner has kept, when the file itself is being written: that is further than what this logcopy has
     /// read, if its rounds are rare, or it has begun just now.
-    fn read_kept(&mut self, index: usize) -> bool {
-        let path = kept_path(index.saturating_add(1));
+    fn read_kept(&mut self, pair: Pair) -> bool {
+        let (path, index) = (kept_path(pair), pair.index());
         let limit = self.plan.limits_of(index).bytes as u64;
         let Some(worker) = self.workers.get_mut(index) else {
             return false;
@@ -311,8 +305,7 @@ impl Gatherer {
             return false;
         }
         worker.good = Some(kept);
-        self.objects
-            .insert(checkpoint_path(index.saturating_add(1)), Object::new(bytes));
+        self.objects.insert(checkpoint_path(pair), Object::new(bytes));
         true
     }
 
@@ -362,8 +355,7 @@ impl Gatherer {
 }
 
 impl Worker {
-    fn refuse(&mut self, index: usize, error: &TreeError) -> ReadOutcome {
-        let pair = index.saturating_add(1);
+    fn refuse(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
         self.refuse_with(format!(
             "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
         ))

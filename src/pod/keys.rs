@@ -4,6 +4,7 @@
 
 use super::ownlog::OWN_LOG;
 use super::run::console;
+use leaderboard_runner::protocol::Pair;
 
 /// Key of the merged file.
 pub const MERGED: &str = "agent/agent_results.json";
@@ -12,18 +13,23 @@ pub const EVALAI: &str = "evalai/";
 /// Before the key of a refused checkpoint: no agent can put a file of its own there.
 pub const REFUSED: &str = "logcopy/refused/";
 
+/// The folder of an agent, without a slash at its end.
+pub fn agent_folder(pair: Pair) -> String {
+    format!("agent/agent{pair}")
+}
+
 /// The checkpoint of a pair.
-pub fn checkpoint_path(pair: usize) -> String {
-    format!("agent/agent{pair}/agent_results.json")
+pub fn checkpoint_path(pair: Pair) -> String {
+    format!("{}/agent_results.json", agent_folder(pair))
 }
 
 /// What the agent of a pair has printed.
-pub fn agent_log(pair: usize) -> String {
-    format!("agent/agent{pair}/leaderboard.log")
+pub fn agent_log(pair: Pair) -> String {
+    format!("{}/leaderboard.log", agent_folder(pair))
 }
 
 /// The logs by which a run is judged: what each agent and each server has printed, and logcopy's own.
 pub fn known_logs(pairs: usize) -> impl Iterator<Item = String> {
-    let of_pairs = (1..=pairs).flat_map(|pair| [agent_log(pair), console(pair)]);
+    let of_pairs = Pair::first(pairs).flat_map(|pair| [agent_log(pair), console(pair)]);
     of_pairs.chain([OWN_LOG.to_owned()])
 }

@@ -9,7 +9,7 @@ use leaderboard_api::text::one_line;
 use serde::{Deserialize, Serialize};
 
 use super::schema::is_read;
-use leaderboard_api::PairState;
+use leaderboard_api::{Attempt, PairState};
 
 /// Key of the report below the run's prefix.
 pub const REPORT_KEY: &str = "logcopy/report.json";
@@ -70,7 +70,7 @@ pub struct Report {
     /// UID of the Submission.
     pub submission_uid: String,
     /// Attempt it belongs to.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// UID of the Pod that wrote it.
     pub pod_uid: String,
     /// Counts the rounds of this Pod.
@@ -223,7 +223,7 @@ impl Report {
     }
 
     /// Whether it is of this attempt of this object.
-    pub fn belongs_to(&self, uid: &str, attempt: i64) -> bool {
+    pub fn belongs_to(&self, uid: &str, attempt: Attempt) -> bool {
         self.submission_uid == uid && self.attempt == attempt
     }
 }

@@ -3,11 +3,11 @@
 //! Written by `controller::submissions::job_spec`, read by `workspace` and `logcopy`. Pure.
 
 use serde::{Deserialize, Serialize};
-use std::fmt::Display;
 
 use crate::services::names::Addresses;
-use leaderboard_api::{Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
+use leaderboard_api::{Attempt, Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
 use leaderboard_results::Format;
+use leaderboard_runner::protocol::Pair;
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";
@@ -40,12 +40,12 @@ pub const IDENTITY_TOKEN_FILE: &str = "token";
 pub const ENV_ROLE_ARN: &str = "LEADERBOARD_ROLE_ARN";
 
 /// Name of the file in the simulators' folder with what a pair's server has printed.
-pub fn console_name(pair: impl Display) -> String {
+pub fn console_name(pair: Pair) -> String {
     format!("console-{pair}.log")
 }
 
 /// The same below the `logs` volume, and below the run's prefix.
-pub fn console(pair: impl Display) -> String {
+pub fn console(pair: Pair) -> String {
     format!("simulator/{}", console_name(pair))
 }
 
@@ -70,8 +70,7 @@ pub struct Run {
     pub submission: String,
     /// UID of the Submission: a report of another one does not count.
     pub uid: String,
-    /// Attempt.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// Routes, slices, format and storage.
     pub plan: RunPlan,
     /// What is done with scores that do not follow from their infractions.

@@ -18,6 +18,7 @@ mod tests {
     use crate::pod::report::{OWNER_SCHEMA, Owner, Report, ReportError, SCHEMA as REPORT_SCHEMA};
     use crate::pod::run::{Run, SCHEMA as RUN_SCHEMA};
     use crate::pod::workspace::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
+    use leaderboard_api::Attempt;
 
     const REPORT_1: &str = include_str!("golden/report-1.json");
     const RUN_1: &str = include_str!("golden/run-1.json");
@@ -44,7 +45,7 @@ mod tests {
     fn each_version_of_the_report_is_read() {
         assert_eq!(REPORT_SCHEMA, 1, "a new version needs a golden file of its own");
         let report = Report::parse(REPORT_1.as_bytes()).unwrap();
-        assert!(report.belongs_to("uid-1", 1) && report.is_final);
+        assert!(report.belongs_to("uid-1", Attempt(1)) && report.is_final);
         assert_round_trip(REPORT_1, &report);
         let newer = REPORT_1.replacen("\"schema\": 1", "\"schema\": 2", 1);
         assert_eq!(Report::parse(newer.as_bytes()), Err(ReportError::Schema(2)));

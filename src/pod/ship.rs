@@ -22,6 +22,7 @@ use super::upload::Memory;
 use crate::backoff::Backoff;
 use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, OVERHEAD, cut};
 use leaderboard_api::RunId;
+use leaderboard_runner::protocol::Pair;
 
 /// Bytes read of one file at once.
 const CHUNK: u64 = 256 << 10;
@@ -89,8 +90,8 @@ impl Shipper {
         restored: &Memory,
         a_day: u64,
     ) -> Self {
-        let agents = (1..=pairs).map(|n| (agent_log(n), format!("{run_id}/agent-{n}")));
-        let simulators = (1..=pairs).map(|n| (console(n), format!("{run_id}/simulator-{n}")));
+        let agents = Pair::first(pairs).map(|pair| (agent_log(pair), format!("{run_id}/{}", pair.agent())));
+        let simulators = Pair::first(pairs).map(|pair| (console(pair), format!("{run_id}/{}", pair.simulator())));
         let streams: BTreeMap<String, String> = agents
             .chain(simulators)
             .chain([

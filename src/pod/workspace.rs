@@ -27,7 +27,7 @@ use super::schema::is_read;
 use super::tree::{Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Enforcement, PairState};
+use leaderboard_api::{Attempt, Enforcement, PairState};
 
 /// Folders that no mount makes. The others are the kubelet's.
 const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
@@ -311,7 +311,7 @@ enum Claim {
 }
 
 async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
-    if run.plan.resume || run.attempt > 1 {
+    if run.plan.resume || run.attempt > Attempt::FIRST {
         return Ok(Claim::TakeUp);
     }
     let stored = archive.get(REPORT_KEY, MAX_BYTES as u64).await?;
@@ -403,7 +403,7 @@ mod tests {
         let run = fixtures::run();
         let report = first_report(&run, "pod-1").unwrap();
         let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
-        assert!(read.belongs_to("uid-1", 1) && !read.is_final);
+        assert!(read.belongs_to("uid-1", Attempt(1)) && !read.is_final);
         assert_eq!((read.total, read.pairs.len(), read.pairs[1].total), (4, 2, 2));
     }
 

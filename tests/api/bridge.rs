@@ -15,7 +15,7 @@ use kube::api::{Api, ApiResource, DynamicObject, ListParams, Patch, PatchParams,
 use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
-use leaderboard_api::{Ingested, Leaderboard, Submission, names};
+use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, names};
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::bridge;
 use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
@@ -299,7 +299,7 @@ async fn two_bridges_make_each_submission_once() {
     world.stand_in.drained(&url).await;
     let made = world.submissions().list(&ListParams::default()).await.unwrap().items;
     assert_eq!(made.len(), 20);
-    assert!(made.iter().all(|submission| submission.spec.attempt == 1));
+    assert!(made.iter().all(|submission| submission.spec.attempt == Attempt(1)));
     let one = world.submissions().get("submission-107").await.unwrap();
     assert_eq!(one.labels()[names::LABEL_LEADERBOARD], "lb");
     assert_eq!(one.labels()[names::LABEL_PHASE], "2");
@@ -338,7 +338,7 @@ async fn a_resume_bumps_once_and_undoes_a_cancel() {
     world.end("submission-7", "Cancelled").await;
     world.stand_in.send(&url, &body(2, 7)).await;
     let resumed = world
-        .submission("submission-7", |submission| submission.spec.attempt == 2)
+        .submission("submission-7", |submission| submission.spec.attempt == Attempt(2))
         .await;
     assert!(!resumed.spec.cancel);
     world.stand_in.send(&url, &body(2, 7)).await;
@@ -346,7 +346,10 @@ async fn a_resume_bumps_once_and_undoes_a_cancel() {
     world.end("submission-7", "Finished").await;
     world.stand_in.send(&url, &body(2, 7)).await;
     eventually("a finished one is not resumed", async || bridge.count("repeat") == 3).await;
-    assert_eq!(world.submissions().get("submission-7").await.unwrap().spec.attempt, 2);
+    assert_eq!(
+        world.submissions().get("submission-7").await.unwrap().spec.attempt,
+        Attempt(2)
+    );
     world.stand_in.drained(&url).await;
     bridge.stop().await;
 }
@@ -373,15 +376,18 @@ async fn the_sweep_begins_one_attempt_and_a_message_any() {
     assert_eq!(take(message("a"), 0).await, Outcome::Created);
     failed().await;
     assert_eq!(take(sweep(Swept::Edited), 10).await, Outcome::Refused);
-    assert_eq!(take(sweep(Swept::Resuming), 20).await, Outcome::Bumped(2));
+    assert_eq!(take(sweep(Swept::Resuming), 20).await, Outcome::Bumped(Attempt(2)));
     failed().await;
     assert_eq!(take(sweep(Swept::Resuming), 30).await, Outcome::Refused);
     assert_eq!(take(sweep(Swept::Resuming), 40).await, Outcome::Repeat, "noted once");
     let found = api.get("submission-7").await.unwrap();
     let record = Ingested::of(&found).unwrap();
-    assert_eq!((found.spec.attempt, record.without_message), (2, vec![2]));
-    assert_eq!(record.refused.map(|refused| refused.attempt), Some(3));
-    assert_eq!(take(message("b"), 50).await, Outcome::Bumped(3));
+    assert_eq!(
+        (found.spec.attempt, record.without_message),
+        (Attempt(2), vec![Attempt(2)])
+    );
+    assert_eq!(record.refused.map(|refused| refused.attempt), Some(Attempt(3)));
+    assert_eq!(take(message("b"), 50).await, Outcome::Bumped(Attempt(3)));
     let record = Ingested::of(&api.get("submission-7").await.unwrap()).unwrap();
     assert_eq!((record.without_message, record.refused), (vec![], None));
 }

@@ -19,6 +19,7 @@ use evalai_stand_in::model::{FileState, Status as Stored};
 use evalai_stand_in::submissions::{NewSubmission, create};
 use evalai_stand_in::{Config, Handle, Knobs};
 use jiff::{SignedDuration, Timestamp};
+use leaderboard_api::Attempt;
 use leaderboard_operator::observability::about::LogSpan;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
@@ -272,7 +273,7 @@ fn leaderboard() -> Key {
 
 fn run(pk: i64, attempt: i64) -> Run {
     Run {
-        attempt,
+        attempt: Attempt(attempt),
         job: format!("submission-{pk}-{attempt}"),
         by_hand: true,
         has_job: false,
@@ -299,7 +300,9 @@ async fn a_submission_lives_through_all_of_it() {
     let mut world = World::new().await;
     let pk = world.submit();
     world.ask(pk, true);
-    let view = world.until(pk, |view| view.answered == 1 && view.image.is_some()).await;
+    let view = world
+        .until(pk, |view| view.answered == Some(Attempt(1)) && view.image.is_some())
+        .await;
     let row = view.row.unwrap();
     assert_eq!(
         (row.status, row.team_id, row.team_name.as_deref()),
@@ -459,7 +462,7 @@ async fn without_the_lease_nothing_is_written() {
     let pk = world.submit();
     world.update(pk, DesiredUpdate::Final(Outcome::Failed, results(&world.target, 0.0)));
     world.ask(pk, false);
-    world.until(pk, |view| view.answered == 1).await;
+    world.until(pk, |view| view.answered == Some(Attempt(1))).await;
     assert_eq!(world.stored(pk), Stored::Submitted);
     world.leads.store(true, Ordering::SeqCst);
     assert!(matches!(world.ended(pk).await, Ended::Published { .. }));

@@ -13,7 +13,7 @@ use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, ResourceExt};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names};
 use leaderboard_operator::controller::runtime::leader;
 use leaderboard_operator::pod::report::{OWNER_KEY, Owner};
 use leaderboard_operator::services::archive::Archive;
@@ -203,7 +203,10 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
     let is_back = |s: &SubmissionStatus| runs(s) && s.job_name.as_ref() == Some(&job);
     world.until(&name, "it runs again", is_back).await;
     let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
-    assert_eq!((status.attempt, status.retry, status.failure), (Some(1), 1, None));
+    assert_eq!(
+        (status.attempt, status.retry, status.failure),
+        (Some(Attempt(1)), 1, None)
+    );
     assert!(status.pairs.iter().all(|pair| pair.crashes == 0));
     let patches = world.evalai.requests().into_iter().filter(|r| r.method == "PATCH");
     let told = patches.filter(|r| r.body["submission_status"] == json!("running"));
@@ -266,7 +269,7 @@ async fn what_can_never_be_an_image_fails_at_once_and_the_participant_reads_why(
         world.until(&name, "it is published", is_published).await;
         let job = world
             .api::<Job>()
-            .get_opt(&names::job(&name, JobNumber::first(1)))
+            .get_opt(&names::job(&name, JobNumber::first(Attempt(1))))
             .await
             .unwrap();
         assert_eq!(job, None);

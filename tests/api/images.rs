@@ -5,7 +5,7 @@ use evalai_stand_in::model::Status;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Secret;
 use kube::api::{ListParams, PostParams};
-use leaderboard_api::{FailureClass, JobNumber, Submission, conditions, names, reasons};
+use leaderboard_api::{Attempt, FailureClass, JobNumber, Submission, conditions, names, reasons};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -106,7 +106,7 @@ async fn every_job_pulls_the_digest_that_the_tag_had_and_the_registry_is_asked_o
     registry.push("one", &config(), 2);
     drop(controller);
     let jobs = world.api::<Job>();
-    let job_name = names::job(&name, JobNumber::first(1));
+    let job_name = names::job(&name, JobNumber::first(Attempt(1)));
     let old = jobs.get(&job_name).await.unwrap();
     jobs.delete(&job_name, &kube::api::DeleteParams::background())
         .await

@@ -12,7 +12,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::Api;
 use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
-use leaderboard_api::{Ingested, Leaderboard, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, SubmissionStatus, conditions, names};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -140,14 +140,14 @@ async fn a_message_becomes_a_submission_once_and_a_resume_raises_its_attempt() {
     world.send(body).await;
     world.left(0).await;
     let failed: Submission = world.api().get(&name).await.unwrap();
-    assert_eq!(failed.spec.attempt, 1);
+    assert_eq!(failed.spec.attempt, Attempt(1));
 
     world
         .post(&format!("/api/jobs/submissions/{pk}/resume/"), &json!({}))
         .await;
     world.left(0).await;
     let resumed: Submission = world.api().get(&name).await.unwrap();
-    assert_eq!(resumed.spec.attempt, 2);
+    assert_eq!(resumed.spec.attempt, Attempt(2));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

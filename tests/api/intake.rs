@@ -21,7 +21,7 @@ use k8s_openapi::api::batch::v1::Job;
 use kube::api::{Api, ListParams, PostParams};
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
-use leaderboard_api::{Submission, conditions, names};
+use leaderboard_api::{Attempt, Submission, conditions, names};
 use serde_json::{Map, json};
 use tokio::net::TcpListener;
 use tokio::time::{Instant, timeout_at};
@@ -359,13 +359,16 @@ impl World {
     async fn check(&self, size: &Size) {
         let submissions: Api<Submission> = Api::namespaced(self.client.clone(), &self.namespace);
         let all = submissions.list(&ListParams::default()).await.unwrap().items;
-        let found: BTreeMap<String, i64> = all
+        let found: BTreeMap<String, Attempt> = all
             .iter()
             .map(|submission| (submission.name_any(), submission.spec.attempt))
             .filter(|(name, _)| *name != names::submission(TAKEN))
             .collect();
         let lost: Vec<_> = self.messages.names().filter(|name| !found.contains_key(name)).collect();
-        let doubled: Vec<_> = found.iter().filter(|(_, attempt)| **attempt != 1).collect();
+        let doubled: Vec<_> = found
+            .iter()
+            .filter(|(_, attempt)| **attempt != Attempt::FIRST)
+            .collect();
         let jobs: Api<Job> = Api::namespaced(self.client.clone(), &self.namespace);
         let jobs = jobs.list(&ListParams::default()).await.unwrap().items;
         let owners: BTreeSet<String> = jobs

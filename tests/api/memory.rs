@@ -9,7 +9,7 @@ use evalai_stand_in::model::Status;
 use futures::StreamExt;
 use kube::ResourceExt;
 use kube::api::{Patch, PatchParams};
-use leaderboard_api::{Submission, SubmissionStatus, conditions};
+use leaderboard_api::{Attempt, Submission, SubmissionStatus, conditions};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, SCHEMA, StoredFile};
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -73,7 +73,7 @@ fn report(submission_uid: String, text: &str) -> String {
     let report = Report {
         schema: SCHEMA,
         submission_uid,
-        attempt: 1,
+        attempt: Attempt(1),
         pod_uid: "pod".into(),
         round: 9,
         done: 1,

@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{LeaderboardVersion, LogGroup, RouteSlice, RunPlan, Storage, StorageClass, Verify};
+use leaderboard_api::{Attempt, LeaderboardVersion, LogGroup, RouteSlice, RunPlan, Storage, StorageClass, Verify};
 use leaderboard_operator::pod::logcopy::{self, LogcopyError};
 use leaderboard_operator::pod::places::{Pace, Places, Setting};
 use leaderboard_operator::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
@@ -245,7 +245,7 @@ fn run(bucket: &str) -> Run {
         namespace: "default".to_owned(),
         submission: "submission-77".to_owned(),
         uid: "uid-1".to_owned(),
-        attempt: 1,
+        attempt: Attempt(1),
         plan: RunPlan {
             run_id: "77".parse().unwrap(),
             leaderboard_version: LeaderboardVersion::V2,

@@ -11,7 +11,9 @@ use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::core::NamespaceResourceScope;
 use kube::{Api, Resource, ResourceExt};
-use leaderboard_api::{Leaderboard, PairState, State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{
+    Attempt, Leaderboard, PairState, State, Submission, SubmissionStatus, conditions, names, reasons,
+};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
 use leaderboard_operator::services::archive::Archive;
 use serde::de::DeserializeOwned;
@@ -211,7 +213,13 @@ async fn report(world: &World, run: &str, name: &str, done: u32) {
     let pod = pods
         .get(&format!(
             "{}-x",
-            names::job(name, leaderboard_api::JobNumber { attempt: 1, retry: 0 })
+            names::job(
+                name,
+                leaderboard_api::JobNumber {
+                    attempt: Attempt(1),
+                    retry: 0
+                }
+            )
         ))
         .await;
     let labels = evalai_stand_in::Config::in_memory().unwrap().0.seed.challenges[0].phases[0].splits[0]
@@ -224,7 +232,7 @@ async fn report(world: &World, run: &str, name: &str, done: u32) {
     let report = Report {
         schema: SCHEMA,
         submission_uid: uid,
-        attempt: 1,
+        attempt: Attempt(1),
         pod_uid: pod.unwrap().uid().unwrap(),
         round: u64::from(done),
         done,

@@ -12,7 +12,7 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
 use kube::runtime::wait::{await_condition, conditions};
-use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{Attempt, JobNumber, State, Submission, SubmissionStatus, names, reasons};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -86,7 +86,7 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
         |s: &SubmissionStatus| s.state == Some(State::Failed) && s.reason.as_deref() == Some(reasons::IMPORTED_FAILURE);
     world.until(&name, "it shows its end", ended).await;
     until_deleted(&world, &name, &uid).await;
-    let job = names::job(&name, JobNumber::first(1));
+    let job = names::job(&name, JobNumber::first(Attempt(1)));
     assert_eq!(world.api::<Job>().get_opt(&job).await.unwrap(), None);
     assert_eq!(in_evalai(), Status::Failed);
     assert_eq!(row(&world, &table).await, ("1".to_owned(), "FAILED".to_owned()));

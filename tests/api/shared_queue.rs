@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::api::ListParams;
-use leaderboard_api::{Leaderboard, Submission, names};
+use leaderboard_api::{Attempt, Leaderboard, Submission, names};
 use leaderboard_operator::kubernetes::Clients;
 use serde_json::json;
 use tokio::sync::watch;
@@ -72,7 +72,7 @@ impl Operator {
             .list(&ListParams::default())
             .await
             .unwrap();
-        assert!(all.iter().all(|submission| submission.spec.attempt == 1));
+        assert!(all.iter().all(|submission| submission.spec.attempt == Attempt(1)));
         all.iter().map(ResourceExt::name_any).collect()
     }
 

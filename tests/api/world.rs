@@ -14,7 +14,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names};
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
@@ -255,7 +255,13 @@ impl World {
     /// Waits for the Job of the first attempt that follows so many failures of the infrastructure.
     pub(super) async fn job(&self, name: &str, retry: i32) -> Job {
         let is_there = |job: Option<&Job>| job.is_some();
-        let job_name = names::job(name, JobNumber { attempt: 1, retry });
+        let job_name = names::job(
+            name,
+            JobNumber {
+                attempt: Attempt(1),
+                retry,
+            },
+        );
         let job = timeout(LIMIT, await_condition(self.api(), &job_name, is_there)).await;
         job.expect("a Job is made").unwrap().unwrap()
     }

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use leaderboard_api::{Submission, conditions};
+use leaderboard_api::{Attempt, Submission, conditions};
 use serde_json::json;
 
 use super::matrix::Case;
@@ -40,7 +40,7 @@ async fn a_participant_who_edits_the_own_row_gets_one_attempt_at_most() {
         let resume = || json!({"status": "resuming", "rerun_resumed_at": Timestamp::now().to_string()});
         evalai.edit_as(PARTICIPANT, pk, &resume()).await;
         // The message of an honest resume may be lost, so one attempt begins; EvalAI's row looks the same.
-        let begun = |s: &Submission| s.spec.attempt == 2;
+        let begun = |s: &Submission| s.spec.attempt == Attempt(2);
         scene.submission(&name, "the sweep has begun an attempt", LOST, begun).await;
         case.ends(scene, &name, LIMIT).await;
         evalai.edit_as(PARTICIPANT, pk, &resume()).await;

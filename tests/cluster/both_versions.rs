@@ -6,7 +6,7 @@ use std::time::Duration;
 use evalai_stand_in::model::Status;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt as _;
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{Attempt, State, Submission};
 use serde_json::{Map, Value, json};
 
 use super::matrix::Case;
@@ -83,7 +83,7 @@ async fn leaderboard_10_comes_from_a_message_over_a_resume_to_its_score() {
         scene.change_leaderboard("lb-10", &json!({"agent": {"env": [prints()]}})).await;
         evalai.resume(pk).await;
         assert_eq!(evalai.submission(pk).status, Status::Resuming);
-        let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(2);
+        let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(Attempt(2));
         scene.submission(&name, "the second attempt begins", LIMIT, resumed).await;
         let finished = case.ends(scene, &name, LIMIT).await;
         case.evalai(evalai.submission(pk).status);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use evalai_stand_in::model::Status;
-use leaderboard_api::{FailureClass, State, Submission};
+use leaderboard_api::{Attempt, FailureClass, State, Submission};
 use serde_json::json;
 
 use super::expected::SIX_ROUTES;
@@ -93,14 +93,14 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         assert_eq!(names(&scene.all::<Submission>().await), [name.as_str()]);
         assert_eq!(scene.jobs().await, [format!("{name}-1")]);
         let still = scene.api::<Submission>().get(&name).await.unwrap();
-        assert_eq!((still.spec.attempt, state(&still)), (1, Some(State::Failed)));
+        assert_eq!((still.spec.attempt, state(&still)), (Attempt(1), Some(State::Failed)));
 
         scene.gate.reopen();
         scene.cloud.await_messages([0, 0], LIMIT).await;
         evalai.await_status(pk, Status::Failed, LIMIT).await;
         scene.change_leaderboard("lb", &json!({"agent": {"env": []}})).await;
         evalai.resume(pk).await;
-        let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(2);
+        let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(Attempt(2));
         scene
             .submission(&name, "the second attempt begins", LIMIT, resumed)
             .await;

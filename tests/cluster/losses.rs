@@ -7,7 +7,7 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::{DeleteParams, EvictParams};
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{Attempt, State, Submission};
 use serde_json::{Value, json};
 
 use super::expected::SIX_ROUTES;
@@ -101,7 +101,10 @@ async fn a_pod_deleted_by_hand_costs_one_route_of_each_pair() {
 /// What a run shows whose one Pod was taken away, where no failure of the infrastructure is retried.
 pub(super) async fn assert_interrupted_once(scene: &Scene, name: &str) {
     let status = scene.api::<Submission>().get(name).await.unwrap().status.unwrap();
-    assert_eq!((status.attempt, status.retry, status.failure), (Some(1), 1, None));
+    assert_eq!(
+        (status.attempt, status.retry, status.failure),
+        (Some(Attempt(1)), 1, None)
+    );
     assert_eq!(status.interruptions.unwrap().number, 1);
     assert!(status.pairs.iter().all(|pair| pair.crashes == 0), "{:?}", status.pairs);
     assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-1-r1")]);

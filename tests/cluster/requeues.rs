@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use leaderboard_api::Submission;
+use leaderboard_api::{Attempt, Submission};
 use serde_json::json;
 
 use super::checks::plugin;
@@ -43,7 +43,7 @@ async fn a_requeued_run_goes_on_in_another_job_at_nobodys_cost() {
 /// The request was carried out once, and nothing else is left of it.
 async fn assert_free_of_charge(scene: &Scene, name: &str) {
     let status = scene.api::<Submission>().get(name).await.unwrap().status.unwrap();
-    assert_eq!((status.attempt, status.retry), (Some(1), 1));
+    assert_eq!((status.attempt, status.retry), (Some(Attempt(1)), 1));
     let requeued = status.requeued.unwrap();
     assert_eq!((requeued.number, requeued.retries), (1, 1));
     assert_eq!((status.failure, status.infrastructure_failures), (None, None));

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use leaderboard_api::{ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
+use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
 use leaderboard_operator::pod::places::Places;
 use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
 use leaderboard_operator::services::archive::Archive;
@@ -211,7 +211,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
         namespace: "default".to_owned(),
         submission: id.to_owned(),
         uid: format!("uid of {id}"),
-        attempt: 1,
+        attempt: Attempt(1),
         plan: RunPlan {
             run_id: id.parse().unwrap(),
             leaderboard_version: format,

@@ -111,7 +111,7 @@ fn failure(what: &str) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::State;
+    use crate::{Attempt, State};
     use jiff::Timestamp;
     use serde_json::json;
 
@@ -142,7 +142,7 @@ mod tests {
             (ImportedState::Cancelled, State::Cancelled),
         ] {
             let status = SubmissionStatus::of_imported(&spec(), end(state), 1, &now);
-            assert_eq!((status.state, status.attempt), (Some(shown), Some(2)));
+            assert_eq!((status.state, status.attempt), (Some(shown), Some(Attempt(2))));
             assert_eq!(status.state_of_conditions(), shown);
             assert_eq!(status.failure.is_some(), shown == State::Failed);
             assert!(!status.failure.is_some_and(|failure| failure.charged));

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Submission, names};
+use super::{Attempt, Submission, names};
 
 /// What the annotation names as the message where the sweep stood in for one.
 pub const SWEEP: &str = "sweep";
@@ -19,10 +19,10 @@ pub struct Ingested {
     pub sent: i64,
     /// The attempt that it began; none of an older operator's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub attempt: Option<i64>,
+    pub attempt: Option<Attempt>,
     /// The attempts that began without a message since the last one that came.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub without_message: Vec<i64>,
+    pub without_message: Vec<Attempt>,
     /// The attempt that EvalAI's row asked for and that did not begin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refused: Option<RefusedAttempt>,
@@ -32,7 +32,7 @@ pub struct Ingested {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RefusedAttempt {
     /// Its number, had it begun.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// When the row first asked for it, in milliseconds since 1970.
     pub at: i64,
 }
@@ -45,7 +45,7 @@ impl Ingested {
     }
 
     /// Whether EvalAI has asked for an attempt, by a message or by its row. Every other was begun by a person.
-    pub fn has_begun(&self, attempt: i64) -> bool {
+    pub fn has_begun(&self, attempt: Attempt) -> bool {
         self.attempt == Some(attempt) || self.without_message.contains(&attempt)
     }
 }

@@ -2,20 +2,19 @@
 //!
 //! Pure.
 
-use crate::{Submission, SubmissionStatus};
+use crate::{Attempt, Submission, SubmissionStatus};
 
 /// Which Job of a submission.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct JobNumber {
-    /// From 1.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// Jobs of this attempt that infrastructure failures ended before it.
     pub retry: i32,
 }
 
 impl JobNumber {
     /// The first Job of an attempt.
-    pub fn first(attempt: i64) -> Self {
+    pub fn first(attempt: Attempt) -> Self {
         Self { attempt, retry: 0 }
     }
 
@@ -34,7 +33,7 @@ impl SubmissionStatus {
     /// The Job that the status speaks of; the very first one before it speaks of any.
     pub fn job_number(&self) -> JobNumber {
         JobNumber {
-            attempt: self.attempt.unwrap_or(1),
+            attempt: self.attempt.unwrap_or_default(),
             retry: self.retry,
         }
     }
@@ -42,7 +41,7 @@ impl SubmissionStatus {
 
 impl Submission {
     /// The attempt that all is about which is done now. A higher one in the spec waits until this one has ended.
-    pub fn present_attempt(&self) -> i64 {
+    pub fn present_attempt(&self) -> Attempt {
         let present = self.status.as_ref().and_then(|status| status.attempt);
         present.unwrap_or(self.spec.attempt)
     }
@@ -56,6 +55,7 @@ mod tests {
     #[test]
     fn each_job_of_a_submission_has_a_name_of_its_own() {
         for (attempt, retry, name) in [(1, 0, "a-1"), (2, 0, "a-2"), (1, 1, "a-1-r1"), (12, 3, "a-12-r3")] {
+            let attempt = Attempt(attempt);
             assert_eq!(names::job("a", JobNumber { attempt, retry }), name);
         }
     }
@@ -63,9 +63,12 @@ mod tests {
     #[test]
     fn a_status_without_an_attempt_speaks_of_the_first_job() {
         let mut status = SubmissionStatus::default();
-        assert_eq!(status.job_number(), JobNumber::first(1));
-        (status.attempt, status.retry) = (Some(3), 2);
-        let expected = JobNumber { attempt: 3, retry: 2 };
+        assert_eq!(status.job_number(), JobNumber::first(Attempt(1)));
+        (status.attempt, status.retry) = (Some(Attempt(3)), 2);
+        let expected = JobNumber {
+            attempt: Attempt(3),
+            retry: 2,
+        };
         assert_eq!(status.job_number(), expected);
     }
 
@@ -73,8 +76,8 @@ mod tests {
     fn an_attempt_that_is_asked_for_is_present_once_the_status_speaks_of_it() {
         let spec = serde_json::json!({"leaderboardName": "lb", "image": "i", "track": "sensors", "attempt": 2});
         let mut submission = Submission::new("a", serde_json::from_value(spec).unwrap());
-        assert_eq!(submission.present_attempt(), 2);
-        for attempt in [1, 2] {
+        assert_eq!(submission.present_attempt(), Attempt(2));
+        for attempt in [Attempt(1), Attempt(2)] {
             submission.status = Some(SubmissionStatus {
                 attempt: Some(attempt),
                 ..SubmissionStatus::default()

@@ -2,6 +2,7 @@
 //!
 //! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
 
+mod attempt;
 pub mod byte_quantity;
 pub mod check;
 #[cfg(feature = "client-errors")]
@@ -42,6 +43,7 @@ mod team;
 pub mod text;
 mod waiting;
 
+pub use attempt::Attempt;
 pub use check::{CheckEnd, CheckImage, CheckResult, LastCheck};
 pub use conditions::Condition;
 pub use evalai_mode::EvalaiMode;

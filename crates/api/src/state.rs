@@ -4,7 +4,7 @@
 //! Called by everyone who reads a status. Pure.
 
 use crate::conditions::{self, Condition, FINISHED, RUNNING};
-use crate::{State, SubmissionStatus, reasons};
+use crate::{Attempt, State, SubmissionStatus, reasons};
 
 impl SubmissionStatus {
     /// A condition, if it was ever set.
@@ -34,7 +34,7 @@ impl SubmissionStatus {
     }
 
     /// Whether an attempt that is asked for follows the present one: only a higher one, and none follows results that count.
-    pub fn is_followed_by(&self, attempt: i64) -> bool {
+    pub fn is_followed_by(&self, attempt: Attempt) -> bool {
         self.attempt.is_some_and(|present| attempt > present) && self.state_of_conditions() != State::Finished
     }
 
@@ -65,7 +65,7 @@ impl SubmissionStatus {
 
     /// Whether its run continues from stored results.
     pub fn is_resumed(&self) -> bool {
-        self.plan.as_ref().is_some_and(|plan| plan.resume) || self.attempt > Some(1)
+        self.plan.as_ref().is_some_and(|plan| plan.resume) || self.attempt > Some(Attempt::FIRST)
     }
 }
 

@@ -6,6 +6,7 @@ use kube::{CustomResource, KubeSchema};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::attempt::Attempt;
 use super::requeue::Requeue;
 use super::submission_status::SubmissionStatus;
 use super::team::Team;
@@ -89,9 +90,9 @@ pub struct SubmissionSpec {
     #[schemars(range(min = -1000, max = 1000))]
     pub priority: i32,
     /// Grows to resume from what is stored; manifests in git leave it out.
-    #[serde(default = "first_attempt")]
+    #[serde(default)]
     #[schemars(range(min = 1, max = 9999))]
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// Stops the present attempt and keeps its results; manifests in git leave it out.
     #[serde(default)]
     pub cancel: bool,
@@ -122,10 +123,6 @@ pub struct EvalaiRef {
     /// Id of the submission.
     #[schemars(range(min = 1))]
     pub submission: i64,
-}
-
-fn first_attempt() -> i64 {
-    1
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]

@@ -7,6 +7,7 @@ use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::attempt::Attempt;
 use super::conditions::Condition;
 use super::gpu::{MAX_NODES_WITHOUT_GPU, NodeWithoutGpu};
 use super::infrastructure_failures::InfrastructureFailures;
@@ -67,7 +68,7 @@ pub struct SubmissionStatus {
     pub observed_generation: Option<i64>,
     /// Attempt that this status speaks of.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub attempt: Option<i64>,
+    pub attempt: Option<Attempt>,
     /// Jobs of this attempt that infrastructure failures ended, `interruptions` among them.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub retry: i32,

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::board::{self, Observed};
 use super::facts::{command, has_ended, is_attempt_requested, is_requeue_requested, shown, state};
 use super::text::{Frame, when};
-use leaderboard_api::{Deadlines, State, Submission, reasons};
+use leaderboard_api::{Attempt, Deadlines, State, Submission, reasons};
 
 /// What a person asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,7 +29,7 @@ pub struct Change {
     /// What happens then.
     pub lines: Vec<String>,
     /// The attempt whose end fulfils the request.
-    pub attempt: i64,
+    pub attempt: Attempt,
 }
 
 /// How to carry out a request, or why that is impossible, with the next step.
@@ -129,7 +129,7 @@ fn requeue(submission: &Submission, why: Option<&str>, frame: Frame) -> Result<C
         if let Some(why_not) = not_resumable(submission) {
             return Err(why_not);
         }
-        attempt = attempt.saturating_add(1);
+        attempt = attempt.next();
         spec["attempt"] = json!(attempt);
         spec["cancel"] = json!(false);
         format!("Requeued {name}: attempt {attempt} begins when its turn comes.")
@@ -178,14 +178,14 @@ fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
 }
 
 /// The attempt that a resume requests, or why there is none.
-fn next_attempt(submission: &Submission) -> Result<i64, String> {
+fn next_attempt(submission: &Submission) -> Result<Attempt, String> {
     match not_resumable(submission) {
         Some(why_not) => Err(why_not),
-        None => Ok(submission.spec.attempt.saturating_add(1)),
+        None => Ok(submission.spec.attempt.next()),
     }
 }
 
-fn resumption(submission: &Submission, attempt: i64, lines: Vec<String>) -> Change {
+fn resumption(submission: &Submission, attempt: Attempt, lines: Vec<String>) -> Change {
     Change {
         // Somebody else may raise the attempt at the same time: then the patch conflicts.
         patch: Some(json!({

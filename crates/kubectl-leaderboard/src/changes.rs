@@ -14,7 +14,7 @@ use crate::error::{self, Error};
 use crate::output::{self, note, print};
 use crate::transitions::Waiting;
 use crate::{Change, requeue, rerun, submit};
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{Attempt, State, Submission};
 
 /// How often a change is tried again after a conflict with somebody else's.
 const TRIES: usize = 4;
@@ -133,7 +133,7 @@ pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCo
     if !wanted.wait {
         return Ok(ExitCode::SUCCESS);
     }
-    let end = wait(cluster, &name, 1).await?;
+    let end = wait(cluster, &name, Attempt::FIRST).await?;
     Ok(if end == State::Finished {
         ExitCode::SUCCESS
     } else {
@@ -142,7 +142,7 @@ pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCo
 }
 
 /// Sends a request to the API server; returns the attempt whose end fulfils it.
-async fn send(cluster: &Cluster, request: Request<'_>, name: &str) -> Result<i64, Error> {
+async fn send(cluster: &Cluster, request: Request<'_>, name: &str) -> Result<Attempt, Error> {
     for _ in 0..TRIES {
         let submission = cluster.submission(name).await?;
         let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
@@ -179,7 +179,7 @@ fn refusal(request: Request<'_>, submission: &Submission, error: kube::Error) ->
 }
 
 /// Waits for the end of an attempt, and prints each state until then.
-async fn wait(cluster: &Cluster, name: &str, attempt: i64) -> Result<State, Error> {
+async fn wait(cluster: &Cluster, name: &str, attempt: Attempt) -> Result<State, Error> {
     let mut waiting = Waiting::new(attempt).within(output::width());
     let mut changes = pin!(cluster.changes(name));
     let mut printed = String::new();

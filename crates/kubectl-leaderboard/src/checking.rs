@@ -22,7 +22,7 @@ use crate::commands::{frame, note_interruption};
 use crate::error::Error;
 use crate::output::{print, width};
 use crate::transitions::Waiting;
-use leaderboard_api::{Leaderboard, State, Submission};
+use leaderboard_api::{Attempt, Leaderboard, State, Submission};
 
 /// How long the operator may take to note a check in its Leaderboard.
 const NOTE: Duration = Duration::from_secs(20);
@@ -119,7 +119,7 @@ async fn run(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<(W
 
 async fn wait(cluster: &Cluster, created: &Submission, seconds: i64) -> Result<Waited, Error> {
     let name = created.name_any();
-    let mut transitions = Waiting::new(1).within(width());
+    let mut transitions = Waiting::new(Attempt::FIRST).within(width());
     let mut interruption = String::new();
     let mut patience = Patience::new(Timestamp::now(), seconds);
     let mut last = created.clone();

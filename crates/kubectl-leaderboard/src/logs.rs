@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Submission, SubmissionStatus, names};
+use leaderboard_api::{Attempt, Submission, SubmissionStatus, names};
 
 use crate::bucket_log::{Unread, read};
 use crate::cluster::Cluster;
@@ -235,8 +235,9 @@ pub(super) fn in_bucket(
     let name = submission.name_any();
     let status = submission.status.as_ref();
     let results = status.and_then(|status| status.results_url.as_deref());
-    let is_before_start =
-        |status: &SubmissionStatus| status.times.started.is_none() && status.attempt <= Some(1) && status.retry == 0;
+    let is_before_start = |status: &SubmissionStatus| {
+        status.times.started.is_none() && status.attempt <= Some(Attempt::FIRST) && status.retry == 0
+    };
     if !facts::has_ended(submission) && status.is_none_or(is_before_start) {
         return Err(format!(
             "{name} is {} and has no Pod yet, so it has no log. `{} -f` waits for it",

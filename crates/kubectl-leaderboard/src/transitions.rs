@@ -7,14 +7,14 @@ use kube::ResourceExt;
 
 use super::text::{WIDTH, wrap};
 use leaderboard_api::conditions;
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{Attempt, State, Submission};
 
 /// Columns before the text of a transition.
 const INDENT: usize = 11;
 
 /// A wait for the end of an attempt.
 pub struct Waiting {
-    attempt: i64,
+    attempt: Attempt,
     width: usize,
     last: Option<(State, String)>,
 }
@@ -30,7 +30,7 @@ pub struct Update {
 
 impl Waiting {
     /// Waits for the end of this attempt, or of a later one.
-    pub fn new(attempt: i64) -> Self {
+    pub fn new(attempt: Attempt) -> Self {
         Self {
             attempt,
             width: WIDTH,

@@ -45,9 +45,31 @@ impl Pair {
         }
     }
 
+    /// The first so many.
+    pub fn first(many: usize) -> impl Iterator<Item = Self> + Clone {
+        (1..=Self::MAX).take(many).map(Self)
+    }
+
     /// Its number, from 1.
     pub const fn get(self) -> u16 {
         self.0
+    }
+
+    /// Its place in a list of all pairs, from 0.
+    pub fn index(self) -> usize {
+        usize::from(self.0).saturating_sub(1)
+    }
+
+    /// Its simulator's container.
+    pub const fn simulator(self) -> Member {
+        let side = Side::Simulator;
+        Member { side, pair: self }
+    }
+
+    /// Its agent's container.
+    pub const fn agent(self) -> Member {
+        let side = Side::Agent;
+        Member { side, pair: self }
     }
 }
 
@@ -264,9 +286,7 @@ impl Progress {
 /// All status files that are there for the pairs 1 to `pairs`, for a reader that reports or stores them. A member's files
 /// beyond the first round it has not crashed in are left out.
 pub fn present(root: &Path, pairs: u16) -> Vec<StatusFile> {
-    let members = (1..=pairs)
-        .filter_map(Pair::new)
-        .flat_map(|pair| [Side::Simulator, Side::Agent].map(|side| Member { side, pair }));
+    let members = Pair::first(pairs.into()).flat_map(|pair| [pair.simulator(), pair.agent()]);
     let mut files = Vec::new();
     for member in members {
         let crashes = Progress::read(root, member).crashes;

@@ -9,8 +9,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, Time};
 use kube::ResourceExt;
 use leaderboard_api::text::{LONGEST_NAME, one_line};
 use leaderboard_api::{
-    EvalaiRef, ImageReference, ImportedEnd, ImportedState, Leaderboard, Progress, Score, Submission, SubmissionSpec,
-    Team, Times, Track, names,
+    Attempt, EvalaiRef, ImageReference, ImportedEnd, ImportedState, Leaderboard, Progress, Score, Submission,
+    SubmissionSpec, Team, Times, Track, names,
 };
 
 use crate::services::table::StoredRow;
@@ -21,8 +21,6 @@ const LONGEST_ID: usize = 128;
 const LONGEST_URL: usize = 2048;
 /// Longest name of a Submission.
 const LONGEST_SUBMISSION: usize = 52;
-/// The highest attempt of a Submission.
-const MOST_ATTEMPTS: i64 = 9999;
 /// Statuses of a row that has not ended, of both pipelines.
 const LIVE: [&str; 5] = ["SUBMITTED", "PENDING", "QUEUED", "RUNNING", "RESUMING"];
 
@@ -74,7 +72,8 @@ pub(super) fn outcome(row: &StoredRow, boards: &[Leaderboard], table: &str) -> O
 fn decide(row: &StoredRow, boards: &[Leaderboard], table: &str) -> Result<Outcome, Undecided> {
     let place = place(row, boards)?;
     let status = row.text("submission_status").unwrap_or_default().to_ascii_uppercase();
-    let attempt = row.attempt.unwrap_or(1).clamp(1, MOST_ATTEMPTS);
+    let attempt = row.attempt.map(Attempt).unwrap_or_default();
+    let attempt = attempt.clamp(Attempt::FIRST, Attempt::HIGHEST);
     let ended = |state| {
         let submission = submission(row, &place, attempt)?;
         let end = end(row, state, place.track, table);
@@ -86,7 +85,7 @@ fn decide(row: &StoredRow, boards: &[Leaderboard], table: &str) -> Result<Outcom
         "CANCELLED" => ended(ImportedState::Cancelled),
         live if LIVE.contains(&live) && row.attempt.is_some() => {
             // The next attempt: it takes up what is stored, and the row takes no attempt that it has already.
-            let next = (attempt + 1).min(MOST_ATTEMPTS);
+            let next = attempt.next().min(Attempt::HIGHEST);
             Ok(Outcome::Adopted(Box::new(submission(row, &place, next)?)))
         }
         live if LIVE.contains(&live) => Err(Undecided::OfAnother(status)),
@@ -136,7 +135,7 @@ fn local<'a>(row: &StoredRow, boards: &'a [Leaderboard]) -> Option<Destination<'
     })
 }
 
-fn submission(row: &StoredRow, place: &Destination<'_>, attempt: i64) -> Result<Submission, Undecided> {
+fn submission(row: &StoredRow, place: &Destination<'_>, attempt: Attempt) -> Result<Submission, Undecided> {
     let board = place.board.name_any();
     let mut labels = BTreeMap::from([(names::LABEL_LEADERBOARD.to_owned(), board.clone())]);
     let image = row

@@ -77,7 +77,10 @@ fn a_finished_row_of_the_original_becomes_a_submission_with_its_score() {
     assert_eq!(submission.annotations()[names::ANNOTATION_IMPORTED], "leaderboard-20");
     assert_eq!(submission.labels()[names::LABEL_PHASE], "4173");
     let spec = &submission.spec;
-    assert_eq!((spec.leaderboard_name.as_str(), spec.attempt), ("leaderboard-20", 1));
+    assert_eq!(
+        (spec.leaderboard_name.as_str(), spec.attempt),
+        ("leaderboard-20", Attempt(1))
+    );
     let evalai = spec.evalai.unwrap();
     assert_eq!((evalai.challenge, evalai.phase, evalai.submission), (2098, 4173, 77));
     let now = Time(Timestamp::UNIX_EPOCH);
@@ -109,7 +112,7 @@ fn the_states_of_ended_rows_are_kept_and_only_a_finished_one_has_a_score() {
             Some(3),
             &[("driving_score", "0.0"), ("progress", "12/20")],
         ));
-        assert_eq!((submission.spec.attempt, end.state), (3, state));
+        assert_eq!((submission.spec.attempt, end.state), (Attempt(3), state));
         assert_eq!(end.score.is_some(), state == ImportedState::Finished, "{status}");
         assert_eq!(end.progress.map(|progress| progress.text).as_deref(), Some("12/20"));
     }
@@ -121,7 +124,7 @@ fn a_live_row_of_ours_is_taken_up_by_the_next_attempt() {
         let Outcome::Adopted(submission) = decided(&row(status, Some(2), &[])) else {
             panic!("{status}")
         };
-        assert_eq!(submission.spec.attempt, 3);
+        assert_eq!(submission.spec.attempt, Attempt(3));
         assert!(
             submission.metadata.annotations.is_none(),
             "the controller begins at once"

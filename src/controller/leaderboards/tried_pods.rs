@@ -91,7 +91,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         submission: &sample,
         leaderboard,
         plan: &plan,
-        number: JobNumber::first(1),
+        number: JobNumber::default(),
         settings,
         without_gpu: &[],
         addresses: None,

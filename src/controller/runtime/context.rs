@@ -14,15 +14,10 @@ use crate::controller::objects::Wake;
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
-use crate::controller::submissions::addresses::Addresses;
-use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::foreign_runs::ForeignRuns;
-use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
-use crate::controller::submissions::observe::lookups::Lookups;
-use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history::Teams;
 use crate::controller::submissions::{act, observe};
@@ -39,14 +34,9 @@ pub struct Context {
     pub settings: Settings,
     pub stores: Stores,
     pub memory: Memory,
-    pub archive: ArchiveWorkers,
-    pub lookups: Lookups,
+    pub workers: Workers,
     pub causes: Causes,
     pub teams: Teams,
-    pub images: Images,
-    pub foreign_runs: ForeignRuns,
-    pub other_results: OtherResults,
-    pub addresses: Addresses,
     pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
@@ -64,15 +54,10 @@ impl Context {
         observe::Uses {
             stores: &self.stores,
             memory: &self.memory,
+            workers: &self.workers,
             slots: &self.slots,
-            archive: &self.archive,
-            lookups: &self.lookups,
             causes: &self.causes,
             teams: &self.teams,
-            images: &self.images,
-            foreign_runs: &self.foreign_runs,
-            other_results: &self.other_results,
-            addresses: &self.addresses,
             reruns: &self.reruns,
             external: &self.external,
         }
@@ -85,13 +70,8 @@ impl Context {
             settings: &self.settings,
             stores: &self.stores,
             memory: &self.memory,
+            workers: &self.workers,
             slots: &self.slots,
-            archive: &self.archive,
-            lookups: &self.lookups,
-            images: &self.images,
-            foreign_runs: &self.foreign_runs,
-            other_results: &self.other_results,
-            addresses: &self.addresses,
             external: &self.external,
             metrics: &self.metrics,
             traces: &self.traces,
@@ -143,11 +123,7 @@ impl Context {
     /// Drops everything that is remembered of an object that is gone.
     pub fn forget(&self, key: &ObjectKey) {
         self.memory.forget(&key.uid);
-        self.archive.forget(&key.uid);
-        self.images.forget(&key.uid);
-        self.foreign_runs.forget(&key.uid);
-        self.other_results.forget(&key.uid);
-        self.addresses.forget(&key.uid);
+        self.workers.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
         self.external.gone(key);
     }

@@ -30,16 +30,11 @@ use super::leaderboards::looks::{self, Look};
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::settings::Settings;
-use crate::controller::submissions::addresses::Addresses;
-use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::foreign_runs::ForeignRuns;
-use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, Objects};
-use crate::controller::submissions::observe::lookups::Lookups;
 use crate::controller::submissions::observe::node;
-use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::phases::Phase;
 use crate::controller::submissions::reruns::Reruns;
 use crate::kubernetes::objects::Event;
@@ -261,14 +256,9 @@ impl Parts {
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), answered()),
-            lookups: Lookups::start(client.clone(), tasks, answered()),
+            workers: Workers::start(aws, client, tasks, self.settings.region.as_deref(), answered),
             causes: self.causes(queues),
             teams: self.watches.teams.clone(),
-            images: Images::start(aws, client.clone(), tasks, answered()),
-            foreign_runs: ForeignRuns::start(aws, tasks, answered()),
-            other_results: OtherResults::start(aws, tasks, answered()),
-            addresses: Addresses::start(aws.names(), self.settings.region.clone(), tasks, answered()),
             reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),

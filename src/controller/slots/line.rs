@@ -6,7 +6,7 @@ use std::mem::discriminant;
 use super::member::{Kind, Member, Stand};
 use crate::controller::slots::turns::{InLine, Limits, Past, RUNS, Turn, turns};
 use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{CheckEnd, State};
+use leaderboard_api::{Attempt, CheckEnd, State};
 
 #[cfg(test)]
 #[path = "tests/histories.rs"]
@@ -23,7 +23,7 @@ pub(super) struct Line {
     /// The UID of the owner of each Job, by the Job's name.
     jobs: HashMap<Box<str>, Box<str>>,
     /// The attempt of everybody in a slot, as the watch shows it.
-    running: HashMap<Box<str>, i64>,
+    running: HashMap<Box<str>, Attempt>,
     reserved: HashMap<String, Reserved>,
     waiting: HashMap<String, Waiting>,
     past: Past,
@@ -48,7 +48,7 @@ struct Reserved {
 
 #[derive(Clone)]
 struct Waiting {
-    attempt: i64,
+    attempt: Attempt,
     place: InLine,
     /// None until it was worked out.
     turn: Option<Turn>,
@@ -129,7 +129,7 @@ impl Line {
     }
 
     /// Whether it may start, as it was worked out last.
-    pub(super) fn turn(&self, uid: &str, attempt: i64) -> Turn {
+    pub(super) fn turn(&self, uid: &str, attempt: Attempt) -> Turn {
         let Some(limits) = self.limits else {
             return Turn::NotInLine;
         };
@@ -144,7 +144,7 @@ impl Line {
         waiting.unwrap_or(Turn::NotInLine)
     }
 
-    pub(super) fn join(&mut self, attempt: i64, place: InLine) {
+    pub(super) fn join(&mut self, attempt: Attempt, place: InLine) {
         // One that is gone has left nothing behind; one that the watch has not shown yet joins when it does.
         let is_known = self.members.contains_key(place.uid.as_str());
         if !is_known
@@ -277,7 +277,7 @@ impl Line {
         through.map(|(_, waiting)| waiting.place.name).collect()
     }
 
-    fn has_slot(&self, uid: &str, attempt: i64) -> bool {
+    fn has_slot(&self, uid: &str, attempt: Attempt) -> bool {
         self.running.get(uid) == Some(&attempt)
     }
 
@@ -298,7 +298,7 @@ impl Line {
             Stand::Idle => has_job(),
         };
         let attempt = member.number.attempt;
-        let is_of_it = |of: i64| attempt >= of;
+        let is_of_it = |of: Attempt| attempt >= of;
         let is_void = |reserved: &Reserved| {
             let is_left = member.is_leaving && !reserved.is_started;
             is_of_it(reserved.waiting.attempt) && (runs || member.stand == Stand::Over || is_left)

@@ -11,17 +11,13 @@ use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
-use super::addresses::{self, Addresses};
-use super::archive::ArchiveWorkers;
+use super::addresses;
 use super::decide::{Action, Event, Plan, StatusWrite, pinned};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
-use super::foreign_runs::ForeignRuns;
-use super::images::Images;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
-use super::observe::lookups::Lookups;
-use super::other_results::OtherResults;
+use super::observe::workers::Workers;
 use super::phases::{self, Ended, Phase};
 use super::spans;
 use super::view::{LogPlace, View};
@@ -49,13 +45,8 @@ pub struct Uses<'a> {
     pub settings: &'a Settings,
     pub stores: &'a Stores,
     pub memory: &'a Memory,
+    pub workers: &'a Workers,
     pub slots: &'a SlotAllocator,
-    pub archive: &'a ArchiveWorkers,
-    pub lookups: &'a Lookups,
-    pub images: &'a Images,
-    pub foreign_runs: &'a ForeignRuns,
-    pub other_results: &'a OtherResults,
-    pub addresses: &'a Addresses,
     pub external: &'a ExternalSystems,
     pub metrics: &'a Metrics,
     pub traces: &'a Traces,
@@ -99,8 +90,8 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for event in &plan.events {
         actor.publish(event).await;
     }
-    uses.archive
-        .demand(&view.submission, &plan.status, view.ended_at(), plan.report);
+    let archive = &uses.workers.archive;
+    archive.demand(&view.submission, &plan.status, view.ended_at(), plan.report);
     // Last comes what the API server may refuse for as long as a quota is used up: it keeps nothing else from being done.
     let (creates, others): (Vec<_>, Vec<_>) = plan
         .actions
@@ -133,7 +124,7 @@ impl Actor<'_> {
 
     /// Carries one action out. What others do is only handed on: to the slots, the workers of S3, EvalAI and the table.
     async fn carry_out(&self, action: Action, status: &SubmissionStatus) -> Result<(), ActError> {
-        let (uses, submission) = (self.uses, self.submission());
+        let (uses, workers, submission) = (self.uses, self.uses.workers, self.submission());
         match action {
             // It went before the status.
             Action::AddFinalizer => {}
@@ -150,15 +141,15 @@ impl Actor<'_> {
                 self.delete_submission(uid, resource_version).await?;
             }
             Action::JoinLine(place) => uses.slots.join(submission, place),
-            Action::LookUpImage(question) => uses.images.want(submission, question),
-            Action::LookForForeignRun(question) => uses.foreign_runs.want(submission, *question),
-            Action::ReadOtherResults(question) => uses.other_results.want(submission, *question),
-            Action::LookUpNames(question) => uses.addresses.want(submission, *question),
-            Action::TakeOwnership => uses.archive.want_fence(submission, status),
-            Action::KeepLog { places } => uses.archive.want_log(submission, status, log_demand(places, status)),
-            Action::ReadTexts { of } => uses.archive.want_texts(submission, status, of),
-            Action::DropTexts => uses.archive.drop_texts(submission, status),
-            Action::LookUpNode(name) => uses.lookups.want(submission, &name),
+            Action::LookUpImage(question) => workers.images.want(submission, question),
+            Action::LookForForeignRun(question) => workers.foreign_runs.want(submission, *question),
+            Action::ReadOtherResults(question) => workers.other_results.want(submission, *question),
+            Action::LookUpNames(question) => workers.addresses.want(submission, *question),
+            Action::TakeOwnership => workers.archive.want_fence(submission, status),
+            Action::KeepLog { places } => workers.archive.want_log(submission, status, log_demand(places, status)),
+            Action::ReadTexts { of } => workers.archive.want_texts(submission, status, of),
+            Action::DropTexts => workers.archive.drop_texts(submission, status),
+            Action::LookUpNode(name) => workers.lookups.want(submission, &name),
             Action::AskEvalai => {
                 uses.memory.asks_evalai(submission);
                 uses.external.ask(self.view);
@@ -166,16 +157,12 @@ impl Actor<'_> {
             Action::FollowEvalai => uses.external.follow(self.view, status),
             Action::UpdateEvalai(update) => {
                 uses.external
-                    .update_evalai(uses.memory, uses.archive, self.view, status, update);
+                    .update_evalai(uses.memory, &workers.archive, self.view, status, update);
             }
             Action::ForgetEvalai => uses.external.hub.forget(&key_of(submission)),
             Action::Forget => {
                 uses.external.gone(&key_of(submission));
-                let uid = uid(submission);
-                uses.archive.forget(uid);
-                uses.images.forget(uid);
-                uses.foreign_runs.forget(uid);
-                uses.addresses.forget(uid);
+                workers.forget(uid(submission));
             }
             Action::Record(update) => uses.external.record(self.view, status, update),
         }
@@ -225,7 +212,7 @@ impl Actor<'_> {
             return;
         }
         tracing::info!(
-            attempt = new.attempt,
+            attempt = new.attempt.map(|attempt| attempt.0),
             from = old.map_or("none", |status| status.state_of_conditions().as_str()),
             to = new.state_of_conditions().as_str(),
             reason = new.reason.as_deref(),
@@ -415,7 +402,7 @@ fn log_delivery(new: &SubmissionStatus, ended: &Ended) {
         Phase::Publish => "EvalAI has the end",
         _ => return,
     };
-    tracing::info!(attempt = new.attempt, "{by}");
+    tracing::info!(attempt = new.attempt.map(|attempt| attempt.0), "{by}");
 }
 
 /// The object of this UID alone.

@@ -10,6 +10,7 @@ use crate::controller::objects::span_of;
 use crate::controller::submissions::decide::{Plan, StatusWrite};
 use crate::controller::submissions::observe::observe;
 use crate::observability::logging::tests::Lines;
+use leaderboard_api::Attempt;
 
 /// A submission whose Job was made, as one reconcile has read it.
 async fn bench() -> (Surroundings, View) {
@@ -167,7 +168,7 @@ async fn a_failed_attempt_is_counted_once_when_it_is_stored() {
         ..failed.clone()
     };
     let resumed = SubmissionStatus {
-        attempt: old.attempt.map(|attempt| attempt + 1),
+        attempt: old.attempt.map(Attempt::next),
         ..failed.clone()
     };
     let family = "leaderboard_submission_failures_total{";

@@ -14,7 +14,7 @@ use crate::services::endpoints::{self, ServiceAddress};
 use crate::services::names::{self, Answer, GOOD_FOR, Names};
 use leaderboard_api::ranges::{self, Range, is_no_service, is_public};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Dns, Egress, LeaderboardSpec, LogGroup, Network, PolicySource, Storage, Submission};
+use leaderboard_api::{Attempt, Dns, Egress, LeaderboardSpec, LogGroup, Network, PolicySource, Storage, Submission};
 
 /// An older answer is none: it may be of the run before. In line it is asked again more often.
 const OLD: SignedDuration = SignedDuration::from_mins(10);
@@ -24,7 +24,7 @@ const LONGEST_WHY: usize = 200;
 /// For which services a Pod needs addresses.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
-    pub attempt: i64,
+    pub attempt: Attempt,
     pub storage: Storage,
     pub log_group: Option<LogGroup>,
     /// The Pod asks STS for its credentials.
@@ -60,7 +60,7 @@ impl questions::Question for Question {
     const AT_ONCE: usize = 4;
     const GOOD_FOR: Duration = GOOD_FOR;
 
-    fn attempt(&self) -> i64 {
+    fn attempt(&self) -> Attempt {
         self.attempt
     }
 }
@@ -88,7 +88,7 @@ impl Addresses {
 }
 
 /// What a Pod of this Leaderboard needs, with the storage of its run.
-pub fn question(leaderboard: &LeaderboardSpec, storage: &Storage, attempt: i64) -> Question {
+pub fn question(leaderboard: &LeaderboardSpec, storage: &Storage, attempt: Attempt) -> Question {
     Question {
         attempt,
         storage: storage.clone(),

@@ -33,7 +33,7 @@ async fn looked(spec: &LeaderboardSpec, answer: &[&str]) -> (Looked, Vec<String>
         let answer = answer.clone();
         async move { Ok(answer) }.boxed()
     });
-    let question = question(spec, &spec.storage, 1);
+    let question = question(spec, &spec.storage, Attempt(1));
     let found = find(&names, &question, None).await;
     let at = Timestamp::UNIX_EPOCH;
     let asked = asked.lock().unwrap().clone();
@@ -133,7 +133,7 @@ async fn public_addresses_that_are_not_allowed_are_shown_in_words_that_do_not_ch
 async fn an_error_of_a_resolver_is_one_line_and_names_what_to_do() {
     let names = Names::by(|_| async { Err(std::io::Error::other("no\nsuch \u{1b}[31mname.")) }.boxed());
     let spec = spec(&json!({}));
-    let question = question(&spec, &spec.storage, 1);
+    let question = question(&spec, &spec.storage, Attempt(1));
     let found = find(&names, &question, None).await;
     let at = Timestamp::UNIX_EPOCH;
     let error = usable(&spec.network, &Looked { at, question, found }).unwrap_err();

@@ -230,7 +230,7 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
     let image_known = !wants_image(submission) || seen.image.is_some();
     let present = seen.attempt == attempt;
     let ended = seen.ended.filter(|_| present);
-    let answered = seen.answered >= attempt;
+    let answered = seen.answered >= Some(attempt);
     let (image, image_problem) = match seen.image.clone() {
         Some(ImageAnswer::Named(image)) => (Some(image), None),
         Some(ImageAnswer::NotAnImage(why)) => (None, Some(why)),

@@ -18,8 +18,8 @@ use crate::controller::submissions::view::{
     ObservedAddresses, ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
     ObservedRoutes, ObservedTexts, ObservedTraces, Turn,
 };
-use leaderboard_api::State;
 use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::{Attempt, State};
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -182,8 +182,8 @@ async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
 fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
     let mut of = |attempt, record: Option<Value>| {
-        submission.spec.attempt = attempt;
-        submission.status.as_mut().unwrap().attempt = Some(attempt);
+        submission.spec.attempt = Attempt(attempt);
+        submission.status.as_mut().unwrap().attempt = Some(Attempt(attempt));
         let annotations = record.map(|record| (names::ANNOTATION_INGESTED.to_owned(), record.to_string()));
         submission.metadata.annotations = annotations.map(|annotation| [annotation].into());
         run_of(&submission).by_hand
@@ -214,17 +214,20 @@ fn a_run_has_a_job_once_that_of_this_attempt_was_asked_for() {
 #[test]
 fn an_attempt_that_is_asked_for_early_is_not_the_one_that_runs() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
-    submission.spec.attempt = 2;
+    submission.spec.attempt = Attempt(2);
     let run = run_of(&submission);
-    assert_eq!((run.attempt, run.job.as_str(), run.has_job), (1, "sub-1", true));
+    assert_eq!(
+        (run.attempt, run.job.as_str(), run.has_job),
+        (Attempt(1), "sub-1", true)
+    );
     let ended_in_evalai = SubmissionState {
-        attempt: 1,
+        attempt: Attempt(1),
         ended: Some(Status::Cancelled),
         ..SubmissionState::default()
     };
     assert!(map_view(&ended_in_evalai, &submission, None).cancelled);
     submission.status = None;
-    assert_eq!(run_of(&submission).attempt, 2);
+    assert_eq!(run_of(&submission).attempt, Attempt(2));
 }
 
 #[test]
@@ -233,7 +236,7 @@ fn an_end_that_evalai_showed_already_is_published_at_one_moment_whatever_is_read
     let at = Timestamp::UNIX_EPOCH;
     let end_after = |seconds: i64| {
         let seen = SubmissionState {
-            attempt: 1,
+            attempt: Attempt(1),
             end: Some(Ended::Agreed {
                 status: Status::Cancelled,
                 at,

@@ -14,9 +14,9 @@ use kube::{Api, Client};
 
 use super::view::{LogAt, LogPlace};
 use crate::services::archive::Archive;
-use leaderboard_api::JobNumber;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_api::{Attempt, JobNumber};
 
 /// Characters that are kept, as EvalAI's own worker does.
 const TAIL_CHARS: usize = 10_000;
@@ -42,7 +42,7 @@ pub struct LogDemand {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tail {
     pub container: String,
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// Where all of it is, below the run's prefix, if it is stored.
     pub key: Option<String>,
     /// With the first line for hosts at most 10,000 characters.
@@ -130,7 +130,7 @@ async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogD
     (None, is_unclear)
 }
 
-fn found(attempt: i64, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
+fn found(attempt: Attempt, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
     let container = place.container.clone();
     let key = match &place.at {
         LogAt::Bucket { key } => Some(key.clone()),
@@ -146,7 +146,7 @@ fn found(attempt: i64, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
     })
 }
 
-fn heading(container: &str, attempt: i64, key: Option<&str>) -> String {
+fn heading(container: &str, attempt: Attempt, key: Option<&str>) -> String {
     match key {
         Some(key) => format!("The end of {container}'s log in attempt {attempt}; all of it is in {key}.\n"),
         None => format!("The end of {container}'s log in attempt {attempt}.\n"),
@@ -254,20 +254,20 @@ mod tests {
     fn a_tail_is_the_end_of_the_text_and_no_longer_than_allowed() {
         let long: Vec<String> = (0..5000).map(|n| format!("line {n} ü")).collect();
         let long = long.join("\n");
-        let cut = found(1, &place(), long.as_bytes()).unwrap().for_hosts();
+        let cut = found(Attempt(1), &place(), long.as_bytes()).unwrap().for_hosts();
         assert_eq!(cut.chars().count(), TAIL_CHARS);
         let heading = "The end of agent-2's log in attempt 1; all of it is in agent/agent2/leaderboard.log.\n";
         assert!(cut.starts_with(heading) && cut.ends_with("line 4999 ü"), "{cut}");
-        let short = found(1, &place(), b"short\n").unwrap();
+        let short = found(Attempt(1), &place(), b"short\n").unwrap();
         assert_eq!(short.for_hosts(), format!("{heading}short"));
         for nothing in ["", " \n\r\n", "\u{1b}[0m\u{0}"] {
-            assert_eq!(found(1, &place(), nothing.as_bytes()), None, "{nothing:?}");
+            assert_eq!(found(Attempt(1), &place(), nothing.as_bytes()), None, "{nothing:?}");
         }
     }
 
     #[test]
     fn what_participants_read_of_a_log_names_no_file_of_the_hosts() {
-        let tail = found(1, &place(), b"Traceback: boom\n").unwrap();
+        let tail = found(Attempt(1), &place(), b"Traceback: boom\n").unwrap();
         assert_eq!(
             tail.for_participants(),
             "The end of agent-2's log in attempt 1:\nTraceback: boom"

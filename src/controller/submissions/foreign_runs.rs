@@ -17,7 +17,7 @@ use crate::services::archive::{Archive, ArchiveError, Cause, Listed};
 use crate::services::aws::Aws;
 use crate::services::table::{ObservedRow, Table, TableError, TableId};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{self as api, RunId, Storage, Submission, effective};
+use leaderboard_api::{self as api, Attempt, RunId, Storage, Submission, effective};
 
 /// Time one look may take.
 const LIMIT: Duration = Duration::from_secs(20);
@@ -35,7 +35,7 @@ const MOST_MARKS: usize = 1000;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
     /// An attempt asks anew: another program may have begun since.
-    pub attempt: i64,
+    pub attempt: Attempt,
     pub table: Option<api::Table>,
     pub storage: Storage,
     pub run_id: RunId,
@@ -85,7 +85,7 @@ impl questions::Question for Question {
     const AT_ONCE: usize = 8;
     const GOOD_FOR: Duration = AGAIN;
 
-    fn attempt(&self) -> i64 {
+    fn attempt(&self) -> Attempt {
         self.attempt
     }
 }
@@ -235,7 +235,12 @@ fn stored(objects: &[Listed]) -> StoredRun {
 }
 
 /// What a submission's run would store, and where its row would be.
-pub fn question(submission: &Submission, leaderboard: &api::LeaderboardSpec, attempt: i64, team: String) -> Question {
+pub fn question(
+    submission: &Submission,
+    leaderboard: &api::LeaderboardSpec,
+    attempt: Attempt,
+    team: String,
+) -> Question {
     Question {
         attempt,
         table: leaderboard.table.clone(),
@@ -264,7 +269,7 @@ mod tests {
 
     fn ask(attempt: i64) -> Question {
         Question {
-            attempt,
+            attempt: Attempt(attempt),
             table: None,
             storage: serde_json::from_value(json!({"bucket": "results"})).unwrap(),
             run_id: "77".parse().unwrap(),
@@ -291,22 +296,25 @@ mod tests {
         shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(shared.next(), None, "it is under way");
         tokio::time::advance(Duration::from_secs(3)).await;
-        assert_eq!(shared.observe("u", 1), ObservedTraces::Asked(Duration::from_secs(3)));
+        assert_eq!(
+            shared.observe("u", Attempt(1)),
+            ObservedTraces::Asked(Duration::from_secs(3))
+        );
         assert_eq!(shared.done("u", &ask(1), nothing()), Some(by("s")));
         let answered = ObservedTraces::Answered(Arc::new(nothing()));
-        assert_eq!(shared.observe("u", 1), answered);
+        assert_eq!(shared.observe("u", Attempt(1)), answered);
         shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(shared.next(), None, "the answer is young");
         tokio::time::advance(AGAIN).await;
         assert_eq!(shared.next(), None, "nobody asks");
         shared.want("u".into(), by("s"), ask(1), LogSpan::default());
         assert_eq!(
-            shared.observe("u", 1),
+            shared.observe("u", Attempt(1)),
             answered,
             "the old answer stays until there is another"
         );
         assert_eq!(shared.next(), Some(("u".into(), ask(1), "one".into())));
-        assert_eq!(shared.observe("u", 2), ObservedTraces::NotAsked);
+        assert_eq!(shared.observe("u", Attempt(2)), ObservedTraces::NotAsked);
         shared.want("u".into(), by("s"), ask(2), LogSpan::default());
         assert_eq!(
             shared.done("u", &ask(1), nothing()),

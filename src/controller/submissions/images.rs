@@ -12,13 +12,13 @@ use crate::kubernetes::call;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::registry::{Credentials, Facts, Fault, Image, Registries};
-use leaderboard_api::Submission;
+use leaderboard_api::{Attempt, Submission};
 
 /// What is asked of a registry.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Question {
     /// An attempt asks anew: its image may have been pushed since.
-    pub attempt: i64,
+    pub attempt: Attempt,
     pub image: Image,
     /// Secrets of the Leaderboard's Pods with credentials of registries.
     pub secrets: Vec<String>,
@@ -31,7 +31,7 @@ impl questions::Question for Question {
     /// One answer serves the whole attempt.
     const GOOD_FOR: Duration = Duration::MAX;
 
-    fn attempt(&self) -> i64 {
+    fn attempt(&self) -> Attempt {
         self.attempt
     }
 }
@@ -88,7 +88,7 @@ mod tests {
 
     fn question(attempt: i64, reference: &str) -> Question {
         Question {
-            attempt,
+            attempt: Attempt(attempt),
             image: Image {
                 registry: "r.example".into(),
                 path: "a".into(),
@@ -112,15 +112,22 @@ mod tests {
         shared.want("u".into(), by("s"), first.clone(), LogSpan::default());
         assert_eq!(shared.next(), None, "it is under way");
         tokio::time::advance(Duration::from_secs(3)).await;
-        assert_eq!(shared.observe("u", 1), ObservedImage::Asked(Duration::from_secs(3)));
+        assert_eq!(
+            shared.observe("u", Attempt(1)),
+            ObservedImage::Asked(Duration::from_secs(3))
+        );
         assert_eq!(shared.done("u", &first, Err(Fault::NotFound)), Some(by("s")));
         assert_eq!(
-            shared.observe("u", 1),
+            shared.observe("u", Attempt(1)),
             ObservedImage::Answered(Arc::new(Err(Fault::NotFound)))
         );
-        assert_eq!(shared.observe("u", 2), ObservedImage::NotAsked);
+        assert_eq!(shared.observe("u", Attempt(2)), ObservedImage::NotAsked);
         shared.want("u".into(), by("s"), question(2, "one"), LogSpan::default());
-        assert_eq!(shared.next().unwrap().1.attempt, 2, "it may have been pushed since");
+        assert_eq!(
+            shared.next().unwrap().1.attempt,
+            Attempt(2),
+            "it may have been pushed since"
+        );
     }
 
     #[tokio::test(start_paused = true)]
@@ -131,7 +138,7 @@ mod tests {
         shared.next();
         shared.want("u".into(), by("s"), new.clone(), LogSpan::default());
         assert_eq!(shared.done("u", &old, Err(Fault::NotFound)), None);
-        assert_eq!(shared.observe("u", 1), ObservedImage::Asked(Duration::ZERO));
+        assert_eq!(shared.observe("u", Attempt(1)), ObservedImage::Asked(Duration::ZERO));
         assert_eq!(shared.next().unwrap().1, new);
     }
 
@@ -147,9 +154,9 @@ mod tests {
         shared.done(&uid, &question, Err(Fault::Denied));
         tokio::time::advance(KEPT).await;
         shared.want("c".into(), by("c"), super::tests::question(1, "c"), LogSpan::default());
-        assert_eq!(shared.observe("a", 1), ObservedImage::NotAsked);
+        assert_eq!(shared.observe("a", Attempt(1)), ObservedImage::NotAsked);
         assert!(
-            matches!(shared.observe("b", 1), ObservedImage::Asked(_)),
+            matches!(shared.observe("b", Attempt(1)), ObservedImage::Asked(_)),
             "it still waits"
         );
     }

@@ -11,7 +11,7 @@ use tokio::time::Instant;
 
 use crate::controller::objects::uid;
 use crate::lock::lock;
-use leaderboard_api::{Submission, SubmissionStatus};
+use leaderboard_api::{Attempt, Submission, SubmissionStatus};
 
 /// Time between two writes of places in line, over all Submissions.
 const PLACE_PACE: Duration = Duration::from_secs(1);
@@ -27,13 +27,13 @@ pub struct Memory {
 #[derive(Default)]
 struct Entry {
     written: Option<Written>,
-    partial: Option<(i64, u32)>,
+    partial: Option<(Attempt, u32)>,
     /// The Job that was created last, and when.
     job: Option<(String, Instant)>,
     /// The Job that the API server refuses to make, and why.
     refused: Option<Box<(String, String)>>,
     /// Of which attempt EvalAI has been asked whether it is to run, and since when.
-    asked: Option<(i64, Instant)>,
+    asked: Option<(Attempt, Instant)>,
     /// When its place may be written, until its status is.
     place_at: Option<Instant>,
 }
@@ -122,7 +122,7 @@ impl Memory {
     }
 
     /// Remembers a partial result.
-    pub fn sent_partial(&self, submission: &Submission, attempt: i64, done: u32) {
+    pub fn sent_partial(&self, submission: &Submission, attempt: Attempt, done: u32) {
         lock(&self.entries).entry(uid(submission).into()).or_default().partial = Some((attempt, done));
     }
 
@@ -261,7 +261,7 @@ mod tests {
         tokio::time::advance(Duration::from_secs(4)).await;
         memory.asks_evalai(&object);
         assert_eq!(memory.evalai_waited(&object), Duration::from_secs(4));
-        object.spec.attempt = 2;
+        object.spec.attempt = Attempt(2);
         assert_eq!(memory.evalai_waited(&object), Duration::ZERO);
         memory.asks_evalai(&object);
         assert_eq!(memory.evalai_waited(&object), Duration::ZERO);

@@ -10,7 +10,7 @@ use crate::controller::objects::Wake;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use leaderboard_api::{RunId, RunPlan, Storage, Submission, effective};
+use leaderboard_api::{Attempt, RunId, RunPlan, Storage, Submission, effective};
 
 /// Time one look may take.
 const LIMIT: Duration = Duration::from_secs(20);
@@ -22,7 +22,7 @@ const RESULTS_KEY: &str = "agent/agent_results.json";
 /// Where the other program stores a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
-    attempt: i64,
+    attempt: Attempt,
     storage: Storage,
     run_id: RunId,
 }
@@ -43,7 +43,7 @@ impl questions::Question for Question {
     // A run that has ended stays as it is.
     const GOOD_FOR: Duration = Duration::from_hours(1);
 
-    fn attempt(&self) -> i64 {
+    fn attempt(&self) -> Attempt {
         self.attempt
     }
 }
@@ -101,7 +101,7 @@ fn routes(bytes: &[u8]) -> Option<Routes> {
 
 impl Question {
     /// The original has no prefix before the ids of runs, and one that observes has one of its own.
-    pub fn of(plan: &RunPlan, attempt: i64) -> Self {
+    pub fn of(plan: &RunPlan, attempt: Attempt) -> Self {
         let storage = Storage {
             prefix: None,
             ..plan.storage.clone()

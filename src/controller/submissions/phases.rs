@@ -7,7 +7,7 @@ use jiff::Timestamp;
 
 use super::view::View;
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, PUBLISHED, RECORDED, RUNNING};
-use leaderboard_api::{Ingested, SubmissionStatus, reasons};
+use leaderboard_api::{Attempt, Ingested, SubmissionStatus, reasons};
 
 /// What a submission goes through.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -180,7 +180,7 @@ impl Step<'_> {
 
     /// When the attempt began: the first one with the object, any other with its status.
     fn begun(&self) -> Option<Timestamp> {
-        if self.new.attempt == Some(1) {
+        if self.new.attempt == Some(Attempt::FIRST) {
             return Some(created(self.view));
         }
         let mut known = self.old.into_iter().chain([self.new]);

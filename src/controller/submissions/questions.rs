@@ -16,7 +16,7 @@ use crate::controller::objects::{Wake, log_span_of, uid, uid_of};
 use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
-use leaderboard_api::Submission;
+use leaderboard_api::{Attempt, Submission};
 
 /// How long an answer is kept that nobody asks for again.
 pub(super) const KEPT: Duration = Duration::from_mins(10);
@@ -30,7 +30,7 @@ pub trait Question: Clone + PartialEq + Send + 'static {
     /// How long an answer is good: after that the same question is asked again.
     const GOOD_FOR: Duration;
     /// Another attempt asks anew.
-    fn attempt(&self) -> i64;
+    fn attempt(&self) -> Attempt;
 }
 
 /// What is known for a submission's present attempt.
@@ -89,7 +89,7 @@ impl<Q: Question> Questions<Q> {
     /// What is known for the submission's present attempt.
     pub fn observe(&self, submission: &Submission) -> Observed<Q::Answer> {
         let attempt = submission.status.as_ref().and_then(|status| status.attempt);
-        self.0.observe(uid(submission), attempt.unwrap_or(1))
+        self.0.observe(uid(submission), attempt.unwrap_or_default())
     }
 
     /// Drops what is known for an object that is gone.
@@ -134,7 +134,7 @@ impl<Q: Question> Shared<Q> {
         self.notify.notify_one();
     }
 
-    pub(super) fn observe(&self, uid: &str, attempt: i64) -> Observed<Q::Answer> {
+    pub(super) fn observe(&self, uid: &str, attempt: Attempt) -> Observed<Q::Answer> {
         let entries = lock(&self.entries);
         let Some(entry) = entries.get(uid).filter(|entry| entry.question.attempt() == attempt) else {
             return Observed::NotAsked;

@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 use crate::pod::report::{Logs, Report, ReportError, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Progress, Score};
+use leaderboard_api::{Attempt, Progress, Score};
 
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
@@ -28,7 +28,7 @@ pub struct StoredReport {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportDigest {
     pub id: ReportId,
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// UID of the Pod that wrote it.
     pub pod_uid: String,
     pub done: u32,

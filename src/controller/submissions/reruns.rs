@@ -13,10 +13,7 @@ use kube::runtime::reflector::ObjectRef;
 
 use crate::lock::lock;
 use crate::services::evalai::row::Row;
-use leaderboard_api::{Rerun, Submission, names};
-
-/// The highest number that `spec.attempt` may have.
-const MOST_ATTEMPTS: i64 = 9999;
+use leaderboard_api::{Attempt, Rerun, Submission, names};
 
 /// The Submission that a row is a re-run of, among `others` of the same namespace. A participant can edit the row, so only a
 /// Submission of the same Leaderboard, phase and team is taken.
@@ -53,7 +50,7 @@ pub(super) fn original(
 /// The newest submission that is older than a row, and was submitted in the second that the row names. A resumed submission names its
 /// own time too, and is no copy.
 fn copied(row: &Row, submission: &Submission, others: &[Arc<Submission>]) -> Option<String> {
-    if submission.spec.attempt != 1 || last_attempt(row) > 0 {
+    if submission.spec.attempt != Attempt::FIRST || last_attempt(row).is_some() {
         return None;
     }
     let second = row.submitted_at?.as_second();
@@ -65,19 +62,19 @@ fn copied(row: &Row, submission: &Submission, others: &[Arc<Submission>]) -> Opt
     older.max_by_key(|other| id(other)).map(|other| other.name_any())
 }
 
-/// The highest attempt whose first Job a row names as its own; 0 for none. A participant can edit the row, so a number that no
+/// The highest attempt whose first Job a row names as its own. A participant can edit the row, so a number that no
 /// Submission can have counts for nothing.
-pub(super) fn last_attempt(row: &Row) -> i64 {
+pub(super) fn last_attempt(row: &Row) -> Option<Attempt> {
     let own = names::submission(row.id);
     let jobs = row.jobs.iter().filter_map(|job| split(job));
-    let attempts = jobs.filter(|(name, attempt)| *name == own && (1..MOST_ATTEMPTS).contains(attempt));
-    attempts.map(|(_, attempt)| attempt).max().unwrap_or(0)
+    let attempts = jobs.filter(|(name, attempt)| *name == own && (Attempt::FIRST..Attempt::HIGHEST).contains(attempt));
+    attempts.map(|(_, attempt)| attempt).max()
 }
 
 /// Submission and attempt of a first Job, `<name>-<attempt>`.
-fn split(job: &str) -> Option<(&str, i64)> {
+fn split(job: &str) -> Option<(&str, Attempt)> {
     let (name, attempt) = job.rsplit_once('-')?;
-    Some((name, attempt.parse().ok()?))
+    Some((name, Attempt(attempt.parse().ok()?)))
 }
 
 /// Which submissions were re-run, by namespace and name of the original: the re-run's name and when.
@@ -202,9 +199,9 @@ mod tests {
             ..copy.clone()
         };
         assert_eq!(found(&own, &new, &all), None, "resumed: it has run under its own id");
-        new.spec.attempt = 2;
+        new.spec.attempt = Attempt(2);
         assert_eq!(found(&copy, &new, &all), None, "resumed");
-        new.spec.attempt = 1;
+        new.spec.attempt = Attempt(1);
         copy.submitted_at = Some("2026-11-19T08:30:01Z".parse().unwrap());
         assert_eq!(found(&copy, &new, &all), None, "of another second");
     }

@@ -140,7 +140,7 @@ fn gpu_seconds(status: &SubmissionStatus) -> String {
 /// The attempt as the row counts it: also those of an earlier Submission of the same run, which is gone.
 pub(super) fn attempt_of_run(status: &SubmissionStatus) -> i64 {
     let earlier = status.plan.as_ref().map_or(0, |plan| plan.earlier_attempts);
-    status.attempt.unwrap_or(1).saturating_add(earlier)
+    status.attempt.unwrap_or_default().0.saturating_add(earlier)
 }
 
 /// Whether its results count.
@@ -177,6 +177,7 @@ fn columns(report: Option<&ReportDigest>, version: LeaderboardVersion) -> Vec<(S
 #[cfg(test)]
 mod tests {
     use super::*;
+    use leaderboard_api::Attempt;
     use serde_json::json;
 
     fn report(results: &str) -> ReportDigest {
@@ -258,7 +259,7 @@ mod tests {
         let shown = |container: &str, readers| {
             let tail = Tail {
                 container: container.into(),
-                attempt: 1,
+                attempt: Attempt(1),
                 key: Some("agent/agent1/leaderboard.log".into()),
                 text: "route 7".into(),
             };

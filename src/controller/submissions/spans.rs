@@ -18,7 +18,7 @@ pub fn of(view: &View, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {
     let uid = uid_of(submission.as_ref());
     let root = id(&uid, Phase::Intake, 0);
     let attempt = new.attempt.unwrap_or_default();
-    let of_attempt = id(&uid, Phase::Attempt, attempt);
+    let of_attempt = id(&uid, Phase::Attempt, attempt.0);
     let span = |one: &Ended| {
         let (own, parent) = match one.phase {
             Phase::Intake => (root, None),
@@ -68,7 +68,7 @@ fn common(submission: &Submission, new: &SubmissionStatus) -> Vec<(&'static str,
         ("k8s.namespace.name", text(meta.namespace.as_deref())),
         ("leaderboard.name", text(Some(&submission.spec.leaderboard_name))),
         ("leaderboard.submission", text(meta.name.as_deref())),
-        ("leaderboard.attempt", Value::Number(new.attempt.unwrap_or_default())),
+        ("leaderboard.attempt", Value::Number(new.attempt.unwrap_or_default().0)),
     ]
 }
 

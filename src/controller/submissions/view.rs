@@ -15,7 +15,7 @@ use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
-use leaderboard_api::{JobNumber, Leaderboard, Rerun, SharedText, Submission, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, Rerun, SharedText, Submission, names};
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]
@@ -410,8 +410,8 @@ pub struct EvalaiInfo {
     pub resumed_at: Option<Timestamp>,
     /// The submission that this one re-runs.
     pub rerun_of: Option<Rerun>,
-    /// The highest attempt whose Job its row names; 0 for none.
-    pub last_attempt: i64,
+    /// The highest attempt whose Job its row names.
+    pub last_attempt: Option<Attempt>,
     pub image: Option<String>,
     /// Why the uploaded file names no image, which no later read changes; none while it has not been read.
     pub image_problem: Option<String>,

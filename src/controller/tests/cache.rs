@@ -8,7 +8,7 @@ use crate::controller::stores::owner_uid;
 use crate::controller::submissions::job_spec::{JobInput, build_object};
 use crate::kubernetes::objects::{Job, Pod, Texts};
 use crate::kubernetes::{Index, Item, Store, Watchable};
-use leaderboard_api::{JobNumber, Leaderboard, Submission};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, Submission};
 
 /// As many as one page of a list has.
 const COUNT: usize = 100;
@@ -63,7 +63,7 @@ fn job(number: usize) -> Value {
         submission: &submission,
         leaderboard: &board(),
         plan,
-        number: JobNumber::first(1),
+        number: JobNumber::first(Attempt(1)),
         settings: &settings(),
         without_gpu: &[],
         addresses: None,

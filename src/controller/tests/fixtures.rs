@@ -26,15 +26,10 @@ use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
 use crate::controller::settings::Settings;
 use crate::controller::stores::{Stores, owner_uid};
-use crate::controller::submissions::addresses::Addresses;
-use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::foreign_runs::ForeignRuns;
-use crate::controller::submissions::images::Images;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
-use crate::controller::submissions::observe::lookups::Lookups;
-use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_history::Teams;
 use crate::kubernetes::Namespaces;
@@ -46,7 +41,7 @@ use crate::observability::traces::Traces;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options};
 use crate::services::table::Recorder;
-use leaderboard_api::{JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";
@@ -123,14 +118,9 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         settings: settings(),
         stores: stores(cluster),
         memory: Memory::default(),
-        archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), noting(&answering)),
-        lookups: Lookups::start(client.clone(), &tasks, noting(&answering)),
+        workers: Workers::start(&aws, &client, &tasks, None, || noting(&answering)),
         causes: Causes::default(),
         teams,
-        images: Images::start(&aws, client.clone(), &tasks, noting(&answering)),
-        foreign_runs: ForeignRuns::start(&aws, &tasks, noting(&answering)),
-        other_results: OtherResults::start(&aws, &tasks, noting(&answering)),
-        addresses: Addresses::start(aws.names(), None, &tasks, noting(&answering)),
         reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),
@@ -280,10 +270,10 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     submission.metadata.finalizers = Some(vec![names::FINALIZER_SUBMISSION.into()]);
     let (track, image) = (&board.spec.tracks[0], "agent:1".to_owned());
     let plan = effective::plan(&board.spec, track, name.parse().unwrap(), image, false);
-    let job_name = names::job(name, JobNumber::first(1));
+    let job_name = names::job(name, JobNumber::first(Attempt(1)));
     submission.status = Some(SubmissionStatus {
         state: Some(State::Pending),
-        attempt: Some(1),
+        attempt: Some(Attempt(1)),
         team: submission.spec.team.clone().map(Into::into),
         plan: Some(plan),
         job_name: Some(job_name.clone()),

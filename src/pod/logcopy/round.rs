@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hyper::body::Bytes;
-use leaderboard_runner::protocol::{self, Mark, Side, StatusFile};
+use leaderboard_runner::protocol::{self, Mark, Pair, StatusFile};
 use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
@@ -17,6 +17,7 @@ use crate::lock::lock;
 use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
+use crate::pod::keys::agent_folder;
 use crate::pod::places::Setting;
 use crate::pod::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
 use crate::pod::run::{STATUS_FOLDER, Stop};
@@ -183,9 +184,9 @@ impl Rounds {
         let Some(watch) = self.folders.clone() else { return };
         let status = self.setting.places.status();
         let mut folders = vec![status.clone(), self.tree.path().join("agent")];
-        for pair in 1..=self.pairs() {
-            folders.push(self.tree.path().join(format!("agent/agent{pair}")));
-            folders.extend([Side::Simulator, Side::Agent].map(|side| status.join(format!("{side}-{pair}"))));
+        for pair in Pair::first(self.pairs()) {
+            folders.push(self.tree.path().join(agent_folder(pair)));
+            folders.extend([pair.simulator(), pair.agent()].map(|member| status.join(member.to_string())));
         }
         // Without a watch the period is all there is.
         let _ = blocking(move || folders.iter().for_each(|folder| _ = watch.add(folder))).await;

@@ -6,7 +6,7 @@ use std::path::Path;
 use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
 
 use super::run::{Run, SCHEMA, STATUS_FOLDER};
-use leaderboard_api::{ByteQuantity, LeaderboardVersion, RouteSlice, RunPlan, Storage, Verify};
+use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RouteSlice, RunPlan, Storage, Verify};
 
 /// Two pairs of two routes each, once.
 pub(crate) fn run() -> Run {
@@ -15,7 +15,7 @@ pub(crate) fn run() -> Run {
         namespace: "default".to_owned(),
         submission: "submission-77".to_owned(),
         uid: "uid-1".to_owned(),
-        attempt: 1,
+        attempt: Attempt(1),
         plan: RunPlan {
             run_id: "77".parse().unwrap(),
             leaderboard_version: LeaderboardVersion::V2,

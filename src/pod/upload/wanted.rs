@@ -6,8 +6,9 @@ use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
 use super::Haste;
-use crate::pod::keys::{REFUSED, checkpoint_path, known_logs};
+use crate::pod::keys::{REFUSED, agent_folder, checkpoint_path, known_logs};
 use crate::pod::tree::{Stamp, Tree};
+use leaderboard_runner::protocol::Pair;
 
 /// Entries read in one agent's folder.
 const AGENT_ENTRIES: usize = 5_000;
@@ -55,8 +56,8 @@ impl Files {
     pub fn find(tree: &Tree, pairs: usize) -> Self {
         let mut found = Self::default();
         let each = ENTRIES.checked_div(pairs).unwrap_or(ENTRIES).min(AGENT_ENTRIES);
-        for pair in 1..=pairs {
-            found.walk(tree, &format!("agent/agent{pair}"), each);
+        for pair in Pair::first(pairs) {
+            found.walk(tree, &agent_folder(pair), each);
         }
         // A flood of other names must not hide them.
         let logs = known_logs(pairs).filter_map(|path| Some((tree.file(&path).ok()??.1, path)));
@@ -84,7 +85,7 @@ impl Files {
     /// What is to be stored of it, by why each pair's checkpoint is refused. A checkpoint is stored from memory, whole. One that
     /// is refused is kept as evidence under another name, so that nothing is resumed from it.
     pub fn wanted(&self, refused: &[Option<String>]) -> Vec<Wanted> {
-        let of_pair: BTreeMap<String, bool> = (1..)
+        let of_pair: BTreeMap<String, bool> = Pair::first(refused.len())
             .zip(refused)
             .map(|(pair, refused)| (checkpoint_path(pair), refused.is_some()))
             .collect();
@@ -136,9 +137,9 @@ mod tests {
 
     #[test]
     fn a_checkpoint_is_wanted_as_evidence_only() {
-        let files = [checkpoint_path(1), checkpoint_path(2), "agent/agent1/x".to_owned()];
+        let files = Pair::first(2).map(checkpoint_path).chain(["agent/agent1/x".to_owned()]);
         let found = Files {
-            files: files.into_iter().map(|path| (path, Stamp::default())).collect(),
+            files: files.map(|path| (path, Stamp::default())).collect(),
             ..Files::default()
         };
         let wanted = found.wanted(&[None, Some("torn".to_owned())]);

@@ -22,6 +22,7 @@ use crate::pod::upload::quota::{LEAST, Quota};
 use crate::pod::upload::{Memory, Stored, fingerprint};
 use crate::services::archive::{Archive, Listed};
 use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_runner::protocol::Pair;
 
 /// Most objects of a run.
 const MAX_OBJECTS: usize = 100_000;
@@ -135,7 +136,7 @@ fn checkpoints_of_workers(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> 
     let workers = objects
         .iter()
         .filter_map(|object| of_worker(&object.key).or_else(|| log_of_worker(&object.key)));
-    if workers.max() != Some(pairs) {
+    if workers.max() != Pair::first(pairs).last() {
         return (Vec::new(), objects);
     }
     let own: BTreeSet<String> = objects.iter().map(|object| object.key.clone()).collect();
@@ -149,22 +150,17 @@ fn checkpoints_of_workers(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> 
 }
 
 /// The number of the worker whose checkpoint a key is.
-fn of_worker(key: &str) -> Option<usize> {
-    number(key.strip_prefix("agent/partial_agent_results")?.strip_suffix(".json")?)
+fn of_worker(key: &str) -> Option<Pair> {
+    let worker = key.strip_prefix("agent/partial_agent_results")?.strip_suffix(".json")?;
+    worker.parse().ok()
 }
 
 /// The number of the worker one of whose containers has this log.
-fn log_of_worker(key: &str) -> Option<usize> {
+fn log_of_worker(key: &str) -> Option<Pair> {
     let (container, worker) = key.strip_prefix("logs/")?.strip_suffix(".log")?.split_once('-')?;
     ["agent", "simulator", "uploader"]
         .contains(&container)
-        .then(|| number(worker))?
-}
-
-/// A number from 1 on, as a shell writes it.
-fn number(text: &str) -> Option<usize> {
-    let number = text.parse().ok().filter(|number| *number > 0)?;
-    (usize::to_string(&number) == text).then_some(number)
+        .then(|| worker.parse().ok())?
 }
 
 /// Whether a key is one that the run goes on with.

@@ -15,6 +15,7 @@ use super::super::status::{Outcome, Progress};
 use super::super::types::Key;
 use super::*;
 use crate::observability::about::LogSpan;
+use leaderboard_api::Attempt;
 
 /// Reads one request, with its body. False at the end of the connection.
 async fn read(stream: &mut TcpStream) -> bool {
@@ -64,7 +65,7 @@ fn submission() -> SubmissionRef {
         },
         challenge: 1,
         pk: 7,
-        attempt: 1,
+        attempt: Attempt(1),
         log: LogSpan::default(),
     }
 }

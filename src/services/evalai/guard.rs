@@ -8,12 +8,12 @@
 //! asked for has begun, `cancelled` is a new cancel. Only an attempt that a person has begun here follows a cancelled one.
 
 use super::status::{Outcome, Progress, Status};
+use leaderboard_api as api;
 
 /// The attempt that a status may be about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Attempt {
-    /// From 1.
-    pub number: i64,
+    pub number: api::Attempt,
     /// A person has begun it here: EvalAI has not asked for it.
     pub by_hand: bool,
     /// See the module's text.
@@ -78,7 +78,7 @@ pub fn progress(status: Status, attempt: Attempt, is_known: bool, wanted: Progre
     match start(status, attempt) {
         Start::Drop(status) => Verdict::Ended(status),
         Start::Unclear => Verdict::Wait,
-        Start::Run if (attempt.number == 1 || is_known) && reached(status, wanted) => Verdict::There,
+        Start::Run if (attempt.number == api::Attempt::FIRST || is_known) && reached(status, wanted) => Verdict::There,
         Start::Run => Verdict::Send,
     }
 }
@@ -109,9 +109,10 @@ pub fn end(status: Status, attempt: Attempt, wanted: Outcome) -> End {
 
 /// The status as it is about this attempt: the end of an earlier attempt is a beginning.
 fn standing(status: Status, attempt: Attempt) -> Status {
+    let follows = attempt.number > api::Attempt::FIRST && !attempt.begun;
     match status {
-        Status::Failed if attempt.number > 1 && !attempt.begun => Status::Resuming,
-        Status::Cancelled if attempt.number > 1 && !attempt.begun && attempt.by_hand => Status::Resuming,
+        Status::Failed if follows => Status::Resuming,
+        Status::Cancelled if follows && attempt.by_hand => Status::Resuming,
         other => other,
     }
 }
@@ -142,7 +143,7 @@ mod tests {
     /// One that a person has begun, as all were once.
     fn of(number: i64, begun: bool) -> Attempt {
         Attempt {
-            number,
+            number: api::Attempt(number),
             by_hand: true,
             begun,
             under_way: false,

@@ -9,6 +9,7 @@ use super::row::{DatasetSplit, Phase, Received, Row, Split};
 use super::status::{Outcome, Progress, Status};
 use super::types::{ImageAnswer, Key, Payload};
 use crate::observability::about::LogSpan;
+use leaderboard_api::Attempt;
 
 /// Whom a request is about.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,7 +18,7 @@ pub struct SubmissionRef {
     pub challenge: i64,
     /// Id of the submission.
     pub pk: i64,
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// For the log.
     pub log: LogSpan,
 }

@@ -13,6 +13,7 @@ use crate::observability::about::LogSpan;
 pub use crate::services::ObjectKey as Key;
 use crate::services::held_text::HeldText;
 use crate::services::token::Token;
+use leaderboard_api::Attempt;
 
 /// The challenge of a Leaderboard and how it is asked.
 #[derive(Clone, Debug, PartialEq)]
@@ -85,8 +86,7 @@ impl Publisher {
 /// One attempt of a submission.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Run {
-    /// From 1.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// Name of the attempt's first Job, sent to EvalAI with `queued`: found there again, it shows that EvalAI knows of the
     /// attempt.
     pub job: String,
@@ -155,12 +155,12 @@ pub struct SubmissionState {
     pub row: Option<Arc<Row>>,
     /// When the row was read.
     pub read_at: Option<Timestamp>,
-    /// The newest attempt whose `ask` the row answers; 0 is none.
-    pub answered: i64,
+    /// The newest attempt whose `ask` the row answers.
+    pub answered: Option<Attempt>,
     /// What the uploaded file names as the image; none before it was asked for and answered.
     pub image: Option<ImageAnswer>,
     /// The attempt that all below is about.
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// How far EvalAI knows this attempt to be.
     pub progress: Option<Progress>,
     /// EvalAI has ended this attempt, and not because of us.

@@ -45,7 +45,7 @@ async fn a_refused_token_is_reported_and_a_new_one_used() {
     world.target = good;
     world.hub.serve(&leaderboard(), &world.target).unwrap();
     world.ask(pk, false);
-    world.until(pk, |view| view.answered == 1).await;
+    world.until(pk, |view| view.answered == Some(Attempt(1))).await;
     assert_eq!(world.hub.token_refused(&leaderboard()), None);
     let Usage { used, limit, .. } = world.hub.usage(&leaderboard()).unwrap();
     assert!(used > 0 && limit == 6000);

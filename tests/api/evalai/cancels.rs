@@ -29,7 +29,7 @@ async fn just_listed(world: &mut World, count: usize) -> Vec<i64> {
         world.ask(*pk, false);
     }
     for pk in &pks {
-        world.until(*pk, |view| view.answered == 1).await;
+        world.until(*pk, |view| view.answered == Some(Attempt(1))).await;
         world.live(*pk);
     }
     world
@@ -154,7 +154,7 @@ async fn measure(what: &str, list_delay_ms: u64, requests_per_minute: u32) {
         world.ask(*pk, false);
     }
     for pk in &pks {
-        world.until(*pk, |view| view.answered == 1).await;
+        world.until(*pk, |view| view.answered == Some(Attempt(1))).await;
         world.live(*pk);
     }
     let cancelled = cancel_all(&world, &pks).await;

@@ -83,7 +83,7 @@ async fn faults_of_the_server_are_survived() {
         let view = world.until(pk, |view| view.last_error.is_some()).await;
         let why = view.last_error.unwrap();
         assert!(why.contains(words), "{words}: {why}");
-        let view = world.until(pk, |view| view.answered == 1).await;
+        let view = world.until(pk, |view| view.answered == Some(Attempt(1))).await;
         assert_eq!(view.last_error, None);
     };
     join_all(cases.map(survive)).await;
@@ -206,7 +206,7 @@ async fn retry_after_is_obeyed_and_a_torn_answer_is_none() {
         "{:?} after the 429",
         second - first
     );
-    world.until(7, |view| view.answered == 1).await;
+    world.until(7, |view| view.answered == Some(Attempt(1))).await;
 }
 
 #[tokio::test]

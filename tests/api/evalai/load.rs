@@ -40,7 +40,7 @@ async fn old_cancelled_submissions_cost_nothing() {
         .with_state(|state| bulk(state, &old, Timestamp::now()).unwrap());
     let pk = world.submit();
     world.ask(pk, false);
-    world.until(pk, |view| view.answered == 1).await;
+    world.until(pk, |view| view.answered == Some(Attempt(1))).await;
     world.live(pk);
     world
         .server
@@ -86,7 +86,7 @@ async fn a_list_of_2000_rows_that_takes_23_seconds_holds_no_end_up() {
     // Older than all that the list shows, so that it reaches back to them.
     let live = world.submit_with(FileState::Stored, Timestamp::now() - SignedDuration::from_hours(1));
     world.ask(live, false);
-    world.until(live, |view| view.answered == 1).await;
+    world.until(live, |view| view.answered == Some(Attempt(1))).await;
     let rows = Bulk {
         count: ROWS - 1,
         phase: 1,

@@ -7,7 +7,7 @@ async fn a_lost_message_is_found_by_the_sweep() {
     let mut world = World::new().await;
     let known = world.submit();
     world.ask(known, false);
-    world.until(known, |view| view.answered == 1).await;
+    world.until(known, |view| view.answered == Some(Attempt(1))).await;
     let lost = world.submit_with(FileState::Stored, Timestamp::now() - SignedDuration::from_secs(300));
     world.hub.serve(&leaderboard(), &world.target).unwrap();
     let found = world.sweep.recv().await.unwrap();

@@ -18,7 +18,7 @@ async fn a_fresh_prefix_is_taken_and_everybody_gets_the_runner() {
     assert_eq!(pod.keys().await, [OWNER_KEY, REPORT_KEY]);
     assert_eq!(pod.owner().await, "pod-1");
     let report = pod.report().await.unwrap();
-    assert!(report.belongs_to("uid-1", 1) && !report.is_final && report.done == 0);
+    assert!(report.belongs_to("uid-1", Attempt(1)) && !report.is_final && report.done == 0);
     for folder in ["agent", STATUS_FOLDER, "logcopy"] {
         assert_eq!(
             fs::metadata(pod.path(folder)).unwrap().mode() & 0o7777,

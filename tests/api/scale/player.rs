@@ -13,7 +13,7 @@ use k8s_openapi::api::core::v1::{Node, Pod};
 use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
-use leaderboard_api::{PairState, names};
+use leaderboard_api::{Attempt, PairState, names};
 use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
 use leaderboard_operator::pod::run::Stop;
 use leaderboard_operator::services::archive::Archive;
@@ -262,7 +262,7 @@ fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
     let report = Report {
         schema: SCHEMA,
         submission_uid: job.owner_references()[0].uid.clone(),
-        attempt: 1,
+        attempt: Attempt(1),
         pod_uid: pod.uid().unwrap(),
         round: 0,
         done: 0,

@@ -8,7 +8,7 @@ use super::{
 use crate::board::Observed;
 use crate::change::{Change, Request, after_refusal, plan};
 use crate::transitions::Waiting;
-use leaderboard_api::{State, Submission};
+use leaderboard_api::{Attempt, State, Submission};
 
 fn planned(request: Request, submission: &Submission) -> Result<Change, String> {
     let plan = plan(request, submission, Observed::Found(&leaderboard()), frame());
@@ -39,7 +39,7 @@ fn a_cancel_explains_what_happens_at_its_stage() {
     ] {
         let plan = planned(Request::Cancel, &submission(&status)).unwrap();
         assert_eq!(plan.patch.as_ref().map(|p| &p["spec"]), Some(&json!({"cancel": true})));
-        assert_eq!(plan.attempt, 1);
+        assert_eq!(plan.attempt, Attempt(1));
         assert!(text(&plan).contains(expected), "{expected}: {}", text(&plan));
         assert!(text(&plan).contains("To continue it later: `kubectl leaderboard resume submission-42 -n carla`."));
     }
@@ -81,9 +81,9 @@ fn what_has_ended_is_not_cancelled() {
         assert!(why_not.starts_with(&expected), "{why_not}");
     }
     let mut higher = submission(&crashed());
-    higher.spec.attempt = 2;
+    higher.spec.attempt = Attempt(2);
     let plan = planned(Request::Cancel, &higher).unwrap();
-    assert_eq!(plan.attempt, 2, "the requested attempt can still be cancelled");
+    assert_eq!(plan.attempt, Attempt(2), "the requested attempt can still be cancelled");
 }
 
 #[test]
@@ -94,7 +94,7 @@ fn what_failed_or_was_cancelled_is_resumed() {
         let plan = planned(Request::Resume, &object).unwrap();
         let patch = json!({"metadata": {"resourceVersion": "17"}, "spec": {"attempt": 2, "cancel": false}});
         assert_eq!(plan.patch, Some(patch));
-        assert_eq!(plan.attempt, 2);
+        assert_eq!(plan.attempt, Attempt(2));
         assert!(
             text(&plan).contains("It continues from the results in s3://results/v2/42"),
             "{}",
@@ -113,7 +113,7 @@ fn nothing_else_is_resumed_and_the_next_step_is_named() {
     let mut going = submission(&crashed());
     going.metadata.deletion_timestamp = going.metadata.creation_timestamp.clone();
     let mut higher = submission(&crashed());
-    higher.spec.attempt = 2;
+    higher.spec.attempt = Attempt(2);
     for (object, expected, next) in [
         (
             submission(&Value::Null),
@@ -183,7 +183,7 @@ fn a_refusal_names_the_other_way() {
 
 #[test]
 fn a_wait_prints_each_transition_once_and_the_end() {
-    let mut wait = Waiting::new(2);
+    let mut wait = Waiting::new(Attempt(2));
     let attempt = |status: Value| submission(&with(status, &json!({"attempt": 2})));
     let mut observe = |object: &Submission| wait.observe(object, now());
     assert_eq!(

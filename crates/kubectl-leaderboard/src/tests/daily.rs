@@ -12,6 +12,7 @@ use super::{
 use crate::board::Observed;
 use crate::submit::{Submit, object};
 use crate::{rerun, status, top, why};
+use leaderboard_api::Attempt;
 
 /// The text, which docs/plugin.md has to show.
 fn shown(lines: &[String]) -> String {
@@ -246,7 +247,7 @@ fn only_what_the_infrastructure_failed_is_run_again() {
     let mut check = named("check-a", &node_lost());
     check.spec.check = true;
     let mut again = named("again", &node_lost());
-    again.spec.attempt = 2;
+    again.spec.attempt = Attempt(2);
     let all = [
         named("b-lost", &node_lost()),
         named("a-lost", &node_lost()),

@@ -13,7 +13,7 @@ use crate::error::Error;
 use crate::requeue;
 use crate::transitions::Waiting;
 use crate::{overview, why};
-use leaderboard_api::Submission;
+use leaderboard_api::{Attempt, Submission};
 
 const DOCS: &str = include_str!("../../../../docs/plugin.md");
 
@@ -80,7 +80,7 @@ fn cancel_and_resume_are_documented_as_they_are_printed() {
 #[test]
 fn the_states_on_the_way_are_documented_as_they_are_printed() {
     let stopping = json!({"reason": "Stopping", "message": "Stopping as requested; completed routes are kept."});
-    let mut wait = Waiting::new(1);
+    let mut wait = Waiting::new(Attempt::FIRST);
     let mut lines = Vec::new();
     for (time, status) in [
         ("2026-11-01T12:00:00Z", running()),

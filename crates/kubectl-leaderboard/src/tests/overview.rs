@@ -6,7 +6,7 @@ use super::{
     assert_width, cancelled, condition, crashed, finished, frame, leaderboard, named, node_lost, running, waiting, with,
 };
 use crate::overview::{Place, lines, nothing, value};
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Attempt, Leaderboard, Submission};
 
 fn printed(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> String {
     let place = Place {
@@ -134,7 +134,7 @@ fn one_that_is_being_deleted_or_resumed_has_a_line() {
     let mut going = named("going", &finished());
     going.metadata.deletion_timestamp = going.metadata.creation_timestamp.clone();
     let mut higher = named("higher", &cancelled());
-    higher.spec.attempt = 2;
+    higher.spec.attempt = Attempt(2);
     let text = printed(&[going, higher], Some(&[leaderboard()]));
     assert!(text.contains("going   Finished   3 min  Being deleted."), "{text}");
     assert!(

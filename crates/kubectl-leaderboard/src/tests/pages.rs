@@ -14,7 +14,7 @@ use crate::output::labelled;
 use crate::text::{Frame, log_line};
 use crate::transitions::Waiting;
 use crate::{report, submit};
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Attempt, Leaderboard, Submission};
 
 const TRIED: &str = "The image of simulator-1 cannot be pulled: not found. It was tried for 60 s.";
 
@@ -27,7 +27,7 @@ fn checked(
     frame: Frame,
 ) -> Vec<String> {
     let check = check(status);
-    let mut wait = Waiting::new(1).within(frame.width);
+    let mut wait = Waiting::new(Attempt::FIRST).within(frame.width);
     let mut lines = begun(&check, frame);
     lines.extend(wait.observe(&check, frame.now).lines);
     lines.push(String::new());

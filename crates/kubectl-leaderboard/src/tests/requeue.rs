@@ -10,7 +10,7 @@ use super::{
 use crate::board::Observed;
 use crate::change::{Request, plan};
 use crate::requeue::Requeue;
-use leaderboard_api::Submission;
+use leaderboard_api::{Attempt, Submission};
 
 #[derive(Parser)]
 struct Line {
@@ -29,7 +29,7 @@ fn all() -> Vec<Submission> {
     let mut check = named("check-a", &crashed());
     check.spec.check = true;
     let mut higher = named("resumed", &crashed());
-    higher.spec.attempt = 2;
+    higher.spec.attempt = Attempt(2);
     let mut going = named("going", &crashed());
     going.metadata.deletion_timestamp = going.metadata.creation_timestamp.clone();
     let mut requested = named("requested", &running());
@@ -127,7 +127,7 @@ fn a_run_keeps_its_attempt_and_an_end_gets_a_higher_one() {
         run,
         json!({"metadata": version, "spec": {"requeue": {"number": 1, "reason": "why"}}})
     );
-    assert_eq!(attempt, 1);
+    assert_eq!(attempt, Attempt(1));
     let mut ended = submission(&with(
         crashed(),
         &json!({"requeued": {"number": 4, "time": "2026-11-01T10:00:00Z"}}),
@@ -135,7 +135,7 @@ fn a_run_keeps_its_attempt_and_an_end_gets_a_higher_one() {
     ended.spec.requeue = serde_json::from_value(json!({"number": 4, "reason": "before"})).unwrap();
     let (end, attempt) = patch(&ended).unwrap();
     let spec = json!({"requeue": {"number": 5, "reason": "why"}, "attempt": 2, "cancel": false});
-    assert_eq!((end, attempt), (json!({"metadata": version, "spec": spec}), 2));
+    assert_eq!((end, attempt), (json!({"metadata": version, "spec": spec}), Attempt(2)));
     let mut twice = submission(&running());
     twice.spec.requeue = serde_json::from_value(json!({"number": 1})).unwrap();
     let why_not = patch(&twice).unwrap_err();

@@ -13,7 +13,7 @@ use crate::change::{Request, plan};
 use crate::requeue::{self, Requeue};
 use crate::transitions::Waiting;
 use crate::{overview, rerun, status, top, why};
-use leaderboard_api::Submission;
+use leaderboard_api::{Attempt, Submission};
 
 fn some() -> Vec<Submission> {
     let broken = "registry.example/carla/simulator:0.9.15-3";
@@ -178,7 +178,7 @@ fn changes_are_printed_as_their_files_show() {
         .lines
     });
     assert_shown("wait", |frame| {
-        let mut wait = Waiting::new(1).within(frame.width);
+        let mut wait = Waiting::new(Attempt::FIRST).within(frame.width);
         let states = [running(), crashed()];
         let lines = states
             .iter()

@@ -8,7 +8,7 @@ use super::{
 };
 use crate::board::Observed;
 use crate::why::explain;
-use leaderboard_api::{Leaderboard, Submission, reasons};
+use leaderboard_api::{Attempt, Leaderboard, Submission, reasons};
 
 fn printed(submission: &Submission, leaderboard: Observed<'_>) -> String {
     let lines = explain(submission, leaderboard, frame());
@@ -296,7 +296,7 @@ fn what_lasts_or_is_requested_is_shown() {
         assert!(flat.contains(&expected), "{expected}\n\n{text}");
     }
     let mut higher = submission(&crashed());
-    higher.spec.attempt = 2;
+    higher.spec.attempt = Attempt(2);
     let text = printed(&higher, Observed::Found(&leaderboard()));
     assert!(
         text.contains("attempt 2 is requested and starts when the operator processes it"),

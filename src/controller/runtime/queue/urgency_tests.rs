@@ -3,7 +3,7 @@ use serde_json::{Value, json};
 use super::*;
 use crate::controller::submissions::decide::StatusWrite;
 use crate::controller::submissions::view::ReportDemand;
-use leaderboard_api::JobNumber;
+use leaderboard_api::{Attempt, JobNumber};
 
 fn submission(change: &Value) -> Submission {
     let mut object = json!({
@@ -155,7 +155,7 @@ fn what_follows_is_urgent_while_the_report_of_an_end_is_awaited() {
         (Some(Stage::JobEnded), Class::Urgent),
     ] {
         let report = stage.map(|stage| ReportDemand {
-            job: JobNumber::first(1),
+            job: JobNumber::first(Attempt(1)),
             pod: None,
             stage,
             period: std::time::Duration::from_secs(10),

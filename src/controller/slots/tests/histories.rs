@@ -92,7 +92,7 @@ fn submission(number: i64, team: u8) -> Submission {
     object.metadata.uid = Some(format!("u{number}"));
     object.metadata.creation_timestamp = Some(time(number));
     object.status = Some(SubmissionStatus {
-        attempt: Some(1),
+        attempt: Some(Attempt(1)),
         ..SubmissionStatus::default()
     });
     object
@@ -180,7 +180,7 @@ impl World {
             Step::Ended(n) => self.end(n),
             Step::Resumed(n) => self.change(n, |object, status| {
                 if status.times.finished.is_some() {
-                    object.spec.attempt += 1;
+                    object.spec.attempt = object.spec.attempt.next();
                     object.spec.cancel = false;
                     *status = SubmissionStatus {
                         attempt: Some(object.spec.attempt),

@@ -4,8 +4,8 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::kubernetes::objects::Owner;
-use leaderboard_api::Eta;
 use leaderboard_api::LeaderboardSpec;
+use leaderboard_api::{Attempt, Eta};
 
 fn leaderboard(running: &Value, paused: bool) -> Leaderboard {
     let spec = json!({
@@ -122,7 +122,7 @@ fn a_slot_is_granted_once_and_given_back_at_the_end() {
 
     // The first one's later attempt is not let past.
     let mut resumed = submission("a", "x", 1, ended(1));
-    resumed.spec.attempt = 2;
+    resumed.spec.attempt = Attempt(2);
     world.shows(&resumed);
     assert!(matches!(world.asks(&resumed), Turn::Wait { position: 1, .. }));
 }
@@ -222,7 +222,7 @@ fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
     assert_eq!(world.woken(), ["b"]);
     // One of an earlier attempt that has ended has none.
     let mut resumed = submission("c", "x", 3, ended(1));
-    resumed.spec.attempt = 2;
+    resumed.spec.attempt = Attempt(2);
     let mut job = Job::clone(&job);
     job.metadata.name = "c-1".into();
     job.metadata.owner_references[0].uid = "c".into();
@@ -237,7 +237,7 @@ fn a_job_in_the_cache_has_a_slot_although_no_status_names_it() {
 fn an_attempt_that_is_asked_for_early_takes_no_second_slot() {
     let early = |status: Value| {
         let mut object = submission("a", "x", 1, status);
-        object.spec.attempt = 2;
+        object.spec.attempt = Attempt(2);
         object
     };
     let (a, b) = (early(json!({"attempt": 1})), submission("b", "y", 2, json!({})));
@@ -430,7 +430,7 @@ fn a_finished_one_waits_for_nothing_although_another_attempt_was_asked_for_while
     let mut end = condition("Finished", "True");
     end["reason"] = json!("Finished");
     let mut a = submission("a", "x", 1, json!({"attempt": 1, "conditions": [end]}));
-    a.spec.attempt = 2;
+    a.spec.attempt = Attempt(2);
     let world = World::new(one(), &[&a]);
     world.slots.wake_pending(&ObjectRef::from_obj(&world.leaderboard));
     assert_eq!(world.woken(), [""; 0]);

@@ -30,7 +30,7 @@ use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
-use leaderboard_api::{JobNumber, RunPlan, Storage, Submission, SubmissionStatus, effective};
+use leaderboard_api::{RunPlan, Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
 use text_budget::TextBudget;
@@ -100,7 +100,7 @@ impl ArchiveWorkers {
     pub fn observe(&self, submission: &Submission, pod: Option<&str>, is_over: bool) -> Observed {
         let now = Instant::now();
         let status = submission.status.as_ref();
-        let job = status.map_or(JobNumber::first(1), SubmissionStatus::job_number);
+        let job = status.map(SubmissionStatus::job_number).unwrap_or_default();
         let found = status.and_then(|status| self.known_bucket(status));
         let uid = uid(submission);
         let nothing = State::default();

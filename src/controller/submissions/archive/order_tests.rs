@@ -1,6 +1,7 @@
 //! In which order ends are read.
 
 use super::*;
+use leaderboard_api::Attempt;
 
 fn ended(before: Duration, now: Instant) -> Arc<Target> {
     Arc::new(Target {
@@ -9,7 +10,7 @@ fn ended(before: Duration, now: Instant) -> Arc<Target> {
         leaderboard: "carla".into(),
         prefix: "7/".into(),
         submission_uid: "u".into(),
-        attempt: 1,
+        attempt: Attempt(1),
         ended: now.checked_sub(before),
     })
 }
@@ -28,7 +29,7 @@ fn order(mut state: State, mut now: Instant) -> Vec<String> {
 fn of_ends_that_wait_the_oldest_is_read_first() {
     let now = Instant::now();
     let demand = ReportDemand {
-        job: JobNumber::first(1),
+        job: JobNumber::first(Attempt(1)),
         pod: None,
         stage: Stage::JobEnded,
         period: Duration::from_secs(10),

@@ -10,7 +10,7 @@ use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
 use crate::observability::about;
-use leaderboard_api::JobNumber;
+use leaderboard_api::{Attempt, JobNumber};
 
 pub(super) type Uid = Arc<str>;
 
@@ -38,7 +38,7 @@ pub struct Target {
     pub prefix: Box<str>,
     /// UID that its reports name.
     pub submission_uid: Uid,
-    pub attempt: i64,
+    pub attempt: Attempt,
     /// When its run ended: of several that have, the oldest end is read first. None: it goes on.
     pub ended: Option<Instant>,
 }

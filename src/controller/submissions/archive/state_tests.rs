@@ -4,6 +4,7 @@ use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{LogAt, LogPlace, Texts};
+use leaderboard_api::Attempt;
 
 struct Bench {
     state: State,
@@ -17,7 +18,7 @@ fn uid(name: &str) -> Uid {
 
 fn demand(stage: Stage) -> ReportDemand {
     ReportDemand {
-        job: JobNumber::first(1),
+        job: JobNumber::first(Attempt(1)),
         pod: Some("p".into()),
         stage,
         period: Duration::from_secs(10),
@@ -26,12 +27,15 @@ fn demand(stage: Stage) -> ReportDemand {
 
 /// The Job after so many that infrastructure failures ended.
 fn again(retry: i32) -> JobNumber {
-    JobNumber { attempt: 1, retry }
+    JobNumber {
+        attempt: Attempt(1),
+        retry,
+    }
 }
 
 fn found(done: u32) -> Answer {
     let report = ReportDigest {
-        attempt: 1,
+        attempt: Attempt(1),
         done,
         ..ReportDigest::default()
     };
@@ -52,7 +56,7 @@ impl Bench {
                 leaderboard: "carla".into(),
                 prefix: "7/".into(),
                 submission_uid: "u".into(),
-                attempt: 1,
+                attempt: Attempt(1),
                 ended: None,
             }),
         }
@@ -91,7 +95,8 @@ impl Bench {
     }
 
     fn seen(&self) -> SeenReport {
-        self.state.report("u", JobNumber::first(1), Some("p"), self.now)
+        self.state
+            .report("u", JobNumber::first(Attempt(1)), Some("p"), self.now)
     }
 
     fn stage(&self) -> Option<Stage> {
@@ -108,7 +113,7 @@ impl Bench {
     }
 
     fn fence(&self) -> ObservedFence {
-        self.state.fence("u", JobNumber::first(1), self.now)
+        self.state.fence("u", JobNumber::first(Attempt(1)), self.now)
     }
 
     fn want_log(&mut self, is_over: bool) {
@@ -116,14 +121,14 @@ impl Bench {
     }
 
     fn log(&self, is_over: bool) -> ObservedLog {
-        self.state.log("u", JobNumber::first(1), is_over, self.now)
+        self.state.log("u", JobNumber::first(Attempt(1)), is_over, self.now)
     }
 }
 
 fn log(is_over: bool) -> LogDemand {
     let key = "agent/agent1/leaderboard.log".to_owned();
     LogDemand {
-        job: JobNumber::first(1),
+        job: JobNumber::first(Attempt(1)),
         places: vec![LogPlace {
             container: "agent-1".into(),
             at: LogAt::Bucket { key },
@@ -135,7 +140,7 @@ fn log(is_over: bool) -> LogDemand {
 fn tail() -> Tail {
     Tail {
         container: "agent-1".into(),
-        attempt: 1,
+        attempt: Attempt(1),
         key: None,
         text: "boom".into(),
     }
@@ -198,7 +203,9 @@ fn what_was_read_for_one_pod_or_job_is_no_answer_for_another() {
     assert_eq!(of(&bench, 0, Some("q")), None);
     assert_eq!(of(&bench, 0, None), None);
     assert_eq!(of(&bench, 1, Some("p")), None);
-    let seen = bench.state.report("u", JobNumber::first(2), Some("p"), bench.now);
+    let seen = bench
+        .state
+        .report("u", JobNumber::first(Attempt(2)), Some("p"), bench.now);
     assert_eq!(seen.report, ObservedReport::Foreign, "another attempt's");
     // The Pod goes with its Job.
     bench.wait(SPACING);
@@ -406,7 +413,7 @@ fn a_log_that_was_found_is_stored_at_the_end_and_given_up_after_some_tries() {
     }
     assert_eq!(bench.log(true), ObservedLog::GivenUp);
     assert_eq!(
-        bench.state.tail("u", JobNumber::first(1)),
+        bench.state.tail("u", JobNumber::first(Attempt(1))),
         Some(tail()),
         "EvalAI's hosts get it all the same"
     );

@@ -12,6 +12,7 @@ use tokio::time::timeout;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{ObservedReport, Stage, TextProblem};
+use leaderboard_api::{Attempt, JobNumber};
 
 /// Longer than a read takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -68,7 +69,7 @@ impl Bench {
     }
 
     fn workers(&self) -> &ArchiveWorkers {
-        &self.around.context.archive
+        &self.around.context.workers.archive
     }
 
     fn status(&self) -> SubmissionStatus {
@@ -77,7 +78,7 @@ impl Bench {
 
     fn demand(&self, stage: Stage) {
         let demand = ReportDemand {
-            job: JobNumber::first(1),
+            job: JobNumber::first(Attempt(1)),
             pod: None,
             stage,
             period: std::time::Duration::from_secs(10),
@@ -220,7 +221,7 @@ async fn leaderboards_that_keep_their_objects_differently_share_a_bucket_and_no_
 async fn a_worker_ends_when_nobody_uses_its_bucket_and_begins_anew_with_the_next() {
     let around = surroundings(Cluster::default(), "http://127.0.0.1:9").await;
     let (submission, _) = with_job("sub", &leaderboard("one", "http://127.0.0.1:9"));
-    let (workers, status) = (&around.context.archive, submission.status.clone().unwrap());
+    let (workers, status) = (&around.context.workers.archive, submission.status.clone().unwrap());
     let runs = || workers.0.tasks.names().contains(&"archive one-bucket".to_owned());
     for _ in 0..2 {
         workers.want_texts(&submission, &status, ReportId::default());

@@ -23,7 +23,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec)
     if leaderboard.network.dns != Dns::Pinned {
         return Step::Go;
     }
-    let attempt = draft.status.attempt.unwrap_or(1);
+    let attempt = draft.status.attempt.unwrap_or_default();
     let storage = draft
         .status
         .plan

@@ -62,7 +62,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
 /// Shows once that EvalAI's row asks for another attempt which does not begin.
 fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
     let refused = Ingested::of(draft.submission()).and_then(|record| record.refused);
-    let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt + 1) else {
+    let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt.next()) else {
         return;
     };
     let reason = reasons::ATTEMPT_WITHOUT_MESSAGE;

@@ -4,7 +4,7 @@
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-use leaderboard_runner::protocol::{Member, Pair, Side};
+use leaderboard_runner::protocol::{Member, Pair};
 
 use super::blame::{self, Crash};
 use super::failure::{infrastructure, participant};
@@ -46,11 +46,11 @@ fn count(container: &ContainerView) -> i32 {
 
 fn last_crash(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
     let pair = u16::try_from(id).ok().and_then(Pair::new)?;
-    let container = |side| {
-        let name = Member { side, pair }.to_string();
+    let container = |member: Member| {
+        let name = member.to_string();
         pod.containers.iter().find(|container| container.name == name)
     };
-    blame::last_crash(container(Side::Simulator), container(Side::Agent), now)
+    blame::last_crash(container(pair.simulator()), container(pair.agent()), now)
 }
 
 fn pair_of(container: &str) -> Option<i32> {

@@ -102,7 +102,7 @@ pub(super) fn look<'a>(draft: &mut PlanBuilder<'a>, terms: Terms<'_>) -> Option<
 }
 
 fn ask(draft: &PlanBuilder<'_>, terms: Terms<'_>) -> Question {
-    let attempt = draft.status.attempt.unwrap_or(1);
+    let attempt = draft.status.attempt.unwrap_or_default();
     let team = draft.status.team.as_ref().and_then(|team| team.id.clone());
     let team = terms.info.map_or(team, |info| Some(info.team_id.clone()));
     question(draft.submission(), terms.leaderboard, attempt, team.unwrap_or_default())

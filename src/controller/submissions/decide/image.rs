@@ -114,7 +114,7 @@ fn ask(
     let repository = Repository::of(reference);
     let named = reference.digest.or(reference.tag).unwrap_or("latest");
     let question = Question {
-        attempt: draft.status.attempt.unwrap_or(1),
+        attempt: draft.status.attempt.unwrap_or_default(),
         image: Image {
             registry: repository.registry.to_owned(),
             path: repository.path.clone().into_owned(),

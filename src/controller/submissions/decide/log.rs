@@ -9,8 +9,10 @@ use super::plan::Action;
 use super::plan_builder::{PlanBuilder, left_of};
 use super::trouble;
 use crate::controller::submissions::view::{LogAt, LogPlace, ObservedLog, PodView};
+use crate::pod::keys::agent_log;
 use crate::pod::run::console;
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
+use leaderboard_runner::protocol::Pair;
 
 /// How long a log is waited for before its Pod goes, or EvalAI has the end without it.
 const LONGEST: Duration = Duration::from_secs(15);
@@ -73,9 +75,11 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     let Some(failure) = &status.failure else {
         return Vec::new();
     };
-    let pair = failure.pair.unwrap_or_else(|| unfinished(status));
-    let agent = || stored(&format!("agent-{pair}"), format!("agent/agent{pair}/leaderboard.log"));
-    let simulator = format!("simulator-{pair}");
+    let id = failure.pair.unwrap_or_else(|| unfinished(status));
+    let Some(pair) = u16::try_from(id).ok().and_then(Pair::new) else {
+        return Vec::new();
+    };
+    let (agent, simulator) = (pair.agent().to_string(), pair.simulator().to_string());
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.as_str() {
         reasons::SIMULATION_CRASHED => vec![on_node(&simulator), Some(stored(&simulator, console(pair)))],
@@ -90,7 +94,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
         ],
         // It never ran.
         reasons::IMAGE_INVALID | reasons::IMAGE_PULL | reasons::CONTAINER_CONFIG => Vec::new(),
-        _ if failure.class == FailureClass::Participant => vec![Some(agent()), on_node(&format!("agent-{pair}"))],
+        _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ => Vec::new(),
     };
     found.into_iter().flatten().collect()

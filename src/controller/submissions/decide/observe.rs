@@ -46,7 +46,7 @@ pub(super) fn awaits_end(draft: &mut PlanBuilder<'_>) -> bool {
 
 /// How many routes the other run has; none while that is read.
 fn routes_of_other(draft: &mut PlanBuilder<'_>) -> Option<Answer> {
-    let attempt = draft.status.attempt.unwrap_or(1);
+    let attempt = draft.status.attempt.unwrap_or_default();
     let Some(plan) = &draft.status.plan else {
         return Some(Err("this run has no plan".to_owned()));
     };

@@ -3,7 +3,7 @@
 use super::plan_builder::{PlanBuilder, Terms};
 use super::stored;
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
-use leaderboard_api::{RouteSlice, RunPlan, effective};
+use leaderboard_api::{Attempt, RouteSlice, RunPlan, effective};
 
 pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) {
     let Terms {
@@ -24,7 +24,8 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
         },
         Some(pinned) => pinned,
         None => {
-            let resume = resumed || draft.spec().attempt > 1 || draft.is_adopted() || stored::takes_up(draft, info);
+            let resume =
+                resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted() || stored::takes_up(draft, info);
             let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
             let plan = if draft.spec().check { first_route(plan) } else { plan };
             RunPlan {
@@ -49,7 +50,8 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
 /// The row takes no attempt that is not above its own.
 fn earlier_attempts(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
     let resumed = info.filter(|info| info.standing == Standing::Resumed);
-    resumed.map_or(0, |info| (info.last_attempt + 1 - draft.spec().attempt).max(0))
+    let next = resumed.and_then(|info| info.last_attempt).map(Attempt::next);
+    next.map_or(0, |next| (next.0 - draft.spec().attempt.0).max(0))
 }
 
 /// The plan of a check: the first route, once, with one pair.

@@ -10,8 +10,8 @@ use super::significance::{self, Change};
 use crate::controller::submissions::view::{EvalaiInfo, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission, SubmissionSpec,
-    SubmissionStatus, Track, effective, names, reasons,
+    Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission,
+    SubmissionSpec, SubmissionStatus, Track, effective, names, reasons,
 };
 
 /// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
@@ -187,7 +187,7 @@ impl<'a> PlanBuilder<'a> {
                 self.start_status(wanted);
                 self.show_unannounced(wanted);
                 // Without a status the world was seen as the first attempt's.
-                wanted != 1
+                wanted != Attempt::FIRST
             }
             Some(present) if wanted > present && self.may_be_resumed() => {
                 self.start_status(wanted);
@@ -204,7 +204,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// The status of a new attempt, with what was pinned and what earlier attempts reached.
-    fn start_status(&mut self, wanted: i64) {
+    fn start_status(&mut self, wanted: Attempt) {
         let old = std::mem::take(&mut self.status);
         self.status = SubmissionStatus {
             observed_generation: self.submission().metadata.generation,
@@ -235,7 +235,7 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Shows that no message has announced an attempt: its row may have been edited by the participant.
-    fn show_unannounced(&mut self, attempt: i64) {
+    fn show_unannounced(&mut self, attempt: Attempt) {
         let record = Ingested::of(self.submission()).filter(|record| record.without_message.contains(&attempt));
         let Some(record) = record else { return };
         let message = format!(

@@ -5,7 +5,7 @@ use crate::controller::submissions::foreign_runs::Traces;
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{EvalaiInfo, ObservedTraces, Standing};
 use crate::pod::run::Stop;
-use leaderboard_api::{ImportedState, effective, names};
+use leaderboard_api::{Attempt, ImportedState, effective, names};
 
 /// What is known of a submission that was run before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,9 +57,9 @@ pub(super) fn attempts_ahead(draft: &PlanBuilder<'_>) -> i64 {
     let Some(traces) = traces(draft) else { return 0 };
     let row = traces.row.as_ref().filter(|row| row.is_ours);
     let of_row = row.and_then(|row| Some(row.attempt?.saturating_add(i64::from(row_end(&row.status).is_some()))));
-    let of_report = traces.report.as_ref().map(|report| report.digest.attempt);
+    let of_report = traces.report.as_ref().map(|report| report.digest.attempt.0);
     let latest = of_row.into_iter().chain(of_report).max();
-    latest.map_or(0, |attempt| attempt.saturating_sub(draft.spec().attempt).max(0))
+    latest.map_or(0, |attempt| attempt.saturating_sub(draft.spec().attempt.0).max(0))
 }
 
 /// What to show of a run that goes on; none for one that begins.
@@ -83,10 +83,10 @@ pub(super) fn traces<'a>(draft: &PlanBuilder<'a>) -> Option<&'a Traces> {
 }
 
 /// What table, bucket and EvalAI together show of attempt `wanted`.
-pub(super) fn found(traces: &Traces, wanted: i64, info: Option<&EvalaiInfo>) -> Found {
+pub(super) fn found(traces: &Traces, wanted: Attempt, info: Option<&EvalaiInfo>) -> Found {
     let row = traces.row.as_ref().filter(|row| row.is_ours);
     let row_end = row
-        .filter(|row| row.attempt >= Some(wanted))
+        .filter(|row| row.attempt >= Some(wanted.0))
         .and_then(|row| row_end(&row.status));
     let report = traces.report.as_ref().map(|report| &report.digest);
     let is_complete = report.is_some_and(|report| report.is_complete() && report.eligible);

@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 
 use super::commands;
 use super::tests::{Case, container};
+use leaderboard_api::Attempt;
 
 /// A word as the kubelet hands it on (k8s.io/kubernetes/third_party/forked/golang/expansion).
 pub(super) fn kubernetes_expand(word: &str, lookup: &dyn Fn(&str) -> Option<String>) -> String {
@@ -272,7 +273,7 @@ fn a_resumed_attempt_sets_resume() {
     let image = Image::new("resume");
     image.program("python3", FAKE_PYTHON);
     let mut case = Case::new("V2", json!({}));
-    case.number.attempt = 2;
+    case.number.attempt = Attempt(2);
     let (words, env) = agent(&case, 1, &image, &TEAM);
     assert!(words.contains(&"--resume=1".to_owned()));
     assert_eq!(env["RESUME"], "1");

@@ -6,7 +6,7 @@ use super::run_document;
 use super::tests::{Case, OPERATOR_IMAGE, addresses, container, containers, role};
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
-use leaderboard_api::names;
+use leaderboard_api::{Attempt, names};
 
 fn env<'a>(container: &'a Value, name: &str) -> Option<&'a Value> {
     container["env"]
@@ -85,7 +85,7 @@ fn only_our_own_containers_are_given_addresses_and_by_a_variable_alone() {
 fn resume_is_1_or_empty() {
     for (attempt, taken_up, expected) in [(1, false, ""), (1, true, "1"), (2, false, "1"), (2, true, "1")] {
         let mut case = Case::new("V2", json!({}));
-        case.number.attempt = attempt;
+        case.number.attempt = Attempt(attempt);
         case.plan.resume = taken_up;
         let job = case.json();
         assert_eq!(
@@ -100,7 +100,7 @@ fn resume_is_1_or_empty() {
 fn the_contents_get_what_the_old_pipelines_had_and_the_hosts_variables_win() {
     let of = |contents: Value, attempt: i64| {
         let mut case = Case::new("V2", json!({ "contents": contents }));
-        case.number.attempt = attempt;
+        case.number.attempt = Attempt(attempt);
         let run = case.plan.run_id.as_str().to_owned();
         let bucket = case.plan.storage.bucket.clone();
         let container = container(&case.json(), "contents").clone();
@@ -256,7 +256,7 @@ fn the_run_document_is_the_plan_and_its_times() {
         "V2",
         json!({"syncPeriodSeconds": 5, "verify": "Refuse", "logGroup": {"name": "g"}}),
     );
-    case.number.attempt = 2;
+    case.number.attempt = Attempt(2);
     let run = run_document(&case.input());
     assert_eq!(
         (run.namespace.as_str(), run.submission.as_str(), run.uid.as_str()),
@@ -264,7 +264,7 @@ fn the_run_document_is_the_plan_and_its_times() {
     );
     assert_eq!(
         (run.attempt, run.period_seconds, run.flush_seconds, run.cancel_seconds),
-        (2, 5, 1800, 120)
+        (Attempt(2), 5, 1800, 120)
     );
     assert_eq!(run.plan, case.plan);
     assert_eq!(run.verify, leaderboard_api::Verify::Refuse);

@@ -11,7 +11,7 @@ use k8s_openapi::api::core::v1::{EnvVar, PodResourceClaim, ResourceClaim, Resour
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 use leaderboard_api::{GpuSource, LeaderboardSpec, NodeWithoutGpu, names};
 use leaderboard_runner::graphics::{INDEX, Needs};
-use leaderboard_runner::protocol::{Member, Side};
+use leaderboard_runner::protocol::{Member, Pair, Side};
 use serde_json::{Value, json};
 
 use super::{JobInput, variable};
@@ -29,9 +29,9 @@ const REQUIRED: &str = "requiredDuringSchedulingIgnoredDuringExecution";
 /// Jobs of an attempt that a node may give no GPU.
 const AVOIDED_AFTER: i32 = 2;
 
-/// The variables of a container of a pair; pairs count from 1.
-pub(super) fn variables(source: GpuSource<'_>, side: Side, pair: usize) -> Vec<EnvVar> {
-    let index = (pair - 1).to_string();
+/// The variables of a container of a pair.
+pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
+    let index = member.pair.index().to_string();
     let devices = match source {
         // `hide` decides, by what the finished container requests.
         GpuSource::None => return Vec::new(),
@@ -41,7 +41,7 @@ pub(super) fn variables(source: GpuSource<'_>, side: Side, pair: usize) -> Vec<E
         GpuSource::Claim(_) => Some(NO_DEVICE),
     };
     let devices = devices.map(|devices| variable(DEVICES, devices));
-    let index = (side == Side::Simulator).then(|| variable(INDEX, &index));
+    let index = (member.side == Side::Simulator).then(|| variable(INDEX, &index));
     devices
         .into_iter()
         .chain([variable(CAPABILITIES, "all")])
@@ -52,8 +52,7 @@ pub(super) fn variables(source: GpuSource<'_>, side: Side, pair: usize) -> Vec<E
 /// What a container of a pair requests, with its GPU.
 pub(super) fn resources(
     source: GpuSource<'_>,
-    side: Side,
-    pair: usize,
+    member: Member,
     hosts: Option<ResourceRequirements>,
 ) -> Option<ResourceRequirements> {
     let is_requested = |mut resources: ResourceRequirements, resource: &str| {
@@ -61,7 +60,7 @@ pub(super) fn resources(
         limits.insert(resource.to_owned(), Quantity("1".into()));
         Some(resources)
     };
-    match (source, side) {
+    match (source, member.side) {
         (GpuSource::None, _) | (GpuSource::NodeIndex(_), Side::Agent) => hosts,
         (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Simulator) => {
             is_requested(hosts.unwrap_or_default(), resource)
@@ -69,7 +68,7 @@ pub(super) fn resources(
         (GpuSource::Claim(_), _) => {
             let mut resources = hosts.unwrap_or_default();
             resources.claims.get_or_insert_with(Vec::new).push(ResourceClaim {
-                name: claim_name(pair),
+                name: claim_name(member.pair),
                 request: None,
             });
             Some(resources)
@@ -89,10 +88,10 @@ pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
         resource_claim_name: None,
         resource_claim_template_name: Some(template.clone()),
     };
-    Some((1..=input.pairs()).map(of_pair).collect())
+    Some(Pair::first(input.pairs()).map(of_pair).collect())
 }
 
-fn claim_name(pair: usize) -> String {
+fn claim_name(pair: Pair) -> String {
     format!("gpu-{pair}")
 }
 

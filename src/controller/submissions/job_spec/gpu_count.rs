@@ -1,12 +1,12 @@
 //! How many GPUs a Pod takes from its node. Pure: read off what the host requests, as the scheduler does.
 
-use leaderboard_runner::protocol::Side;
+use leaderboard_runner::protocol::Pair;
 use serde_json::{Value, json};
 
 use super::gpu;
 use crate::controller::gpu_claims::source;
 use crate::controller::submissions::pod_overlay;
-use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track, effective, names};
+use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track, effective};
 
 /// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
 pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
@@ -15,15 +15,13 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     let agents = track.and_then(|track| track.agent.as_ref());
     let of_simulator = effective::resources(simulators, spec.simulator.resources.as_ref());
     let of_agent = effective::resources(agents, spec.agent.resources.as_ref());
-    let of_pair = |pair| {
-        let of_simulator = gpu::resources(source, Side::Simulator, pair, of_simulator.clone());
-        let of_agent = gpu::resources(source, Side::Agent, pair, of_agent.clone());
-        [
-            json!({"name": names::simulator_container(pair), "resources": of_simulator}),
-            json!({"name": names::agent_container(pair), "resources": of_agent}),
-        ]
+    let of_pair = |pair: Pair| {
+        [(pair.simulator(), &of_simulator), (pair.agent(), &of_agent)].map(|(member, hosts)| {
+            let resources = gpu::resources(source, member, hosts.clone());
+            json!({"name": member.to_string(), "resources": resources})
+        })
     };
-    let containers: Vec<Value> = (1..=plan.slices.len()).flat_map(of_pair).collect();
+    let containers: Vec<Value> = Pair::first(plan.slices.len()).flat_map(of_pair).collect();
     let mut template = json!({"spec": {"containers": containers}});
     let overlay = spec.pod_overrides.as_ref();
     if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {

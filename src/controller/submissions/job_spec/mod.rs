@@ -44,9 +44,10 @@ use crate::pod::run::{Isolation, Run, SCHEMA};
 use crate::services::names::Addresses;
 pub use gpu_count::gpus;
 use leaderboard_api::{
-    Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan, Submission,
-    Track, conditions, effective, names, reasons,
+    Attempt, Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan,
+    Submission, Track, conditions, effective, names, reasons,
 };
+use leaderboard_runner::protocol::Pair;
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;
@@ -259,7 +260,7 @@ fn generation(input: &JobInput<'_>) -> i64 {
 }
 
 fn pod(input: &JobInput<'_>) -> PodSpec {
-    let pairs = 1..=input.pairs();
+    let pairs = Pair::first(input.pairs());
     let identity = input.spec().pod_identity.as_ref();
     PodSpec {
         restart_policy: Some("OnFailure".into()),
@@ -353,7 +354,7 @@ fn variable(name: &str, value: &str) -> EnvVar {
 
 /// `RESUME` of a run: the evaluator takes any text for a yes.
 fn resume(input: &JobInput<'_>) -> &'static str {
-    if input.plan.resume || input.number.attempt > 1 {
+    if input.plan.resume || input.number.attempt > Attempt::FIRST {
         "1"
     } else {
         ""

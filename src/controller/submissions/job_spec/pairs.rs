@@ -12,9 +12,9 @@ use crate::controller::submissions::pod_layout::{
     AGENT, CARLA_ROOT, FIXED_ENV, LEADERBOARD_ROOT, SAVED, SCENARIO_RUNNER_ROOT, STATUS, python_path,
 };
 use crate::pod::run::{RUNNER, TOOLS, console_name};
-use leaderboard_api::{GpuSource, LeaderboardVersion, SimulatorContainer, effective, names};
+use leaderboard_api::{GpuSource, LeaderboardVersion, SimulatorContainer, effective};
 use leaderboard_runner::graphics::Needs;
-use leaderboard_runner::protocol::Side;
+use leaderboard_runner::protocol::{Member, Pair};
 
 const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
@@ -23,16 +23,17 @@ const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
 /// A server prints little; one that floods must not fill the disk. In bytes.
 const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
 
-/// Port of a pair's simulator; pairs count from 1.
-fn port(pair: usize) -> usize {
-    2000 + 100 * (pair - 1)
+/// Port of a pair's simulator.
+fn port(pair: Pair) -> usize {
+    2000 + 100 * pair.index()
 }
 
 /// The simulator of a pair.
-pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
+pub(super) fn simulator(input: &JobInput<'_>, pair: Pair) -> Container {
     let (spec, deadlines) = (&input.spec().simulator, input.deadlines());
     let own = input.track().and_then(|track| track.simulator.as_ref());
-    let name = names::simulator_container(pair);
+    let member = pair.simulator();
+    let name = member.to_string();
     let (version, gpus) = (input.plan.leaderboard_version, source(input.spec()));
     let flags = [
         format!("--port={}", port(pair)),
@@ -48,13 +49,13 @@ pub(super) fn simulator(input: &JobInput<'_>, pair: usize) -> Container {
     let env = [variable("CARLA_PORT", &port(pair).to_string())].into_iter();
     let env = env
         .chain(display::variables(spec, version))
-        .chain(gpu::variables(gpus, Side::Simulator, pair));
+        .chain(gpu::variables(gpus, member));
     let resources = effective::resources(own, spec.resources.as_ref());
     Container {
         image: Some(input.plan.simulator_image.to_string()),
-        command: Some(behind_runner(Side::Simulator, pair, flags, words)),
+        command: Some(behind_runner(member, flags, words)),
         env: Some(merged(env.collect(), &spec.env)),
-        resources: gpu::resources(gpus, Side::Simulator, pair, resources),
+        resources: gpu::resources(gpus, member, resources),
         security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_simulator(input, &name)),
         name,
@@ -80,10 +81,11 @@ fn adapter(spec: &SimulatorContainer, gpus: GpuSource<'_>) -> Adapter {
 }
 
 /// The agent of a pair.
-pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
+pub(super) fn agent(input: &JobInput<'_>, pair: Pair) -> Container {
     let (spec, deadlines) = (&input.spec().agent, input.deadlines());
     let own = input.track().and_then(|track| track.agent.as_ref());
-    let name = names::agent_container(pair);
+    let member = pair.agent();
+    let name = member.to_string();
     let flags = [
         format!("--work={AGENT}"),
         format!("--checkpoint={CHECKPOINT}"),
@@ -100,9 +102,9 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
     let resources = effective::resources(own, spec.resources.as_ref());
     Container {
         image: Some(input.plan.image.clone()),
-        command: Some(behind_runner(Side::Agent, pair, flags, words)),
+        command: Some(behind_runner(member, flags, words)),
         env: Some(merged(agent_env(input, pair), &spec.env)),
-        resources: gpu::resources(source(input.spec()), Side::Agent, pair, resources),
+        resources: gpu::resources(source(input.spec()), member, resources),
         security_context: Some(context(spec.security_context.as_ref())),
         volume_mounts: Some(volumes::of_agent(input, &name, pair)),
         name,
@@ -110,11 +112,11 @@ pub(super) fn agent(input: &JobInput<'_>, pair: usize) -> Container {
     }
 }
 
-fn behind_runner(side: Side, pair: usize, flags: impl IntoIterator<Item = String>, words: Vec<String>) -> Vec<String> {
+fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words: Vec<String>) -> Vec<String> {
     let start = [
         format!("{TOOLS}/{RUNNER}"),
-        side.name().to_owned(),
-        format!("--pair={pair}"),
+        member.side.name().to_owned(),
+        format!("--pair={}", member.pair),
         format!("--status={STATUS}"),
     ];
     start
@@ -131,7 +133,7 @@ fn seconds(what: &str, value: i64) -> String {
     format!("--{what}-seconds={value}")
 }
 
-fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
+fn agent_env(input: &JobInput<'_>, pair: Pair) -> Vec<EnvVar> {
     let (plan, track) = (input.plan, input.track());
     let routes = track
         .and_then(|track| track.routes_file.as_deref())
@@ -139,7 +141,8 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
     let scenarios = track
         .and_then(|track| track.scenarios_file.as_deref())
         .unwrap_or(SCENARIOS_FILE);
-    let slice = plan.slices.get(pair - 1).map(ToString::to_string).unwrap_or_default();
+    let slice = plan.slices.get(pair.index());
+    let slice = slice.map(ToString::to_string).unwrap_or_default();
     let mut env = vec![
         variable("CARLA_PORT", &port(pair).to_string()),
         variable("CARLA_TM_PORT", &(port(pair) + 10).to_string()),
@@ -160,7 +163,7 @@ fn agent_env(input: &JobInput<'_>, pair: usize) -> Vec<EnvVar> {
         // The original's file lies in the contents, which are read-only here.
         LeaderboardVersion::V2 => variable("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS),
     });
-    env.extend(gpu::variables(source(input.spec()), Side::Agent, pair));
+    env.extend(gpu::variables(source(input.spec()), pair.agent()));
     env
 }
 

@@ -62,7 +62,7 @@ impl Case {
             submission,
             leaderboard,
             plan,
-            number: JobNumber::first(1),
+            number: JobNumber::first(Attempt(1)),
             settings: Settings {
                 image: OPERATOR_IMAGE.into(),
                 image_pull_policy: None,
@@ -160,7 +160,7 @@ fn the_job_of_leaderboard_2_is_as_committed() {
             }],
         }),
     );
-    case.number.attempt = 3;
+    case.number.attempt = Attempt(3);
     case.number.retry = 1;
     case.addresses = Some(addresses());
     golden("v2.json", &case);
@@ -200,7 +200,7 @@ fn an_overlay_that_is_refused_is_not_applied() {
 fn names_fit_wherever_kubernetes_puts_them() {
     let mut case = Case::new("V2", json!({"pairs": 16, "routes": 100}));
     case.submission.metadata.name = Some("s".repeat(52));
-    case.number.attempt = 99_999;
+    case.number.attempt = Attempt(99_999);
     case.number.retry = 100;
     let job = case.json();
     // Kubernetes makes a label of it.
@@ -221,7 +221,10 @@ fn names_fit_wherever_kubernetes_puts_them() {
 #[test]
 fn jobs_and_pods_show_whose_they_are() {
     let mut case = Case::new("V2", json!({}));
-    case.number = JobNumber { attempt: 2, retry: 3 };
+    case.number = JobNumber {
+        attempt: Attempt(2),
+        retry: 3,
+    };
     let job = case.json();
     assert_eq!(job["metadata"]["name"], "submission-4711-2-r3");
     assert_eq!(job["metadata"]["annotations"]["leaderboard.carla.org/retry"], "3");

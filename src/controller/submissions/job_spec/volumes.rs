@@ -11,8 +11,10 @@ use crate::controller::submissions::pod_layout::{
     AGENT, CONTENTS_LOG_FOLDER, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, SHM, SHM_VOLUME,
     STATUS, TOOLS_VOLUME,
 };
+use crate::pod::keys::agent_folder;
 use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
 use leaderboard_api::{ByteQuantity, names};
+use leaderboard_runner::protocol::Pair;
 
 const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;
@@ -30,14 +32,14 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
     ];
     let identity = input.spec().has_role().then(identity);
     let shared = input.spec().agent.shm_size.iter();
-    let shared = shared.flat_map(|size| (1..=input.pairs()).map(|pair| memory(pair, size)));
+    let shared = shared.flat_map(|size| Pair::first(input.pairs()).map(|pair| memory(pair, size)));
     let display = display::volume(input);
     let all = contents.into_iter().chain(own).chain(identity);
     all.chain(display).chain(shared).collect()
 }
 
 /// The shared memory of one agent, which no other one sees.
-fn memory(pair: usize, size: &ByteQuantity) -> Volume {
+fn memory(pair: Pair, size: &ByteQuantity) -> Volume {
     Volume {
         name: format!("{SHM_VOLUME}{pair}"),
         empty_dir: Some(EmptyDirVolumeSource {
@@ -141,9 +143,9 @@ pub(super) fn of_simulator(input: &JobInput<'_>, container: &str) -> Vec<VolumeM
 }
 
 /// What an agent sees.
-pub(super) fn of_agent(input: &JobInput<'_>, container: &str, pair: usize) -> Vec<VolumeMount> {
+pub(super) fn of_agent(input: &JobInput<'_>, container: &str, pair: Pair) -> Vec<VolumeMount> {
     let contents = CONTENTS_VOLUMES.map(|(volume, _, read)| read_only(mount(volume, read)));
-    let own = [mount_part(LOGS_VOLUME, format!("agent/agent{pair}"), AGENT)];
+    let own = [mount_part(LOGS_VOLUME, agent_folder(pair), AGENT)];
     let shared = input.spec().agent.shm_size.as_ref();
     let shared = shared.map(|_| mount(&format!("{SHM_VOLUME}{pair}"), SHM));
     runner_and_status(container)

@@ -5,6 +5,7 @@ pub mod job;
 pub mod lookups;
 pub mod node;
 pub mod pod;
+pub mod workers;
 
 use std::sync::Arc;
 
@@ -12,14 +13,9 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
-use super::addresses::Addresses;
-use super::archive::ArchiveWorkers;
 use super::decide::job_name;
 use super::external::ExternalSystems;
-use super::foreign_runs::ForeignRuns;
-use super::images::Images;
 use super::memory::Memory;
-use super::other_results::OtherResults;
 use super::reruns::Reruns;
 use super::team_history::{TeamHistory, Teams};
 use super::view::{NodeView, ObservedJob, PodView, View};
@@ -28,28 +24,24 @@ use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
 use causes::Causes;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
-use lookups::Lookups;
+use workers::Workers;
 
 /// What reading the world of a submission uses.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
     pub stores: &'a Stores,
     pub memory: &'a Memory,
+    pub workers: &'a Workers,
     pub slots: &'a SlotAllocator,
-    pub archive: &'a ArchiveWorkers,
-    pub lookups: &'a Lookups,
     pub causes: &'a Causes,
     pub teams: &'a Teams,
-    pub images: &'a Images,
-    pub foreign_runs: &'a ForeignRuns,
-    pub other_results: &'a OtherResults,
-    pub addresses: &'a Addresses,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
 
 /// Reads everything a reconcile may depend on. `is_policy_in_place` returns whether the NetworkPolicy of a Leaderboard is.
 pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: impl Fn(&Leaderboard) -> bool) -> View {
+    let workers = uses.workers;
     let submission = uses.memory.with_own_status(submission);
     let now = Timestamp::now();
     let namespace = submission.namespace().unwrap_or_default();
@@ -59,16 +51,16 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let is_over = status.is_some_and(SubmissionStatus::has_ended);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
     let node = node(uses, pod.as_ref());
-    let archive = uses.archive.observe(&submission, pod_uid, is_over);
+    let archive = workers.archive.observe(&submission, pod_uid, is_over);
     let others = || uses.stores.submissions_of(&namespace);
     View {
         now,
         // Comparing it takes longer than reading the rest.
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
-        image: uses.images.observe(&submission),
-        traces: uses.foreign_runs.observe(&submission),
-        other_routes: uses.other_results.observe(&submission),
-        addresses: uses.addresses.observe(&submission),
+        image: workers.images.observe(&submission),
+        traces: workers.foreign_runs.observe(&submission),
+        other_routes: workers.other_results.observe(&submission),
+        addresses: workers.addresses.observe(&submission),
         job_refused: refusal(uses, &submission, &job),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,
@@ -146,7 +138,7 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
 /// The node of a Pod that has not ended, as its watch shows it, or as it was last asked for.
 fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
     let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
-    let known = |name| node::watched(uses.stores, name).unwrap_or_else(|| uses.lookups.node(name));
+    let known = |name| node::watched(uses.stores, name).unwrap_or_else(|| uses.workers.lookups.node(name));
     name.map(known).unwrap_or_default()
 }
 

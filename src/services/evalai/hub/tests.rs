@@ -4,6 +4,7 @@ use crate::observability::shutdown::Stop;
 use crate::services::evalai::types::Run;
 use crate::services::token::Token;
 use futures::FutureExt;
+use leaderboard_api::Attempt;
 use std::time::Duration;
 
 fn hub(tasks: &Tasks, write_guard: impl WriteGuard) -> Hub {
@@ -55,7 +56,7 @@ async fn the_task_of_each_token_is_one_of_the_process() {
 fn only_a_leaderboard_that_publishes_has_a_publisher() {
     for is_observed in [false, true] {
         let run = Run {
-            attempt: 1,
+            attempt: Attempt(1),
             job: "submission-7-1".into(),
             by_hand: false,
             has_job: true,
@@ -103,7 +104,7 @@ async fn nothing_is_remembered_of_a_thousand_submissions_that_are_forgotten() {
         key: key(&pk.to_string()),
         pk,
         run: Run {
-            attempt: 1,
+            attempt: Attempt(1),
             job: format!("submission-{pk}-1"),
             by_hand: false,
             has_job: true,

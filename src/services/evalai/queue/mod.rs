@@ -237,7 +237,7 @@ impl Queue {
         };
         let mut news = image && !sub.image;
         sub.image |= image;
-        if sub.view.answered < subject.run.attempt && sub.asked.is_none() {
+        if sub.view.answered < Some(subject.run.attempt) && sub.asked.is_none() {
             news = true;
             sub.asked = Some(Asked {
                 since: now.at,

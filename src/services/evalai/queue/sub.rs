@@ -271,7 +271,7 @@ impl Sub {
     fn answer(&mut self, requested: Duration) {
         if self.asked.as_ref().is_some_and(|asked| requested >= asked.since) {
             self.asked = None;
-            self.view.answered = self.run.attempt;
+            self.view.answered = Some(self.run.attempt);
         }
     }
 

@@ -10,13 +10,13 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
 use crate::controller::submissions::view::{Standing, Turn};
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
-use leaderboard_api::{FailureClass, JobNumber, SubmissionStatus, Team, conditions, reasons};
+use leaderboard_api::{Attempt, FailureClass, JobNumber, SubmissionStatus, Team, conditions, reasons};
 
 #[test]
 fn a_local_submission_is_accepted_and_its_job_made_in_one_reconcile() {
     let mut world = World::local();
     let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert_eq!(plan.actions[0], Action::CreateJob(JobNumber::first(1)));
+    assert_eq!(plan.actions[0], Action::CreateJob(JobNumber::first(Attempt(1))));
     assert!(events(&plan).is_empty(), "the status shows it");
     assert_eq!(condition(&plan, ACCEPTED), ("True".into(), reasons::ACCEPTED.into()));
     assert_eq!(condition(&plan, FINISHED).0, "False");
@@ -249,7 +249,7 @@ fn a_later_attempt_with_an_image_runs_that_image() {
     let info = world.in_evalai().info.as_mut().unwrap();
     (info.image, info.image_problem) = (None, Some("the uploaded file is no JSON".into()));
     world.pass_to(Failed, reasons::IMAGE_INVALID);
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass();
     world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
     assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));

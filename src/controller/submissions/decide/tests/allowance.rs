@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::controller::submissions::team_history::{Others, TeamHistory};
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::{OnRepeatedInfrastructure, reasons};
+use leaderboard_api::{Attempt, OnRepeatedInfrastructure, reasons};
 
 /// Two attempts of the team in a row, on two nodes, while others finish.
 fn repeated() -> TeamHistory {
@@ -78,9 +78,9 @@ fn a_resume_keeps_the_count_and_a_finish_ends_it() {
         .status
         .infrastructure_failures;
     assert_eq!(known.as_ref().unwrap().nodes, ["node-a"]);
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     let plan = world.pass();
-    assert_eq!((plan.status.attempt, &plan.status.failure), (Some(2), &None));
+    assert_eq!((plan.status.attempt, &plan.status.failure), (Some(Attempt(2)), &None));
     assert_eq!(plan.status.infrastructure_failures, known, "also after a resume");
 
     let mut world = World::local().running();

@@ -20,7 +20,9 @@ use crate::controller::submissions::view::{
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::conditions;
-use leaderboard_api::{Leaderboard, LeaderboardSpec, PairState, Requeue, State, Submission, SubmissionStatus, names};
+use leaderboard_api::{
+    Attempt, Leaderboard, LeaderboardSpec, PairState, Requeue, State, Submission, SubmissionStatus, names,
+};
 use leaderboard_runner::verdict::{Verdict, What};
 
 /// UID of every submission here.
@@ -83,7 +85,7 @@ pub fn info() -> EvalaiInfo {
         submitted_at: Some(at(-60)),
         resumed_at: None,
         rerun_of: None,
-        last_attempt: 0,
+        last_attempt: None,
         image: Some("ecr/agent:9".into()),
         image_problem: None,
     }
@@ -417,7 +419,7 @@ pub fn report(done: u32) -> Report {
     Report {
         schema: 1,
         submission_uid: UID.into(),
-        attempt: 1,
+        attempt: Attempt(1),
         pod_uid: "pod-uid".into(),
         round: 1,
         done,

@@ -10,7 +10,7 @@ use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
 use leaderboard_api::reasons;
-use leaderboard_api::{Failure, JobNumber};
+use leaderboard_api::{Attempt, Failure, JobNumber};
 
 #[test]
 fn complete_results_that_count_finish() {
@@ -243,7 +243,7 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         let plan = world.pass_to(Pending, reasons::REPLACING);
         assert_eq!(events(&plan), [reasons::REPLACING]);
         assert_eq!(evalai_updates(&plan), [], "EvalAI keeps saying running");
-        assert_eq!((plan.status.retry, plan.status.attempt), (n, Some(1)));
+        assert_eq!((plan.status.retry, plan.status.attempt), (n, Some(Attempt(1))));
         assert_eq!(
             (plan.status.failure.as_ref(), plan.status.node_name.as_ref()),
             (None, None)
@@ -259,7 +259,11 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
         world.wait(1);
         let plan = world.pass();
-        assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber { attempt: 1, retry: n })));
+        assert!(has(&plan, |a| *a
+            == Action::CreateJob(JobNumber {
+                attempt: Attempt(1),
+                retry: n
+            })));
         world.see_job();
         let now = world.view.now;
         world.view.pod = Some(crate::controller::submissions::view::PodView {

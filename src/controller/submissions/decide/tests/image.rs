@@ -12,7 +12,7 @@ use crate::controller::submissions::view::ObservedImage;
 use crate::services::registry::{Facts, Fault, Image};
 use leaderboard_api::State::{Failed, Pending};
 use leaderboard_api::conditions::ACCEPTED;
-use leaderboard_api::{FailureClass, ImagePattern, PinnedImage, SubmissionStatus, Team, reasons};
+use leaderboard_api::{Attempt, FailureClass, ImagePattern, PinnedImage, SubmissionStatus, Team, reasons};
 
 const ECR: &str = "123456789012.dkr.ecr.us-east-1.amazonaws.com";
 const OURS: &str = "123456789012.dkr.ecr.us-east-1.amazonaws.com/carla-participant-team-42:one";
@@ -120,7 +120,7 @@ fn the_registry_is_asked_once_and_an_answer_within_five_seconds_costs_no_write()
         may_be_local: false,
     };
     let wanted = Question {
-        attempt: 1,
+        attempt: Attempt(1),
         image,
         secrets: vec!["registry".into()],
     };
@@ -153,9 +153,9 @@ fn the_digest_stays_through_retries_and_attempts() {
     world.job_gone();
     world.pass();
     let spec = &mut world.submission().spec;
-    (spec.cancel, spec.attempt) = (false, 2);
+    (spec.cancel, spec.attempt) = (false, Attempt(2));
     world.pass();
-    assert_eq!(world.status().attempt, Some(2));
+    assert_eq!(world.status().attempt, Some(Attempt(2)));
     assert_eq!(question(&mut world), None);
     assert_eq!(world.status().image, Some(PinnedImage { digest: digest() }));
 }
@@ -232,10 +232,10 @@ fn a_new_attempt_asks_again_for_an_image_that_was_missing() {
     let mut world = answered(Err(Fault::NotFound));
     world.pass_to(Failed, reasons::IMAGE_NOT_FOUND);
     world.published();
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.view.image = ObservedImage::NotAsked;
     world.pass();
-    assert_eq!(question(&mut world).map(|question| question.attempt), Some(2));
+    assert_eq!(question(&mut world).map(|question| question.attempt), Some(Attempt(2)));
 }
 
 #[test]

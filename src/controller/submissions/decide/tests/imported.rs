@@ -5,7 +5,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, decide};
 use leaderboard_api::State::{Cancelled, Failed, Finished};
-use leaderboard_api::{ImportedEnd, ImportedState, Rerun, Score, State, SubmissionStatus, Times, names};
+use leaderboard_api::{Attempt, ImportedEnd, ImportedState, Rerun, Score, State, SubmissionStatus, Times, names};
 
 const STATES: [(ImportedState, State); 3] = [
     (ImportedState::Finished, Finished),
@@ -73,11 +73,11 @@ fn one_without_its_status_is_left_alone_however_long_that_takes() {
 #[test]
 fn a_failed_one_is_resumed_as_any_other() {
     let mut world = imported(World::local(), ImportedState::Failed);
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.submission().metadata.generation = Some(2);
     world.pass();
     let plan = world.pass();
-    assert_eq!(plan.status.attempt, Some(2));
+    assert_eq!(plan.status.attempt, Some(Attempt(2)));
     assert!(plan.actions.iter().any(|action| matches!(action, Action::CreateJob(_))));
     assert!(
         plan.status.plan.is_some_and(|plan| plan.resume),

@@ -6,7 +6,7 @@ use crate::controller::submissions::view::{JobEnd, ObservedNode, PodView};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::State::{Finished, Pending, Running};
-use leaderboard_api::{Interruptions, JobNumber, conditions, reasons};
+use leaderboard_api::{Attempt, Interruptions, JobNumber, conditions, reasons};
 
 const TAINT: &str = "karpenter.sh/disrupted";
 
@@ -69,14 +69,18 @@ fn a_node_that_is_about_to_go_is_left_with_all_that_was_reached() {
             .unwrap()
             .ends_with("this costs neither an attempt nor a retry.")
     );
-    assert_eq!((plan.status.attempt, plan.status.retry), (Some(1), 1));
+    assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(1)), 1));
     assert_eq!((plan.status.failure, plan.status.infrastructure_failures), (None, None));
     let known = plan.status.interruptions.unwrap();
     assert_eq!((known.number, known.nodes), (1, vec!["node-a".to_owned()]));
     world.job_gone();
     let plan = world.pass();
     assert!(
-        has(&plan, |a| *a == Action::CreateJob(JobNumber { attempt: 1, retry: 1 })),
+        has(&plan, |a| *a
+            == Action::CreateJob(JobNumber {
+                attempt: Attempt(1),
+                retry: 1
+            })),
         "at once"
     );
 }

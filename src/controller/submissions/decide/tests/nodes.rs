@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::controller::submissions::decide::Action;
 use crate::controller::submissions::view::{ObservedNode, PodView};
 use leaderboard_api::State::{Pending, Running};
-use leaderboard_api::{JobNumber, reasons};
+use leaderboard_api::{Attempt, JobNumber, reasons};
 
 #[test]
 fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
@@ -26,11 +26,15 @@ fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
     world.job_gone();
     let plan = world.pass_to(Pending, reasons::REPLACING);
     assert!(plan.status.message.as_ref().unwrap().contains("Node node-a was lost"));
-    assert_eq!((plan.status.retry, plan.status.attempt), (1, Some(1)));
+    assert_eq!((plan.status.retry, plan.status.attempt), (1, Some(Attempt(1))));
     assert!(!creates(&plan), "after a pause");
     world.wait(10);
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber { attempt: 1, retry: 1 })));
+    assert!(has(&plan, |a| *a
+        == Action::CreateJob(JobNumber {
+            attempt: Attempt(1),
+            retry: 1
+        })));
     assert_eq!(evalai_updates(&plan), [], "EvalAI keeps saying running");
     assert_eq!(plan.status.job_name.as_deref(), Some("sub-1-r1"));
 }
@@ -118,7 +122,10 @@ fn a_lost_node_costs_neither_an_attempt_nor_a_pairs_retry() {
     world.job_gone();
     world.view.node = ObservedNode::Unknown;
     let plan = world.pass_to(Pending, reasons::REPLACING);
-    assert_eq!((plan.status.attempt, plan.status.failure.as_ref()), (Some(1), None));
+    assert_eq!(
+        (plan.status.attempt, plan.status.failure.as_ref()),
+        (Some(Attempt(1)), None)
+    );
     assert!(
         plan.status.pairs.iter().all(|pair| pair.crashes == 0),
         "{:?}",

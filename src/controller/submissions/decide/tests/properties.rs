@@ -397,7 +397,7 @@ fn apply(world: &mut World, change: Change) {
         Change::Cancel => world.submission().spec.cancel = true,
         Change::Resume => {
             let spec = &mut world.submission().spec;
-            spec.attempt += 1;
+            spec.attempt = spec.attempt.next();
             spec.cancel = false;
         }
         Change::Requeue => world.requeue(None),

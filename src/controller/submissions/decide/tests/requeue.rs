@@ -5,7 +5,7 @@ use crate::controller::submissions::decide::Action;
 use crate::controller::submissions::view::{ObservedReport, Turn};
 use crate::pod::run::Stop;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
-use leaderboard_api::{JobNumber, reasons};
+use leaderboard_api::{Attempt, JobNumber, reasons};
 
 const WHY: &str = "Simulator image 0.9.15-3 was broken";
 
@@ -36,7 +36,7 @@ fn a_run_stops_with_all_that_was_reached_and_waits_for_its_turn_in_the_same_atte
     world.go_to(120);
     world.complete();
     let plan = world.pass_to(Pending, reasons::REPLACING);
-    assert_eq!((plan.status.attempt, plan.status.retry), (Some(1), 1));
+    assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(1)), 1));
     assert_eq!((plan.status.failure, plan.status.interruptions), (None, None));
     let done = plan.status.requeued.unwrap();
     assert_eq!((done.number, done.retries, done.time.0), (1, 1, at(120)));
@@ -46,7 +46,11 @@ fn a_run_stops_with_all_that_was_reached_and_waits_for_its_turn_in_the_same_atte
     assert!(!creates(&plan), "a host who upgrades nodes pauses the Leaderboard");
     world.view.turn = Turn::Go;
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber { attempt: 1, retry: 1 })));
+    assert!(has(&plan, |a| *a
+        == Action::CreateJob(JobNumber {
+            attempt: Attempt(1),
+            retry: 1
+        })));
 }
 
 #[test]
@@ -117,11 +121,11 @@ fn a_failed_submission_begins_again_with_a_higher_attempt_and_its_team_is_forgiv
     world.requeue(Some(WHY));
     let status = world.pass_to(Failed, reasons::SIMULATION_CRASHED).status;
     assert_eq!(status.requeued, None, "without a higher attempt nothing begins");
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass_to(Pending, reasons::PREPARING);
     world.job_gone();
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(2))));
+    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(Attempt(2)))));
     assert_eq!(plan.status.infrastructure_failures, None);
     assert_eq!(plan.status.requeued.unwrap().retries, 0);
     let event = plan

@@ -14,7 +14,7 @@ use crate::services::table::ObservedRow;
 use leaderboard_api::ImportedState::{Cancelled as WasCancelled, Failed as HasFailed, Finished as HasFinished};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending};
 use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED};
-use leaderboard_api::{names, reasons};
+use leaderboard_api::{Attempt, names, reasons};
 
 /// UID of the object before it was restored.
 const OLD: &str = "uid-0";
@@ -71,7 +71,7 @@ fn refused() -> Report {
 
 #[test]
 fn one_that_is_not_evalais_ends_as_bucket_and_table_show() {
-    let of = |row, report| found(&traces(row, report), 1, None);
+    let of = |row, report| found(&traces(row, report), Attempt(1), None);
     assert_eq!(of(None, None), Found::Nothing);
     assert_eq!(of(Some(row("RUNNING", 1)), None), Found::Nothing, "nothing was stored");
     assert_eq!(of(None, Some(report(2))), Found::Run);
@@ -86,14 +86,15 @@ fn one_that_is_not_evalais_ends_as_bucket_and_table_show() {
     assert_eq!(of(Some(row("CANCELLED", 1)), None), Found::Ended(WasCancelled));
     assert_eq!(of(Some(row("RUNNING", 1)), Some(final_report())), Found::Stored);
     // A person asks for another attempt.
-    let again = |row, report| found(&traces(row, report), 2, None);
+    let again = |row, report| found(&traces(row, report), Attempt(2), None);
     assert_eq!(again(Some(row("FAILED", 1)), Some(report(2))), Found::Run);
     assert_eq!(again(None, Some(stopped(Stop::Retries))), Found::Run);
 }
 
 #[test]
 fn what_evalai_shows_goes_before_what_is_stored() {
-    let of = |standing, status: &str, row, report| found(&traces(row, report), 1, Some(&evalai(standing, status)));
+    let of =
+        |standing, status: &str, row, report| found(&traces(row, report), Attempt(1), Some(&evalai(standing, status)));
     let running = || Some(row("RUNNING", 1));
     assert_eq!(of(Standing::Wanted, "submitted", None, None), Found::Nothing);
     assert_eq!(of(Standing::Wanted, "running", running(), Some(report(2))), Found::Run);

@@ -7,7 +7,7 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{EvalaiView, ObservedReport};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Resumed};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, STALLED};
-use leaderboard_api::{JobNumber, names, reasons};
+use leaderboard_api::{Attempt, JobNumber, names, reasons};
 
 fn failed() -> World {
     let mut world = World::evalai().running();
@@ -42,7 +42,7 @@ fn the_plan_is_kept_and_the_images_renewed() {
         spec.pairs = 4;
         spec.routes = 8;
         spec.simulator.image = "simulator:2".into();
-        world.submission().spec.attempt = 2;
+        world.submission().spec.attempt = Attempt(2);
         world.submission().spec.cancel = false;
         let plan = world.pass_to(Pending, reasons::PREPARING);
         let is_drop = |action: &Action| *action == Action::DropTexts;
@@ -62,7 +62,7 @@ fn the_plan_is_kept_and_the_images_renewed() {
             ..EvalaiView::default()
         });
         let plan = world.pass();
-        assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(2))));
+        assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(Attempt(2)))));
         assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
         let pinned = plan.status.plan.unwrap();
         assert!(pinned.resume);
@@ -79,11 +79,11 @@ fn the_plan_is_kept_and_the_images_renewed() {
 #[test]
 fn an_attempt_that_begins_on_its_own_old_job_does_not_end_by_it() {
     let mut world = failed();
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass();
     // The watch is slow: the first attempt's Job is still what is seen.
     let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert_eq!(plan.status.attempt, Some(2));
+    assert_eq!(plan.status.attempt, Some(Attempt(2)));
     assert!(!creates(&plan));
 }
 
@@ -93,21 +93,24 @@ fn finished_is_final() {
     world.complete();
     world.report(final_report());
     world.pass_to(Finished, reasons::FINISHED);
-    world.submission().spec.attempt = 2;
-    assert_eq!(world.pass_to(Finished, reasons::FINISHED).status.attempt, Some(1));
+    world.submission().spec.attempt = Attempt(2);
+    assert_eq!(
+        world.pass_to(Finished, reasons::FINISHED).status.attempt,
+        Some(Attempt(1))
+    );
 }
 
 #[test]
 fn a_jump_or_a_first_attempt_above_one_is_an_attempt_like_any() {
     let mut world = failed();
-    world.submission().spec.attempt = 9;
-    assert_eq!(world.pass().status.attempt, Some(9));
+    world.submission().spec.attempt = Attempt(9);
+    assert_eq!(world.pass().status.attempt, Some(Attempt(9)));
 
     let mut world = World::local();
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     assert_eq!(world.pass_to(Pending, reasons::PREPARING).actions, []);
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(2))));
+    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(Attempt(2)))));
     assert!(plan.status.plan.unwrap().resume);
 }
 
@@ -118,7 +121,7 @@ fn what_the_old_pipeline_left_is_taken_up_without_status_or_report() {
     world.in_evalai().info.as_mut().unwrap().standing = crate::controller::submissions::view::Standing::Resumed;
     world.view.report = ObservedReport::Absent;
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(1))));
+    assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(Attempt(1)))));
     assert!(
         plan.status.plan.as_ref().unwrap().resume,
         "workspace restores what is there"
@@ -134,7 +137,7 @@ fn what_the_old_pipeline_left_is_taken_up_without_status_or_report() {
 
     // By hand, for data without EvalAI.
     let mut world = World::local();
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass();
     assert!(world.pass().status.plan.unwrap().resume);
 }
@@ -143,7 +146,7 @@ fn what_the_old_pipeline_left_is_taken_up_without_status_or_report() {
 fn the_image_is_the_first_attempts() {
     let mut world = failed();
     world.submission().spec.image = None;
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass();
     world.job_gone();
     world.view.evalai = Some(EvalaiView {
@@ -166,7 +169,7 @@ fn an_attempt_that_no_message_has_announced_is_shown() {
             &mut world,
             &json!({"message": "sweep", "sent": 1_767_225_600_000_i64, "withoutMessage": numbers}),
         );
-        world.submission().spec.attempt = 2;
+        world.submission().spec.attempt = Attempt(2);
         let plan = world.pass_to(Pending, reasons::PREPARING);
         let found = plan
             .events
@@ -193,7 +196,7 @@ fn an_attempt_that_does_not_begin_is_shown_until_a_person_begins_it() {
     assert_eq!(condition(&plan, STALLED), ("True".into(), said.into()));
     assert_eq!(events(&plan), [said]);
     assert_eq!(events(&world.pass()), [""; 0], "once");
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass_to(Pending, reasons::PREPARING);
     let plan = world.pass();
     assert_ne!(condition(&plan, STALLED).1, said);

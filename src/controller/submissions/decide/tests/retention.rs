@@ -7,7 +7,7 @@ use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::EvalaiEnd;
 use leaderboard_api::State::{Failed, Finished};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
-use leaderboard_api::reasons;
+use leaderboard_api::{Attempt, reasons};
 
 /// What a host keeps, in seconds.
 const KEPT: i64 = 3600;
@@ -87,7 +87,7 @@ fn nothing_else_is_ever_deleted() {
             let conditions = &mut w.submission().status.as_mut().unwrap().conditions;
             let end = conditions.iter_mut().find(|c| c.type_ == FINISHED).unwrap();
             end.reason = reasons::CANCELLED.into();
-            w.submission().spec.attempt = 2;
+            w.submission().spec.attempt = Attempt(2);
         }),
     ];
     let mut last = known_to_all();
@@ -104,7 +104,7 @@ fn nothing_else_is_ever_deleted() {
 #[test]
 fn a_finished_one_goes_although_another_attempt_was_asked_for_while_it_ran() {
     let mut world = known_to_all();
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.wait(KEPT);
     assert!(deletes(&world.pass()));
 }
@@ -149,20 +149,20 @@ fn a_failed_one_goes_with_its_end_published_and_its_log_kept() {
 #[test]
 fn a_resume_of_a_deleted_one_counts_on_in_the_table() {
     for (standing, attempt, jobs, earlier) in [
-        (crate::controller::submissions::view::Standing::Resumed, 1, 3, 3),
-        (crate::controller::submissions::view::Standing::Resumed, 4, 3, 0),
-        (crate::controller::submissions::view::Standing::Resumed, 1, 0, 0),
-        (crate::controller::submissions::view::Standing::Wanted, 1, 3, 0),
+        (crate::controller::submissions::view::Standing::Resumed, 1, Some(3), 3),
+        (crate::controller::submissions::view::Standing::Resumed, 4, Some(3), 0),
+        (crate::controller::submissions::view::Standing::Resumed, 1, None, 0),
+        (crate::controller::submissions::view::Standing::Wanted, 1, Some(3), 0),
     ] {
         let mut world = World::evalai();
-        world.submission().spec.attempt = attempt;
+        world.submission().spec.attempt = Attempt(attempt);
         let info = world.in_evalai().info.as_mut().unwrap();
-        (info.standing, info.last_attempt) = (standing, jobs);
+        (info.standing, info.last_attempt) = (standing, jobs.map(Attempt));
         world.pass();
         let plan = world.pass().status.plan.unwrap();
         assert_eq!(
             plan.earlier_attempts, earlier,
-            "{standing:?}, attempt {attempt}, {jobs}"
+            "{standing:?}, attempt {attempt}, {jobs:?}"
         );
     }
 }

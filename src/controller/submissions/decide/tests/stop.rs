@@ -6,7 +6,7 @@ use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport, Ob
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
-use leaderboard_api::{names, reasons};
+use leaderboard_api::{Attempt, names, reasons};
 
 type Request = fn(&mut World);
 
@@ -302,22 +302,25 @@ fn a_higher_attempt_does_not_take_a_stop_back() {
     world.submission().spec.cancel = true;
     world.pass_to(Running, reasons::STOPPING);
     world.submission().spec.cancel = false;
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass_to(Running, reasons::STOPPING);
     world.complete();
     world.pass_to(Cancelled, reasons::CANCELLED);
     let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert_eq!(plan.status.attempt, Some(2));
+    assert_eq!(plan.status.attempt, Some(Attempt(2)));
 }
 
 #[test]
 fn a_higher_attempt_takes_the_place_of_a_retry() {
     let mut world = World::local().running();
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.pass_to(Running, reasons::RUNNING);
     world.complete();
     world.pass_to(Failed, reasons::RESULTS_NOT_STORED);
-    assert_eq!(world.pass_to(Pending, reasons::PREPARING).status.attempt, Some(2));
+    assert_eq!(
+        world.pass_to(Pending, reasons::PREPARING).status.attempt,
+        Some(Attempt(2))
+    );
 }
 
 #[test]

@@ -5,7 +5,7 @@ use serde_json::json;
 use super::builders::*;
 use crate::controller::submissions::view::PodView;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
-use leaderboard_api::{Use, reasons};
+use leaderboard_api::{Attempt, Use, reasons};
 
 /// A submission whose two pairs have a GPU each, before its Job.
 fn with_gpus() -> World {
@@ -55,7 +55,7 @@ fn the_jobs_of_all_attempts_are_summed_up() {
     let plan = world.pass_to(Cancelled, reasons::CANCELLED);
     assert_eq!(plan.status.usage, Some(used(200 + 200)));
     world.submission().spec.cancel = false;
-    world.submission().spec.attempt = 2;
+    world.submission().spec.attempt = Attempt(2);
     world.job_gone();
     assert_eq!(
         world.pass_to(Pending, reasons::PREPARING).status.usage,

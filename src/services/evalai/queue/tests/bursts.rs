@@ -207,7 +207,11 @@ fn a_question_whether_a_submission_may_run_waits_a_minute_for_ends_and_no_longer
             server.bench.ask(pk, 1);
         }
         let answered = |queue: &Queue| {
-            let listed = |pk| queue.view(&key(pk)).is_some_and(|view| view.answered == 1);
+            let listed = |pk| {
+                queue
+                    .view(&key(pk))
+                    .is_some_and(|view| view.answered == Some(Attempt(1)))
+            };
             (3001..3001 + asked).any(listed)
         };
         let took = server.until(Duration::from_mins(5), answered);

@@ -122,7 +122,7 @@ fn an_old_cancellation_does_not_end_a_resumed_attempt() {
     bench.get(7, old.clone());
     bench.live(7, 2);
     let early = bench.expect("list of cancelled");
-    assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, None));
+    assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(2)), None));
     bench.update(7, 2, DesiredUpdate::Queued);
     bench.get(7, old.clone());
     bench.write("queued 7");
@@ -150,7 +150,7 @@ fn a_cancel_before_the_first_read_of_an_attempt_that_evalai_has_asked_for_stays(
         let now = bench.now();
         bench.queue.ask(&subject(&key(7), 7, &run), false, now);
         bench.get(7, cancelled.clone());
-        assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, ended));
+        assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(2)), ended));
         bench
             .queue
             .update(&subject(&key(7), 7, &run), DesiredUpdate::Queued, now);

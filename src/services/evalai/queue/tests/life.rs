@@ -98,7 +98,10 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
         let mut bench = Bench::new();
         bench.ask(7, 1);
         bench.get(7, row(7, status));
-        assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, Some(status)));
+        assert_eq!(
+            (bench.view(7).answered, bench.view(7).ended),
+            (Some(Attempt(1)), Some(status))
+        );
         bench.update(7, 1, DesiredUpdate::Queued);
         bench.wait(100.0);
         bench.expect_nothing();
@@ -144,7 +147,7 @@ fn after_a_restart_a_run_with_a_job_is_still_not_finished_by_others() {
     let now = bench.now();
     bench.queue.ask(&subject(&key(7), 7, &run), false, now);
     bench.get(7, finished.clone());
-    assert_eq!((bench.view(7).answered, bench.view(7).ended), (1, None));
+    assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(1)), None));
     bench
         .queue
         .update(&subject(&key(7), 7, &run), DesiredUpdate::Running, now);
@@ -170,13 +173,16 @@ fn an_unknown_status_starts_nothing_and_ends_nothing() {
     bench.ask(7, 1);
     bench.get(7, row(7, Status::Unknown));
     let view = bench.view(7);
-    assert_eq!((view.answered, view.ended), (0, None));
+    assert_eq!((view.answered, view.ended), (None, None));
     assert!(view.last_error.is_some_and(|why| why.contains("does not know")));
     bench.wait(59.0);
     bench.expect_nothing();
     bench.wait(1.0);
     bench.get(7, row(7, Status::Submitted));
-    assert_eq!((bench.view(7).answered, bench.view(7).last_error), (1, None));
+    assert_eq!(
+        (bench.view(7).answered, bench.view(7).last_error),
+        (Some(Attempt(1)), None)
+    );
 }
 
 #[test]
@@ -244,9 +250,9 @@ fn a_later_attempt_makes_the_requests_of_the_earlier_one_void() {
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, results(2.0)));
     bench.expect_nothing();
     bench.answer(&put, Reply::Written(Answer::Done(())));
-    assert_eq!((bench.view(7).attempt, bench.view(7).end), (2, None));
+    assert_eq!((bench.view(7).attempt, bench.view(7).end), (Attempt(2), None));
     bench.get(7, row(7, Status::Failed));
-    assert_eq!((bench.view(7).answered, bench.view(7).ended), (2, None));
+    assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(2)), None));
 }
 
 #[test]

@@ -19,6 +19,7 @@ use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
 use crate::services::evalai::status::Status;
 use crate::services::evalai::types::{ImageAnswer, Run, Usage};
 use crate::services::token::Token;
+use leaderboard_api::Attempt;
 
 /// A queue whose time is ours.
 struct Bench {
@@ -57,7 +58,7 @@ fn key(pk: i64) -> Key {
 
 fn run(pk: i64, attempt: i64) -> Run {
     Run {
-        attempt,
+        attempt: Attempt(attempt),
         job: format!("submission-{pk}-{attempt}"),
         by_hand: true,
         has_job: false,

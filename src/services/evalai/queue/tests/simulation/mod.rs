@@ -356,7 +356,7 @@ impl World {
             key: key(pk),
             pk,
             run: Run {
-                attempt: actor.attempt,
+                attempt: Attempt(actor.attempt),
                 job: format!("submission-{pk}-{}", actor.attempt),
                 by_hand: true,
                 has_job: actor.began.is_some(),
@@ -369,7 +369,7 @@ impl World {
         if let Some(end) = view.end {
             return self.settle(pk, &end);
         }
-        if view.answered < actor.attempt {
+        if view.answered < Some(Attempt(actor.attempt)) {
             return;
         }
         let Some(began) = actor.began else {
