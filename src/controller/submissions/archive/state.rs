@@ -1,5 +1,4 @@
-//! What is to be read from and written to one bucket, and what came of it. Pure: knows no client, and no clock but the times
-//! handed in.
+//! What is to be read from and written to one bucket, and what came of it. Pure: no client, and no clock but the times given.
 //!
 //! A demand stands until it is answered. Answers carry what was known when they were asked for: a demand that comes while a read
 //! is under way is answered by a second read.

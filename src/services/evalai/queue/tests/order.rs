@@ -94,26 +94,6 @@ fn many_waiting_submissions_are_asked_for_by_one_list() {
 }
 
 #[test]
-fn a_list_that_goes_on_failing_keeps_no_submission_from_being_asked_for() {
-    let mut bench = Bench::new();
-    for pk in 1..=8 {
-        bench.ask(pk, 1);
-    }
-    for wait in [5.0, 10.0, 0.0] {
-        let ticket = bench.expect("list of submitted");
-        bench.answer(&ticket, Reply::Rows(Answer::Broken("EvalAI has broken down".into())));
-        if wait > 0.0 {
-            bench.expect_nothing();
-        }
-        bench.wait(wait);
-    }
-    for pk in 1..=3 {
-        bench.get(pk, row(pk, Status::Submitted));
-        assert_eq!(bench.view(pk).answered, Some(Attempt(1)));
-    }
-}
-
-#[test]
 fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
     let mut bench = Bench::new();
     bench.serve();
