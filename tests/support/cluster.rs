@@ -19,7 +19,6 @@ use kube::{Client, Config, Resource, ResourceExt};
 use leaderboard_api::names::LABEL_SUBMISSION;
 use leaderboard_api::{Leaderboard, Submission};
 use serde_json::{Value, json};
-use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
 pub use self::reads::{containers, done, is_settled, is_true, names, reason, score, state};
@@ -38,8 +37,6 @@ mod waits;
 
 /// Every wait of a test ends; this one ends what was forgotten.
 const TEST_LIMIT: Duration = Duration::from_mins(20);
-/// How many tests run at once, however many threads there are: more would only wait for the processors.
-static SLOTS: Semaphore = Semaphore::const_new(6);
 /// Names the tests' own requests in the API server's audit log.
 pub const USER_AGENT: &str = "leaderboard-tests";
 /// Marks the tests' namespaces, where no service account may write.
@@ -97,7 +94,6 @@ pub struct Scene {
 /// `LEADERBOARD_TEST_KEEP` is set.
 pub async fn scenario(name: &str, body: impl AsyncFnOnce(&Scene)) {
     let lab = Lab::from_environment();
-    let _slot = SLOTS.acquire().await.unwrap();
     let scene = Scene::set_up(lab, name).await;
     let begun = Instant::now();
     let outcome = AssertUnwindSafe(timeout(TEST_LIMIT, body(&scene))).catch_unwind().await;
