@@ -25,6 +25,16 @@ pub fn uid_of(object: &impl Resource) -> String {
     uid(object).to_owned()
 }
 
+/// The resource version of an object: those of one kind grow, and the API promises that they can be compared as numbers.
+pub fn version(object: &impl Resource) -> u64 {
+    object.meta().resource_version.as_deref().map_or(0, version_number)
+}
+
+/// The same of one that a write has made.
+pub fn version_number(version: &str) -> u64 {
+    version.parse().unwrap_or(0)
+}
+
 /// The key of an object towards the services.
 pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
     ObjectKey {

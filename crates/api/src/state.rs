@@ -60,7 +60,12 @@ impl SubmissionStatus {
     /// Whether the present attempt takes up one of the slots that `concurrency.total` counts: it has a Job, also while that starts, or has
     /// lost one to the infrastructure and is about to get another.
     pub fn has_slot(&self) -> bool {
-        !self.has_ended() && (self.job_name.is_some() || self.retry > 0)
+        !self.has_ended() && self.has_run()
+    }
+
+    /// Whether a Job was made for the present attempt: that of a try that the infrastructure ended counts.
+    pub fn has_run(&self) -> bool {
+        self.job_name.is_some() || self.retry > 0
     }
 
     /// Whether its run continues from stored results.

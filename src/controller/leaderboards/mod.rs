@@ -31,7 +31,7 @@ use kube::Client;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::time::Instant;
 
-use super::objects::{key_of, uid_of};
+use super::objects::{key_of, uid_of, version, version_number};
 use super::settings::Settings;
 use super::slots::SlotAllocator;
 use super::writes::{apply_status, set_finalizer};
@@ -212,7 +212,7 @@ async fn write_status(
     now: Timestamp,
 ) -> Result<Duration, CallError> {
     let uid = uid_of(leaderboard);
-    if state.awaits_write(&uid, number(leaderboard.metadata.resource_version.as_deref()), now) {
+    if state.awaits_write(&uid, version(leaderboard), now) {
         return Ok(SOONEST);
     }
     let old = leaderboard.status.clone().unwrap_or_default();
@@ -232,12 +232,7 @@ async fn write_status(
     if only_numbers && old.counts == plan.status.counts && !state.is_older(&uid, now, RESYNC) {
         return Ok(RESYNC);
     }
-    let version = apply_status(client, leaderboard, &plan.status).await?;
-    state.change(&uid, |entry| entry.written = Some((now, number(Some(&version)))));
+    let made = apply_status(client, leaderboard, &plan.status).await?;
+    state.change(&uid, |entry| entry.written = Some((now, version_number(&made))));
     Ok(RESYNC)
-}
-
-/// Versions of one kind grow; the API promises that they can be compared as numbers.
-fn number(version: Option<&str>) -> u64 {
-    version.and_then(|version| version.parse().ok()).unwrap_or(0)
 }

@@ -79,7 +79,7 @@ impl Member {
             stand: match status {
                 _ if is_over => Stand::Over,
                 // Between two tries it keeps its slot: it lost its Job to the infrastructure and is about to get another.
-                status if !is_finished && (status.job_name.is_some() || status.retry > 0) => Stand::HasSlot,
+                status if !is_finished && status.has_run() => Stand::HasSlot,
                 _ => Stand::Idle,
             },
             is_leaving: is_over || spec.cancel || is_deleting,

@@ -185,7 +185,7 @@ fn run_of(submission: &Submission) -> Run {
         attempt,
         job: names::job(&submission.name_any(), JobNumber::first(attempt)),
         by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
-        has_job: status.is_some_and(|s| s.job_name.is_some() || s.retry > 0),
+        has_job: status.is_some_and(SubmissionStatus::has_run),
         ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
         log: log_span_of(submission),
     }

@@ -6,10 +6,9 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use kube::ResourceExt;
 use tokio::time::Instant;
 
-use crate::controller::objects::uid;
+use crate::controller::objects::{self, uid, version_number};
 use crate::lock::lock;
 use leaderboard_api::{Attempt, Submission, SubmissionStatus};
 
@@ -69,8 +68,8 @@ impl Memory {
     /// Remembers a status that we wrote, and the version that the API server has made of it. The watch may be faster than the
     /// answer: what the cache has `shown` by now is not kept.
     pub fn wrote(&self, submission: &Submission, status: &SubmissionStatus, version: &str, shown: Option<&Submission>) {
-        let made = version.parse().unwrap_or(0);
-        let is_shown = shown.is_some_and(|shown| uid(shown) == uid(submission) && self::version(shown) >= made);
+        let made = version_number(version);
+        let is_shown = shown.is_some_and(|shown| uid(shown) == uid(submission) && objects::version(shown) >= made);
         let written = Written {
             version: made,
             at: Instant::now(),
@@ -86,7 +85,7 @@ impl Memory {
         let mut entries = lock(&self.entries);
         let entry = entries.get_mut(uid(submission));
         if let Some(written) = entry.and_then(|e| e.written.as_mut())
-            && version(submission) >= written.version
+            && objects::version(submission) >= written.version
         {
             written.status = None;
         }
@@ -182,11 +181,6 @@ impl Memory {
     pub fn forget(&self, uid: &str) {
         lock(&self.entries).remove(uid);
     }
-}
-
-/// Resource versions of one kind grow; the API promises that they can be compared as numbers.
-fn version(object: &Submission) -> u64 {
-    object.resource_version().and_then(|v| v.parse().ok()).unwrap_or(0)
 }
 
 #[cfg(test)]

@@ -29,9 +29,8 @@ const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 pub(super) fn waits(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
     let accepted = draft.status.condition(conditions::ACCEPTED);
     let is_accepted = accepted.is_some_and(|c| c.status == "True");
-    let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
     // One that observes stores below a prefix of its own, and runs what another program runs on purpose.
-    let is_settled = is_accepted || has_run || draft.observes();
+    let is_settled = is_accepted || draft.status.has_run() || draft.observes();
     let is_asked = if draft.is_adopted() || terms.info.is_none() {
         stored::may_be(draft) && stored::is_marked(draft)
     } else {

@@ -32,8 +32,7 @@ pub(super) enum Step {
 
 /// Why the Leaderboard does not allow the image. No registry is needed for that.
 pub(super) fn not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, image: &str) -> Option<Failure> {
-    let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
-    let reference = ImageReference::parse(image).ok().filter(|_| !has_run)?;
+    let reference = ImageReference::parse(image).ok().filter(|_| !draft.status.has_run())?;
     let repository = Repository::of(&reference);
     let own = [&leaderboard.contents.image, &leaderboard.simulator.image];
     let is_hosts = own
@@ -88,7 +87,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec,
         let note = (known.reason == reasons::IMAGE_NOT_PINNED).then(|| known.message.to_string());
         return Step::Go(note);
     }
-    let has_run = draft.status.image.is_some() || draft.status.job_name.is_some() || draft.status.retry > 0;
+    let has_run = draft.status.image.is_some() || draft.status.has_run();
     let patterns = patterns(draft, leaderboard).filter(|_| !has_run);
     let (Some(patterns), Ok(reference)) = (patterns, ImageReference::parse(image)) else {
         return Step::Go(None);

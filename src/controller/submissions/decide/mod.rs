@@ -100,7 +100,7 @@ fn look_up_node(draft: &mut PlanBuilder<'_>) {
 fn needs_finalizer(draft: &PlanBuilder<'_>) -> bool {
     let is_recorded = draft.view.record.is_some() && !draft.spec().check;
     let is_owed = draft.spec().evalai.is_some() || is_recorded;
-    let has_begun = draft.status.job_name.is_some() || draft.status.retry > 0;
+    let has_begun = draft.status.has_run();
     let is_requested = draft.does(|action| matches!(action, Action::UpdateEvalai(_) | Action::Record(_)));
     let is_settled = draft.does(|action| *action == Action::Forget);
     is_owed && (has_begun || is_requested) && !is_settled && !draft.has_finalizer() && !draft.is_deleting()

@@ -112,8 +112,7 @@ pub(super) fn requested_fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> 
 /// Whether the report of an ended run is there. Asks for it.
 pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     // What never had a Job has stored nothing.
-    let had_job = draft.status.job_name.is_some() || draft.status.retry > 0;
-    if draft.status.plan.is_none() || !had_job {
+    if draft.status.plan.is_none() || !draft.status.has_run() {
         return Reading::Done;
     }
     draft.needs_report = true;

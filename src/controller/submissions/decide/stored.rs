@@ -26,9 +26,8 @@ pub(super) fn may_be(draft: &PlanBuilder<'_>) -> bool {
 }
 
 fn has_not_run(draft: &PlanBuilder<'_>) -> bool {
-    let has_run = draft.status.job_name.is_some() || draft.status.retry > 0;
     // What is only observed and what is checked have places of their own.
-    !has_run && !draft.observes() && !draft.spec().check
+    !draft.status.has_run() && !draft.observes() && !draft.spec().check
 }
 
 /// Whether it is marked as one that was run before. EvalAI's are looked for anyway; of a local one nothing else shows it.
